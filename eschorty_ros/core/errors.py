@@ -1,0 +1,21 @@
+"""The package's errors: each message is one line that names the thing, the value and the remedy."""
+
+
+class EschortyError(Exception):
+    """A failure a user can cause or cure; command line and nodes print it without a traceback."""
+
+
+class ArgumentError(EschortyError, ValueError):
+    """A value outside what a function accepts; the message names the argument and its value."""
+
+
+class FormatError(EschortyError):
+    """A file or stream that is not what its reader expects."""
+
+
+class CalibrationError(EschortyError):
+    """A calibration that is missing, malformed or does not fit the sensor."""
+
+
+class DeviceError(EschortyError):
+    """A camera, laser or stage that refused or failed."""

@@ -1,0 +1,117 @@
+"""Planned straight-line motion as pieces of constant acceleration.
+
+Two processes that hold the same plan compute the same position at the same time: the plan is
+exchanged instead of sampled positions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPlan:
+    """Position as a function of time from ``start_ns`` on; at rest after the last piece.
+
+    Parameters
+    ----------
+    start_ns : int
+        Time the plan begins, int64 nanoseconds of whatever clock the owner uses.
+    position_mm, velocity_mm_s : float
+        State at ``start_ns``.
+    durations_s, accelerations_mm_s2 : tuple of float
+        One entry per piece.
+    """
+
+    start_ns: int
+    position_mm: float
+    velocity_mm_s: float = 0.0
+    durations_s: tuple[float, ...] = ()
+    accelerations_mm_s2: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.durations_s) != len(self.accelerations_mm_s2):
+            raise ArgumentError(
+                f"durations_s has {len(self.durations_s)} pieces and accelerations_mm_s2 "
+                f"{len(self.accelerations_mm_s2)}; give one acceleration per duration"
+            )
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the last piece's end."""
+        return self.start_ns + round(math.fsum(self.durations_s) * 1e9)
+
+    @property
+    def end_mm(self) -> float:
+        """Position after the last piece."""
+        return float(self.state(self.end_ns)[0])
+
+    def state(self, t_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position (mm) and velocity (mm/s) at integer times ``t_ns``, same shape as ``t_ns``."""
+        elapsed_s = np.maximum((np.asarray(t_ns, dtype=np.int64) - self.start_ns) * 1e-9, 0.0)
+        position = np.full(elapsed_s.shape, self.position_mm)
+        velocity = np.full(elapsed_s.shape, self.velocity_mm_s)
+        began_s = 0.0
+        for duration_s, acceleration in zip(
+            self.durations_s, self.accelerations_mm_s2, strict=True
+        ):
+            dt = np.clip(elapsed_s - began_s, 0.0, duration_s)
+            position += velocity * dt + 0.5 * acceleration * dt * dt
+            velocity += acceleration * dt
+            began_s += duration_s
+        if self.durations_s:
+            velocity[elapsed_s >= began_s] = 0.0
+        return position, velocity
+
+
+def plan_move(
+    start_ns: int,
+    position_mm: float,
+    target_mm: float,
+    speed_mm_s: float,
+    acceleration_mm_s2: float,
+) -> MotionPlan:
+    """Trapezoid from rest at ``position_mm`` to rest at ``target_mm``.
+
+    Raises
+    ------
+    ArgumentError
+        When speed or acceleration is not positive.
+    """
+    if not speed_mm_s > 0.0:
+        raise ArgumentError(f"speed_mm_s is {speed_mm_s!r}; choose a positive speed")
+    if not acceleration_mm_s2 > 0.0:
+        raise ArgumentError(f"acceleration_mm_s2 is {acceleration_mm_s2!r}; choose a positive one")
+    distance = abs(target_mm - position_mm)
+    sign = math.copysign(1.0, target_mm - position_mm)
+    peak = min(speed_mm_s, math.sqrt(distance * acceleration_mm_s2))
+    ramp_s = peak / acceleration_mm_s2
+    cruise_s = distance / peak - ramp_s if peak > 0.0 else 0.0
+    return MotionPlan(
+        start_ns,
+        position_mm,
+        0.0,
+        (ramp_s, cruise_s, ramp_s),
+        (sign * acceleration_mm_s2, 0.0, -sign * acceleration_mm_s2),
+    )
+
+
+def plan_stop(plan: MotionPlan, at_ns: int, deceleration_mm_s2: float) -> MotionPlan:
+    """Profiled stop of ``plan`` begun at ``at_ns``."""
+    position, velocity = plan.state(at_ns)
+    speed = float(velocity)
+    if speed == 0.0:
+        return MotionPlan(at_ns, float(position))
+    return MotionPlan(
+        at_ns,
+        float(position),
+        speed,
+        (abs(speed) / deceleration_mm_s2,),
+        (-math.copysign(deceleration_mm_s2, speed),),
+    )

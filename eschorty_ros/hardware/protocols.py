@@ -1,0 +1,129 @@
+"""What the nodes ask of a camera, a laser and a stage, real or simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.motion import MotionPlan
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceIdentity:
+    """Who answers at the other end: goes into logs, diagnostics and file headers."""
+
+    model: str
+    serial: str
+    firmware: str = ""
+
+
+class EventSource(Protocol):
+    """A camera that hands out raw EVT3 bytes."""
+
+    identity: DeviceIdentity
+    width: int
+    height: int
+
+    def start(self) -> None:
+        """Begin streaming."""
+
+    def stop(self) -> None:
+        """End streaming; idempotent."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whole 16-bit EVT3 words that have arrived, ``b""`` when none came in ``timeout_s``.
+
+        Raises ``DeviceError`` when the camera is gone.
+        """
+
+    def sensor_zero_ns(self) -> int:
+        """Host time (ns) at which the sensor's clock read zero, as well as it is known."""
+
+    def statistics(self) -> dict[str, float]:
+        """Counters for diagnostics, by name with unit."""
+
+    def close(self) -> None:
+        """Release the device; idempotent."""
+
+
+class LaserOutput(IntEnum):
+    """Output state; ``UNKNOWN`` counts as on."""
+
+    OFF = 0
+    ON = 1
+    UNKNOWN = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LaserReadback:
+    """What the generator says it does."""
+
+    output: LaserOutput
+    modulation: Modulation
+    phase_epoch_ns: int
+    output_since_ns: int
+
+
+class LaserModulator(Protocol):
+    """The generator that gates the laser. Off at construction and after every failure."""
+
+    identity: DeviceIdentity
+
+    def configure(self, modulation: Modulation) -> None:
+        """Set waveform, frequency and duty; raises ``DeviceError`` when refused."""
+
+    def arm(self) -> None:
+        """Allow the next ``enable``."""
+
+    def enable(self) -> None:
+        """Switch the output on; raises ``DeviceError`` when not armed."""
+
+    def disable(self) -> None:
+        """Switch the output off and disarm; idempotent, never raises for being off already."""
+
+    def readback(self) -> LaserReadback:
+        """Read settings and output state back."""
+
+    def close(self) -> None:
+        """Switch off and release; idempotent."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageState:
+    """One reading of the stage."""
+
+    position_mm: float
+    velocity_mm_s: float
+    t_ns: int
+    homed: bool
+    moving: bool
+    flags: tuple[str, ...] = field(default=())
+
+
+class LinearStage(Protocol):
+    """A linear stage with absolute moves that end by themselves."""
+
+    identity: DeviceIdentity
+    travel_mm: tuple[float, float]
+    speed_max_mm_s: float
+    acceleration_mm_s2: float
+
+    def home(self) -> None:
+        """Start homing; ``state().homed`` tells when it is done."""
+
+    def move_to(self, position_mm: float, speed_mm_s: float) -> None:
+        """Start an absolute move; raises ``DeviceError`` outside travel, too fast or not homed."""
+
+    def stop(self) -> None:
+        """Profiled stop; idempotent."""
+
+    def state(self) -> StageState:
+        """Position, velocity, time and flags now."""
+
+    def plan(self) -> MotionPlan | None:
+        """The motion under way in host time, ``None`` when the device does not know it."""
+
+    def close(self) -> None:
+        """Stop and release; idempotent."""

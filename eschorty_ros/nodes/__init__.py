@@ -1,0 +1,1 @@
+"""ROS 2 nodes: convert in, call the core, convert out."""

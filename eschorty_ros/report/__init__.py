@@ -1,0 +1,1 @@
+"""Figures and accuracy figures of a scan."""

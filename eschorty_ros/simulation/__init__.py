@@ -1,0 +1,1 @@
+"""A simulated bench: scene, event pixels, laser and stage, with the truth known."""
