@@ -1,0 +1,253 @@
+"""Where the stage was at a sensor time, and what ROS time that was."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+
+NM_PER_MM = 1_000_000
+NS_PER_US = 1_000
+POSITION_LIMIT_MM = 1e9
+
+
+def quantise_nm(position_mm: ArrayLike) -> NDArray[np.int64]:
+    """Positions rounded to the nanometre, int64.
+
+    Positions that went through text with six decimals and through ROS metres give the same
+    integers, so a recording and the live nodes place points identically.
+
+    Raises
+    ------
+    ArgumentError
+        When a position is not finite or farther than 1e9 mm.
+    """
+    position = np.asarray(position_mm, dtype=np.float64)
+    wrong = ~(np.abs(position) <= POSITION_LIMIT_MM)
+    if wrong.any():
+        raise ArgumentError(
+            f"position_mm is {float(position[wrong][0])!r}; give finite positions within "
+            f"{POSITION_LIMIT_MM:g} mm"
+        )
+    return np.rint(position * NM_PER_MM).astype(np.int64)
+
+
+class StageTrack:
+    """Stage positions over sensor time, linear between samples, never extrapolated.
+
+    Parameters
+    ----------
+    max_gap_us : int, optional
+        Longest distance of two samples that is still bridged, us; ``None`` bridges any.
+
+    Attributes
+    ----------
+    dropped : int
+        Samples refused because they were not later than the one before.
+    """
+
+    def __init__(self, max_gap_us: int | None = None) -> None:
+        if max_gap_us is not None and max_gap_us <= 0:
+            raise ArgumentError(f"max_gap_us is {max_gap_us!r}; choose a positive time or None")
+        self.max_gap_us = max_gap_us
+        self.dropped = 0
+        self._t_us = np.empty(256, np.int64)
+        self._nm = np.empty(256, np.int64)
+        self._begin = 0
+        self._end = 0
+
+    def __len__(self) -> int:
+        """Samples held."""
+        return self._end - self._begin
+
+    @property
+    def first_us(self) -> int | None:
+        """Time of the oldest sample held, ``None`` when there is none."""
+        return int(self._t_us[self._begin]) if len(self) else None
+
+    @property
+    def last_us(self) -> int | None:
+        """Time of the newest sample, ``None`` when there is none."""
+        return int(self._t_us[self._end - 1]) if len(self) else None
+
+    def append(self, t_us: ArrayLike, position_mm: ArrayLike) -> None:
+        """Add samples; those not later than all before them are dropped and counted.
+
+        Parameters
+        ----------
+        t_us : int or array_like of int, shape (n,)
+            Sensor time, us.
+        position_mm : float or array_like, shape (n,)
+            Position, quantised to 1 nm.
+
+        Raises
+        ------
+        ArgumentError
+            For fractional times, unequal lengths or positions that are not finite.
+        """
+        times = np.atleast_1d(_whole_us(t_us))
+        positions = np.atleast_1d(quantise_nm(position_mm))
+        if times.ndim != 1 or times.shape != positions.shape:
+            raise ArgumentError(
+                f"t_us has shape {times.shape} and position_mm {positions.shape}; "
+                "give one position for each time"
+            )
+        floor = np.iinfo(np.int64).min if self.last_us is None else self.last_us
+        newest_before = np.maximum.accumulate(np.concatenate(([floor], times)))[:-1]
+        later = times > newest_before
+        self.dropped += int(later.size - np.count_nonzero(later))
+        self._extend(times[later], positions[later])
+
+    def position_mm(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Stage position at sensor times.
+
+        Parameters
+        ----------
+        t_us : array_like of int, any shape
+            Sensor time, us.
+
+        Returns
+        -------
+        ndarray of float64, shape of ``t_us``
+            mm; NaN outside the samples and inside a gap longer than ``max_gap_us``.
+        """
+        query = _whole_us(t_us)
+        times, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
+        if times.size == 0:
+            return np.full(query.shape, np.nan)
+        left = np.clip(np.searchsorted(times, query, side="right") - 1, 0, times.size - 1)
+        right = np.minimum(left + 1, times.size - 1)
+        since = query - times[left]
+        gap = times[right] - times[left]
+        step_nm = (nm[right] - nm[left]).astype(np.float64)
+        position = (nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM
+        unknown = (since < 0) | (since > gap)
+        if self.max_gap_us is not None:
+            unknown |= (gap > self.max_gap_us) & (since > 0)
+        return np.where(unknown, np.nan, position)
+
+    def forget_before(self, t_us: int) -> None:
+        """Release samples that no query at ``t_us`` or later needs."""
+        held = self._t_us[self._begin : self._end]
+        self._begin += max(int(np.searchsorted(held, t_us, side="right")) - 1, 0)
+
+    def _extend(self, times: NDArray[np.int64], nm: NDArray[np.int64]) -> None:
+        if self._end + times.size > self._t_us.size:
+            self._make_room(times.size)
+        stop = self._end + times.size
+        self._t_us[self._end : stop] = times
+        self._nm[self._end : stop] = nm
+        self._end = stop
+
+    def _make_room(self, count: int) -> None:
+        size = max(2 * (len(self) + count), 256)
+        for name in ("_t_us", "_nm"):
+            grown = np.empty(size, np.int64)
+            grown[: len(self)] = getattr(self, name)[self._begin : self._end]
+            setattr(self, name, grown)
+        self._begin, self._end = 0, len(self)
+
+
+class SensorClock:
+    """Exact conversion between sensor microseconds and ROS nanoseconds.
+
+    With ``zero_ns`` given (announced by the camera) the zero is fixed. Without it the zero is
+    the lower envelope of ``arrival - sensor time`` over a sliding window: a packet can be late
+    but never early, so the smallest difference seen is the closest to the truth, and the window
+    lets the estimate follow a drifting oscillator.
+
+    The estimate may step at an observation, never between two of them: times converted between
+    two observations are monotone. When arrival or sensor time goes back (clock set, camera
+    restarted) the window starts anew and ``restarts`` counts it.
+
+    Parameters
+    ----------
+    zero_ns : int, optional
+        ROS time (ns) at which the sensor's clock read zero.
+    window_ns : int
+        Length of the sliding window, ns of arrival time.
+
+    Attributes
+    ----------
+    restarts : int
+        Times the window was thrown away.
+    residual_ns : int or None
+        How much later than the zero says the last observed packet arrived.
+    """
+
+    def __init__(self, zero_ns: int | None = None, window_ns: int = 10_000_000_000) -> None:
+        if window_ns <= 0:
+            raise ArgumentError(f"window_ns is {window_ns!r}; choose a positive time")
+        self._announced = zero_ns is not None
+        self._zero_ns = zero_ns
+        self._window_ns = window_ns
+        self._candidates: deque[tuple[int, int]] = deque()
+        self._last: tuple[int, int] | None = None
+        self.restarts = 0
+        self.residual_ns: int | None = None
+
+    @property
+    def zero_ns(self) -> int | None:
+        """ROS time of sensor time 0, ns; ``None`` while nothing is known."""
+        return self._zero_ns
+
+    def observe(self, t_us: int, arrival_ns: int) -> None:
+        """Take note that the event of sensor time ``t_us`` arrived at ROS time ``arrival_ns``."""
+        t_us, arrival_ns = int(t_us), int(arrival_ns)
+        if not self._announced:
+            self._estimate(t_us, arrival_ns)
+        self._last = (t_us, arrival_ns)
+        self.residual_ns = arrival_ns - self.to_ns(t_us)
+
+    @overload
+    def to_ns(self, t_us: int) -> int: ...
+    @overload
+    def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
+    def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+        """ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
+        zero = self._known_zero()
+        if isinstance(t_us, np.ndarray):
+            return _whole_us(t_us) * NS_PER_US + zero
+        return int(t_us) * NS_PER_US + zero
+
+    @overload
+    def to_us(self, t_ns: int) -> int: ...
+    @overload
+    def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
+    def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+        """Sensor time (us, nearest, halves up) of ROS time ``t_ns``; undoes :meth:`to_ns`."""
+        zero = self._known_zero()
+        if isinstance(t_ns, np.ndarray):
+            return (_whole_us(t_ns) - zero + NS_PER_US // 2) // NS_PER_US
+        return (int(t_ns) - zero + NS_PER_US // 2) // NS_PER_US
+
+    def _known_zero(self) -> int:
+        if self._zero_ns is None:
+            raise ArgumentError(
+                "the ROS time of sensor time 0 is unknown; announce it or observe a packet first"
+            )
+        return self._zero_ns
+
+    def _estimate(self, t_us: int, arrival_ns: int) -> None:
+        if self._last is not None and (t_us < self._last[0] or arrival_ns < self._last[1]):
+            self._candidates.clear()
+            self.restarts += 1
+        offset = arrival_ns - t_us * NS_PER_US
+        while self._candidates and self._candidates[-1][1] >= offset:
+            self._candidates.pop()
+        self._candidates.append((arrival_ns, offset))
+        while self._candidates[0][0] < arrival_ns - self._window_ns:
+            self._candidates.popleft()
+        self._zero_ns = self._candidates[0][1]
+
+
+def _whole_us(times: ArrayLike) -> NDArray[np.int64]:
+    """``times`` as int64; fractional input is refused, since floats lose microseconds."""
+    array = np.asarray(times)
+    if array.size and array.dtype.kind not in "iu":
+        raise ArgumentError(f"times have dtype {array.dtype}; give integers")
+    return array.astype(np.int64, copy=False)

@@ -1,0 +1,38 @@
+"""Files that are whole or absent: write beside the target, then rename."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from eschorty_ros.core.errors import ArgumentError
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a binary file that takes the name ``path`` only when the block ends without error.
+
+    Raises
+    ------
+    ArgumentError
+        When the file cannot be written; names the path and the reason.
+    """
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(target)
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot write {target}: {error.strerror or error}; choose a folder that exists, "
+            "is writable and has room"
+        ) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink()

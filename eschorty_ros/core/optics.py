@@ -1,0 +1,188 @@
+"""Scheimpflug ranging: rows to ranges and back, magnification, sampling and lateral scale.
+
+Signs: ``k_mm > 0``, ``k_prime_px < 0``, ``b_prime_px < 0``, so ``K = k k' < 0`` and a row sees
+something only where ``row + b' < 0``. The pole ``row = -b'`` is infinitely far away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+
+Array = NDArray[np.float64]
+
+POLE_MARGIN_PX = 1.0
+PIXEL_UM = 4.86
+COLUMNS = 1280
+ROWS = 720
+PRINCIPAL_COLUMN = 639.5
+
+
+def object_scale_mm(focal_mm: float, theta_deg: float) -> float:
+    """``k = f / sin(theta)`` in mm, unrounded (Eq. 1)."""
+    return focal_mm / math.sin(math.radians(theta_deg))
+
+
+def depth_of_field_mm(
+    magnification: ArrayLike,
+    f_number: float,
+    theta_deg: float,
+    theta_prime_deg: float,
+    pixel_um: float = PIXEL_UM,
+) -> Array:
+    """Half depth of field along the sheet, mm (Eq. 3).
+
+    A focus tolerance, not a ranging error.
+
+    Parameters
+    ----------
+    magnification : array_like, any shape
+        Image size over object size; 0 (the pole) gives infinity.
+    f_number : float
+    theta_deg, theta_prime_deg : float
+        Tilt of the light sheet and of the sensor against the lens plane; signs do not matter.
+    pixel_um : float
+        Pixel pitch, taken as the circle of confusion.
+
+    Returns
+    -------
+    ndarray of float64, shape of ``magnification``
+        The object is in focus within plus and minus this length.
+    """
+    m = np.asarray(magnification, dtype=np.float64)
+    blur_mm = pixel_um * 1e-3 * math.cos(math.radians(theta_prime_deg)) * f_number
+    with np.errstate(divide="ignore"):
+        return np.asarray(blur_mm / (m * m * abs(math.sin(math.radians(theta_deg)))))
+
+
+@dataclass(frozen=True, slots=True)
+class RangeModel:
+    """The calibrated range equation of one build (Eq. 2) and what follows from it.
+
+    Parameters
+    ----------
+    k_mm : float
+        ``f / sin(theta)``, mm, positive.
+    k_prime_px : float
+        ``-f / (p sin|theta'|)``, px, negative.
+    b_mm : float
+        Distance from the mechanical datum to the front focal line, mm.
+    b_prime_px : float
+        Row offset, px, at most -1.
+    pixel_um : float
+        Pixel pitch, um.
+    columns, rows : int
+        Sensor size; columns run along the laser line, rows along the range.
+    principal_column : float
+        Column of zero scan angle; pixel centres are integers.
+
+    Raises
+    ------
+    ArgumentError
+        When a parameter has the wrong sign or is not finite.
+    """
+
+    k_mm: float
+    k_prime_px: float
+    b_mm: float
+    b_prime_px: float
+    pixel_um: float = PIXEL_UM
+    columns: int = COLUMNS
+    rows: int = ROWS
+    principal_column: float = PRINCIPAL_COLUMN
+
+    def __post_init__(self) -> None:
+        for name in ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "pixel_um", "principal_column"):
+            if not math.isfinite(getattr(self, name)):
+                raise ArgumentError(f"{name} is {getattr(self, name)!r}; give a finite number")
+        for name in ("k_mm", "pixel_um", "columns", "rows"):
+            if not getattr(self, name) > 0:
+                raise ArgumentError(f"{name} is {getattr(self, name)!r}; choose a positive value")
+        if not self.k_prime_px < 0.0:
+            raise ArgumentError(f"k_prime_px is {self.k_prime_px!r}; choose a negative value")
+        if not self.b_prime_px <= -POLE_MARGIN_PX:
+            raise ArgumentError(
+                f"b_prime_px is {self.b_prime_px!r}; choose {-POLE_MARGIN_PX:g} or less, "
+                "so that row 0 lies in front of the pole"
+            )
+
+    @property
+    def product_mm_px(self) -> float:
+        """``K = k k'``, mm px, negative: the only product ranging depends on."""
+        return self.k_mm * self.k_prime_px
+
+    @property
+    def range_limits_mm(self) -> tuple[float, float]:
+        """Range at row 0 and at the last row, mm; infinite where the pole is on the sensor."""
+        near, far = self.range_mm([0.0, self.rows - 1.0])
+        return float(near), math.inf if math.isnan(far) else float(far)
+
+    def range_mm(self, row: ArrayLike) -> Array:
+        """Range along the sheet from the mechanical datum (Eq. 2 inverted).
+
+        Parameters
+        ----------
+        row : array_like, any shape
+            Row coordinate, px; may lie off the sensor.
+
+        Returns
+        -------
+        ndarray of float64, shape of ``row``
+            mm; NaN within 1 px of the pole and behind it (``row + b' > -1``).
+        """
+        return np.asarray(self.product_mm_px / self._image_px(row) - self.b_mm)
+
+    def row(self, range_mm: ArrayLike) -> Array:
+        """Row at which a range appears, px (Eq. 2); NaN where ``range + b <= 0``."""
+        return np.asarray(self.product_mm_px / self._depth_mm(range_mm) - self.b_prime_px)
+
+    def magnification(self, row: ArrayLike) -> Array:
+        """Image size over object size at ``row``: ``(row + b') / k'``.
+
+        A straight line in row that reaches 0 at the pole; NaN behind the pole.
+        """
+        m = (np.asarray(row, dtype=np.float64) + self.b_prime_px) / self.k_prime_px
+        return np.where(m >= 0.0, m, np.nan)
+
+    def range_per_row_mm(self, range_mm: ArrayLike) -> Array:
+        """Range step of one row, mm per px (Eq. 4); NaN where ``range + b <= 0``."""
+        depth = self._depth_mm(range_mm)
+        return np.asarray(depth * depth / -self.product_mm_px)
+
+    def range_sigma_mm(self, row: ArrayLike, sigma_row: ArrayLike) -> Array:
+        """One-sigma range error (mm) of a row known to ``sigma_row`` px (Eq. 4).
+
+        ``row`` and ``sigma_row`` broadcast; NaN where :meth:`range_mm` is NaN.
+        """
+        image = self._image_px(row)
+        return np.asarray(
+            -self.product_mm_px / (image * image) * np.asarray(sigma_row, dtype=np.float64)
+        )
+
+    def column_slope(self, column: ArrayLike) -> Array:
+        """Lateral offset per mm of depth at ``column``: ``(column - c0) p / k``, mm per mm."""
+        offset = np.asarray(column, dtype=np.float64) - self.principal_column
+        return np.asarray(offset * (self.pixel_um * 1e-3 / self.k_mm))
+
+    def lateral_mm(self, column: ArrayLike, range_mm: ArrayLike) -> Array:
+        """Position along the laser line, mm, of ``range_mm`` seen in ``column``.
+
+        Image columns meet at the front focal line, so the offset grows with ``range + b``.
+        The arguments broadcast; NaN where ``range + b <= 0``.
+        """
+        return np.asarray(self.column_slope(column) * self._depth_mm(range_mm))
+
+    def _image_px(self, row: ArrayLike) -> Array:
+        """``row + b'``, NaN from one pixel before the pole on."""
+        image = np.asarray(row, dtype=np.float64) + self.b_prime_px
+        return np.where(image <= -POLE_MARGIN_PX, image, np.nan)
+
+    def _depth_mm(self, range_mm: ArrayLike) -> Array:
+        """``R + b``, NaN where it is not positive."""
+        depth = np.asarray(range_mm, dtype=np.float64) + self.b_mm
+        return np.where(depth > 0.0, depth, np.nan)
