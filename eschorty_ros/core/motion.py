@@ -41,6 +41,11 @@ class MotionPlan:
                 f"durations_s has {len(self.durations_s)} pieces and accelerations_mm_s2 "
                 f"{len(self.accelerations_mm_s2)}; give one acceleration per duration"
             )
+        numbers = (self.position_mm, self.velocity_mm_s, *self.accelerations_mm_s2)
+        if not all(math.isfinite(number) for number in numbers):
+            raise ArgumentError(f"a plan holds {numbers!r}; give finite numbers")
+        if not all(0.0 <= duration < math.inf for duration in self.durations_s):
+            raise ArgumentError(f"durations_s is {self.durations_s!r}; give lengths of 0 or more")
 
     @property
     def end_ns(self) -> int:
@@ -53,8 +58,14 @@ class MotionPlan:
         return float(self.state(self.end_ns)[0])
 
     def state(self, t_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Position (mm) and velocity (mm/s) at integer times ``t_ns``, same shape as ``t_ns``."""
-        elapsed_s = np.maximum((np.asarray(t_ns, dtype=np.int64) - self.start_ns) * 1e-9, 0.0)
+        """Position (mm) and velocity (mm/s) at integer times ``t_ns``, same shape as ``t_ns``.
+
+        Before ``start_ns`` the state at ``start_ns``; from ``end_ns`` on exactly one position and
+        velocity 0.
+        """
+        times = np.asarray(t_ns, dtype=np.int64)
+        ended = times >= self.end_ns
+        elapsed_s = np.where(ended, np.inf, np.maximum((times - self.start_ns) * 1e-9, 0.0))
         position = np.full(elapsed_s.shape, self.position_mm)
         velocity = np.full(elapsed_s.shape, self.velocity_mm_s)
         began_s = 0.0
@@ -65,8 +76,7 @@ class MotionPlan:
             position += velocity * dt + 0.5 * acceleration * dt * dt
             velocity += acceleration * dt
             began_s += duration_s
-        if self.durations_s:
-            velocity[elapsed_s >= began_s] = 0.0
+        velocity[ended] = 0.0
         return position, velocity
 
 
@@ -82,17 +92,21 @@ def plan_move(
     Raises
     ------
     ArgumentError
-        When speed or acceleration is not positive.
+        When speed or acceleration is not positive or a value is not finite.
     """
-    if not speed_mm_s > 0.0:
+    for name, place in (("position_mm", position_mm), ("target_mm", target_mm)):
+        if not math.isfinite(place):
+            raise ArgumentError(f"{name} is {place!r}; give a finite position")
+    if not 0.0 < speed_mm_s < math.inf:
         raise ArgumentError(f"speed_mm_s is {speed_mm_s!r}; choose a positive speed")
-    if not acceleration_mm_s2 > 0.0:
+    if not 0.0 < acceleration_mm_s2 < math.inf:
         raise ArgumentError(f"acceleration_mm_s2 is {acceleration_mm_s2!r}; choose a positive one")
     distance = abs(target_mm - position_mm)
     sign = math.copysign(1.0, target_mm - position_mm)
     peak = min(speed_mm_s, math.sqrt(distance * acceleration_mm_s2))
     ramp_s = peak / acceleration_mm_s2
-    cruise_s = distance / peak - ramp_s if peak > 0.0 else 0.0
+    # Where the ramps meet, rounding may leave a cruise of less than nothing.
+    cruise_s = max(distance / peak - ramp_s, 0.0) if peak > 0.0 else 0.0
     return MotionPlan(
         start_ns,
         position_mm,
@@ -103,7 +117,15 @@ def plan_move(
 
 
 def plan_stop(plan: MotionPlan, at_ns: int, deceleration_mm_s2: float) -> MotionPlan:
-    """Profiled stop of ``plan`` begun at ``at_ns``."""
+    """Profiled stop of ``plan`` begun at ``at_ns``.
+
+    Raises
+    ------
+    ArgumentError
+        When the deceleration is not positive.
+    """
+    if not 0.0 < deceleration_mm_s2 < math.inf:
+        raise ArgumentError(f"deceleration_mm_s2 is {deceleration_mm_s2!r}; choose a positive one")
     position, velocity = plan.state(at_ns)
     speed = float(velocity)
     if speed == 0.0:

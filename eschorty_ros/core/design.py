@@ -1,0 +1,300 @@
+"""Choosing an optical build: from lens and tilts to ranges, and from ranges to tilts.
+
+A build is a lens (focal length, f-number), a light sheet tilted by ``theta`` against the lens
+plane, a sensor tilted by ``theta'`` and the row offset ``b'`` that says which part of the sensor
+plane is used. All three planes meet in the Scheimpflug line, ``baseline_mm`` from the lens centre.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.optics import (
+    COLUMNS,
+    PIXEL_UM,
+    ROWS,
+    Array,
+    RangeModel,
+    depth_of_field_mm,
+    object_scale_mm,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DesignTable:
+    """What a build does at some ranges; arrays of one shape, float64, NaN out of reach.
+
+    Attributes
+    ----------
+    range_mm : ndarray
+        Range from the mechanical datum.
+    row : ndarray
+        Where it appears, px; may lie off the sensor, see ``in_view``.
+    in_view : ndarray of bool
+        Whether the row is on the sensor.
+    magnification : ndarray
+        Image size over object size.
+    range_per_row_mm : ndarray
+        Range step of one row (Eq. 4).
+    depth_of_field_mm : ndarray
+        In focus within plus and minus this (Eq. 3).
+    lateral_pitch_mm : ndarray
+        Distance of neighbouring columns along the laser line.
+    swath_mm : ndarray
+        Length of laser line that all columns see.
+    """
+
+    range_mm: Array
+    row: Array
+    in_view: np.typing.NDArray[np.bool_]
+    magnification: Array
+    range_per_row_mm: Array
+    depth_of_field_mm: Array
+    lateral_pitch_mm: Array
+    swath_mm: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """One optical build with everything that follows from it.
+
+    Made by :func:`design` or :func:`design_for_ranges`. Angles in degrees; ``theta_prime_deg``
+    carries the sign it was given, which tells the side, and no formula uses it.
+    """
+
+    focal_length_mm: float
+    f_number: float
+    theta_deg: float
+    theta_prime_deg: float
+    model: RangeModel
+
+    @property
+    def baseline_mm(self) -> float:
+        """Lens centre to Scheimpflug line, ``f (cot theta + cot|theta'|)``, mm."""
+        return self.focal_length_mm * (_cot(self.theta_deg) + _cot(abs(self.theta_prime_deg)))
+
+    @property
+    def range_limits_mm(self) -> tuple[float, float]:
+        """Nearest and farthest range on the sensor, rows 0 and ``rows - 1``, mm."""
+        return self.model.range_limits_mm
+
+    @property
+    def field_deg(self) -> float:
+        """Full scan angle of all columns, seen from the front focal line, degrees."""
+        return 2.0 * math.degrees(math.atan(0.5 * self.model.columns * self.column_pitch_rad))
+
+    @property
+    def column_pitch_rad(self) -> float:
+        """Scan angle of one column, ``p / k``, radians."""
+        return self.model.pixel_um * 1e-3 / self.model.k_mm
+
+    @property
+    def depth_of_field_rows(self) -> float:
+        """Half depth of field over range step, px: ``N p cos(theta') |k'| / (k sin theta)``.
+
+        The same at every range.
+        """
+        return (
+            self.f_number
+            * self.model.pixel_um
+            * 1e-3
+            * math.cos(math.radians(self.theta_prime_deg))
+            * -self.model.k_prime_px
+            / (self.model.k_mm * math.sin(math.radians(self.theta_deg)))
+        )
+
+    @property
+    def axis_range_mm(self) -> float:
+        """Range at which the light sheet crosses the optical axis, mm; infinite when parallel."""
+        theta = math.radians(self.theta_deg)
+        if self.theta_deg == 90.0:
+            return math.inf
+        depth = (self.baseline_mm * math.tan(theta) - self.focal_length_mm) / math.sin(theta)
+        return depth - self.model.b_mm
+
+    @property
+    def axis_row(self) -> float:
+        """Row that looks along the optical axis, px; usually just off the sensor."""
+        return float(self.model.row(self.axis_range_mm))
+
+    def at(self, range_mm: ArrayLike) -> DesignTable:
+        """Tabulate the build at ranges (mm, any shape)."""
+        ranges = np.asarray(range_mm, dtype=np.float64)
+        row = self.model.row(ranges)
+        magnification = self.model.magnification(row)
+        pitch_mm = self.model.pixel_um * 1e-3 / magnification
+        return DesignTable(
+            range_mm=ranges,
+            row=row,
+            in_view=(row >= 0.0) & (row <= self.model.rows - 1),
+            magnification=magnification,
+            range_per_row_mm=self.model.range_per_row_mm(ranges),
+            depth_of_field_mm=depth_of_field_mm(
+                magnification,
+                self.f_number,
+                self.theta_deg,
+                self.theta_prime_deg,
+                self.model.pixel_um,
+            ),
+            lateral_pitch_mm=pitch_mm,
+            swath_mm=pitch_mm * self.model.columns,
+        )
+
+
+def design(
+    *,
+    focal_length_mm: float,
+    f_number: float,
+    theta_deg: float,
+    theta_prime_deg: float | None = None,
+    baseline_mm: float | None = None,
+    b_prime_px: float | None = None,
+    near_mm: float | None = None,
+    b_mm: float = 0.0,
+    pixel_um: float = PIXEL_UM,
+    columns: int = COLUMNS,
+    rows: int = ROWS,
+) -> Design:
+    """Build from lens, tilts and row offset (Eq. 1).
+
+    Parameters
+    ----------
+    focal_length_mm, f_number : float
+        The lens.
+    theta_deg : float
+        Tilt of the light sheet, above 0 up to 90.
+    theta_prime_deg, baseline_mm : float
+        Exactly one: tilt of the sensor, or the distance from lens centre to Scheimpflug line
+        that implies it.
+    b_prime_px, near_mm : float
+        Exactly one: the row offset, or the range that row 0 shall see.
+    b_mm : float
+        Mechanical datum to front focal line.
+    pixel_um, columns, rows
+        The sensor.
+
+    Raises
+    ------
+    ArgumentError
+        When a value is out of its range or a choice is not made exactly once.
+    """
+    _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
+    tilt_deg = _sensor_tilt_deg(focal_length_mm, theta_deg, theta_prime_deg, baseline_mm)
+    k_mm = object_scale_mm(focal_length_mm, theta_deg)
+    k_prime_px = -focal_length_mm / (pixel_um * 1e-3 * math.sin(math.radians(abs(tilt_deg))))
+    if (b_prime_px is None) == (near_mm is None):
+        raise ArgumentError(
+            f"b_prime_px is {b_prime_px!r} and near_mm {near_mm!r}; give exactly one of them"
+        )
+    if b_prime_px is None:
+        b_prime_px = k_mm * k_prime_px / _depth("near_mm", near_mm, b_mm)
+    model = RangeModel(
+        k_mm=k_mm,
+        k_prime_px=k_prime_px,
+        b_mm=b_mm,
+        b_prime_px=b_prime_px,
+        pixel_um=pixel_um,
+        columns=columns,
+        rows=rows,
+        principal_column=(columns - 1) / 2,
+    )
+    return Design(focal_length_mm, f_number, theta_deg, tilt_deg, model)
+
+
+def design_for_ranges(
+    *,
+    near_mm: float,
+    far_mm: float,
+    focal_length_mm: float,
+    f_number: float,
+    theta_deg: float,
+    b_mm: float = 0.0,
+    pixel_um: float = PIXEL_UM,
+    columns: int = COLUMNS,
+    rows: int = ROWS,
+) -> Design:
+    """Build that sees ``near_mm`` at row 0 and ``far_mm`` at the last row (Eq. 2 at two rows).
+
+    The two ranges fix ``K`` and ``b'``; the lens fixes ``k``, so ``k'`` and the sensor tilt
+    follow. Parameters as in :func:`design`.
+
+    Raises
+    ------
+    ArgumentError
+        When ``0 < near + b < far + b`` does not hold or no sensor tilt reaches both ranges.
+    """
+    _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
+    near, far = _depth("near_mm", near_mm, b_mm), _depth("far_mm", far_mm, b_mm)
+    if not near < far:
+        raise ArgumentError(f"far_mm is {far_mm!r}; choose more than near_mm = {near_mm!r}")
+    if rows < 2:
+        raise ArgumentError(f"rows is {rows!r}; choose 2 or more")
+    product_mm_px = -(rows - 1) * near * far / (far - near)
+    k_prime_px = product_mm_px / object_scale_mm(focal_length_mm, theta_deg)
+    sine = -focal_length_mm / (pixel_um * 1e-3 * k_prime_px)
+    if not sine < 1.0:
+        raise ArgumentError(
+            f"near_mm = {near_mm!r} to far_mm = {far_mm!r} needs sin(theta') = {sine:.3g}; "
+            "choose a longer near range or a shorter focal length"
+        )
+    return design(
+        focal_length_mm=focal_length_mm,
+        f_number=f_number,
+        theta_deg=theta_deg,
+        theta_prime_deg=-math.degrees(math.asin(sine)),
+        near_mm=near_mm,
+        b_mm=b_mm,
+        pixel_um=pixel_um,
+        columns=columns,
+        rows=rows,
+    )
+
+
+def _cot(angle_deg: float) -> float:
+    return 1.0 / math.tan(math.radians(angle_deg))
+
+
+def _check_lens(focal_length_mm: float, f_number: float, theta_deg: float, pixel_um: float) -> None:
+    named = {"focal_length_mm": focal_length_mm, "f_number": f_number, "pixel_um": pixel_um}
+    for name, value in named.items():
+        if not 0.0 < value < math.inf:
+            raise ArgumentError(f"{name} is {value!r}; choose a positive value")
+    if not 0.0 < theta_deg <= 90.0:
+        raise ArgumentError(f"theta_deg is {theta_deg!r}; choose above 0 up to 90 degrees")
+
+
+def _sensor_tilt_deg(
+    focal_length_mm: float, theta_deg: float, tilt_deg: float | None, baseline_mm: float | None
+) -> float:
+    if (tilt_deg is None) == (baseline_mm is None):
+        raise ArgumentError(
+            f"theta_prime_deg is {tilt_deg!r} and baseline_mm {baseline_mm!r}; "
+            "give exactly one of them"
+        )
+    if tilt_deg is not None:
+        if not 0.0 < abs(tilt_deg) < 90.0:
+            raise ArgumentError(
+                f"theta_prime_deg is {tilt_deg!r}; choose 0 to 90 degrees of either sign, "
+                "without the ends"
+            )
+        return tilt_deg
+    assert baseline_mm is not None
+    cotangent = baseline_mm / focal_length_mm - _cot(theta_deg)
+    if not 0.0 < cotangent < math.inf:
+        raise ArgumentError(
+            f"baseline_mm is {baseline_mm!r}; choose more than f cot(theta) = "
+            f"{focal_length_mm * _cot(theta_deg):.3f} mm"
+        )
+    return -math.degrees(math.atan(1.0 / cotangent))
+
+
+def _depth(name: str, range_mm: float | None, b_mm: float) -> float:
+    assert range_mm is not None
+    if not 0.0 < range_mm + b_mm < math.inf:
+        raise ArgumentError(f"{name} is {range_mm!r}; choose a range beyond -b_mm = {-b_mm:g} mm")
+    return range_mm + b_mm
