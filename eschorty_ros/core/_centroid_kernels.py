@@ -1,0 +1,315 @@
+"""Compiled column estimators on packed events.
+
+An event of a column is one uint32: the row in the low 10 bits, the time within the window
+(microseconds) in the upper 22. A list is padded with ``PAD`` to a multiple of ``BLOCK`` entries, so
+that the inner loops have a constant length and run on vector registers.
+
+All sums are integers, hence exact, independent of the events' order and of the row they are counted
+from. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places, rounded half to
+even: mirroring the rows mirrors every window exactly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+ROW_BITS = 10
+ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
+TIME_LIMIT_US = 1 << (32 - ROW_BITS)
+PAD = np.uint32(0xFFFFFFFF)
+BLOCK = 16
+FRACTION_BITS = 6
+FRACTION = 1 << FRACTION_BITS
+ITERATIONS_MAX = 5
+ROW_LAST = 1022
+_PAIRWISE_MAX = 192
+
+MODE_MEAN = 0
+MEAN = 1
+MEDIAN = 2
+
+FOUND = 0
+TOO_FEW = 1
+AMBIGUOUS = 2
+
+
+@njit(cache=True, nogil=True)
+def _pad(packed, n):
+    """Fill the last block behind ``n`` entries; returns the number of blocks."""
+    blocks = (n + BLOCK - 1) // BLOCK
+    for i in range(n, blocks * BLOCK):
+        packed[i] = PAD
+    return blocks
+
+
+@njit(cache=True, nogil=True)
+def _window_sums(packed, blocks, low, high):
+    """Count, sum of d, of d squared (d = row - low) and of times over rows low..high."""
+    base = np.uint32(low)
+    span = np.uint32(high - low)
+    count = np.int64(0)
+    sum_d = np.int64(0)
+    sum_d2 = np.int64(0)
+    sum_time = np.int64(0)
+    for block in range(blocks):
+        first = np.uintp(block) * np.uintp(BLOCK)
+        c = np.uint32(0)
+        d1 = np.uint32(0)
+        d2 = np.uint32(0)
+        ts = np.uint32(0)
+        for j in range(BLOCK):
+            v = packed[first + np.uintp(j)]
+            d = np.uint32((v & ROW_MASK) - base)
+            inside = np.uint32(d <= span)
+            d = np.uint32(d * inside)
+            c = np.uint32(c + inside)
+            d1 = np.uint32(d1 + d)
+            d2 = np.uint32(d2 + np.uint32(d * d))
+            ts = np.uint32(ts + np.uint32((v >> np.uint32(ROW_BITS)) * inside))
+        count += np.int64(c)
+        sum_d += np.int64(d1)
+        sum_d2 += np.int64(d2)
+        sum_time += np.int64(ts)
+    return count, sum_d, sum_d2, sum_time
+
+
+@njit(cache=True, nogil=True)
+def _window_count(packed, blocks, low, high):
+    base = np.uint32(low)
+    span = np.uint32(high - low)
+    count = np.int64(0)
+    for block in range(blocks):
+        first = np.uintp(block) * np.uintp(BLOCK)
+        c = np.uint32(0)
+        for j in range(BLOCK):
+            d = np.uint32((packed[first + np.uintp(j)] & ROW_MASK) - base)
+            c = np.uint32(c + np.uint32(d <= span))
+        count += np.int64(c)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _limits(centre, half):
+    """First and last whole row within ``half`` of ``centre`` (both fixed point)."""
+    low = (centre - half + FRACTION - 1) >> FRACTION_BITS
+    high = (centre + half) >> FRACTION_BITS
+    return max(low, 0), min(high, ROW_LAST)
+
+
+@njit(cache=True, nogil=True)
+def _mean_shift(packed, blocks, centre, half):
+    """Move a window to the mean of its events until it stays or ``ITERATIONS_MAX`` is reached.
+
+    Returns the sums of the last window, its low row and the fixed-point mean.
+    """
+    low, high = _limits(centre, half)
+    count, sum_d, sum_d2, sum_time = _window_sums(packed, blocks, low, high)
+    for _ in range(ITERATIONS_MAX - 1):
+        if count == 0:
+            break
+        moved = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
+        if moved == centre:
+            break
+        centre = moved
+        next_low, next_high = _limits(centre, half)
+        if next_low == low and next_high == high:
+            break
+        low, high = next_low, next_high
+        count, sum_d, sum_d2, sum_time = _window_sums(packed, blocks, low, high)
+    if count > 0:
+        centre = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
+    return count, low, sum_d, sum_d2, sum_time, centre
+
+
+@njit(cache=True, nogil=True)
+def _densest_pairwise(packed, n, blocks, radius):
+    best = np.int64(0)
+    lowest = np.int64(ROW_LAST)
+    highest = np.int64(0)
+    for i in range(n):
+        row = np.int64(packed[i] & ROW_MASK)
+        support = _window_count(packed, blocks, max(row - radius, 0), min(row + radius, ROW_LAST))
+        if support > best:
+            best, lowest, highest = support, row, row
+        elif support == best:
+            lowest = min(lowest, row)
+            highest = max(highest, row)
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True)
+def _densest_histogram(packed, n, radius):
+    size = 1 << ROW_BITS
+    below = np.zeros(size + 1, np.int64)
+    for i in range(n):
+        below[(packed[i] & ROW_MASK) + np.uint32(1)] += 1
+    for row in range(size):
+        below[row + 1] += below[row]
+    best = np.int64(0)
+    lowest = np.int64(ROW_LAST)
+    highest = np.int64(0)
+    for row in range(size):
+        if below[row + 1] == below[row]:
+            continue
+        support = below[min(row + radius, ROW_LAST) + 1] - below[max(row - radius, 0)]
+        if support > best:
+            best, lowest, highest = support, np.int64(row), np.int64(row)
+        elif support == best:
+            highest = np.int64(row)
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True)
+def _mode_mean_search(packed, n, blocks, half):
+    """Densest window, then mean shift; a tie is settled without preferring a direction.
+
+    The lowest and the highest of the equally dense seeds are both followed. The window with more
+    events wins, then the one with the smaller spread; windows that overlap are restarted from their
+    common mean; two separate windows without any difference leave the column undecided.
+    """
+    radius = max(half >> (FRACTION_BITS + 1), 1)
+    if n <= _PAIRWISE_MAX:
+        lowest, highest = _densest_pairwise(packed, n, blocks, radius)
+    else:
+        lowest, highest = _densest_histogram(packed, n, radius)
+    a = _mean_shift(packed, blocks, lowest * FRACTION, half)
+    if lowest == highest:
+        return FOUND, a
+    b = _mean_shift(packed, blocks, highest * FRACTION, half)
+    if a[0] != b[0]:
+        return FOUND, (a if a[0] > b[0] else b)
+    spread_a = a[0] * a[3] - a[2] * a[2]
+    spread_b = b[0] * b[3] - b[2] * b[2]
+    if spread_a != spread_b:
+        return FOUND, (a if spread_a < spread_b else b)
+    if a[5] == b[5]:
+        return FOUND, a
+    if abs(a[5] - b[5]) <= 2 * half:
+        middle = np.int64(np.rint((a[5] + b[5]) / 2.0))
+        return FOUND, _mean_shift(packed, blocks, middle, half)
+    return AMBIGUOUS, a
+
+
+@njit(cache=True, nogil=True)
+def _stands_out(count, n, half, rows):
+    """Whether ``count`` of ``n`` events exceed what the others would put into the window.
+
+    Uniform background of the density found outside the window, 4 standard deviations.
+    """
+    width = (2 * half) / FRACTION + 1.0
+    if width >= rows:
+        return True
+    expected = (n - count) * width / (rows - width)
+    excess = count - expected
+    return excess > 0.0 and excess * excess > 16.0 * expected
+
+
+@njit(cache=True, nogil=True)
+def _mode_mean(packed, n, blocks, seed, half, rows, events_min):
+    """Windowed mean from ``seed`` (fixed point, < 0: none), or from the densest window.
+
+    A seed is trusted only where its window holds most of the column's events: no window elsewhere
+    can then hold more.
+    """
+    if seed >= 0:
+        found = _mean_shift(packed, blocks, seed, half)
+        if found[0] >= events_min and 2 * found[0] > n:
+            return FOUND, found
+    status, found = _mode_mean_search(packed, n, blocks, half)
+    if status == FOUND and (found[0] < events_min or not _stands_out(found[0], n, half, rows)):
+        status = TOO_FEW
+    return status, found
+
+
+@njit(cache=True, nogil=True)
+def _median_row(packed, n, counts):
+    """Middle row, or the mean of the two middle rows; ``counts`` is zeroed scratch of 1024."""
+    low = np.int64(ROW_LAST)
+    high = np.int64(0)
+    for i in range(n):
+        row = np.int64(packed[i] & ROW_MASK)
+        counts[row] += 1
+        low = min(low, row)
+        high = max(high, row)
+    seen = np.int64(0)
+    lower = np.int64(-1)
+    upper = np.int64(-1)
+    for row in range(low, high + 1):
+        seen += counts[row]
+        counts[row] = 0
+        if lower < 0 and 2 * seen >= n:
+            lower = row
+        if upper < 0 and 2 * seen > n:
+            upper = row
+    return (lower + upper) / 2.0
+
+
+@njit(cache=True, nogil=True)
+def _variance(count, sum_d, sum_d2):
+    """Sample variance; the numerator is an exact integer, so a constant column gives 0."""
+    if count < 2:
+        return 0.0
+    return (count * sum_d2 - sum_d * sum_d) / (float(count) * (count - 1))
+
+
+@njit(cache=True, nogil=True)
+def _sigma2(variance, count, row, rows, factor, floor):
+    """Variance of the estimated row, px squared.
+
+    Rows quantise to a twelfth when there is no spread to judge by. A footprint cut by the edge of
+    the sensor may be off by up to 0.8 of its spread.
+    """
+    sigma2 = factor * factor * variance / count + floor * floor
+    if count < 2 or variance == 0.0:
+        sigma2 = max(sigma2, 1.0 / 12.0 + floor * floor)
+    reach = 2.0 * np.sqrt(variance)
+    if row < reach or rows - 1.0 - row < reach:
+        sigma2 += 0.64 * variance
+    return sigma2
+
+
+@njit(cache=True, nogil=True)
+def _estimate_column(packed, n, method, seed, half, rows, events_min, counts):
+    """One column: status, row, events used, variance, sum of times, fixed-point mean."""
+    blocks = _pad(packed, n)
+    status = FOUND
+    if method == MODE_MEAN:
+        status, found = _mode_mean(packed, n, blocks, seed, half, rows, events_min)
+    else:
+        total = _window_sums(packed, blocks, 0, ROW_LAST)
+        found = (total[0], np.int64(0), total[1], total[2], total[3], np.int64(-1))
+    count, low, sum_d, sum_d2, sum_time, centre = found
+    if count < events_min or count == 0:
+        return TOO_FEW, np.nan, count, 0.0, sum_time, centre
+    row = _median_row(packed, n, counts) if method == MEDIAN else (count * low + sum_d) / count
+    return status, row, count, _variance(count, sum_d, sum_d2), sum_time, centre
+
+
+@njit(cache=True, nogil=True)
+def _estimate_lists(
+    packed, offsets, method, half, rows, events_min, factor, floor, scratch, out_row, out_sigma,
+    out_variance, out_events, out_status,
+):  # fmt: skip
+    """Every column of a CSR layout on its own, without seeds."""
+    counts = np.zeros(1 << ROW_BITS, np.int64)
+    for column in range(offsets.size - 1):
+        n = offsets[column + 1] - offsets[column]
+        out_row[column] = np.nan
+        out_sigma[column] = np.nan
+        out_variance[column] = np.nan
+        out_events[column] = 0
+        out_status[column] = TOO_FEW
+        if n < events_min or n == 0:
+            continue
+        scratch[:n] = packed[offsets[column] : offsets[column + 1]]
+        status, row, count, variance, _, _ = _estimate_column(
+            scratch, n, method, -1, half, rows, events_min, counts
+        )
+        out_status[column] = status
+        if status != FOUND:
+            continue
+        out_row[column] = row
+        out_events[column] = count
+        out_variance[column] = variance
+        out_sigma[column] = np.sqrt(_sigma2(variance, count, row, rows, factor, floor))
