@@ -1,0 +1,101 @@
+"""Settings of the reconstruction; command line and ROS parameters are generated from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from eschorty_ros.core.centroid import METHODS, SIGMA_FACTOR, SIGMA_FLOOR_PX
+from eschorty_ros.core.errors import ArgumentError
+
+NOISE_FILTERS = ("none", "activity")
+
+
+def _number(
+    default: float, low: float, high: float, unit: str, description: str
+) -> Any:  # a dataclass field stands in for the value it describes
+    return field(
+        default=default,
+        metadata={"description": description, "unit": unit, "range": (low, high)},
+    )
+
+
+def _choice(default: str, choices: tuple[str, ...], description: str) -> Any:
+    return field(
+        default=default, metadata={"description": description, "unit": "", "choices": choices}
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How events become points.
+
+    Every field carries ``metadata``: ``description``, ``unit`` and ``range`` (both ends included)
+    or ``choices``.
+
+    Notes
+    -----
+    The activity filter is off by default: ``mode_mean`` already leaves background out, and the
+    filter costs more time than the rest of the reconstruction together.
+
+    ``periods_per_profile`` is for frequencies at which a column gives fewer than ``events_min``
+    events per period (above about 5 kHz).
+
+    Raises
+    ------
+    ArgumentError
+        When a value lies outside its range or choices.
+    """
+
+    centroid: str = _choice("mode_mean", METHODS, "column estimator")
+    noise_filter: str = _choice("none", NOISE_FILTERS, "filter before the events are binned")
+    line_width_px: float = _number(
+        20.0, 1.0, 200.0, "px", "largest full width at half maximum of the line, in rows"
+    )
+    events_min: int = _number(
+        4, 1, 1000, "events", "fewest events near the line for a column to give a point"
+    )
+    column_limit: int = _number(
+        128, 16, 4096, "events", "most events kept per column and profile"
+    )
+    periods_per_profile: int = _number(
+        1, 1, 1000, "periods", "modulation periods that make one profile"
+    )
+    smoothing_half_width: int = _number(
+        2, 0, 20, "columns", "neighbours averaged on either side; 0 is off"
+    )
+    smoothing_gate_px: float = _number(
+        2.0, 0.0, 100.0, "px", "neighbours further off in rows are not averaged"
+    )
+    isolation_gate_px: float = _number(
+        12.0, 0.0, 720.0, "px", "a weak point needs a neighbouring column this near in rows"
+    )
+    isolation_events: int = _number(
+        10, 0, 1000, "events", "points with fewer events than this are weak"
+    )
+    sigma_factor: float = _number(
+        SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"
+    )
+    sigma_floor_px: float = _number(
+        SIGMA_FLOOR_PX, 0.0, 10.0, "px", "part of the standard deviation that does not average out"
+    )
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            _check(item.name, getattr(self, item.name), item.default, item.metadata)
+
+
+def _check(name: str, value: Any, default: Any, metadata: Any) -> None:
+    if "choices" in metadata:
+        if value not in metadata["choices"]:
+            raise ArgumentError(
+                f"{name} is {value!r}; choose one of {', '.join(metadata['choices'])}"
+            )
+        return
+    low, high = metadata["range"]
+    whole = isinstance(default, int)
+    kind = "a whole number" if whole else "a number"
+    accepted = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
+    if not accepted or not low <= value <= high:
+        unit = f" {metadata['unit']}" if metadata["unit"] else ""
+        raise ArgumentError(f"{name} is {value!r}; choose {kind} from {low:g} to {high:g}{unit}")
