@@ -15,11 +15,12 @@ NS_PER_US = 1_000
 POSITION_LIMIT_MM = 1e9
 
 
-def quantise_nm(position_mm: ArrayLike) -> NDArray[np.int64]:
+def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np.int64]:
     """Positions rounded to the nanometre, int64.
 
     Positions that went through text with six decimals and through ROS metres give the same
-    integers, so a recording and the live nodes place points identically.
+    integers, so a recording and the live nodes place points identically. ``name`` is what an
+    error calls them.
 
     Raises
     ------
@@ -30,7 +31,7 @@ def quantise_nm(position_mm: ArrayLike) -> NDArray[np.int64]:
     wrong = ~(np.abs(position) <= POSITION_LIMIT_MM)
     if wrong.any():
         raise ArgumentError(
-            f"position_mm is {float(position[wrong][0])!r}; give finite positions within "
+            f"{name} is {float(position[wrong][0])!r}; give finite positions within "
             f"{POSITION_LIMIT_MM:g} mm"
         )
     return np.rint(position * NM_PER_MM).astype(np.int64)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from eschorty_ros.core.calibration import Calibration, load_calibration
-from eschorty_ros.core.clock import NM_PER_MM, StageTrack, quantise_nm
+from eschorty_ros.core.clock import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
 from eschorty_ros.core.errors import ArgumentError, FormatError
 from eschorty_ros.core.files import atomic_write
 from eschorty_ros.core.modulation import Modulation
@@ -187,12 +188,19 @@ def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
     table = np.empty(next(iter(shapes)), dtype)
     for name, array in arrays.items():
         if dtype[name].kind == "f":
-            table[name] = quantise_nm(array) / NM_PER_MM
-        elif array.size and array.dtype.kind not in "iu":
-            raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
+            table[name] = quantise_nm(array, name) / NM_PER_MM
         else:
-            table[name] = array
+            table[name] = _whole(array, name, np.iinfo(dtype[name]))
     return table
+
+
+def _whole(array: NDArray[Any], name: str, limits: np.iinfo[Any]) -> NDArray[Any]:
+    if array.size and array.dtype.kind not in "iu":
+        raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
+    wrong = (array < limits.min) | (array > limits.max)
+    if wrong.any():
+        raise ArgumentError(f"{name} is {array[wrong][0]}; choose {limits.min} to {limits.max}")
+    return array
 
 
 def _write_csv(path: str | os.PathLike[str], table: NDArray[np.void]) -> None:
@@ -213,13 +221,10 @@ def _read_stage(path: Path) -> NDArray[np.void]:
     back = np.flatnonzero(np.diff(times) <= 0)
     if back.size:
         raise FormatError(
-            f"{path} line {back[0] + 3}: t_us goes from {times[back[0]]} to "
+            f"{path} line {_line_number(path, back[0] + 1)}: t_us goes from {times[back[0]]} to "
             f"{times[back[0] + 1]}; write each time once and in order"
         )
-    try:
-        samples["position_mm"] = quantise_nm(samples["position_mm"]) / NM_PER_MM
-    except ArgumentError as error:
-        raise FormatError(f"{path}: {error}") from error
+    samples["position_mm"] = quantise_nm(samples["position_mm"]) / NM_PER_MM
     return samples
 
 
@@ -232,22 +237,40 @@ def _read_csv(path: Path, dtype: np.dtype[Any]) -> NDArray[np.void]:
                 raise FormatError(
                     f"{path} line 1: it reads {header[:60]!r}; write {','.join(names)}"
                 )
-            return _parse_table(stream, dtype)
+            table = _parse_table(stream, dtype)
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror or error}; check it") from error
     except UnicodeDecodeError as error:
         raise FormatError(f"{path}: it is not text; write {','.join(names)} lines") from error
     except ValueError:
         raise FormatError(_first_fault(path, dtype)) from None
+    for name in names:
+        if dtype[name].kind == "f":
+            _check_lengths(path, name, table[name])
+    return table
+
+
+def _check_lengths(path: Path, name: str, values: NDArray[np.float64]) -> None:
+    wrong = np.flatnonzero(~(np.abs(values) <= POSITION_LIMIT_MM))
+    if wrong.size:
+        raise FormatError(
+            f"{path} line {_line_number(path, wrong[0])}: {name} is {values[wrong[0]]:g}; "
+            f"write a length within {POSITION_LIMIT_MM:g} mm"
+        )
 
 
 def _parse_table(stream: Any, dtype: np.dtype[Any]) -> NDArray[np.void]:
-    import warnings
-
     with warnings.catch_warnings():
         # An empty table is for the caller to judge.
         warnings.filterwarnings("ignore", "loadtxt: input contained no data", UserWarning)
         return np.atleast_1d(np.loadtxt(stream, dtype, delimiter=",", comments=None))
+
+
+def _line_number(path: Path, index: int) -> int:
+    """Line of table row ``index``, blank lines counted as an editor does."""
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    filled = [number for number, line in enumerate(lines, 1) if line.strip()]
+    return filled[index + 1]
 
 
 def _first_fault(path: Path, dtype: np.dtype[Any]) -> str:

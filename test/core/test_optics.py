@@ -76,9 +76,7 @@ def test_all_rows_against_50_digits(build: str) -> None:
     with mpmath.workdps(50):
         ours = model(build).range_mm(ROWS)
         exact = exact_range_mm(build, ROWS)
-        worst = max(
-            abs(mpmath.mpf(float(a)) - b) / b for a, b in zip(ours, exact, strict=True)
-        )
+        worst = max(abs(mpmath.mpf(float(a)) - b) / b for a, b in zip(ours, exact, strict=True))
     assert worst < 1e-15
 
 
