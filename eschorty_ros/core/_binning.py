@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from eschorty_ros.core._centroid_kernels import (
+    AMBIGUOUS,
     FOUND,
     FRACTION,
     MODE_MEAN,
@@ -13,7 +14,6 @@ from eschorty_ros.core._centroid_kernels import (
     TIME_LIMIT_US,
     _estimate_column,
     _sigma2,
-    AMBIGUOUS,
 )
 from eschorty_ros.core.smoothing import _reject_isolated, _smooth
 
