@@ -1,0 +1,90 @@
+"""The `eschorty` command."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import click
+
+from eschorty_ros.core.errors import EschortyError
+
+COMMANDS = {
+    "scan": "Scan a simulated scene through the ROS 2 nodes; cloud, picture and error.",
+    "simulate": "Simulate a recording with its truth; needs no ROS.",
+    "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
+    "view": "Draw a cloud, or open it in a window.",
+    "info": "Say what a file or recording holds.",
+    "design": "Tabulate range, sampling and depth of field of an optical build.",
+}
+INTERRUPTED = 130
+
+
+class StatedFailure(click.ClickException):
+    """A failure with its one line; exit code 1."""
+
+    def show(self, file: Any = None) -> None:
+        """Write the line to stderr."""
+        click.echo(f"eschorty: {self.format_message()}", err=True)
+
+
+class LazyGroup(click.Group):
+    """Imports a command's module when the command runs, so that ``--help`` answers at once."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Command names in the order a newcomer needs them."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Command of that name, ``None`` when there is none."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"eschorty_ros.cli.{cmd_name}")
+        command: click.Command = module.command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; stated failures become one line, Ctrl-C exit code 130."""
+        try:
+            return super().invoke(ctx)
+        except EschortyError as error:
+            raise StatedFailure(" ".join(str(error).split())) from error
+        except (FileNotFoundError, PermissionError, IsADirectoryError, FileExistsError) as error:
+            named = error.filename or "a file"
+            raise StatedFailure(f"cannot use {named}: {error.strerror}; check the path") from error
+        except KeyboardInterrupt:
+            click.echo("eschorty: interrupted", err=True)
+            ctx.exit(INTERRUPTED)
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+def main() -> None:
+    """Event-based Scheimpflug LiDAR: simulate, scan, reconstruct, look.
+
+    A camera on a tilted sensor plane watches a modulated laser line while a stage carries it past
+    the scene; every modulation period becomes one profile of 3D points. Ranges are along the
+    laser sheet. The command line takes millimetres, clouds hold metres.
+
+    \b
+    A recording is a folder:
+      events.raw        the camera's bytes, Prophesee RAW with EVT3
+      stage.csv         t_us,position_mm in the sensor's time
+      laser.yaml        frequency_hz, duty, waveform, on_edge_us
+      calibration.yaml  the optical build
+      truth.csv         simulated only: t_us,column,range_mm
+
+    \b
+    Examples:
+      eschorty scan --scene steps --out scan
+      eschorty simulate --scene sphere --out rec
+      eschorty reconstruct rec --out rec/cloud.pcd
+      eschorty view rec/cloud.pcd
+    """

@@ -1,0 +1,117 @@
+"""`eschorty reconstruct`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import click
+
+from eschorty_ros.cli.console import pairs, progress_bar
+
+
+class SettingsCommand(click.Command):
+    """Adds one option per reconstruction setting, read from the settings themselves."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Options of the command and of the settings."""
+        return [*super().get_params(ctx), *setting_options()]
+
+
+def setting_options() -> list[click.Parameter]:
+    """One click option per field of `Settings`."""
+    from eschorty_ros.core.settings import Settings
+
+    options: list[click.Parameter] = []
+    for item in fields(Settings):
+        meta = item.metadata
+        kind: click.ParamType
+        if "choices" in meta:
+            kind = click.Choice(meta["choices"])
+        elif isinstance(item.default, int):
+            kind = click.IntRange(*map(int, meta["range"]))
+        else:
+            kind = click.FloatRange(*meta["range"])
+        unit = f" ({meta['unit']})" if meta["unit"] else ""
+        options.append(
+            click.Option(
+                [f"--{item.name.replace('_', '-')}", item.name],
+                type=kind,
+                default=item.default,
+                show_default=True,
+                help=meta["description"] + unit,
+            )
+        )
+    return options
+
+
+@click.command("reconstruct", cls=SettingsCommand)
+@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Cloud to write, .pcd or .ply.  [default: RECORDING/cloud.pcd]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -> None:
+    """Turn the folder RECORDING into a point cloud.
+
+    The cloud is in eschorty_base, in metres: x y z, intensity (events used), sigma (one sigma of
+    the range), t (seconds since the first event), column.
+
+    \b
+    --json prints events, dropped_events, profiles, points, seconds, events_per_second and
+    sigma_median_m (null when there is no point).
+
+    \b
+    Examples:
+      eschorty reconstruct rec
+      eschorty reconstruct rec --out rec.ply --centroid median
+      eschorty reconstruct rec --json --smoothing-half-width 0
+    """
+    from eschorty_ros.core.cloud import write_cloud
+    from eschorty_ros.core.recording import load_recording
+    from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+
+    target = out or recording / "cloud.pcd"
+    if target.suffix not in (".pcd", ".ply"):
+        raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
+    chosen = Settings(**settings)
+    with progress_bar("reconstructing") as report:
+        result = reconstruct_recording(load_recording(recording), chosen, progress=report)
+    write_cloud(target, result.points)
+    facts = summary(result)
+    if as_json:
+        click.echo(json.dumps(facts))
+        return
+    sigma = facts["sigma_median_m"]
+    pairs(
+        str(target),
+        {
+            "events": f"{facts['events']:,}",
+            "events dropped": f"{facts['dropped_events']:,}",
+            "profiles": f"{facts['profiles']:,}",
+            "points": f"{facts['points']:,}",
+            "median sigma": "none" if sigma is None else f"{sigma * 1e3:.3f} mm",
+            "seconds": f"{facts['seconds']:.2f}",
+            "events/s": f"{facts['events_per_second']:.3g}",
+        },
+    )
+
+
+def summary(result: Any) -> dict[str, float | int | None]:
+    """The keys of ``--json`` from a reconstruction's result."""
+    import numpy as np
+
+    points = result.points
+    return {
+        "events": int(result.events),
+        "dropped_events": int(result.dropped_events),
+        "profiles": int(result.profiles),
+        "points": len(points),
+        "seconds": float(result.seconds),
+        "events_per_second": float(result.events / result.seconds) if result.seconds else 0.0,
+        "sigma_median_m": float(np.median(points["sigma"])) if len(points) else None,
+    }

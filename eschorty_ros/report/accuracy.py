@@ -1,0 +1,196 @@
+"""How far a cloud is from a known scene, and how much of the scene it holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.optics import RangeModel
+
+
+class KnownScene(Protocol):
+    """What the truth of a cloud is computed from; every simulated scene is one."""
+
+    def range_mm(
+        self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
+    ) -> NDArray[np.float64]:
+        """Range in mm, shape (len(stage_mm), len(columns)); NaN where the sheet hits nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """A cloud against its scene.
+
+    Attributes
+    ----------
+    profiles, points, expected_points : int
+        Modulation periods within the sweep, points found and lit columns times those periods.
+    completeness : float
+        ``points / expected_points``.
+    error_median_mm, error_p95_mm : float
+        Median and 95th percentile of the absolute range error.
+    bias_mm : float
+        Median of the signed range error (measured minus true).
+    within_1_sigma, within_2_sigma : float
+        Share of points whose error is within one and two of their own sigma.
+    off_target : int
+        Points where the scene holds nothing; they enter no error statistic.
+    """
+
+    profiles: int
+    points: int
+    expected_points: int
+    completeness: float
+    error_median_mm: float
+    error_p95_mm: float
+    bias_mm: float
+    within_1_sigma: float
+    within_2_sigma: float
+    off_target: int
+
+
+def stage_and_range_mm(
+    points: NDArray[np.void], stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Stage position and range of every point, undoing ``P = (R, 0, Z) + s t_hat``.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+        Metres, in ``eschorty_base``.
+    stage_direction : tuple of float
+        Unit vector of the stage.
+
+    Returns
+    -------
+    stage_mm, range_mm : ndarray of float64, shape (n,)
+
+    Raises
+    ------
+    ArgumentError
+        When the stage moves within the laser sheet, which leaves its position unknown.
+    """
+    along_x, along_y, _ = stage_direction
+    if abs(along_y) < 1e-6:
+        raise ArgumentError(
+            f"stage_direction is {stage_direction!r}; it must leave the laser sheet (y not 0)"
+        )
+    stage_mm = points["y"].astype(np.float64) * 1e3 / along_y
+    return stage_mm, points["x"].astype(np.float64) * 1e3 - stage_mm * along_x
+
+
+def true_range_mm(
+    scene: KnownScene,
+    model: RangeModel,
+    stage_mm: NDArray[np.float64],
+    columns: NDArray[np.integer[Any]],
+) -> NDArray[np.float64]:
+    """Range of the scene at one stage position and column per point.
+
+    Parameters
+    ----------
+    stage_mm : ndarray of float64, shape (n,)
+    columns : ndarray of integers, shape (n,)
+
+    Returns
+    -------
+    ndarray of float64, shape (n,)
+        Millimetres; NaN where the sheet hits nothing.
+    """
+    truth = np.full(len(stage_mm), np.nan)
+    if truth.size == 0:
+        return truth
+    order = np.argsort(columns, kind="stable")
+    values, starts = np.unique(columns[order], return_index=True)
+    for column, members in zip(values, np.split(order, starts[1:]), strict=True):
+        at = np.array([column], dtype=np.int64)
+        truth[members] = scene.range_mm(stage_mm[members], at, model)[:, 0]
+    return truth
+
+
+def sweep_positions_mm(
+    start_mm: float, stop_mm: float, speed_mm_s: float, frequency_hz: float
+) -> NDArray[np.float64]:
+    """Stage position at the middle of each modulation period of a sweep at constant speed."""
+    if not speed_mm_s > 0.0:
+        raise ArgumentError(f"speed_mm_s is {speed_mm_s!r}; choose a positive speed")
+    periods = round(abs(stop_mm - start_mm) / speed_mm_s * frequency_hz)
+    step = (stop_mm - start_mm) / max(periods, 1)
+    return start_mm + step * (np.arange(periods) + 0.5)
+
+
+def lit_columns(
+    scene: KnownScene, model: RangeModel, positions_mm: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Columns that see the scene within the sensor's rows, counted at each stage position."""
+    columns = np.arange(model.columns, dtype=np.int64)
+    near_mm, far_mm = model.range_limits_mm
+    counts = np.zeros(len(positions_mm), np.int64)
+    for index, position in enumerate(positions_mm):
+        truth = scene.range_mm(np.array([position]), columns, model)[0]
+        with np.errstate(invalid="ignore"):
+            counts[index] = np.count_nonzero((truth >= near_mm) & (truth <= far_mm))
+    return counts
+
+
+def range_error_mm(
+    points: NDArray[np.void],
+    scene: KnownScene,
+    model: RangeModel,
+    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> NDArray[np.float64]:
+    """Measured minus true range of every point in mm; NaN where the scene holds nothing."""
+    stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
+    return range_mm - true_range_mm(scene, model, stage_mm, points["column"])
+
+
+def measure(
+    points: NDArray[np.void],
+    scene: KnownScene,
+    model: RangeModel,
+    positions_mm: NDArray[np.float64],
+    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
+    error_mm: NDArray[np.float64] | None = None,
+) -> Accuracy:
+    """Compare a cloud with the scene it was taken of.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    scene : KnownScene
+    model : RangeModel
+    positions_mm : ndarray of float64
+        Stage position of every modulation period of the sweep; see `sweep_positions_mm`.
+    stage_direction : tuple of float
+    error_mm : ndarray of float64, shape (n,), optional
+        Result of `range_error_mm` when it is already known.
+
+    Returns
+    -------
+    Accuracy
+    """
+    if error_mm is None:
+        error_mm = range_error_mm(points, scene, model, stage_direction)
+    expected = int(lit_columns(scene, model, positions_mm).sum())
+    known = np.isfinite(error_mm)
+    error = error_mm[known]
+    size = np.abs(error)
+    ratio = size / (points["sigma"][known].astype(np.float64) * 1e3)
+    empty = error.size == 0
+    nan = float("nan")
+    return Accuracy(
+        profiles=len(positions_mm),
+        points=len(points),
+        expected_points=expected,
+        completeness=error.size / expected if expected else nan,
+        error_median_mm=nan if empty else float(np.median(size)),
+        error_p95_mm=nan if empty else float(np.percentile(size, 95.0)),
+        bias_mm=nan if empty else float(np.median(error)),
+        within_1_sigma=nan if empty else float(np.mean(ratio <= 1.0)),
+        within_2_sigma=nan if empty else float(np.mean(ratio <= 2.0)),
+        off_target=int(np.count_nonzero(~known)),
+    )

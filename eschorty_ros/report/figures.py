@@ -1,0 +1,264 @@
+"""Pictures of a cloud: depth map, 3-D view, range error and error against sigma.
+
+Every function returns a matplotlib figure that belongs to no window; `save` writes it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.report.accuracy import stage_and_range_mm
+from eschorty_ros.report.profiles import period_s, profile_index
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POINTS_IN_3D = 30_000
+SIGMAS_SHOWN = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A cloud as an image: one line per modulation period, one pixel per column.
+
+    Attributes
+    ----------
+    columns : int
+        Width of ``values``.
+    stage_mm : ndarray of float64, shape (profiles,)
+        Median stage position of each line.
+    profile : ndarray of int64, shape (n,)
+        Line of every point.
+    """
+
+    columns: int
+    stage_mm: NDArray[np.float64]
+    profile: NDArray[np.int64]
+
+
+def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
+    """Sort the points into modulation periods.
+
+    Raises
+    ------
+    ArgumentError
+        When the cloud is empty.
+    """
+    if len(points) == 0:
+        raise ArgumentError("the cloud holds 0 points; there is nothing to draw")
+    period = period_s(points)
+    profile = (
+        profile_index(points, period) if period > 0.0 else np.zeros(len(points), dtype=np.int64)
+    )
+    lines = int(profile.max()) + 1
+    counts = np.bincount(profile, minlength=lines)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        middle = np.bincount(profile, weights=stage_mm, minlength=lines) / counts
+    index = np.arange(lines)
+    known = counts > 0
+    positions = np.interp(index, index[known], middle[known])
+    return Grid(int(points["column"].max()) + 1, positions, profile)
+
+
+def image_of(
+    grid: Grid, points: NDArray[np.void], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``values`` of the points as an image, shape (profiles, columns); NaN where there is none."""
+    image = np.full((len(grid.stage_mm), grid.columns), np.nan)
+    image[grid.profile, points["column"].astype(np.intp)] = values
+    return image
+
+
+def scan_figure(
+    points: NDArray[np.void],
+    error_mm: NDArray[np.float64] | None = None,
+    title: str = "",
+    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> Figure:
+    """Depth map and 3-D view; with the error known, its map and its histogram too.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    error_mm : ndarray of float64, shape (n,), optional
+        Measured minus true range; NaN where the truth is unknown.
+    title : str
+    stage_direction : tuple of float
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ArgumentError
+        When the cloud is empty.
+    """
+    stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
+    grid = grid_of(points, stage_mm)
+    rows = 1 if error_mm is None else 2
+    figure = _figure(12.0, 4.9 * rows)
+    if title:
+        figure.suptitle(title)
+    limits = _central(range_mm)
+    axes = figure.add_subplot(rows, 2, 1)
+    _map(axes, grid, image_of(grid, points, range_mm), "range (mm)", "viridis", limits)
+    axes.set_title("Depth map")
+    _view_3d(figure.add_subplot(rows, 2, 2, projection="3d"), points, range_mm, limits)
+    if error_mm is not None:
+        bound = max(float(np.nanpercentile(np.abs(error_mm), 99.0)), 1e-3)
+        axes = figure.add_subplot(rows, 2, 3)
+        _map(
+            axes,
+            grid,
+            image_of(grid, points, error_mm),
+            "range error (mm)",
+            "RdBu_r",
+            (-bound, bound),
+        )
+        axes.set_title("Measured minus true range")
+        _histogram(figure.add_subplot(rows, 2, 4), error_mm, points["sigma"] * 1e3)
+    return figure
+
+
+def design_figure(
+    range_mm: NDArray[np.float64],
+    row: NDArray[np.float64],
+    sampling_mm: NDArray[np.float64],
+    lateral_mm: NDArray[np.float64],
+    depth_of_field_mm: NDArray[np.float64],
+    title: str,
+) -> Figure:
+    """Range over row, sampling and depth of field over range; all arrays of one shape, mm."""
+    figure = _figure(12.0, 4.2)
+    figure.suptitle(title)
+    axes = figure.add_subplot(1, 3, 1)
+    axes.plot(row, range_mm)
+    axes.set(xlabel="sensor row (px)", ylabel="range (mm)", title="Range over row")
+    axes.grid(alpha=0.3)
+    axes = figure.add_subplot(1, 3, 2)
+    axes.plot(range_mm, sampling_mm, label="range step of one row")
+    axes.plot(range_mm, lateral_mm, label="lateral step of one column")
+    axes.set(xlabel="range (mm)", ylabel="step (mm/px)", title="Sampling", ylim=(0.0, None))
+    axes.legend()
+    axes.grid(alpha=0.3)
+    axes = figure.add_subplot(1, 3, 3)
+    axes.plot(range_mm, depth_of_field_mm)
+    axes.set(
+        xlabel="range (mm)", ylabel="± depth of field (mm)", title="Depth of field", ylim=(0.0, None)
+    )
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure; the extension (.png, .pdf, .svg) decides the format.
+
+    Raises
+    ------
+    ArgumentError
+        When the path cannot be written or its extension is unknown.
+    """
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise ArgumentError(f"cannot write the picture {path}: {error}") from error
+
+
+def _figure(width_in: float, height_in: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _central(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Limits that a few stray points do not stretch."""
+    low, high = np.nanpercentile(values, [0.5, 99.5])
+    margin = max(0.05 * (high - low), 0.5)
+    return float(low - margin), float(high + margin)
+
+
+def _map(
+    axes: Axes,
+    grid: Grid,
+    image: NDArray[np.float64],
+    label: str,
+    colours: str,
+    limits: tuple[float, float],
+) -> None:
+    # Even spacing is what a sweep has; a stage at rest leaves no height to draw.
+    first, last = float(grid.stage_mm[0]), float(grid.stage_mm[-1])
+    if abs(last - first) < 1e-6:
+        first, last = first - 0.5, last + 0.5
+    half = 0.5 * (last - first) / max(len(grid.stage_mm) - 1, 1)
+    artist = axes.imshow(
+        image,
+        cmap=colours,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=(-0.5, grid.columns - 0.5, first - half, last + half),
+        origin="lower",
+        aspect="auto",
+        interpolation="nearest",
+    )
+    axes.set_facecolor("0.85")
+    axes.set(xlabel="column (px)", ylabel="stage position (mm)")
+    axes.figure.colorbar(artist, ax=axes, label=label)
+
+
+def _view_3d(
+    axes: Any,
+    points: NDArray[np.void],
+    range_mm: NDArray[np.float64],
+    limits: tuple[float, float],
+) -> None:
+    shown = np.flatnonzero((range_mm >= limits[0]) & (range_mm <= limits[1]))
+    if shown.size > POINTS_IN_3D:
+        shown = np.random.default_rng(0).choice(shown, POINTS_IN_3D, replace=False)
+    cloud = points[shown]
+    axes.scatter(
+        cloud["y"] * 1e3,
+        cloud["x"] * 1e3,
+        cloud["z"] * 1e3,
+        c=range_mm[shown],
+        cmap="viridis",
+        vmin=limits[0],
+        vmax=limits[1],
+        s=1.0,
+        linewidths=0.0,
+        depthshade=False,
+    )
+    axes.set(xlabel="y, stage (mm)", ylabel="x, range (mm)", zlabel="z, line (mm)")
+    axes.set_title("Point cloud" + (f" ({shown.size} points shown)"))
+    axes.view_init(elev=22.0, azim=-58.0)
+
+
+def _histogram(
+    axes: Axes, error_mm: NDArray[np.float64], sigma_mm: NDArray[np.floating[Any]]
+) -> None:
+    ratio = error_mm / sigma_mm
+    ratio = ratio[np.isfinite(ratio)]
+    edges = np.linspace(-SIGMAS_SHOWN, SIGMAS_SHOWN, 81)
+    weights = np.full(ratio.size, 1.0 / max(ratio.size, 1) / (edges[1] - edges[0]))
+    axes.hist(ratio, edges, weights=weights, color="tab:blue", alpha=0.75, label="points")
+    axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k--", label="unit normal")
+    beyond = float(np.mean(np.abs(ratio) > SIGMAS_SHOWN)) if ratio.size else 0.0
+    axes.set(
+        xlabel="range error / its sigma",
+        ylabel="density",
+        title=f"Error against the reported sigma ({beyond:.1%} beyond ±{SIGMAS_SHOWN:g})",
+    )
+    axes.legend()
+    axes.grid(alpha=0.3)

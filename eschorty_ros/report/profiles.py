@@ -1,0 +1,72 @@
+"""Which modulation period each point of a cloud belongs to, from the points alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+
+
+def period_s(points: NDArray[np.void]) -> float:
+    """Modulation period of a cloud in seconds, NaN when no column has two points.
+
+    A column's points lie one period apart unless some are missing, so the median distance in time
+    is a first guess; straight-line fits over doubling spans then sharpen it.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE
+
+    Returns
+    -------
+    float
+    """
+    order = np.lexsort((points["t"], points["column"]))
+    t_s = points["t"][order]
+    same = np.diff(points["column"][order].astype(np.int64)) == 0
+    gaps = np.diff(t_s)[same]
+    gaps = gaps[gaps > 0.0]
+    if gaps.size == 0:
+        return float("nan")
+    period = float(np.median(gaps))
+    elapsed = np.sort(points["t"]) - points["t"].min()
+    span = 16.0 * period
+    while True:
+        part = elapsed[elapsed <= span]
+        index = np.rint(part / period)
+        if index[-1] > 0:
+            slope = float(np.polyfit(index, part, 1)[0])
+            if abs(slope / period - 1.0) < 0.02:
+                period = slope
+        if span > elapsed[-1]:
+            return period
+        span *= 2.0
+
+
+def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
+    """Number of the modulation period of every point, the first being 0.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    period : float
+        Modulation period, seconds.
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+
+    Raises
+    ------
+    ArgumentError
+        When the period is not positive.
+    """
+    if not period > 0.0:
+        raise ArgumentError(f"period is {period!r} s; give a positive modulation period")
+    if len(points) == 0:
+        return np.empty(0, np.int64)
+    turns = (points["t"] - points["t"].min()) / period
+    phase = float(np.angle(np.mean(np.exp(2j * np.pi * turns)))) / (2.0 * np.pi)
+    index = np.rint(turns - phase).astype(np.int64)
+    return index - index.min()

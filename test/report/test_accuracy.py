@@ -1,0 +1,121 @@
+"""Accuracy of a cloud against a scene that is known in closed form."""
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.cloud import POINT_DTYPE
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.report import accuracy, profiles
+
+MODEL = load_calibration("config_3").model()
+PERIOD_S = 1.0 / 70.0
+
+
+class Wedge:
+    """Range grows along the stage; columns from 1000 on see nothing."""
+
+    def range_mm(self, stage_mm, columns, model):
+        stage = np.atleast_1d(stage_mm)[:, None]
+        column = np.atleast_1d(columns)[None, :]
+        return np.where(column < 1000, 1300.0 + 0.5 * stage + 0.01 * column, np.nan)
+
+
+def cloud(error_mm, direction=(0.0, 1.0, 0.0), lines=20, seed=3):
+    """One point per lit column and line, `error_mm` off in range, sigma 0.5 mm."""
+    rng = np.random.default_rng(seed)
+    line, column = (a.ravel() for a in np.mgrid[0:lines, 0:1000])
+    t_s = line * PERIOD_S + rng.normal(0.0, 5e-4, line.size)
+    stage = 50.0 * t_s
+    true = 1300.0 + 0.5 * stage + 0.01 * column
+    range_mm = true + np.broadcast_to(error_mm, line.shape)
+    points = np.zeros(line.size, POINT_DTYPE)
+    points["x"] = (range_mm + stage * direction[0]) * 1e-3
+    points["y"] = stage * direction[1] * 1e-3
+    points["z"] = (MODEL.lateral_mm(column, range_mm) + stage * direction[2]) * 1e-3
+    points["t"], points["column"], points["sigma"] = t_s, column, 5e-4
+    return points
+
+
+@pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.6, 0.8, 0.0), (0.1, -0.98, 0.17)])
+def test_exact_points_have_no_error_for_any_stage_direction(direction):
+    error = accuracy.range_error_mm(cloud(0.0, direction), Wedge(), MODEL, direction)
+    assert np.abs(error).max() < 2e-4  # float32 metres
+
+
+def test_statistics_of_a_known_error():
+    rng = np.random.default_rng(11)
+    error = rng.normal(0.2, 0.5, 20_000)
+    points = cloud(error)
+    positions = accuracy.sweep_positions_mm(0.0, 20 * PERIOD_S * 50.0, 50.0, 70.0)
+    result = accuracy.measure(points, Wedge(), MODEL, positions)
+    assert result.profiles == 20
+    assert (result.points, result.expected_points, result.completeness) == (20_000, 20_000, 1.0)
+    assert result.error_median_mm == pytest.approx(np.median(np.abs(error)), abs=1e-3)
+    assert result.error_p95_mm == pytest.approx(np.percentile(np.abs(error), 95), abs=1e-3)
+    assert result.bias_mm == pytest.approx(0.2, abs=0.02)
+    assert result.within_1_sigma == pytest.approx(np.mean(np.abs(error) <= 0.5), abs=1e-3)
+    assert result.within_2_sigma == pytest.approx(np.mean(np.abs(error) <= 1.0), abs=1e-3)
+
+
+def test_points_where_the_scene_is_empty_are_counted_not_measured():
+    points = cloud(0.0)
+    points["column"][:50] = 1100
+    positions = accuracy.sweep_positions_mm(0.0, 20 * PERIOD_S * 50.0, 50.0, 70.0)
+    result = accuracy.measure(points, Wedge(), MODEL, positions)
+    assert result.off_target == 50
+    assert result.completeness == pytest.approx(19_950 / 20_000)
+    assert result.error_p95_mm < 2e-4
+
+
+def test_missing_points_lower_the_completeness():
+    points = cloud(0.0)[::2]
+    positions = accuracy.sweep_positions_mm(0.0, 20 * PERIOD_S * 50.0, 50.0, 70.0)
+    assert accuracy.measure(points, Wedge(), MODEL, positions).completeness == 0.5
+
+
+def test_columns_out_of_the_sensors_view_are_not_expected():
+    class Far:
+        def range_mm(self, stage_mm, columns, model):
+            return np.full((np.size(stage_mm), np.size(columns)), 5000.0)
+
+    assert accuracy.lit_columns(Far(), MODEL, np.zeros(3)).tolist() == [0, 0, 0]
+
+
+def test_an_empty_cloud_gives_nan_not_a_crash():
+    positions = accuracy.sweep_positions_mm(0.0, 1.0, 50.0, 700.0)
+    result = accuracy.measure(np.empty(0, POINT_DTYPE), Wedge(), MODEL, positions)
+    assert result.points == 0
+    assert result.completeness == 0.0
+    assert np.isnan(result.error_median_mm)
+
+
+def test_a_stage_that_moves_within_the_sheet_is_refused():
+    with pytest.raises(ArgumentError, match="stage_direction"):
+        accuracy.stage_and_range_mm(cloud(0.0), (1.0, 0.0, 0.0))
+
+
+def test_sweep_positions_lie_in_the_middle_of_each_period():
+    positions = accuracy.sweep_positions_mm(10.0, 0.0, 50.0, 70.0)
+    assert len(positions) == 14
+    assert positions[0] == pytest.approx(10.0 - 10.0 / 28)
+    with pytest.raises(ArgumentError, match="speed"):
+        accuracy.sweep_positions_mm(0.0, 1.0, 0.0, 70.0)
+
+
+def test_periods_are_recovered_from_the_points_alone():
+    points = cloud(0.0, lines=300)
+    rng = np.random.default_rng(5)
+    keep = rng.random(len(points)) < 0.7
+    keep &= ~((points["t"] > 1.0) & (points["t"] < 1.3))
+    points = rng.permutation(points[keep])
+    period = profiles.period_s(points)
+    assert period == pytest.approx(PERIOD_S, rel=1e-4)
+    index = profiles.profile_index(points, period)
+    np.testing.assert_array_equal(index, np.rint(points["t"] / PERIOD_S))
+
+
+def test_a_single_profile_has_no_period():
+    assert np.isnan(profiles.period_s(cloud(0.0, lines=1)))
+    with pytest.raises(ArgumentError, match="period"):
+        profiles.profile_index(cloud(0.0, lines=1), float("nan"))

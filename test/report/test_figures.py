@@ -1,0 +1,78 @@
+"""The pictures are written and show what they should."""
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core.cloud import POINT_DTYPE
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.report import figures
+
+
+def step_cloud(lines=24, columns=320):
+    """A step of 40 mm in stage and column, with 1 mm noise."""
+    rng = np.random.default_rng(2)
+    line, column = (a.ravel() for a in np.mgrid[0:lines, 0:columns])
+    true = 1300.0 + 40.0 * ((line > lines // 2) ^ (column > columns // 2))
+    points = np.zeros(line.size, POINT_DTYPE)
+    error = rng.normal(0.0, 1.0, line.size)
+    points["x"] = (true + error) * 1e-3
+    points["y"] = line * 0.7e-3
+    points["z"] = (column - columns / 2) * 0.26e-3
+    points["t"] = line / 70.0 + rng.normal(0, 1e-4, line.size)
+    points["column"], points["sigma"] = column, 1e-3
+    return points, error
+
+
+def png_size(path):
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+
+
+def test_scan_figure_has_every_part_with_units(tmp_path):
+    points, error = step_cloud()
+    figure = figures.scan_figure(points, error, "a step")
+    labels = {axes.get_ylabel() for axes in figure.axes}
+    assert {"stage position (mm)", "range (mm)", "range error (mm)", "density"} <= labels
+    figures.save(figure, tmp_path / "scan.png")
+    width, height = png_size(tmp_path / "scan.png")
+    assert width > 1000 and height > 700
+    assert (tmp_path / "scan.png").stat().st_size < 500_000
+
+
+def test_without_truth_there_is_no_error_map(tmp_path):
+    figure = figures.scan_figure(step_cloud()[0])
+    assert "range error (mm)" not in {axes.get_ylabel() for axes in figure.axes}
+
+
+def test_the_depth_map_holds_each_point_once():
+    points, _ = step_cloud()
+    stage, range_mm = figures.stage_and_range_mm(points)
+    grid = figures.grid_of(points, stage)
+    image = figures.image_of(grid, points, range_mm)
+    assert image.shape == (24, 320)
+    np.testing.assert_allclose(image.ravel(), range_mm)
+    np.testing.assert_allclose(grid.stage_mm, np.arange(24) * 0.7, atol=1e-4)
+
+
+def test_one_profile_draws(tmp_path):
+    points, error = step_cloud(lines=1)
+    figures.save(figures.scan_figure(points, error), tmp_path / "one.png")
+    png_size(tmp_path / "one.png")
+
+
+def test_an_error_that_is_nowhere_known_draws(tmp_path):
+    points, error = step_cloud(lines=3)
+    figures.save(figures.scan_figure(points, np.full_like(error, np.nan)), tmp_path / "nan.png")
+
+
+def test_an_empty_cloud_is_refused():
+    with pytest.raises(ArgumentError, match="0 points"):
+        figures.scan_figure(np.empty(0, POINT_DTYPE))
+
+
+def test_a_path_that_cannot_be_written_is_one_line(tmp_path):
+    figure = figures.scan_figure(step_cloud(lines=2)[0])
+    with pytest.raises(ArgumentError, match="cannot write the picture") as failure:
+        figures.save(figure, tmp_path / "scan.nonsense")
+    assert "\n" not in str(failure.value)
