@@ -11,8 +11,8 @@ from eschorty_ros.core.errors import ArgumentError
 def period_s(points: NDArray[np.void]) -> float:
     """Modulation period of a cloud in seconds, NaN when no column has two points.
 
-    A column's points lie one period apart unless some are missing, so the median distance in time
-    is a first guess; straight-line fits over doubling spans then sharpen it.
+    A column's points lie whole periods apart and mostly one, so their distances in time give a
+    first guess; straight-line fits over doubling spans then sharpen it.
 
     Parameters
     ----------
@@ -29,16 +29,16 @@ def period_s(points: NDArray[np.void]) -> float:
     gaps = gaps[gaps > 0.0]
     if gaps.size == 0:
         return float("nan")
-    period = float(np.median(gaps))
+    guess = float(np.median(gaps))
+    period = float(gaps.sum() / np.maximum(np.rint(gaps / guess), 1.0).sum())
     elapsed = np.sort(points["t"]) - points["t"].min()
+    elapsed -= _phase(elapsed[elapsed <= 16.0 * period] / period) * period
     span = 16.0 * period
     while True:
         part = elapsed[elapsed <= span]
         index = np.rint(part / period)
-        if index[-1] > 0:
-            slope = float(np.polyfit(index, part, 1)[0])
-            if abs(slope / period - 1.0) < 0.02:
-                period = slope
+        if index[-1] > index[0]:
+            period = float(np.polyfit(index, part, 1)[0])
         if span > elapsed[-1]:
             return period
         span *= 2.0
@@ -67,6 +67,10 @@ def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
     if len(points) == 0:
         return np.empty(0, np.int64)
     turns = (points["t"] - points["t"].min()) / period
-    phase = float(np.angle(np.mean(np.exp(2j * np.pi * turns)))) / (2.0 * np.pi)
-    index = np.rint(turns - phase).astype(np.int64)
+    index = np.rint(turns - _phase(turns)).astype(np.int64)
     return index - index.min()
+
+
+def _phase(turns: NDArray[np.float64]) -> float:
+    """Circular mean of the fractional part, -0.5 to 0.5."""
+    return float(np.angle(np.mean(np.exp(2j * np.pi * turns)))) / (2.0 * np.pi)
