@@ -1,0 +1,83 @@
+"""Health of a node on ``/diagnostics`` once a second."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+
+Report = tuple[bytes, str, Mapping[str, Any]]
+
+
+class Rate:
+    """Amount per second between two readings, on the steady clock."""
+
+    def __init__(self) -> None:
+        self._total = 0.0
+        self._read_at_s = time.monotonic()
+
+    def read(self, total: float) -> float:
+        """Rate since the last reading, given the running ``total``."""
+        now_s = time.monotonic()
+        elapsed_s = now_s - self._read_at_s
+        rate = (total - self._total) / elapsed_s if elapsed_s > 0.0 else 0.0
+        self._total, self._read_at_s = total, now_s
+        return max(rate, 0.0)
+
+
+class Diagnostics:
+    """Publishes what ``report`` returns, in every lifecycle state.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    report : callable
+        Returns level (``OK``, ``WARN``, ``ERROR``), one line, and named values with their units
+        in the names.
+    callback_group : rclpy.callback_groups.CallbackGroup, optional
+        Group of the timer; the node's default group when omitted.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        report: Callable[[], Report],
+        callback_group: CallbackGroup | None = None,
+    ) -> None:
+        self._node = node
+        self._report = report
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        node.create_timer(
+            1.0,
+            self.publish,
+            callback_group=callback_group,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+
+    def publish(self) -> None:
+        """Publish now; also called every second."""
+        level, message, values = self._report()
+        status = DiagnosticStatus(
+            level=level,
+            name=self._node.get_fully_qualified_name().lstrip("/"),
+            message=message,
+            hardware_id=str(values.get("device", "")),
+            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

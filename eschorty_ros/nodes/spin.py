@@ -1,0 +1,105 @@
+"""Running nodes: one way from ``init`` to a clean exit, with the hardware safe on every path."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+
+import rclpy
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
+from rclpy.node import Node
+
+from eschorty_ros.core.errors import EschortyError
+
+
+def make_safe(nodes: Sequence[Node]) -> None:
+    """Call ``safe_state()`` of every node that has one; a failure does not keep the next from it.
+
+    It reaches the drivers directly: after a signal the ROS context is already invalid.
+    """
+    for node in nodes:
+        safe_state = getattr(node, "safe_state", None)
+        if safe_state is None:
+            continue
+        try:
+            safe_state()
+        except Exception as error:
+            print(f"{node.get_name()}: not safe: {error}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Within it a second Ctrl-C or SIGTERM cannot interrupt the way to the safe state."""
+    kept = {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        kept[number] = signal.signal(number, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+def run(
+    *factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None
+) -> int:
+    """Build the nodes, spin them until a signal, make the hardware safe; returns the exit code.
+
+    Parameters
+    ----------
+    factories : callables
+        Each makes one node once the context exists.
+    threads : int
+        1 spins in this thread; more gives that many to a ``MultiThreadedExecutor``, needed where
+        a callback waits (actions).
+    args : sequence of str, optional
+        Command line; the process's own when omitted.
+
+    Returns
+    -------
+    int
+        0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built or a callback failed
+        (one line for an ``EschortyError``).
+    """
+    nodes: list[Node] = []
+    executor: Executor | None = None
+    code = 0
+    try:
+        rclpy.init(args=list(args) if args is not None else None)
+        signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+        executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
+        for factory in factories:
+            node = factory()
+            nodes.append(node)
+            executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except EschortyError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        code = 1
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    finally:
+        with undisturbed():
+            make_safe(nodes)
+            _tear_down(nodes, executor)
+    return code
+
+
+def _tear_down(nodes: Sequence[Node], executor: Executor | None) -> None:
+    if executor is not None:
+        executor.shutdown(timeout_sec=1.0)
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown()

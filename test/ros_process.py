@@ -1,0 +1,247 @@
+"""Helpers of the process tests: nodes as processes of their own, in a private ROS domain."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter as ParameterMsg
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+
+NAMESPACE = "/eschorty"
+DEADLINE_S = 30.0
+
+
+def free_domain() -> int:
+    """A ROS domain (1..101) nobody on this host uses: its discovery port can be bound."""
+    candidates = list(range(1, 102))
+    random.SystemRandom().shuffle(candidates)
+    for domain in candidates:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7400 + 250 * domain + 10))
+            except OSError:
+                continue
+            return domain
+    raise RuntimeError("no free ROS domain between 1 and 101 on this host")
+
+
+def wait_until(
+    condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S, poll_s: float = 0.02
+) -> Any:
+    """The first truthy value of ``condition()``; fails with ``what`` after ``deadline_s``."""
+    end_s = time.monotonic() + deadline_s
+    while time.monotonic() < end_s:
+        value = condition()
+        if value:
+            return value
+        time.sleep(poll_s)
+    raise AssertionError(f"not within {deadline_s:g} s: {what}")
+
+
+class NodeProcess:
+    """One node running as a process of its own.
+
+    Parameters
+    ----------
+    module : str
+        Module to run, e.g. ``eschorty_ros.nodes.laser``.
+    parameters : mapping
+        Parameters of the node.
+    domain : int
+        ``ROS_DOMAIN_ID``.
+    namespace : str
+    """
+
+    def __init__(
+        self,
+        module: str,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        domain: int,
+        namespace: str = NAMESPACE,
+    ) -> None:
+        self.module = module
+        self._log = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed in kill()
+            prefix=f"{module.rsplit('.', 1)[-1]}_", suffix=".log"
+        )
+        command = [sys.executable, "-m", module, "--ros-args", "-r", f"__ns:={namespace}"]
+        for name, value in (parameters or {}).items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            command += ["-p", f"{name}:={text}"]
+        self._process = subprocess.Popen(
+            command,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            env=domain_environment(domain),
+            start_new_session=True,
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def output(self) -> str:
+        """Everything the process has printed."""
+        return Path(self._log.name).read_text(errors="replace")
+
+    def send(self, number: int) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def wait(self, deadline_s: float = 10.0) -> int:
+        """Exit code; fails with the output when the process does not end in time."""
+        try:
+            return self._process.wait(deadline_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(
+                f"{self.module} still runs after {deadline_s:g} s:\n{self.output}"
+            ) from None
+
+    def running(self) -> bool:
+        """Whether the process is still there."""
+        return self._process.poll() is None
+
+    def interrupt(self, deadline_s: float = 10.0) -> int:
+        """SIGINT, then the exit code."""
+        if self.running():
+            self.send(signal.SIGINT)
+        return self.wait(deadline_s)
+
+    def cpu_s(self) -> float:
+        """CPU time used so far, user and system."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def kill(self) -> None:
+        """SIGKILL if it still runs; always leaves nothing behind."""
+        if self.running():
+            self._process.kill()
+        self._process.wait()
+        self._log.close()
+
+
+def domain_environment(domain: int) -> dict[str, str]:
+    """Environment of a process in ``domain``, discovering on this host only."""
+    return {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+class Observer:
+    """A test's own node, spun in a thread: collects messages, calls services.
+
+    Use it as a context manager.
+    """
+
+    def __init__(self, domain: int, name: str = "observer", namespace: str = NAMESPACE) -> None:
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = Node(name, namespace=namespace, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Observer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def _spin(self) -> None:
+        while not self._closing.is_set():
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def collect(self, message_type: Any, topic: str, profile: QoSProfile) -> list[Any]:
+        """A list that grows by every message of ``topic`` from now on."""
+        messages: list[Any] = []
+        self.node.create_subscription(message_type, topic, messages.append, profile)
+        self._executor.wake()
+        return messages
+
+    def publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:
+        """A publisher that has already found a subscriber."""
+        publisher = self.node.create_publisher(message_type, topic, profile)
+        wait_until(publisher.get_subscription_count, f"a subscriber of {topic}")
+        return publisher
+
+    def call(
+        self, service_type: Any, name: str, request: Any = None, deadline_s: float = DEADLINE_S
+    ) -> Any:
+        """The service's response."""
+        client = self.node.create_client(service_type, name)
+        try:
+            wait_until(client.service_is_ready, f"service {name}", deadline_s)
+            future = client.call_async(request if request is not None else service_type.Request())
+            wait_until(future.done, f"answer of {name}", deadline_s)
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def lifecycle_state(self, node: str) -> str:
+        """Label of the lifecycle state of ``node``."""
+        return str(self.call(GetState, f"{node}/get_state").current_state.label)
+
+    def wait_for_state(self, node: str, label: str, deadline_s: float = DEADLINE_S) -> None:
+        """Wait until ``node`` reports lifecycle state ``label``."""
+        wait_until(
+            lambda: self.lifecycle_state(node) == label, f"{node} {label}", deadline_s, poll_s=0.1
+        )
+
+    def change_state(self, node: str, transition: str) -> bool:
+        """Ask ``node`` for a transition by label, e.g. ``deactivate``; whether it succeeded."""
+        request = ChangeState.Request(transition=Transition(label=transition))
+        return bool(self.call(ChangeState, f"{node}/change_state", request).success)
+
+    def set_parameter(self, node: str, name: str, value: Any) -> tuple[bool, str]:
+        """Set one parameter of ``node``: accepted, reason."""
+        message: ParameterMsg = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        result = self.call(SetParameters, f"{node}/set_parameters", request).results[0]
+        return bool(result.successful), str(result.reason)
+
+
+@contextlib.contextmanager
+def processes(
+    nodes: Mapping[str, Mapping[str, Any]], domain: int
+) -> Iterator[dict[str, NodeProcess]]:
+    """Run ``{module: parameters}`` side by side, keyed by last module name; killed at the end."""
+    running = {
+        module.rsplit(".", 1)[-1]: NodeProcess(module, parameters, domain=domain)
+        for module, parameters in nodes.items()
+    }
+    try:
+        yield running
+    finally:
+        for process in running.values():
+            process.kill()
