@@ -16,7 +16,7 @@ from eschorty_ros.cli.console import show, table
     "--theta-deg", type=float, default=85.87, show_default=True, help="Tilt of the laser sheet."
 )
 @click.option("--theta-prime-deg", type=float, help="Tilt of the sensor; with --near-mm.")
-@click.option("--near-mm", type=float, default=810.0, show_default=True, help="Range at row 0, mm.")
+@click.option("--near-mm", type=float, default=810.45, show_default=True, help="Range at row 0, mm.")
 @click.option(
     "--far-mm", type=float, help="Range at the last row, mm; finds the sensor tilt by itself."
 )

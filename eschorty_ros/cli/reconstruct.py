@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
+
+if TYPE_CHECKING:
+    from eschorty_ros.core.reconstruction import Result
 
 
 class SettingsCommand(click.Command):
@@ -80,7 +83,11 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
         raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
     chosen = Settings(**settings)
     with progress_bar("reconstructing") as report:
-        result = reconstruct_recording(load_recording(recording), chosen, progress=report)
+        result = reconstruct_recording(
+            load_recording(recording), chosen, lambda done, total: report(done / max(total, 1), "")
+        )
+    for warning in result.warnings:
+        click.echo(f"eschorty: warning: {warning}", err=True)
     write_cloud(target, result.points)
     facts = summary(result)
     if as_json:
@@ -101,17 +108,17 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     )
 
 
-def summary(result: Any) -> dict[str, float | int | None]:
+def summary(result: Result) -> dict[str, float | int | None]:
     """The keys of ``--json`` from a reconstruction's result."""
     import numpy as np
 
     points = result.points
     return {
-        "events": int(result.events),
-        "dropped_events": int(result.dropped_events),
-        "profiles": int(result.profiles),
+        "events": result.events,
+        "dropped_events": result.counters["events_dropped"],
+        "profiles": result.profile_count,
         "points": len(points),
-        "seconds": float(result.seconds),
-        "events_per_second": float(result.events / result.seconds) if result.seconds else 0.0,
+        "seconds": result.seconds,
+        "events_per_second": result.events_per_second,
         "sigma_median_m": float(np.median(points["sigma"])) if len(points) else None,
     }

@@ -1,0 +1,126 @@
+"""`eschorty info`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from eschorty_ros.cli.console import pairs, progress_bar
+
+PEAK_WINDOW_US = 10_000
+
+
+@click.command("info")
+@click.argument("path", type=click.Path(exists=True, path_type=Path))
+def command(path: Path) -> None:
+    """Say what PATH holds: a .raw file, a .pcd or .ply cloud, or a recording folder.
+
+    \b
+    Examples:
+      eschorty info rec
+      eschorty info rec/events.raw
+      eschorty info scan/scan.pcd
+    """
+    if path.is_dir():
+        _recording(path)
+    elif path.suffix in (".pcd", ".ply"):
+        _cloud(path)
+    else:
+        _raw(path)
+
+
+def _recording(path: Path) -> None:
+    from eschorty_ros.core.recording import load_recording
+
+    recording = load_recording(path)
+    stage, laser = recording.stage_samples, recording.modulation
+    seconds = (int(stage["t_us"][-1]) - int(stage["t_us"][0])) * 1e-6
+    near, far = recording.calibration.model().range_limits_mm
+    edge = "unknown" if laser.on_edge_us is None else f"{laser.on_edge_us} us"
+    truth = recording.truth
+    pairs(
+        str(path),
+        {
+            "calibration": f"{recording.calibration.name} ({near:.1f} to {far:.1f} mm)",
+            "laser": f"{laser.waveform}, {laser.frequency_hz:g} Hz, duty {laser.duty:g}",
+            "rising edge": edge,
+            "stage": f"{stage['position_mm'].min():.3f} to {stage['position_mm'].max():.3f} mm "
+            f"in {seconds:.3f} s, {len(stage):,} samples",
+            "truth": "none" if truth is None else f"{len(truth):,} ranges",
+        },
+    )
+    _raw(recording.events_path)
+
+
+def _cloud(path: Path) -> None:
+    import numpy as np
+
+    from eschorty_ros.core.cloud import read_cloud
+
+    points = read_cloud(path)
+    rows = {"points": f"{len(points):,}"}
+    if len(points):
+        for name, unit, scale in (
+            ("x", "mm", 1e3),
+            ("y", "mm", 1e3),
+            ("z", "mm", 1e3),
+            ("t", "s", 1.0),
+            ("intensity", "events", 1.0),
+            ("column", "px", 1.0),
+        ):
+            values = points[name] * scale
+            rows[name] = f"{values.min():.3f} to {values.max():.3f} {unit}"
+        rows["median sigma"] = f"{float(np.median(points['sigma'])) * 1e3:.3f} mm"
+    pairs(str(path), rows)
+
+
+def _raw(path: Path) -> None:
+    import numpy as np
+
+    from eschorty_ros.core.evt3 import Decoder
+    from eschorty_ros.core.raw_file import RawReader
+
+    reader = RawReader(path)
+    header = reader.header
+    decoder = Decoder(int(header.width), int(header.height))
+    events = rising = triggers = on = 0
+    first_us = last_us = 0
+    busiest: dict[int, int] = {}
+    total, done = max(path.stat().st_size, 1), 0
+    with progress_bar("decoding") as report:
+        for chunk in reader.chunks(1 << 20):
+            decoded = decoder.decode(chunk)
+            done += len(chunk)
+            report(done / total, "")
+            triggers += len(decoded.triggers.t)
+            rising += int(np.count_nonzero(decoded.triggers.edge))
+            if len(decoded.t) == 0:
+                continue
+            if events == 0:
+                first_us = int(decoded.t[0])
+            last_us = int(decoded.t[-1])
+            events += len(decoded.t)
+            on += int(np.count_nonzero(decoded.p))
+            windows, counts = np.unique(decoded.t // PEAK_WINDOW_US, return_counts=True)
+            for window, count in zip(windows.tolist(), counts.tolist(), strict=True):
+                busiest[window] = busiest.get(window, 0) + count
+    seconds = (last_us - first_us) * 1e-6
+    peak = max(busiest.values(), default=0) / (PEAK_WINDOW_US * 1e-6)
+    rows = {
+        "format": f"{header.format}, {header.width} x {header.height}",
+        "events": f"{events:,} ({on:,} on, {events - on:,} off)",
+        "time": f"{first_us * 1e-6:.6f} to {last_us * 1e-6:.6f} s ({seconds:.3f} s)",
+        "mean rate": f"{events / seconds if seconds else 0.0:.4g} events/s",
+        "peak rate": f"{peak:.4g} events/s in {PEAK_WINDOW_US // 1000} ms",
+        "triggers": f"{triggers:,} ({rising:,} rising)",
+    }
+    rows |= {
+        name.replace("_", " "): f"{value:,}"
+        for name, value in asdict(decoder.counters).items()
+        if name != "events" and value
+    }
+    pairs(str(path), rows)
+    for warning in reader.warnings:
+        click.echo(f"eschorty: warning: {warning}", err=True)
