@@ -1,0 +1,217 @@
+"""Scene, laser, stage and pixels joined over sensor time: EVT3 bytes out, with the truth known."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.calibration import Calibration
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.motion import MotionPlan
+from eschorty_ros.core.recording import TRUTH_DTYPE
+from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
+from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.timeline import LaserTimeline, StageTimeline
+
+BACKGROUND_HZ = 0.22
+"""Background activity per pixel: 5 % of all events at 70 Hz with every column lit."""
+
+STEP_MM = 0.25
+"""Stage travel after which a moving line is drawn anew."""
+
+_STEP_MAX_US = 5_000
+_STEP_MIN_US = 50
+_ROW_STEP = 0.02
+_PIECE_US = 16_384
+_TIME_HIGH_US = 4_096
+_PHASES_KEPT = 1_000_000
+
+
+class World:
+    """What the camera would see.
+
+    The bytes depend on scene, calibration, parameters, seed and on what laser and stage do, never
+    on how calls to :meth:`advance` are spaced.
+
+    Parameters
+    ----------
+    scene : Scene
+    calibration : Calibration
+    parameters : PixelParameters
+    seed : int
+        Fixes thresholds, jitter and background.
+    background_hz : float
+        Background events per pixel and second.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        calibration: Calibration,
+        parameters: PixelParameters | None = None,
+        seed: int = 0,
+        background_hz: float = BACKGROUND_HZ,
+    ) -> None:
+        self.scene = scene
+        self.model = calibration.model()
+        self.columns = self.model.columns
+        self.rows = self.model.rows
+        self.events = 0
+        self._pixels = PixelArray(
+            self.columns, self.rows, parameters or PixelParameters(), seed, background_hz
+        )
+        self._encoder = Encoder(self.columns, self.rows)
+        self._laser = LaserTimeline()
+        self._stage = StageTimeline()
+        self._every_column = np.arange(self.columns)
+        self._now_us = 0
+        self._handled_us = -1
+        self._lit_since_us: int | None = None
+        self._step_us: int | None = None
+        self._drawn_mm = np.nan
+        self._drawn_row = np.full(self.columns, np.nan)
+        self._phases: deque[tuple[int, float]] = deque(maxlen=_PHASES_KEPT)
+
+    @property
+    def now_us(self) -> int:
+        """Sensor time simulated so far."""
+        return self._now_us
+
+    def set_laser(self, t_us: int, on: bool, modulation: Modulation | None = None) -> None:
+        """Switch the laser from ``t_us`` on; ``modulation.on_edge_us`` places the wave.
+
+        Replaces what was set for later times.
+
+        Raises
+        ------
+        ArgumentError
+            When ``t_us`` has been simulated already, or the modulation cannot be rendered.
+        """
+        self._refuse_past("t_us", t_us)
+        self._laser.set(t_us, on, modulation)
+
+    def set_stage(self, plan: MotionPlan, zero_ns: int = 0, from_us: int | None = None) -> None:
+        """Follow ``plan``, whose clock read ``zero_ns`` at sensor time 0.
+
+        The plan holds from its own start on, or from ``from_us``; before the first plan the
+        stage rests at 0 mm.
+
+        Raises
+        ------
+        ArgumentError
+            When that time has been simulated already.
+        """
+        start_us = -((zero_ns - plan.start_ns) // 1000) if from_us is None else from_us
+        self._refuse_past("the plan's start", start_us)
+        self._stage.set(start_us, plan, zero_ns)
+
+    def stage_mm(self, t_us: int) -> float:
+        """Stage position at sensor time ``t_us``, as far as it is known now."""
+        return self._stage.state(t_us)[0]
+
+    def advance(self, until_us: int) -> bytes:
+        """EVT3 bytes of all events read out before ``until_us`` and not handed out yet.
+
+        Raises
+        ------
+        ArgumentError
+            When ``until_us`` lies before what has been simulated.
+        """
+        self._refuse_past("until_us", until_us)
+        parts = []
+        while self._now_us < until_us:
+            end_us = min(until_us, self._now_us + _PIECE_US)
+            self._follow(end_us)
+            self._pixels.run_until(end_us)
+            keys = self._pixels.take(end_us)
+            self.events += keys.size
+            parts.append(self._encoder.encode(*unpack(keys)))
+            # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
+            parts.append(self._encoder.advance(end_us // _TIME_HIGH_US * _TIME_HIGH_US)
+                         if self._idle(end_us) else b"")
+            self._now_us = end_us
+            self._laser.forget_before(self._handled_us)
+            self._stage.forget_before(self._handled_us)
+        return b"".join(parts)
+
+    @property
+    def truth(self) -> NDArray[np.void]:
+        """True range per modulation period and lit column, TRUTH_DTYPE, in time order.
+
+        ``t_us`` is the middle of the lit phase; a column counts as lit when its line falls on
+        the sensor. The last million periods are kept.
+        """
+        if not self._phases:
+            return np.empty(0, dtype=TRUTH_DTYPE)
+        parts = []
+        phases = list(self._phases)
+        for k in range(0, len(phases), 256):
+            t_us, stage_mm = zip(*phases[k : k + 256], strict=True)
+            range_mm = self.scene.range_mm(np.array(stage_mm), self._every_column, self.model)
+            row = self.model.row(range_mm)
+            phase, column = np.nonzero((row >= 0.0) & (row <= self.rows - 1.0))
+            part = np.empty(phase.size, dtype=TRUTH_DTYPE)
+            part["t_us"] = np.array(t_us)[phase]
+            part["column"] = column
+            part["range_mm"] = range_mm[phase, column]
+            parts.append(part)
+        return np.concatenate(parts)
+
+    def _refuse_past(self, name: str, t_us: int) -> None:
+        if t_us < self._now_us:
+            raise ArgumentError(
+                f"{name} is {t_us} us and {self._now_us} us are simulated; give a later time"
+            )
+
+    def _idle(self, end_us: int) -> bool:
+        reached = self._encoder.time_us
+        return reached is None or end_us // _TIME_HIGH_US > reached // _TIME_HIGH_US
+
+    def _follow(self, end_us: int) -> None:
+        """Apply every change of light before ``end_us``."""
+        while True:
+            candidates = [self._laser.next_us(self._handled_us), self._step_us]
+            t_us = min((t for t in candidates if t is not None), default=end_us)
+            if t_us >= end_us:
+                return
+            self._handled_us = t_us
+            lit = self._laser.lit(t_us)
+            if lit:
+                self._draw(t_us)
+            elif self._lit_since_us is not None:
+                self._darken(t_us)
+
+    def _draw(self, t_us: int) -> None:
+        """Put the line where the scene has it now, in the columns where it moved."""
+        position_mm, velocity_mm_s = self._stage.state(t_us)
+        if self._lit_since_us is None:
+            self._lit_since_us = t_us
+            self._drawn_row[:] = np.nan
+            self._drawn_mm = np.nan
+        if position_mm != self._drawn_mm:
+            stage = np.array([position_mm])
+            range_mm = self.scene.range_mm(stage, self._every_column, self.model)[0]
+            row = self.model.row(range_mm)
+            moved = ~(np.abs(row - self._drawn_row) <= _ROW_STEP)
+            moved &= ~(np.isnan(row) & np.isnan(self._drawn_row))
+            if moved.any():
+                albedo = self.scene.reflectance(stage, self._every_column, self.model)[0]
+                columns = self._every_column[moved]
+                self._pixels.relight(t_us, columns, row[moved], albedo[moved])
+                self._drawn_row[moved] = row[moved]
+            self._drawn_mm = position_mm
+        pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
+        self._step_us = t_us + int(min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US))
+
+    def _darken(self, t_us: int) -> None:
+        """Take the line away and note the phase that ends here."""
+        dark = np.zeros(self.columns)
+        self._pixels.relight(t_us, self._every_column, self._drawn_row, dark)
+        middle_us = ((self._lit_since_us or 0) + t_us) // 2
+        self._phases.append((middle_us, self._stage.state(middle_us)[0]))
+        self._lit_since_us = None
+        self._step_us = None
