@@ -149,6 +149,11 @@ class Reconstructor:
         return self._modulation
 
     @property
+    def time_us(self) -> int | None:
+        """Sensor time up to which the stream has been read, events or not; ``None`` at first."""
+        return self._decoder.time_us
+
+    @property
     def phase_missing(self) -> bool:
         """Whether a flush found no phase and cut from the first event's time on."""
         return self._phase_missing
