@@ -1,0 +1,144 @@
+"""All of the reconstruction node's work on data, without ROS: packets and stage samples to scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eschorty_ros.core.calibration import Calibration
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.reconstruction import Settings, place
+from eschorty_ros.nodes.packet_stream import Packet, PacketStream
+from eschorty_ros.nodes.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
+from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
+
+
+@dataclass(frozen=True, slots=True)
+class ScanReport:
+    """An assembled scan and what was lost while it was collected."""
+
+    scan: AssembledScan
+    events: int
+    packets_lost: int
+    events_dropped: int
+    points_without_stage: int
+    points_over_limit: int
+
+
+class Pipeline:
+    """Packets, laser settings and stage samples in; live profiles, points and scans out.
+
+    Owned by one thread.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    settings : Settings
+    clock_timeout_s, stage_gap_s, stage_timeout_s : float
+        See ``PacketStream`` and ``StagePlacer``.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        settings: Settings,
+        clock_timeout_s: float,
+        stage_gap_s: float,
+        stage_timeout_s: float,
+    ) -> None:
+        self.calibration = calibration
+        self.model = calibration.model()
+        self.stream = PacketStream(calibration, settings, clock_timeout_s)
+        self.placer = StagePlacer(stage_gap_s, stage_timeout_s)
+        self.profiles = 0
+        self.points = 0
+        self._fresh: list[TimedProfiles] = []
+        self._buffer: ScanBuffer | None = None
+        self._at_begin: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+    @property
+    def scan_id(self) -> str:
+        """Of the scan being collected, empty when none."""
+        return self._buffer.scan_id if self._buffer is not None else ""
+
+    @property
+    def scan_points(self) -> int:
+        """Points collected for the scan so far."""
+        return len(self._buffer) if self._buffer is not None else 0
+
+    def add_packet(self, packet: Packet, now_s: float) -> None:
+        """Queue a packet and reconstruct what is possible."""
+        self.stream.add(packet, now_s)
+        self._receive(self.stream.process(now_s), now_s)
+
+    def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
+        """Advance whatever waited: profiles completed and points placed since the last call."""
+        self._receive(self.stream.process(now_s), now_s)
+        placed = [self._place(timed, mm) for timed, mm in self.placer.ready(now_s)]
+        for part in placed:
+            self.points += len(part)
+            if self._buffer is not None:
+                self._buffer.add(part)
+        fresh, self._fresh = self._fresh, []
+        return fresh, placed
+
+    def begin_scan(self, scan_id: str, start_mm: float, stop_mm: float) -> None:
+        """Start collecting.
+
+        Raises
+        ------
+        ArgumentError
+            When a scan is being collected already, or for bad limits.
+        """
+        if self._buffer is not None:
+            raise ArgumentError(
+                f"scan {self._buffer.scan_id!r} is being collected; end it before beginning "
+                f"{scan_id!r}"
+            )
+        self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
+        self._at_begin = self._losses()
+
+    def close_period(self, scan_id: str, now_s: float) -> None:
+        """First half of ending a scan: complete the open period, as the light is off by now.
+
+        Raises
+        ------
+        ArgumentError
+            When ``scan_id`` is not the scan being collected.
+        """
+        if self._buffer is None or self._buffer.scan_id != scan_id:
+            raise ArgumentError(
+                f"scan {scan_id!r} is not being collected; "
+                + (f"end {self.scan_id!r} or " if self.scan_id else "")
+                + "begin it first"
+            )
+        self._receive(self.stream.flush(), now_s)
+
+    def end_scan(self) -> ScanReport:
+        """Second half: what was collected, in order."""
+        assert self._buffer is not None
+        buffer, self._buffer = self._buffer, None
+        events, lost, dropped, without = np.subtract(self._losses(), self._at_begin).tolist()
+        return ScanReport(
+            buffer.assemble(), events, lost, dropped, without, buffer.points_over_limit
+        )
+
+    def _receive(self, timed: list[TimedProfiles], now_s: float) -> None:
+        for part in timed:
+            self.profiles += part.profiles.profile_count
+            self._fresh.append(part)
+            self.placer.add_profiles(part, now_s)
+
+    def _place(self, timed: TimedProfiles, stage_mm: np.ndarray) -> PlacedPoints:
+        points = place(timed.profiles, self.model, stage_mm, self.calibration.stage_direction)
+        return PlacedPoints(points, timed.t_ns, timed.edge_ns, stage_mm)
+
+    def _losses(self) -> tuple[int, int, int, int]:
+        counters = self.stream.counters
+        return (
+            counters["events"],
+            self.stream.packets_lost,
+            counters["events_dropped"],
+            self.placer.points_without_stage,
+        )

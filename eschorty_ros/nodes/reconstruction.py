@@ -1,0 +1,336 @@
+"""Node ``reconstruction``: event packets in, profiles, points and assembled scans out."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from event_camera_msgs.msg import EventPacket
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import TimeReference
+from tf2_msgs.msg import TFMessage
+
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.errors import ArgumentError, EschortyError
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
+from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.msg import LaserState, ReconstructionState
+from eschorty_ros.nodes import diagnostics, qos, transforms
+from eschorty_ros.nodes.conversions import (
+    mm_from_m,
+    modulation_from_laser_state,
+    ns_from_stamp,
+    stamp_from_ns,
+)
+from eschorty_ros.nodes.mailbox import Mailbox
+from eschorty_ros.nodes.packet_stream import Packet
+from eschorty_ros.nodes.parameters import Param, Parameters, from_settings
+from eschorty_ros.nodes.pipeline import Pipeline, ScanReport
+from eschorty_ros.nodes.reconstruction_outputs import Outputs
+from eschorty_ros.nodes.spin import run
+from eschorty_ros.srv import BeginScan, EndScan
+
+TABLE = (
+    Param("calibration", "config_3", "calibration: a name in config/ or a file's path"),
+    Param("frequency", 0.0, "modulation frequency; 0 takes the laser node's settings", "Hz",
+          0.0, FREQUENCY_MAX_HZ, dynamic=True),
+    Param("duty", 0.5, "duty where frequency is given", "", 0.001, 0.999, dynamic=True),
+    Param("waveform", "square", "waveform where frequency is given",
+          choices=WAVEFORMS, dynamic=True),
+    Param("clock_timeout", 2.0, "wait for camera/clock before the packets' stamps serve instead",
+          "s", 0.0, 60.0),
+    Param("stage_gap", 0.5, "longest distance of two stage samples that is bridged; 0 bridges any",
+          "s", 0.0, 1e6, dynamic=True),
+    Param("stage_timeout", 2.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
+    Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
+    Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
+    Param("publish_tf", True, "publish /tf and /tf_static"),
+)  # fmt: skip
+
+_STAGE_DEPTH = 2000
+
+
+class ReconstructionNode(Node):
+    """Callbacks queue; one worker thread computes and publishes.
+
+    Parameters are those of ``core.reconstruction.Settings`` and of ``TABLE``.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("reconstruction", **kwargs)
+        table = (*TABLE, *from_settings(Settings, dynamic=True))
+        self.parameters = Parameters(self, table, self._on_change)
+        self.calibration = load_calibration(self.parameters["calibration"])
+        self._override = _override(self.parameters)
+        self._pipeline = Pipeline(
+            self.calibration,
+            self.parameters.settings(Settings),
+            self.parameters["clock_timeout"],
+            self.parameters["stage_gap"],
+            self.parameters["stage_timeout"],
+        )
+        if self._override is not None:
+            self._pipeline.stream.set_laser(self._override, None)
+        self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
+        self._mailbox = Mailbox(self.parameters["packets_max"])
+        self._ending: tuple[Callable[[ScanReport], None], ...] = ()
+        self._faults = 0
+        self._rate = diagnostics.Rate()
+        self._diagnostics_rate = diagnostics.Rate()
+        self._closing = threading.Event()
+        self._make_interfaces()
+        self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
+        self._worker.start()
+
+    def _make_interfaces(self) -> None:
+        override = {"qos_overriding_options": qos.overridable()}
+        bulk = MutuallyExclusiveCallbackGroup()
+        waiting = MutuallyExclusiveCallbackGroup()
+        self.create_subscription(EventPacket, "camera/events", self._on_packet, qos.events(),
+                                 callback_group=bulk, **override)  # fmt: skip
+        self.create_subscription(TimeReference, "camera/clock", self._on_clock, qos.latched())
+        self.create_subscription(
+            LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
+        )
+        self.create_subscription(
+            Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
+        )
+        self._state = self.create_publisher(ReconstructionState, "reconstruction/state", 10)
+        if self.parameters["publish_tf"]:
+            self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
+            self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
+            now_ns = self.get_clock().now().nanoseconds
+            self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
+        for kind, name, callback in (
+            (BeginScan, "reconstruction/begin_scan", self._on_begin),
+            (EndScan, "reconstruction/end_scan", self._on_end),
+        ):
+            self.create_service(kind, name, callback, callback_group=waiting)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(0.1, self._publish_state, clock=steady)
+        self._diagnostics = diagnostics.Diagnostics(self, self._report)
+
+    def destroy_node(self) -> None:
+        """Stop the worker, then the node."""
+        self._closing.set()
+        self._worker.join(timeout=5.0)
+        super().destroy_node()
+
+    # Callbacks: queue and return.
+
+    def _on_packet(self, message: EventPacket) -> None:
+        if message.encoding != "evt3":
+            self.get_logger().error(
+                f"camera/events has encoding {message.encoding!r}; set the camera to evt3",
+                throttle_duration_sec=5.0,
+            )
+            return
+        packet = Packet(message.seq, ns_from_stamp(message.header.stamp), message.events)
+        self._mailbox.post_bulk(partial(self._take_packet, packet))
+
+    def _on_clock(self, message: TimeReference) -> None:
+        zero_ns = ns_from_stamp(message.header.stamp) - ns_from_stamp(message.time_ref)
+        self._mailbox.post(partial(self._pipeline.stream.announce_zero, zero_ns))
+
+    def _on_laser(self, message: LaserState) -> None:
+        if self._override is not None:
+            return
+        try:
+            modulation, epoch_ns = modulation_from_laser_state(message)
+        except ArgumentError as error:
+            self.get_logger().error(f"laser/state: {error}", throttle_duration_sec=5.0)
+            return
+        self._mailbox.post(partial(self._pipeline.stream.set_laser, modulation, epoch_ns))
+
+    def _on_stage(self, message: Odometry) -> None:
+        t_ns = ns_from_stamp(message.header.stamp)
+        position_mm = mm_from_m(message.pose.pose.position.y)
+        self._mailbox.post(partial(self._pipeline.placer.add_stage, t_ns, position_mm))
+        if self.parameters["publish_tf"]:
+            x, y, z = self.calibration.stage_direction
+            carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
+            self._tf.publish(TFMessage(transforms=[carriage]))
+
+    def _on_begin(self, request: Any, response: Any) -> Any:
+        begin = partial(
+            self._pipeline.begin_scan,
+            request.scan_id,
+            mm_from_m(request.start),
+            mm_from_m(request.stop),
+        )
+        response.success, response.message = self._in_worker(begin)
+        return response
+
+    def _on_end(self, request: Any, response: Any) -> Any:
+        finished = threading.Event()
+        reports: list[ScanReport] = []
+
+        def done(report: ScanReport) -> None:
+            reports.append(report)
+            finished.set()
+
+        def begin_end() -> None:
+            self._pipeline.close_period(request.scan_id, time.monotonic())
+            self._ending = (done,)
+
+        response.success, response.message = self._in_worker(begin_end)
+        if not response.success:
+            return response
+        if not finished.wait(self.parameters["stage_timeout"] + 30.0):
+            response.success = False
+            response.message = "the scan was not assembled in time; see the node's log"
+            return response
+        _fill(response, reports[0])
+        return response
+
+    def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
+        """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
+        answered = threading.Event()
+        refusal: list[str] = []
+
+        def guarded() -> None:
+            try:
+                job()
+            except EschortyError as error:
+                refusal.append(str(error))
+            finally:
+                answered.set()
+
+        self._mailbox.post(guarded)
+        if not answered.wait(timeout_s):
+            return False, f"the reconstruction did not answer within {timeout_s:g} s"
+        return not refusal, "".join(refusal)
+
+    # The worker.
+
+    def _work(self) -> None:
+        while not self._closing.is_set():
+            try:
+                job = self._mailbox.take(0.02)
+                if job is not None:
+                    job()
+                self._step()
+            except Exception:
+                # The context is invalid after a signal; a failure then is no news.
+                if self._closing.is_set() or not self.context.ok():
+                    return
+                self._faults += 1
+                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
+
+    def _take_packet(self, packet: Packet) -> None:
+        self._outputs.packet(packet.data)
+        self._pipeline.add_packet(packet, time.monotonic())
+
+    def _step(self) -> None:
+        fresh, placed = self._pipeline.step(time.monotonic())
+        until_ns = self._pipeline.stream.processed_until_ns
+        self._outputs.profiles(fresh)
+        self._outputs.points(placed)
+        if until_ns is not None:
+            self._outputs.event_frame(until_ns)
+        if self._ending and self._pipeline.placer.waiting == 0:
+            callbacks, self._ending = self._ending, ()
+            report = self._pipeline.end_scan()
+            self._outputs.scan(report.scan, self.get_clock().now().nanoseconds)
+            for callback in callbacks:
+                callback(report)
+
+    def _on_change(self, values: dict[str, Any]) -> None:
+        names = Settings.__dataclass_fields__
+        settings = Settings(**{name: values[name] for name in names if name in values})
+        override = _override(values)
+        self._mailbox.post(partial(self._pipeline.stream.set_settings, settings))
+        self._mailbox.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
+        self._override = override
+        if override is not None:
+            self._mailbox.post(partial(self._pipeline.stream.set_laser, override, None))
+
+    # Reports.
+
+    def _publish_state(self) -> None:
+        pipeline = self._pipeline
+        counters = pipeline.stream.counters
+        until_ns = pipeline.stream.processed_until_ns
+        state = ReconstructionState()
+        state.header.stamp = self.get_clock().now().to_msg()
+        if until_ns is not None:
+            state.processed_until = stamp_from_ns(until_ns)
+        state.events = counters["events"]
+        state.events_per_second = self._rate.read(counters["events"])
+        state.profiles = pipeline.profiles
+        state.points = pipeline.points
+        state.packets_lost = pipeline.stream.packets_lost
+        state.events_dropped = counters["events_dropped"]
+        state.sensor_drop_words = counters["sensor_drop_words"]
+        state.points_without_stage = pipeline.placer.points_without_stage
+        state.scan_id = pipeline.scan_id
+        state.calibration = self.calibration.name
+        self._state.publish(state)
+
+    def _report(self) -> diagnostics.Report:
+        stream, placer = self._pipeline.stream, self._pipeline.placer
+        residual_ns = stream.clock_residual_ns
+        values: dict[str, Any] = {
+            "packets": stream.packets,
+            "packets_lost": stream.packets_lost,
+            "packets_refused_queue_full": self._mailbox.overflows,
+            "packets_held": stream.held,
+            "stream_restarts": stream.restarts,
+            "queue": len(self._mailbox),
+            "events_per_second": self._diagnostics_rate.read(stream.counters["events"]),
+            "clock": "announced" if stream.clock_announced else "from packet stamps",
+            "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
+            "profiles": self._pipeline.profiles,
+            "points": self._pipeline.points,
+            "points_waiting_for_stage": placer.waiting,
+            "points_without_stage": placer.points_without_stage,
+            "stage_samples_late": placer.late_samples,
+            "faults": self._faults,
+            **{f"reconstructor_{k}": v for k, v in sorted(stream.counters.items())},
+        }
+        if self._faults:
+            return diagnostics.ERROR, "internal errors; see the log", values
+        if stream.held:
+            return diagnostics.WARN, f"packets wait for the {stream.waits_for}", values
+        if stream.packets_lost or placer.points_without_stage:
+            return diagnostics.WARN, "packets or points were lost", values
+        return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
+
+
+def _override(values: Any) -> Modulation | None:
+    if not values["frequency"]:
+        return None
+    return Modulation(values["frequency"], values["duty"], values["waveform"])
+
+
+def _fill(response: Any, report: ScanReport) -> None:
+    response.profiles = report.scan.profiles
+    response.points = len(report.scan.points)
+    response.events = report.events
+    response.packets_lost = report.packets_lost
+    response.events_dropped = report.events_dropped
+    response.sigma_median = report.scan.sigma_median_m
+    notes = []
+    if report.points_without_stage:
+        notes.append(f"{report.points_without_stage} points had no stage position")
+    if report.points_over_limit:
+        notes.append(f"{report.points_over_limit} points were over the scan's limit")
+    response.message = "; ".join(notes)
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ReconstructionNode, threads=4)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,97 @@
+"""Holds measured profiles until the stage's position at their time is known."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.clock import NS_PER_US, StageTrack
+from eschorty_ros.core.reconstruction import Profiles
+
+_HISTORY_US = 600_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class TimedProfiles:
+    """Profiles with int64 ROS nanoseconds of each point and of its period's rising edge."""
+
+    profiles: Profiles
+    t_ns: NDArray[np.int64]
+    edge_ns: NDArray[np.int64]
+
+    def select(self, mask: NDArray[np.bool_]) -> TimedProfiles:
+        """Points where ``mask`` is set."""
+        return TimedProfiles(self.profiles.select(mask), self.t_ns[mask], self.edge_ns[mask])
+
+
+class StagePlacer:
+    """Joins profiles and stage positions by time; interpolates, never extrapolates.
+
+    Parameters
+    ----------
+    gap_s : float
+        Longest distance of two stage samples that is bridged; 0 bridges any.
+    timeout_s : float
+        Longest time (steady clock) a profile waits for a stage position.
+
+    Attributes
+    ----------
+    points_without_stage : int
+        Points discarded because no position covers their time.
+    waiting : int
+        Points that wait for a stage position.
+    """
+
+    def __init__(self, gap_s: float, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self.points_without_stage = 0
+        self.waiting = 0
+        self._track = StageTrack(max_gap_us=round(gap_s * 1e6) or None)
+        self._waiting: deque[tuple[float, TimedProfiles]] = deque()
+
+    @property
+    def late_samples(self) -> int:
+        """Stage samples that were not later than the one before, and so were not used."""
+        return self._track.dropped
+
+    def set_gap(self, gap_s: float) -> None:
+        """Change the longest bridged distance of two samples."""
+        self._track.max_gap_us = round(gap_s * 1e6) or None
+
+    def add_stage(self, t_ns: int, position_mm: float) -> None:
+        """Add one stage sample at ROS time ``t_ns``."""
+        self._track.append(t_ns // NS_PER_US, position_mm)
+        assert self._track.last_us is not None
+        self._track.forget_before(self._track.last_us - _HISTORY_US)
+
+    def add_profiles(self, timed: TimedProfiles, now_s: float) -> None:
+        """Queue profiles that arrived at steady time ``now_s``."""
+        if len(timed.profiles):
+            self._waiting.append((now_s, timed))
+            self.waiting += len(timed.profiles)
+
+    def ready(self, now_s: float) -> list[tuple[TimedProfiles, NDArray[np.float64]]]:
+        """Profiles whose position is known, each with its positions (mm, float64), oldest first."""
+        placed = []
+        still: deque[tuple[float, TimedProfiles]] = deque()
+        for arrived_s, timed in self._waiting:
+            t_us = timed.t_ns // NS_PER_US
+            last_us = self._track.last_us
+            early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
+            if now_s - arrived_s > self.timeout_s:
+                self.points_without_stage += int(np.count_nonzero(early))
+            elif early.any():
+                still.append((arrived_s, timed.select(early)))
+            if early.all():
+                continue
+            position_mm = self._track.position_mm(t_us)
+            known = ~early & ~np.isnan(position_mm)
+            self.points_without_stage += int(np.count_nonzero(~early & ~known))
+            if known.any():
+                placed.append((timed.select(known), position_mm[known]))
+        self._waiting = still
+        self.waiting = sum(len(timed.profiles) for _, timed in still)
+        return placed

@@ -1,0 +1,47 @@
+"""Frames of the instrument: base -> stage carriage -> link -> optical."""
+
+from __future__ import annotations
+
+import math
+
+from geometry_msgs.msg import TransformStamped
+
+from eschorty_ros.nodes.conversions import m_from_mm, stamp_from_ns
+
+BASE = "eschorty_base"
+STAGE = "eschorty_stage"
+LINK = "eschorty_link"
+OPTICAL = "eschorty_optical"
+
+
+def carriage(
+    t_ns: int, position_mm: float, direction: tuple[float, float, float]
+) -> TransformStamped:
+    """Base to carriage at ROS time ``t_ns``: along the unit vector ``direction``."""
+    transform = _between(BASE, STAGE, t_ns)
+    position_m = m_from_mm(position_mm)
+    transform.transform.translation.x = position_m * direction[0]
+    transform.transform.translation.y = position_m * direction[1]
+    transform.transform.translation.z = position_m * direction[2]
+    return transform
+
+
+def mounts(t_ns: int) -> list[TransformStamped]:
+    """The static ones: carriage to link (same axes), link to optical (z forward, x along the line).
+
+    The optical frame shares the link's origin: it is a change of axes, x right along increasing
+    columns, y down, z along the range axis.
+    """
+    optical = _between(LINK, OPTICAL, t_ns)
+    optical.transform.rotation.x = optical.transform.rotation.z = math.sqrt(0.5)
+    optical.transform.rotation.w = 0.0
+    return [_between(STAGE, LINK, t_ns), optical]
+
+
+def _between(parent: str, child: str, t_ns: int) -> TransformStamped:
+    transform = TransformStamped()
+    transform.header.stamp = stamp_from_ns(t_ns)
+    transform.header.frame_id = parent
+    transform.child_frame_id = child
+    transform.transform.rotation.w = 1.0
+    return transform
