@@ -7,6 +7,7 @@ from numba import njit
 
 from eschorty_ros.core._centroid_kernels import (
     AMBIGUOUS,
+    BLOCK,
     FOUND,
     FRACTION,
     MODE_MEAN,
@@ -52,7 +53,7 @@ _WIDTH_MIN_DOF = 64
 def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
     """Append events before time ``limit``; returns the first event left."""
     columns = np.uintp(counts.size)
-    room = np.uint32(lists.shape[1] - 16)
+    room = np.uint32(lists.shape[1] - BLOCK)
     i = np.uintp(first)
     end = np.uintp(stop)
     over = 0

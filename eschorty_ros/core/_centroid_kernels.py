@@ -2,7 +2,7 @@
 
 An event of a column is one uint32: the row in the low 10 bits, the time within the window
 (microseconds) in the upper 22. A list is padded with ``PAD`` to a multiple of ``BLOCK`` entries, so
-that the inner loops have a constant length and run on vector registers.
+that the inner loops run on whole vector registers without a remainder.
 
 All sums are integers, hence exact, independent of the events' order and of the row they are counted
 from. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places, rounded half to
@@ -18,11 +18,15 @@ ROW_BITS = 10
 ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
 TIME_LIMIT_US = 1 << (32 - ROW_BITS)
 PAD = np.uint32(0xFFFFFFFF)
-BLOCK = 16
+BLOCK = 32
 FRACTION_BITS = 6
 FRACTION = 1 << FRACTION_BITS
 ITERATIONS_MAX = 5
 ROW_LAST = 1022
+_ONE_BITS = np.uint32(20)
+_ONE = np.uint32(1 << 20)
+# Entries summed in 32 bits: 512 times (row or row squared or time) still fits.
+_CHUNK = np.uintp(512)
 _PAIRWISE_MAX = 192
 
 MODE_MEAN = 0
@@ -44,34 +48,52 @@ def _pad(packed, n):
 
 
 @njit(cache=True, nogil=True)
-def _window_sums(packed, blocks, low, high):
-    """Count, sum of d, of d squared (d = row - low) and of times over rows low..high."""
+def _window_spread(packed, blocks, low, high):
+    """Sums of d squared (d = row - low) and of times over rows low..high."""
+    base = np.uint32(low)
+    span = np.uint32(high - low)
+    sum_d2 = np.int64(0)
+    sum_time = np.int64(0)
+    padded = np.uintp(blocks) * np.uintp(BLOCK)
+    begin = np.uintp(0)
+    while begin < padded:
+        end = min(begin + _CHUNK, padded)
+        d2 = np.uint32(0)
+        ts = np.uint32(0)
+        for i in range(begin, end):
+            v = packed[i]
+            d = np.uint32((v & ROW_MASK) - base)
+            inside = d <= span
+            d2 = np.uint32(d2 + (np.uint32(d * d) if inside else np.uint32(0)))
+            ts = np.uint32(ts + ((v >> np.uint32(ROW_BITS)) if inside else np.uint32(0)))
+        sum_d2 += np.int64(d2)
+        sum_time += np.int64(ts)
+        begin = end
+    return sum_d2, sum_time
+
+
+@njit(cache=True, nogil=True)
+def _window_mean(packed, blocks, low, high):
+    """Count and sum of d (d = row - low) over rows low..high.
+
+    Both grow in one register lane: a chunk's sum of d stays below ``_ONE``.
+    """
     base = np.uint32(low)
     span = np.uint32(high - low)
     count = np.int64(0)
     sum_d = np.int64(0)
-    sum_d2 = np.int64(0)
-    sum_time = np.int64(0)
-    for block in range(blocks):
-        first = np.uintp(block) * np.uintp(BLOCK)
-        c = np.uint32(0)
-        d1 = np.uint32(0)
-        d2 = np.uint32(0)
-        ts = np.uint32(0)
-        for j in range(BLOCK):
-            v = packed[first + np.uintp(j)]
-            d = np.uint32((v & ROW_MASK) - base)
-            inside = np.uint32(d <= span)
-            d = np.uint32(d * inside)
-            c = np.uint32(c + inside)
-            d1 = np.uint32(d1 + d)
-            d2 = np.uint32(d2 + np.uint32(d * d))
-            ts = np.uint32(ts + np.uint32((v >> np.uint32(ROW_BITS)) * inside))
-        count += np.int64(c)
-        sum_d += np.int64(d1)
-        sum_d2 += np.int64(d2)
-        sum_time += np.int64(ts)
-    return count, sum_d, sum_d2, sum_time
+    padded = np.uintp(blocks) * np.uintp(BLOCK)
+    begin = np.uintp(0)
+    while begin < padded:
+        end = min(begin + _CHUNK, padded)
+        both = np.uint32(0)
+        for i in range(begin, end):
+            d = np.uint32((packed[i] & ROW_MASK) - base)
+            both = np.uint32(both + (np.uint32(d + _ONE) if d <= span else np.uint32(0)))
+        count += np.int64(both >> _ONE_BITS)
+        sum_d += np.int64(both & (_ONE - np.uint32(1)))
+        begin = end
+    return count, sum_d
 
 
 @njit(cache=True, nogil=True)
@@ -79,13 +101,16 @@ def _window_count(packed, blocks, low, high):
     base = np.uint32(low)
     span = np.uint32(high - low)
     count = np.int64(0)
-    for block in range(blocks):
-        first = np.uintp(block) * np.uintp(BLOCK)
+    padded = np.uintp(blocks) * np.uintp(BLOCK)
+    begin = np.uintp(0)
+    while begin < padded:
+        end = min(begin + _CHUNK, padded)
         c = np.uint32(0)
-        for j in range(BLOCK):
-            d = np.uint32((packed[first + np.uintp(j)] & ROW_MASK) - base)
+        for i in range(begin, end):
+            d = np.uint32((packed[i] & ROW_MASK) - base)
             c = np.uint32(c + np.uint32(d <= span))
         count += np.int64(c)
+        begin = end
     return count
 
 
@@ -104,21 +129,19 @@ def _mean_shift(packed, blocks, centre, half):
     Returns the sums of the last window, its low row and the fixed-point mean.
     """
     low, high = _limits(centre, half)
-    count, sum_d, sum_d2, sum_time = _window_sums(packed, blocks, low, high)
+    count, sum_d = _window_mean(packed, blocks, low, high)
     for _ in range(ITERATIONS_MAX - 1):
         if count == 0:
             break
-        moved = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
-        if moved == centre:
-            break
-        centre = moved
+        centre = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
         next_low, next_high = _limits(centre, half)
         if next_low == low and next_high == high:
             break
         low, high = next_low, next_high
-        count, sum_d, sum_d2, sum_time = _window_sums(packed, blocks, low, high)
+        count, sum_d = _window_mean(packed, blocks, low, high)
     if count > 0:
         centre = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
+    sum_d2, sum_time = _window_spread(packed, blocks, low, high)
     return count, low, sum_d, sum_d2, sum_time, centre
 
 
@@ -277,8 +300,9 @@ def _estimate_column(packed, n, method, seed, half, rows, events_min, counts):
     if method == MODE_MEAN:
         status, found = _mode_mean(packed, n, blocks, seed, half, rows, events_min)
     else:
-        total = _window_sums(packed, blocks, 0, ROW_LAST)
-        found = (total[0], np.int64(0), total[1], total[2], total[3], np.int64(-1))
+        count, sum_d = _window_mean(packed, blocks, 0, ROW_LAST)
+        sum_d2, sum_time = _window_spread(packed, blocks, 0, ROW_LAST)
+        found = (count, np.int64(0), sum_d, sum_d2, sum_time, np.int64(-1))
     count, low, sum_d, sum_d2, sum_time, centre = found
     if count < events_min or count == 0:
         return TOO_FEW, np.nan, count, 0.0, sum_time, centre
