@@ -2,8 +2,7 @@
 
 from pkgutil import extend_path
 
-# Sources and generated ROS interfaces may lie in two folders on the path: a checkout is used
-# with the interfaces of its install.
+# The generated msg, srv and action modules live in an installed folder of the same name; this lets the
+# sources be used in place beside them.
 __path__ = extend_path(__path__, __name__)
-
 __version__ = "0.1.0"
