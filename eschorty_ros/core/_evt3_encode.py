@@ -48,7 +48,10 @@ def _put_time(t, s, words, n):
 
 @njit(types.Tuple((uint64, types.uint32))(_U2, uint64, uint64, int64), cache=True, nogil=True)
 def _group(x, k, end, base):
-    """Events from ``k`` on that fit one 32-pixel group at ``base``, x rising; their count and mask."""
+    """Events from ``k`` on that fit one 32-pixel group at ``base``, x rising.
+
+    Returns their count and mask.
+    """
     mask = np.uint32(0)
     count = np.uint64(0)
     last = np.int64(-1)
@@ -69,7 +72,7 @@ def _group(x, k, end, base):
     nogil=True,
 )
 def _put_row(k, end, x, y, p, width, s, words, n):
-    """Events ``k`` to ``end``, of one time, row and polarity, as vectors where those are shorter."""
+    """Events ``k`` to ``end``, of one time, row, polarity; as vectors where shorter."""
     if s[_Y] != y:
         words[n] = np.uint16(y)
         n += np.uint64(1)
@@ -81,7 +84,7 @@ def _put_row(k, end, x, y, p, width, s, words, n):
         # A group never reaches past the sensor: other decoders refuse it.
         base = s[_BASE] if chained else min(first, width - 32)
         count = np.uint64(0)
-        if 0 <= base and base + 32 <= width:
+        if base >= 0 and base + 32 <= width:
             count, mask = _group(x, k, end, base)
         if count <= np.uint64(3 if chained else 4):
             words[n] = np.uint16(0x2000 | (p << 11) | first)
@@ -166,6 +169,7 @@ class Encoder:
         self.width = int(width)
         self.height = int(height)
         self._state = np.full(6, _NONE, dtype=np.int64)
+        self._words = np.empty(0, dtype="<u2")
 
     @property
     def time_us(self) -> int | None:
@@ -203,8 +207,8 @@ class Encoder:
         columns = _checked("x", x, np.uint16, self.width)
         rows = _checked("y", y, np.uint16, self.height)
         polarities = _checked("p", p, np.uint8, 2)
-        trigger_times = _checked("trigger_t", () if trigger_t is None else trigger_t, np.int64, 1 << 62)
-        edges = _checked("trigger_edge", () if trigger_edge is None else trigger_edge, np.uint8, 2)
+        trigger_times = _checked("trigger_t", _or_none(trigger_t), np.int64, 1 << 62)
+        edges = _checked("trigger_edge", _or_none(trigger_edge), np.uint8, 2)
         if not times.size == columns.size == rows.size == polarities.size:
             raise ArgumentError(
                 f"t, x, y, p have {times.size}, {columns.size}, {rows.size}, {polarities.size} "
@@ -223,11 +227,21 @@ class Encoder:
         starts = [int(series[0]) for series in (times, trigger_times) if series.size]
         steps = self._high_words(min(starts), max(ends))
         # At most TIME_LOW, ADDR_Y and ADDR_X for each event, TIME_LOW and the trigger for each.
-        words = np.empty(3 * times.size + 2 * edges.size + steps, dtype="<u2")
+        bound = 3 * times.size + 2 * edges.size + steps
+        if self._words.size < bound:
+            self._words = np.empty(bound, dtype="<u2")
         n = _encode(
-            times, columns, rows, polarities, trigger_times, edges, self.width, self._state, words
+            times,
+            columns,
+            rows,
+            polarities,
+            trigger_times,
+            edges,
+            self.width,
+            self._state,
+            self._words,
         )
-        return words[:n].tobytes()
+        return self._words[:n].tobytes()
 
     def advance(self, t_us: int) -> bytes:
         """Time words that bring a silent stream to ``t_us``.
@@ -259,6 +273,10 @@ class Encoder:
                 f"stay within {_IDLE_MAX_US} us"
             )
         return (end_us >> 12) - (begun_us >> 12) + 1
+
+
+def _or_none(values: ArrayLike | None) -> ArrayLike:
+    return () if values is None else values
 
 
 def _checked(name: str, values: ArrayLike, dtype: Any, limit: int) -> NDArray[Any]:

@@ -25,6 +25,7 @@ __all__ = [
     "Encoder",
     "Events",
     "Triggers",
+    "event_arrays",
     "sort_readout",
 ]
 
@@ -101,7 +102,7 @@ class Decoder:
                 raise ArgumentError(f"{name} is {size!r}; choose 1 to {_MAX_SIZE} pixels")
         self.width = int(width)
         self.height = int(height)
-        self._events = _event_buffers(0)
+        self._events = event_arrays(0)
         self._triggers = _trigger_buffers(0)
         self.reset()
 
@@ -161,7 +162,7 @@ class Decoder:
         else:
             events, triggers = (int(bound) for bound in _bounds(words))
         if len(self._events[0]) < events:
-            self._events = _event_buffers(events)
+            self._events = event_arrays(events)
         if len(self._triggers[0]) < triggers:
             self._triggers = _trigger_buffers(triggers)
         n, m = _decode(
@@ -184,9 +185,10 @@ class Decoder:
         return words if words.flags.aligned else words.copy()
 
 
-def _event_buffers(
+def event_arrays(
     size: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]:
+    """Uninitialised t, x, y, p of ``size`` events."""
     return (
         np.empty(size, dtype=np.int64),
         np.empty(size, dtype=np.uint16),
