@@ -1,0 +1,154 @@
+"""`eschorty scan`."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.core.errors import DeviceError, EschortyError
+
+if TYPE_CHECKING:
+    from eschorty_ros.nodes.one_process import OneScan, Outcome
+    from eschorty_ros.report.accuracy import Accuracy
+
+
+@click.command("scan")
+@click.option(
+    "--scene",
+    default="steps",
+    show_default=True,
+    help="steps, plane, tilted, sphere, or a mesh file in metres (needs open3d).",
+)
+@click.option(
+    "--frequency",
+    type=click.FloatRange(16, 20_000),
+    default=70.0,
+    show_default=True,
+    help="Modulation frequency, Hz: one profile per period.",
+)
+@click.option(
+    "--speed",
+    type=click.FloatRange(0, min_open=True),
+    default=50.0,
+    show_default=True,
+    help="Stage speed, mm/s.",
+)
+@click.option("--start", type=float, default=0.0, show_default=True, help="Stage position, mm.")
+@click.option("--stop", type=float, default=100.0, show_default=True, help="Stage position, mm.")
+@click.option(
+    "--calibration",
+    default="config_3",
+    show_default=True,
+    help="nominal, config_1, config_2, config_3, or the path of a calibration.yaml.",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("scan"),
+    show_default=True,
+    help="Folder for scan.pcd and scan.png.",
+)
+def command(
+    scene: str,
+    frequency: float,
+    speed: float,
+    start: float,
+    stop: float,
+    calibration: str,
+    seed: int,
+    out: Path,
+) -> None:
+    """Scan a simulated scene with camera, laser, stage, reconstruction and scanner nodes.
+
+    The nodes run in this process, on simulated hardware, over ordinary ROS 2 topics. Written are
+    scan.pcd (the cloud, metres, in eschorty_base) and scan.png (depth map, 3-D view, error map);
+    printed is the cloud's error against the scene. The noise depends on when things happen, so
+    two runs differ slightly.
+
+    \b
+    Examples:
+      eschorty scan
+      eschorty scan --scene sphere --speed 20 --out sphere
+      eschorty scan --scene part.ply --frequency 140 --calibration nominal
+    """
+    if start == stop:
+        raise click.UsageError(f"--start and --stop are both {start:g} mm; give a distance")
+    one_process = _nodes()
+    request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed)
+    out.mkdir(parents=True, exist_ok=True)
+    previous = signal.signal(signal.SIGTERM, _terminated)
+    try:
+        with progress_bar("scanning") as report, one_process.instrument(request) as made:
+            outcome = made.scan(request, report)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    finish(request, outcome, out)
+
+
+def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
+    """Write cloud and picture, print the table; a failed scan keeps its cloud and raises."""
+    from eschorty_ros.core.calibration import load_calibration
+    from eschorty_ros.core.cloud import write_cloud
+    from eschorty_ros.report import accuracy, figures
+    from eschorty_ros.simulation import scene as scenes
+
+    write_cloud(out / "scan.pcd", outcome.points)
+    if not outcome.success:
+        raise DeviceError(f"{outcome.message} ({len(outcome.points):,} points kept in {out})")
+    calibration = load_calibration(request.calibration)
+    truth = scenes.named(request.scene)
+    model, direction = calibration.model(), calibration.stage_direction
+    error_mm = accuracy.range_error_mm(outcome.points, truth, model, direction)
+    positions = accuracy.sweep_positions_mm(
+        request.start_mm, request.stop_mm, request.speed_mm_s, request.frequency_hz
+    )
+    measured = accuracy.measure(outcome.points, truth, model, positions, direction, error_mm)
+    title = (
+        f"{request.scene}: {request.frequency_hz:g} Hz, {request.speed_mm_s:g} mm/s, "
+        f"{request.calibration}; median |error| {measured.error_median_mm:.2f} mm"
+    )
+    figures.save(
+        figures.scan_figure(outcome.points, error_mm, title, direction), out / "scan.png"
+    )
+    _print(request, outcome, measured, out)
+
+
+def _print(request: OneScan, outcome: Outcome, measured: Accuracy, out: Path) -> None:
+    lost = outcome.packets_lost
+    pairs(
+        f"{out / 'scan.pcd'}, {out / 'scan.png'}",
+        {
+            "profiles": f"{outcome.profiles:,} of {measured.profiles:,}",
+            "points": f"{measured.points:,} of {measured.expected_points:,}",
+            "complete": f"{measured.completeness:.2%}",
+            "median |range error|": f"{measured.error_median_mm:.3f} mm",
+            "95th percentile": f"{measured.error_p95_mm:.3f} mm",
+            "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, "
+            f"{measured.within_2_sigma:.1%}",
+            "events": f"{outcome.events:,} ({outcome.events_dropped:,} dropped, "
+            f"{lost:,} packets lost)",
+            "seconds of sweep": f"{request.sweep_s:.2f}",
+        },
+    )
+
+
+def _nodes() -> type:
+    """The composition of nodes; a missing ROS 2 is a stated failure."""
+    try:
+        from eschorty_ros.nodes import one_process
+    except ImportError as error:
+        raise EschortyError(
+            f"ROS 2 is not ready ({error}); run `make scan`, or source a ROS 2 installation in "
+            "which this package is built; `eschorty simulate` needs no ROS"
+        ) from error
+    return one_process  # type: ignore[return-value]
+
+
+def _terminated(*_: object) -> NoReturn:
+    sys.exit(128 + signal.SIGTERM)
