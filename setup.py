@@ -1,0 +1,34 @@
+"""Python metadata: `pip install .` gives the ROS-free part and the `eschorty` command."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+HERE = Path(__file__).parent
+REQUIREMENTS = [
+    line
+    for line in (HERE / "requirements" / "run.txt").read_text().splitlines()
+    if line and not line.startswith("#")
+]
+NODES = ("camera", "laser", "stage", "reconstruction", "scanner", "replay")
+
+setup(
+    name="eschorty_ros",
+    version="0.1.0",
+    description="Event-based Scheimpflug LiDAR: events and stage motion in, point cloud out",
+    long_description=(HERE / "README.md").read_text(),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    python_requires=">=3.11",
+    packages=[*find_packages(include=["eschorty_ros", "eschorty_ros.*"]), "eschorty_ros.config"],
+    package_dir={"eschorty_ros.config": "config"},
+    package_data={"eschorty_ros.config": ["*.yaml"]},
+    install_requires=REQUIREMENTS,
+    extras_require={"mesh": ["open3d>=0.19"]},
+    entry_points={
+        "console_scripts": [
+            "eschorty = eschorty_ros.cli:main",
+            *(f"eschorty-{node} = eschorty_ros.nodes.{node}:main" for node in NODES),
+        ]
+    },
+)
