@@ -60,8 +60,10 @@ def _latency_us(t_us, column, row, seed, timing):
     """Latency of one event: a Gaussian (sum of four uniforms) drawn from what the event is."""
     place = np.uint64((column << 12) | row) ^ np.uint64(seed)
     bits = _mix(_mix(place) ^ np.uint64(np.int64(t_us * 1024.0)))
-    total = np.float64(bits & np.uint64(0xFFFF)) + np.float64((bits >> np.uint64(16)) & np.uint64(0xFFFF))
-    total += np.float64((bits >> np.uint64(32)) & np.uint64(0xFFFF)) + np.float64(bits >> np.uint64(48))
+    total = 0.0
+    for _ in range(4):
+        total += np.float64(bits & np.uint64(0xFFFF))
+        bits >>= np.uint64(16)
     return max(1.0, timing[0] + timing[1] * (total - 131070.0) * _JITTER_UNIT)
 
 
@@ -153,8 +155,8 @@ def _relight(pixels, spans, due, columns, line_row, contrast, optics, t_us, seed
         hi = 0
         if contrast[k] > least and line_row[k] > -1e6 and line_row[k] < 1e6:
             half = sigma * math.sqrt(2.0 * math.log(contrast[k] / least))
-            lo = min(max(0, int(math.ceil(line_row[k] - half))), rows)
-            hi = max(lo, min(rows, int(math.floor(line_row[k] + half)) + 1))
+            lo = min(max(0, math.ceil(line_row[k] - half)), rows)
+            hi = max(lo, min(rows, math.floor(line_row[k] + half) + 1))
         old_lo, old_hi = spans[column, 0], spans[column, 1]
         first = rows
         last = 0
@@ -162,9 +164,7 @@ def _relight(pixels, spans, due, columns, line_row, contrast, optics, t_us, seed
         for row in range(old_lo, old_hi):
             if row < lo or row >= hi:
                 pixel = pixels[column, row]
-                out, n = _light(
-                    pixel, background, omega, t_us, column, row, seed, timing, out, n
-                )
+                out, n = _light(pixel, background, omega, t_us, column, row, seed, timing, out, n)
                 earliest = min(earliest, pixel.t_next)
                 first = min(first, row)
                 last = max(last, row + 1)

@@ -45,9 +45,7 @@ class Scene(Protocol):
         """Reflectance (0 to 1) where the rays of :meth:`range_mm` hit, same shape."""
 
 
-def sheet(
-    stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
-) -> tuple[Array, Array]:
+def sheet(stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> tuple[Array, Array]:
     """Stage positions as (n, 1) and ray slopes (mm of z per mm of depth) as (1, m)."""
     stage = np.atleast_1d(np.asarray(stage_mm, dtype=np.float64))
     return stage[:, np.newaxis], model.column_slope(np.atleast_1d(columns))[np.newaxis, :]
@@ -59,7 +57,7 @@ class UniformReflectance:
     albedo: float = 1.0
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Same value for every ray, shape (n, m)."""
+        """Give the same value to every ray, shape (n, m)."""
         return np.full((np.size(stage_mm), np.size(columns)), self.albedo)
 
 
@@ -137,10 +135,7 @@ class Sphere(UniformReflectance):
         depth = self.centre_range_mm + model.b_mm
         half_linear = depth + slope * self.centre_line_mm
         constant = (
-            depth**2
-            + self.centre_line_mm**2
-            + (y - self.centre_stage_mm) ** 2
-            - self.radius_mm**2
+            depth**2 + self.centre_line_mm**2 + (y - self.centre_stage_mm) ** 2 - self.radius_mm**2
         )
         discriminant = half_linear**2 - (1.0 + slope**2) * constant
         hit = (discriminant >= 0.0) & (half_linear > 0.0) & (constant > 0.0)

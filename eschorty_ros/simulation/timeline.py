@@ -76,7 +76,7 @@ class LaserTimeline:
         self._gates: list[Gate | None] = []
 
     def set(self, t_us: int, on: bool, modulation: Modulation | None) -> None:
-        """Setting from ``t_us`` on; replaces what was set for later times.
+        """Switch from ``t_us`` on; replaces what was set for later times.
 
         Raises
         ------

@@ -131,8 +131,11 @@ class World:
             self.events += keys.size
             parts.append(self._encoder.encode(*unpack(keys)))
             # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
-            parts.append(self._encoder.advance(end_us // _TIME_HIGH_US * _TIME_HIGH_US)
-                         if self._idle(end_us) else b"")
+            parts.append(
+                self._encoder.advance(end_us // _TIME_HIGH_US * _TIME_HIGH_US)
+                if self._idle(end_us)
+                else b""
+            )
             self._now_us = end_us
             self._laser.forget_before(self._handled_us)
             self._stage.forget_before(self._handled_us)
