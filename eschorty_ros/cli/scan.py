@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Stage speed, mm/s.",
 )
-@click.option("--start", type=float, default=0.0, show_default=True, help="Stage position, mm.")
-@click.option("--stop", type=float, default=100.0, show_default=True, help="Stage position, mm.")
+@click.option("--start", type=float, default=10.0, show_default=True, help="Stage position, mm.")
+@click.option("--stop", type=float, default=110.0, show_default=True, help="Stage position, mm.")
 @click.option(
     "--calibration",
     default="config_3",

@@ -44,7 +44,7 @@ NODES = {
     "reconstruction": ReconstructionNode,
     "scanner": ScannerNode,
 }
-THREADS = 4
+THREADS = 12
 START_S = 30.0
 SLACK_S = 60.0
 _POLL_S = 0.02

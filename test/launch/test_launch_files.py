@@ -1,0 +1,141 @@
+"""Launch files and RViz view: they parse, and name only what exists."""
+
+import ast
+import importlib.util
+import re
+import xml.etree.ElementTree
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+LAUNCH = ROOT / "launch"
+NODES = {"camera", "laser", "stage", "reconstruction", "scanner", "replay"}
+FRAMES = {"eschorty_base", "eschorty_stage", "eschorty_link", "eschorty_optical"}
+# Topic -> durability its publisher offers.
+CLOUDS = {
+    "/eschorty/scan/points": "Transient Local",
+    "/eschorty/points": "Volatile",
+    "/eschorty/profile": "Volatile",
+}
+EXPECTED = {
+    "scan.launch.py": {
+        "fake",
+        "scene",
+        "calibration",
+        "frequency",
+        "speed",
+        "start",
+        "stop",
+        "rviz",
+        "auto_scan",
+        "dds_profile",
+    },
+    "replay.launch.py": {"recording", "rate", "rviz", "dds_profile"},
+}
+
+
+def declared(tree):
+    """Names and descriptions in the file's ARGUMENTS table."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and node.targets[0].id == "ARGUMENTS":
+            return {row.elts[0].value: ast.unparse(row.elts[2]) for row in node.value.elts}
+    raise AssertionError("no ARGUMENTS table")
+
+
+def configurations(tree):
+    """Every argument name the file reads."""
+    used = set()
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id in ("LaunchConfiguration", "number", "text")
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+        ):
+            used.add(node.args[0].value)
+    return used
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_every_argument_is_declared_described_and_used(name):
+    tree = ast.parse((LAUNCH / name).read_text())
+    compile(tree, name, "exec")
+    arguments = declared(tree)
+    assert set(arguments) == EXPECTED[name]
+    assert all(len(description) > 15 for description in arguments.values())
+    assert configurations(tree) == EXPECTED[name]
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_launch_files_use_only_what_launch_ros_0_28_has(name):
+    text = (LAUNCH / name).read_text()
+    assert "autostart" not in text
+    assert "LifecycleNode" not in text
+
+
+def test_every_node_a_launch_file_starts_is_a_module():
+    for name in NODES:
+        assert (ROOT / "eschorty_ros" / "nodes" / f"{name}.py").is_file()
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_launch_loads_the_description(name):
+    pytest.importorskip("launch", reason="needs the package launch")
+    pytest.importorskip("launch_ros", reason="needs the package launch_ros")
+    from launch import LaunchContext
+    from launch.actions import DeclareLaunchArgument
+    from launch_ros.actions import Node
+
+    spec = importlib.util.spec_from_file_location("described", LAUNCH / name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    entities = module.generate_launch_description().entities
+    context = LaunchContext()
+    context.launch_configurations["recording"] = "/tmp"
+    for entity in entities:
+        if isinstance(entity, DeclareLaunchArgument):
+            entity.execute(context)
+    started = [
+        entity.node_executable
+        for entity in entities
+        if isinstance(entity, Node)
+        and (entity.condition is None or entity.condition.evaluate(context))
+    ]
+    expected = NODES - {"replay"} if name.startswith("scan") else {"reconstruction", "replay"}
+    assert set(started) == expected
+
+
+def test_rviz_shows_our_topics_with_our_quality_of_service():
+    view = yaml.safe_load((ROOT / "config" / "scan.rviz").read_text())["Visualization Manager"]
+    assert view["Global Options"]["Fixed Frame"] == "eschorty_base"
+    clouds = {
+        display["Topic"]["Value"]: display["Topic"]
+        for display in view["Displays"]
+        if "Topic" in display
+    }
+    assert {topic: values["Durability Policy"] for topic, values in clouds.items()} == CLOUDS
+    assert {values["Reliability Policy"] for values in clouds.values()} == {"Reliable"}
+    assert any(display["Class"].endswith("/TF") for display in view["Displays"])
+
+
+def test_rviz_names_frames_that_are_published():
+    text = (ROOT / "config" / "scan.rviz").read_text()
+    published = (ROOT / "eschorty_ros" / "nodes" / "transforms.py").read_text()
+    named = set(re.findall(r"\beschorty_\w+", text))
+    assert named <= FRAMES
+    assert all(f'"{frame}"' in published for frame in named)
+
+
+def test_dds_profile_has_room_for_large_messages():
+    space = {"d": "http://www.eprosima.com"}
+    root = xml.etree.ElementTree.parse(ROOT / "config" / "fastdds.xml").getroot()
+    size = root.find(".//d:segment_size", space)
+    assert size is not None
+    assert int(size.text) == 128 * 2**20
+    assert root.find(".//d:useBuiltinTransports", space).text == "false"
+    assert root.find(".//d:participant", space).get("is_default_profile") == "true"
+    transports = {node.text for node in root.findall(".//d:transport_descriptor/d:type", space)}
+    assert transports == {"SHM", "UDPv4"}
