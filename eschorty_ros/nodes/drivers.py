@@ -1,0 +1,76 @@
+"""Driver names of the ``driver`` parameter and what makes each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.hardware.protocols import EventSource, LaserModulator, LinearStage
+from eschorty_ros.nodes.parameters import Param
+from eschorty_ros.simulation.devices import FakeCamera, FakeLaser, FakeStage
+from eschorty_ros.simulation.scene import named
+from eschorty_ros.simulation.world import BACKGROUND_HZ, World
+
+ClockNs = Callable[[], int]
+Device = TypeVar("Device")
+Registry = dict[str, Callable[[Mapping[str, Any], ClockNs], Device]]
+
+DRIVER = Param("driver", "fake", "device driver; 'fake' simulates the device")
+
+CAMERA_TABLE = (
+    Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
+    Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
+    Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
+    Param(
+        "background_rate",
+        BACKGROUND_HZ,
+        "fake camera: background events of one pixel",
+        "Hz",
+        0.0,
+        100.0,
+    ),
+)
+LASER_TABLE = (
+    Param("fake_log", "", "fake laser: file that gets one line per change of the output"),
+)
+
+
+def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
+    world = World(
+        named(parameters["scene"]),
+        load_calibration(parameters["calibration"]),
+        seed=parameters["seed"],
+        background_hz=parameters["background_rate"],
+    )
+    return FakeCamera(world, clock_ns)
+
+
+def _fake_laser(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
+    return FakeLaser(clock_ns, log_path=parameters["fake_log"] or None)
+
+
+def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
+    return FakeStage(clock_ns)
+
+
+CAMERAS: Registry[EventSource] = {"fake": _fake_camera}
+LASERS: Registry[LaserModulator] = {"fake": _fake_laser}
+STAGES: Registry[LinearStage] = {"fake": _fake_stage}
+
+
+def make(registry: Registry[Device], parameters: Mapping[str, Any], clock_ns: ClockNs) -> Device:
+    """The device the ``driver`` parameter names.
+
+    Raises
+    ------
+    ArgumentError
+        For a name the registry does not hold.
+    EschortyError
+        Whatever the driver refuses.
+    """
+    name = parameters["driver"]
+    if name not in registry:
+        raise ArgumentError(f"driver {name!r} is unknown; choose one of {', '.join(registry)}")
+    return registry[name](parameters, clock_ns)
