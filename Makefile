@@ -29,12 +29,12 @@ VENV_FLAGS :=
 RUN_REQUIREMENTS := -r requirements/run.txt -r requirements/ros.txt
 UNDERLAY := $(VENV)
 endif
-# Message packages that the underlay lacks are built from external/.
+# Message packages that the underlay lacks are built from external_msgs/.
 provided = $(strip $(foreach prefix,$(subst :, ,$(UNDERLAY)),$(wildcard $(prefix)/share/$(1)/package.xml)))
 EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(package)),,$(package)))
 
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/*) \
-              $(shell find external -type f)
+              $(shell find external_msgs -type f)
 
 .PHONY: help setup scan test check lint format types contracts clean
 
@@ -78,7 +78,7 @@ $(BUILD)/test.stamp: $(BUILD)/run.stamp requirements/test.txt
 	@touch $@
 
 $(BUILD)/interfaces.stamp: $(BUILD)/run.stamp $(INTERFACES)
-	@for package in $(EXTERNAL); do $(MAKE) --no-print-directory build-package SOURCE=external/$$package NAME=$$package; done
+	@for package in $(EXTERNAL); do $(MAKE) --no-print-directory build-package SOURCE=external_msgs/$$package NAME=$$package; done
 	@$(MAKE) --no-print-directory build-package SOURCE=. NAME=eschorty_ros
 	@touch $@
 
