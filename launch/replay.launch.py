@@ -1,11 +1,10 @@
 """A recording through the reconstruction node, without any device.
 
-    ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
+ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
 """
 
 from pathlib import Path
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
 from launch.conditions import IfCondition
 from launch.substitutions import (
@@ -16,6 +15,8 @@ from launch.substitutions import (
 )
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+
+from launch import LaunchDescription
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 NAMESPACE = "eschorty"
@@ -49,7 +50,9 @@ def generate_launch_description():
             ),
             # The name Fast DDS reads was changed; both are set for every version.
             SetEnvironmentVariable("FASTDDS_DEFAULT_PROFILES_FILE", profile, condition=has_profile),
-            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", profile, condition=has_profile),
+            SetEnvironmentVariable(
+                "FASTRTPS_DEFAULT_PROFILES_FILE", profile, condition=has_profile
+            ),
             Node(
                 package="eschorty_ros",
                 executable="reconstruction",

@@ -1,12 +1,11 @@
 """Camera, laser, stage, reconstruction and scanner, each a process of its own, and one scan.
 
-    ros2 launch eschorty_ros scan.launch.py scene:=sphere speed:=0.02 rviz:=true
-    ros2 launch eschorty_ros scan.launch.py --show-args
+ros2 launch eschorty_ros scan.launch.py scene:=sphere speed:=0.02 rviz:=true
+ros2 launch eschorty_ros scan.launch.py --show-args
 """
 
 from pathlib import Path
 
-from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
@@ -25,13 +24,25 @@ from launch.substitutions import (
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from launch import LaunchDescription
+
 CONFIG = Path(__file__).resolve().parents[1] / "config"
 NAMESPACE = "eschorty"
 EVENTS = f"/{NAMESPACE}/camera/events"
 
 ARGUMENTS = (
-    ("fake", "true", "true: simulated camera, laser and stage; false: real ones", ["true", "false"]),
-    ("scene", "steps", "what a simulated camera sees: steps, plane, tilted, sphere or a mesh", None),
+    (
+        "fake",
+        "true",
+        "true: simulated camera, laser and stage; false: real ones",
+        ["true", "false"],
+    ),
+    (
+        "scene",
+        "steps",
+        "what a simulated camera sees: steps, plane, tilted, sphere or a mesh",
+        None,
+    ),
     ("calibration", "config_3", "optical build: a name in config/ or the path of a file", None),
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000: one profile per period", None),
     ("speed", "0.05", "stage speed, m/s", None),
@@ -59,7 +70,7 @@ def text(name):
 
 
 def driver(real):
-    """Simulated device, or the real one's driver."""
+    """Choose the simulated device, or the real one's driver."""
     return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
 
 
@@ -70,7 +81,7 @@ def reliable(end):
 
 
 def nodes():
-    """The five nodes with their parameters."""
+    """Make the five nodes with their parameters."""
     parameters = {
         "camera": {
             "driver": driver("evk4"),
@@ -122,7 +133,9 @@ def generate_launch_description():
             ),
             # The name Fast DDS reads was changed; both are set for every version.
             SetEnvironmentVariable("FASTDDS_DEFAULT_PROFILES_FILE", profile, condition=has_profile),
-            SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", profile, condition=has_profile),
+            SetEnvironmentVariable(
+                "FASTRTPS_DEFAULT_PROFILES_FILE", profile, condition=has_profile
+            ),
             *nodes(),
             rviz,
             RegisterEventHandler(

@@ -87,4 +87,4 @@ def main() -> None:
       eschorty simulate --scene sphere --out rec
       eschorty reconstruct rec --out rec/cloud.pcd
       eschorty view rec/cloud.pcd
-    """
+    """  # noqa: D301

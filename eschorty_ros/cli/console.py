@@ -31,12 +31,16 @@ def progress_bar(title: str) -> Iterator[Report]:
         disable=not sys.stderr.isatty(),
     )
     task = bar.add_task(title, total=1.0, note="")
+
+    def report(share: float, note: str) -> None:
+        bar.update(task, completed=share, note=note)
+
     with bar:
-        yield lambda share, note="": bar.update(task, completed=share, note=note)
+        yield report
 
 
 def table(title: str, *columns: str) -> Table:
-    """An empty table; the first column is left aligned, the others right."""
+    """Make an empty table; the first column is left aligned, the others right."""
     from rich import box
     from rich.table import Table
 

@@ -16,7 +16,9 @@ from eschorty_ros.cli.console import show, table
     "--theta-deg", type=float, default=85.87, show_default=True, help="Tilt of the laser sheet."
 )
 @click.option("--theta-prime-deg", type=float, help="Tilt of the sensor; with --near-mm.")
-@click.option("--near-mm", type=float, default=810.45, show_default=True, help="Range at row 0, mm.")
+@click.option(
+    "--near-mm", type=float, default=810.45, show_default=True, help="Range at row 0, mm."
+)
 @click.option(
     "--far-mm", type=float, help="Range at the last row, mm; finds the sensor tilt by itself."
 )
@@ -51,19 +53,31 @@ def command(
       eschorty design --near-mm 500 --far-mm 1500
       eschorty design --focal-mm 24 --f-number 2 --theta-deg 85.87 --theta-prime-deg -7.62 \\
                       --near-mm 784.6 --out design.png
-    """
+    """  # noqa: D301
     import numpy as np
 
     from eschorty_ros.core.design import design, design_for_ranges
 
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
-    lens = {"focal_length_mm": focal_mm, "f_number": f_number, "theta_deg": theta_deg}
     if far_mm is not None:
-        build = design_for_ranges(near_mm=near_mm, far_mm=far_mm, b_mm=b_mm, **lens)
+        build = design_for_ranges(
+            focal_length_mm=focal_mm,
+            f_number=f_number,
+            theta_deg=theta_deg,
+            near_mm=near_mm,
+            far_mm=far_mm,
+            b_mm=b_mm,
+        )
     else:
-        tilt = -7.77 if theta_prime_deg is None else theta_prime_deg
-        build = design(theta_prime_deg=tilt, near_mm=near_mm, b_mm=b_mm, **lens)
+        build = design(
+            focal_length_mm=focal_mm,
+            f_number=f_number,
+            theta_deg=theta_deg,
+            theta_prime_deg=-7.77 if theta_prime_deg is None else theta_prime_deg,
+            near_mm=near_mm,
+            b_mm=b_mm,
+        )
     near, far = build.range_limits_mm
     # A pole on the sensor puts the last row at infinity.
     last = far if np.isfinite(far) else 20.0 * near

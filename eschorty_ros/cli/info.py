@@ -22,7 +22,7 @@ def command(path: Path) -> None:
       eschorty info rec
       eschorty info rec/events.raw
       eschorty info scan/scan.pcd
-    """
+    """  # noqa: D301
     if path.is_dir():
         _recording(path)
     elif path.suffix in (".pcd", ".ply"):

@@ -34,7 +34,8 @@ def setting_options() -> list[click.Parameter]:
         if "choices" in meta:
             kind = click.Choice(meta["choices"])
         elif isinstance(item.default, int):
-            kind = click.IntRange(*map(int, meta["range"]))
+            low, high = meta["range"]
+            kind = click.IntRange(int(low), int(high))
         else:
             kind = click.FloatRange(*meta["range"])
         unit = f" ({meta['unit']})" if meta["unit"] else ""
@@ -73,10 +74,10 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
       eschorty reconstruct rec
       eschorty reconstruct rec --out rec.ply --centroid median
       eschorty reconstruct rec --json --smoothing-half-width 0
-    """
+    """  # noqa: D301
     from eschorty_ros.core.cloud import write_cloud
-    from eschorty_ros.core.recording import load_recording
     from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+    from eschorty_ros.core.recording import load_recording
 
     target = out or recording / "cloud.pcd"
     if target.suffix not in (".pcd", ".ply"):
@@ -109,7 +110,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
 
 
 def summary(result: Result) -> dict[str, float | int | None]:
-    """The keys of ``--json`` from a reconstruction's result."""
+    """Return the keys of ``--json`` for a reconstruction's result."""
     import numpy as np
 
     points = result.points

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, NoReturn
 
 import click
@@ -76,7 +77,7 @@ def command(
       eschorty scan
       eschorty scan --scene sphere --speed 20 --out sphere
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
-    """
+    """  # noqa: D301
     if start == stop:
         raise click.UsageError(f"--start and --stop are both {start:g} mm; give a distance")
     one_process = _nodes()
@@ -113,9 +114,7 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
         f"{request.scene}: {request.frequency_hz:g} Hz, {request.speed_mm_s:g} mm/s, "
         f"{request.calibration}; median |error| {measured.error_median_mm:.2f} mm"
     )
-    figures.save(
-        figures.scan_figure(outcome.points, error_mm, title, direction), out / "scan.png"
-    )
+    figures.save(figures.scan_figure(outcome.points, error_mm, title, direction), out / "scan.png")
     _print(request, outcome, measured, out)
 
 
@@ -138,8 +137,8 @@ def _print(request: OneScan, outcome: Outcome, measured: Accuracy, out: Path) ->
     )
 
 
-def _nodes() -> type:
-    """The composition of nodes; a missing ROS 2 is a stated failure."""
+def _nodes() -> ModuleType:
+    """Import the composition of nodes; a missing ROS 2 is a stated failure."""
     try:
         from eschorty_ros.nodes import one_process
     except ImportError as error:
@@ -147,7 +146,7 @@ def _nodes() -> type:
             f"ROS 2 is not ready ({error}); run `make scan`, or source a ROS 2 installation in "
             "which this package is built; `eschorty simulate` needs no ROS"
         ) from error
-    return one_process  # type: ignore[return-value]
+    return one_process
 
 
 def _terminated(*_: object) -> NoReturn:

@@ -73,7 +73,7 @@ def command(
     Examples:
       eschorty simulate --scene steps --out rec
       eschorty simulate --scene sphere --frequency 300 --speed 200 --seed 7 --out rec300
-    """
+    """  # noqa: D301
     if start == stop:
         raise click.UsageError(f"--start and --stop are both {start:g} mm; give a distance")
     if out.is_dir() and any(out.iterdir()):

@@ -23,7 +23,7 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
       eschorty view scan/scan.pcd
       eschorty view scan/scan.pcd --out depth.pdf
       eschorty view scan/scan.pcd --window
-    """
+    """  # noqa: D301
     from eschorty_ros.core.cloud import read_cloud
 
     points = read_cloud(cloud)

@@ -207,7 +207,7 @@ def instrument(scan: OneScan) -> Iterator[Instrument]:
 
 
 def free_domain() -> int:
-    """A ROS domain (1 to 101) whose discovery port nobody on this host holds."""
+    """Find a ROS domain (1 to 101) whose discovery port nobody on this host holds."""
     domains = list(range(1, 102))
     random.SystemRandom().shuffle(domains)
     for domain in domains:

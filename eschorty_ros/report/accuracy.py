@@ -120,7 +120,7 @@ def sweep_positions_mm(
         raise ArgumentError(f"speed_mm_s is {speed_mm_s!r}; choose a positive speed")
     periods = round(abs(stop_mm - start_mm) / speed_mm_s * frequency_hz)
     step = (stop_mm - start_mm) / max(periods, 1)
-    return start_mm + step * (np.arange(periods) + 0.5)
+    return np.asarray(start_mm + step * (np.arange(periods) + 0.5))
 
 
 def lit_columns(
@@ -145,7 +145,7 @@ def range_error_mm(
 ) -> NDArray[np.float64]:
     """Measured minus true range of every point in mm; NaN where the scene holds nothing."""
     stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
-    return range_mm - true_range_mm(scene, model, stage_mm, points["column"])
+    return np.asarray(range_mm - true_range_mm(scene, model, stage_mm, points["column"]))
 
 
 def measure(

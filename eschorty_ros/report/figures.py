@@ -153,7 +153,10 @@ def design_figure(
     axes = figure.add_subplot(1, 3, 3)
     axes.plot(range_mm, depth_of_field_mm)
     axes.set(
-        xlabel="range (mm)", ylabel="± depth of field (mm)", title="Depth of field", ylim=(0.0, None)
+        xlabel="range (mm)",
+        ylabel="± depth of field (mm)",
+        title="Depth of field",
+        ylim=(0.0, None),
     )
     axes.grid(alpha=0.3)
     return figure
@@ -252,7 +255,7 @@ def _histogram(
     ratio = ratio[np.isfinite(ratio)]
     edges = np.linspace(-SIGMAS_SHOWN, SIGMAS_SHOWN, 81)
     weights = np.full(ratio.size, 1.0 / max(ratio.size, 1) / (edges[1] - edges[0]))
-    axes.hist(ratio, edges, weights=weights, color="tab:blue", alpha=0.75, label="points")
+    axes.hist(ratio, edges.tolist(), weights=weights, color="tab:blue", alpha=0.75, label="points")
     axes.plot(edges, np.exp(-0.5 * edges**2) / np.sqrt(2.0 * np.pi), "k--", label="unit normal")
     beyond = float(np.mean(np.abs(ratio) > SIGMAS_SHOWN)) if ratio.size else 0.0
     axes.set(

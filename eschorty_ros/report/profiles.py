@@ -45,7 +45,7 @@ def period_s(points: NDArray[np.void]) -> float:
 
 
 def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
-    """Number of the modulation period of every point, the first being 0.
+    """Number the modulation periods and give every point its own, the first being 0.
 
     Parameters
     ----------

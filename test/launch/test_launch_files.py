@@ -85,9 +85,10 @@ def test_every_node_a_launch_file_starts_is_a_module():
 def test_launch_loads_the_description(name):
     pytest.importorskip("launch", reason="needs the package launch")
     pytest.importorskip("launch_ros", reason="needs the package launch_ros")
-    from launch import LaunchContext
     from launch.actions import DeclareLaunchArgument
     from launch_ros.actions import Node
+
+    from launch import LaunchContext
 
     spec = importlib.util.spec_from_file_location("described", LAUNCH / name)
     module = importlib.util.module_from_spec(spec)

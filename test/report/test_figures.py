@@ -36,7 +36,8 @@ def test_scan_figure_has_every_part_with_units(tmp_path):
     assert {"stage position (mm)", "range (mm)", "range error (mm)", "density"} <= labels
     figures.save(figure, tmp_path / "scan.png")
     width, height = png_size(tmp_path / "scan.png")
-    assert width > 1000 and height > 700
+    assert width > 1000
+    assert height > 700
     assert (tmp_path / "scan.png").stat().st_size < 500_000
 
 
