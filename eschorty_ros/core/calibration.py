@@ -26,7 +26,7 @@ from eschorty_ros.core.optics import (
 from eschorty_ros.core.yaml_file import Schema, read_yaml, validate
 
 BUILDS = ("nominal", "config_1", "config_2", "config_3")
-PARAMETERS = ("k_mm", "k_prime_px", "b_mm", "b_prime_px")
+PARAMETERS = ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "principal_column")
 
 Positive = Annotated[float, Field(gt=0.0)]
 # A strict tuple refuses the list that YAML makes of it; its items stay strict.
@@ -102,8 +102,9 @@ class Calibration(Schema):
     @field_validator("parameters_fitted")
     @classmethod
     def _known_parameters(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        if value is not None and (not value or len(set(value)) != len(value)):
-            raise ValueError("name each fitted parameter once")
+        known = value is None or (value and set(value) <= set(PARAMETERS))
+        if not known or (value and len(set(value)) != len(value)):
+            raise ValueError(f"name each fitted parameter once, of {', '.join(PARAMETERS)}")
         return value
 
     @model_validator(mode="after")
@@ -130,7 +131,7 @@ class Calibration(Schema):
         return object_scale_mm(self.focal_length_mm, self.theta_deg)
 
     def model(self) -> RangeModel:
-        """The range equation of this calibration."""
+        """Return the range equation of this calibration."""
         return RangeModel(
             k_mm=self.object_scale_mm,
             k_prime_px=self.k_prime_px,

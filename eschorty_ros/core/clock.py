@@ -62,7 +62,7 @@ class StageTrack:
         self._end = 0
 
     def __len__(self) -> int:
-        """Samples held."""
+        """Count the samples held."""
         return self._end - self._begin
 
     @property
@@ -247,7 +247,7 @@ class SensorClock:
 
 
 def _whole_us(times: ArrayLike) -> NDArray[np.int64]:
-    """``times`` as int64; fractional input is refused, since floats lose microseconds."""
+    """Return int64 times; fractional input is refused, since floats lose microseconds."""
     array = np.asarray(times)
     if array.size and array.dtype.kind not in "iu":
         raise ArgumentError(f"times have dtype {array.dtype}; give integers")

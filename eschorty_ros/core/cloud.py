@@ -131,7 +131,7 @@ def _ply_header(count: int) -> bytes:
 
 
 def _parse_header(source: Path, data: bytes) -> tuple[int, int]:
-    """Number of points and offset of the first one."""
+    """Find the number of points and the offset of the first one."""
     pcd = source.suffix.lower() == ".pcd"
     end, key = (b"DATA binary\n", b"POINTS ") if pcd else (b"end_header\n", b"element vertex ")
     stop = data.find(end, 0, _HEADER_LIMIT)

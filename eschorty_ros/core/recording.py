@@ -274,7 +274,7 @@ def _line_number(path: Path, index: int) -> int:
 
 
 def _first_fault(path: Path, dtype: np.dtype[Any]) -> str:
-    """The first line that does not fit, in words."""
+    """Say which line is the first that does not fit."""
     names = dtype.names or ()
     for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
         cells = line.split(",")
