@@ -114,7 +114,8 @@ def scan_figure(
     axes.set_title("Depth map")
     _view_3d(figure.add_subplot(rows, 2, 2, projection="3d"), points, range_mm, limits)
     if error_mm is not None:
-        bound = max(float(np.nanpercentile(np.abs(error_mm), 99.0)), 1e-3)
+        size_mm = np.abs(error_mm[np.isfinite(error_mm)])
+        bound = max(float(np.percentile(size_mm, 99.0)), 1e-3) if size_mm.size else 1.0
         axes = figure.add_subplot(rows, 2, 3)
         _map(
             axes,

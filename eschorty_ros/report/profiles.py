@@ -45,7 +45,7 @@ def period_s(points: NDArray[np.void]) -> float:
 
 
 def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
-    """Number the modulation periods and give every point its own, the first being 0.
+    """Give every point the number of its modulation period, the first being 0.
 
     Parameters
     ----------
