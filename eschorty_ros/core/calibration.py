@@ -205,7 +205,10 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def _config_folders() -> list[Path]:
-    """Source tree first, then ``share/`` of every prefix above (pip and colcon put it there)."""
+    """List where builds may lie: source tree, inside a pip-installed package, colcon's share."""
     here = Path(__file__).absolute()
-    tree = here.parents[2] / "config"
-    return [tree, *(folder / "share" / "eschorty_ros" / "config" for folder in here.parents)]
+    return [
+        here.parents[2] / "config",
+        here.parents[1] / "config",
+        *(prefix / "share" / "eschorty_ros" / "config" for prefix in here.parents),
+    ]

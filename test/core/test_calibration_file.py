@@ -208,17 +208,20 @@ def test_a_name_that_names_itself_ends(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "site", ["lib/python3.11/site-packages", "local/lib/python3.11/dist-packages", "."]
+    ("site", "config"),
+    [
+        ("lib/python3.11/site-packages", "share/eschorty_ros/config"),
+        ("local/lib/python3.11/dist-packages", "share/eschorty_ros/config"),
+        ("site-packages", "site-packages/eschorty_ros/config"),
+        ("tree", "tree/config"),
+    ],
 )
-def test_names_are_found_beside_an_installed_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, site: str
+def test_names_are_found_where_colcon_pip_and_git_put_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, site: str, config: str
 ) -> None:
-    """Below a prefix that has ``share/eschorty_ros/config``: colcon, pip, pip --target."""
     installed = tmp_path / site / "eschorty_ros" / "core" / "calibration.py"
-    share = tmp_path / "share" / "eschorty_ros" / "config"
-    installed.parent.mkdir(parents=True)
-    share.mkdir(parents=True)
-    shutil.copy(ROOT / "config" / "config_2.yaml", share / "shop_floor.yaml")
+    (tmp_path / config).mkdir(parents=True)
+    shutil.copy(ROOT / "config" / "config_2.yaml", tmp_path / config / "shop_floor.yaml")
     monkeypatch.setattr(module, "__file__", str(installed))
     assert load_calibration("shop_floor").name == "config_2"
 
