@@ -159,6 +159,7 @@ class Observer:
 
     def __init__(self, domain: int, name: str = "observer", namespace: str = NAMESPACE) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.domain = domain
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = Node(name, namespace=namespace, context=self._context)

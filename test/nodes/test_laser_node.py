@@ -1,0 +1,228 @@
+"""The laser node as a process: its emulator's own log says when there was light."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+
+from ros_process import NodeProcess, Observer, free_domain, wait_until
+from std_msgs.msg import Bool, Header
+from std_srvs.srv import SetBool, Trigger
+
+from eschorty_ros.msg import LaserState
+from eschorty_ros.nodes import qos
+
+MODULE = "eschorty_ros.nodes.laser"
+PARAMETERS = {"arm_timeout": 1.0, "heartbeat_timeout": 0.5, "max_on_time": 3.0}
+
+
+class Bench:
+    """A laser node with its log, its state and a heartbeat that can be switched."""
+
+    def __init__(self, log: Path, domain: int, observer: Observer, **parameters: Any) -> None:
+        self.log = log
+        self.observer = observer
+        self.beating = False
+        self.process = NodeProcess(
+            MODULE, {**PARAMETERS, "fake_log": log, **parameters}, domain=domain
+        )
+        self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
+        self._heart = observer.node.create_publisher(Header, "laser/heartbeat", qos.stream(10))
+        self._timer = observer.node.create_timer(0.05, self._beat)
+        self.interlock = observer.node.create_publisher(Bool, "laser/interlock", qos.stream(10))
+        observer.wait_for_state("laser", "active")
+        wait_until(self._heart.get_subscription_count, "the heartbeat's subscriber")
+        wait_until(self.interlock.get_subscription_count, "the interlock's subscriber")
+        wait_until(lambda: self.states, "a laser state")
+
+    def _beat(self) -> None:
+        if self.beating:
+            self._heart.publish(Header())
+
+    def light(self) -> list[str]:
+        """ON and OFF as the emulator logged them."""
+        return [line.split()[1] for line in self.log.read_text().splitlines()]
+
+    def lit_for_s(self) -> float:
+        """Length of the last light."""
+        on, off = (int(line.split()[0]) for line in self.log.read_text().splitlines()[-2:])
+        return (off - on) * 1e-9
+
+    def arm(self) -> Any:
+        return self.observer.call(Trigger, "laser/arm")
+
+    def enable(self, on: bool = True) -> Any:
+        return self.observer.call(SetBool, "laser/enable", SetBool.Request(data=on))
+
+    def switch_on(self) -> None:
+        """Heartbeat, arm, enable, in the order a client does it."""
+        self.beating = True
+        time.sleep(0.2)
+        assert self.arm().success
+        response = self.enable()
+        assert response.success, response.message
+        assert self.light()[-1] == "ON"
+
+    def wait_dark(self) -> None:
+        wait_until(lambda: self.light()[-1] == "OFF", "the laser off in the log")
+
+    def close(self) -> None:
+        self.beating = False
+        self.observer.node.destroy_timer(self._timer)
+        self.process.kill()
+
+
+@pytest.fixture(scope="module")
+def domain() -> int:
+    return free_domain()
+
+
+@pytest.fixture(scope="module")
+def observer(domain: int) -> Iterator[Observer]:
+    with Observer(domain, "laser_observer") as observer:
+        yield observer
+
+
+@pytest.fixture(scope="module")
+def shared(
+    domain: int, observer: Observer, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Bench]:
+    bench = Bench(tmp_path_factory.mktemp("laser") / "laser.log", domain, observer)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def bench(shared: Bench) -> Iterator[Bench]:
+    yield shared
+    shared.beating = False
+    shared.interlock.publish(Bool(data=False))
+    shared.enable(False)
+    if shared.observer.lifecycle_state("laser") == "inactive":
+        assert shared.observer.change_state("laser", "activate")
+    assert shared.light()[-1] == "OFF"
+
+
+def test_laser_is_off_at_start(bench: Bench) -> None:
+    assert bench.light() == ["OFF"]
+    assert bench.states[-1].output == LaserState.OUTPUT_OFF
+
+
+def test_enable_is_refused_with_the_reason(bench: Bench) -> None:
+    bench.beating = True
+    assert "not armed" in bench.enable().message
+    bench.beating = False
+    bench.arm()
+    time.sleep(0.6)
+    refused = bench.enable()
+    assert not refused.success
+    assert "heartbeat" in refused.message
+    bench.beating = True
+    time.sleep(0.6)
+    assert "arming expired" in bench.enable().message
+    assert "ON" not in bench.light()
+
+
+def test_open_interlock_refuses_and_switches_off(bench: Bench) -> None:
+    bench.interlock.publish(Bool(data=True))
+    wait_until(lambda: bench.states[-1].interlock_open, "the interlock open")
+    assert "interlock open" in bench.arm().message
+    bench.interlock.publish(Bool(data=False))
+    wait_until(lambda: not bench.states[-1].interlock_open, "the interlock closed")
+    bench.switch_on()
+    bench.interlock.publish(Bool(data=True))
+    bench.wait_dark()
+    assert not bench.enable().success
+
+
+def test_lost_heartbeat_switches_off(bench: Bench) -> None:
+    bench.switch_on()
+    bench.beating = False
+    bench.wait_dark()
+    wait_until(lambda: "heartbeat" in bench.states[-1].reason, "the reason in laser/state")
+
+
+def test_light_ends_after_the_longest_time_on(bench: Bench) -> None:
+    bench.switch_on()
+    bench.wait_dark()
+    assert bench.lit_for_s() >= 3.0
+    wait_until(lambda: "max_on_time" in bench.states[-1].reason, "the reason in laser/state")
+
+
+def test_deactivate_switches_off_and_refuses(bench: Bench) -> None:
+    bench.switch_on()
+    assert bench.observer.change_state("laser", "deactivate")
+    assert bench.light()[-1] == "OFF"
+    assert "inactive" in bench.arm().message
+    assert not bench.enable().success
+    assert bench.light()[-1] == "OFF"
+
+
+def test_bad_parameter_is_refused_and_changes_nothing(bench: Bench) -> None:
+    for name, value in (("frequency", 5.0), ("duty", 1.5), ("waveform", "triangle"), ("seed", 1)):
+        accepted, reason = bench.observer.set_parameter("laser", name, value)
+        assert not accepted
+        assert name in reason
+    accepted, reason = bench.observer.set_parameter("laser", "waveform", "sine")
+    assert not accepted
+    assert "square" in reason
+    state = bench.states[-1]
+    assert (state.frequency, state.duty, state.waveform) == (70.0, 0.5, "square")
+    accepted, reason = bench.observer.set_parameter("laser", "frequency", 100)
+    assert accepted, reason
+    wait_until(lambda: bench.states[-1].frequency == 100.0, "the new frequency")
+
+
+def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
+    bench.switch_on()
+    assert bench.enable(False).success
+    wait_until(lambda: bench.states[-1].output == LaserState.OUTPUT_OFF, "off in laser/state")
+    logged = [int(line.split()[0]) for line in bench.log.read_text().splitlines()[-2:]]
+    told = {s.output_since.sec * 10**9 + s.output_since.nanosec for s in bench.states}
+    assert set(logged) <= told
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signal_switches_off_and_exits_clean(
+    number: int, tmp_path: Path
+) -> None:
+    with Observer(free_domain(), "signal_observer") as own:
+        bench = Bench(tmp_path / "laser.log", own.domain, own)
+        try:
+            bench.switch_on()
+            bench.process.send(number)
+            assert bench.process.wait() == 0
+            assert bench.light() == ["OFF", "ON", "OFF"]
+            assert "Traceback" not in bench.process.output
+        finally:
+            bench.close()
+
+
+def test_unknown_driver_is_one_clear_line() -> None:
+    with Observer(free_domain(), "driver_observer") as own:
+        process = NodeProcess(MODULE, {"driver": "quantum"}, domain=own.domain)
+        try:
+            wait_until(lambda: "quantum" in process.output, "the refusal")
+            assert "choose one of fake" in process.output
+            assert "Traceback" not in process.output
+            assert own.lifecycle_state("laser") == "unconfigured"
+            assert process.interrupt() == 0
+        finally:
+            process.kill()
+
+
+def test_frequency_out_of_range_at_start_ends_with_one_line() -> None:
+    process = NodeProcess(MODULE, {"frequency": 5.0}, domain=free_domain())
+    try:
+        assert process.wait(20.0) == 1
+        assert process.output.startswith("error: parameter frequency")
+        assert len(process.output.strip().splitlines()) == 1
+    finally:
+        process.kill()

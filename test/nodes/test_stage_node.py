@@ -1,0 +1,147 @@
+"""The stage node as a process: odometry, planned motion, moves and their refusals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+
+from action_msgs.msg import GoalStatus
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionClient
+from ros_process import NodeProcess, Observer, free_domain, wait_until
+
+from eschorty_ros.action import MoveStage
+from eschorty_ros.msg import StageMotion
+from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.conversions import ns_from_stamp
+from eschorty_ros.nodes.device_messages import plan_from_motion
+
+
+class Stage:
+    """A stage node and a client of it."""
+
+    def __init__(self, domain: int, observer: Observer) -> None:
+        self.process = NodeProcess("eschorty_ros.nodes.stage", domain=domain)
+        self.odometry = observer.collect(Odometry, "stage/odom", qos.stream())
+        self.motions = observer.collect(StageMotion, "stage/motion", qos.stream())
+        self.observer = observer
+        self._client = ActionClient(observer.node, MoveStage, "stage/move")
+        observer.wait_for_state("stage", "active")
+        wait_until(self._client.server_is_ready, "stage/move")
+        wait_until(lambda: self.odometry and self.motions, "odometry and motion")
+
+    def start(self, position: float, speed: float) -> Any:
+        """Goal handle of a move, m and m/s."""
+        goal = MoveStage.Goal(position=position, speed=speed)
+        future = self._client.send_goal_async(goal)
+        wait_until(future.done, "the goal's acceptance")
+        handle = future.result()
+        assert handle.accepted
+        return handle
+
+    @staticmethod
+    def finish(handle: Any) -> Any:
+        """Status and result of a goal."""
+        future = handle.get_result_async()
+        wait_until(future.done, "the move's end")
+        return future.result()
+
+    def move(self, position: float, speed: float) -> Any:
+        return self.finish(self.start(position, speed))
+
+    def close(self) -> None:
+        self._client.destroy()
+        self.process.kill()
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    domain = free_domain()
+    with Observer(domain, "stage_observer") as observer:
+        stage = Stage(domain, observer)
+        yield stage
+        stage.close()
+
+
+def test_activate_homes(stage: Stage) -> None:
+    wait_until(lambda: stage.odometry[-1].pose.pose.position.y == 0.0, "the home position")
+
+
+def test_move_arrives(stage: Stage) -> None:
+    outcome = stage.move(0.02, 0.1)
+    assert outcome.status == GoalStatus.STATUS_SUCCEEDED
+    assert outcome.result.success
+    assert outcome.result.position == pytest.approx(0.02, abs=1e-9)
+
+
+def test_odometry_lies_on_the_planned_motion(stage: Stage) -> None:
+    first = len(stage.motions)
+    begun = len(stage.odometry)
+    stage.move(0.05, 0.1)
+    stage.move(0.03, 0.2)
+    wait_until(
+        lambda: ns_from_stamp(stage.motions[-1].header.stamp)
+        > ns_from_stamp(stage.odometry[-2].header.stamp),
+        "motion newer than odometry",
+    )
+    plans = sorted(
+        {plan_from_motion(m) for m in stage.motions[first - 1 :]}, key=lambda plan: plan.start_ns
+    )
+    assert len(plans) == 3
+    starts = np.array([plan.start_ns for plan in plans])
+    seen = stage.odometry[begun:-2]
+    assert len(seen) > 20
+    for message in seen:
+        t_ns = ns_from_stamp(message.header.stamp)
+        plan = plans[int(np.searchsorted(starts, t_ns, side="right")) - 1]
+        position_mm, velocity_mm_s = plan.state(t_ns)
+        assert message.pose.pose.position.y * 1e3 == pytest.approx(float(position_mm), abs=1e-6)
+        assert message.twist.twist.linear.y * 1e3 == pytest.approx(float(velocity_mm_s), abs=1e-6)
+        assert message.pose.covariance[7] == pytest.approx(1e-12)
+
+
+@pytest.mark.parametrize(
+    ("position", "speed", "reason"),
+    [(0.5, 0.1, "outside the travel"), (-0.01, 0.1, "outside the travel"), (0.1, 1.0, "speed")],
+)
+def test_impossible_goal_tells_why(
+    stage: Stage, position: float, speed: float, reason: str
+) -> None:
+    outcome = stage.move(position, speed)
+    assert outcome.status == GoalStatus.STATUS_ABORTED
+    assert reason in outcome.result.message
+
+
+def test_second_move_is_refused_and_cancel_stops(stage: Stage) -> None:
+    handle = stage.start(0.2, 0.03)
+    wait_until(lambda: stage.odometry[-1].twist.twist.linear.y == 0.03, "full speed")
+    assert "another move" in stage.move(0.0, 0.1).result.message
+    cancelled = handle.cancel_goal_async()
+    wait_until(cancelled.done, "the cancel's answer")
+    outcome = stage.finish(handle)
+    assert outcome.status == GoalStatus.STATUS_CANCELED
+    assert 0.03 < outcome.result.position < 0.2
+    wait_until(lambda: stage.odometry[-1].twist.twist.linear.y == 0.0, "rest")
+    assert stage.move(0.03, 0.3).result.success
+
+
+def test_deactivate_stops_a_move(stage: Stage) -> None:
+    handle = stage.start(0.2, 0.03)
+    wait_until(lambda: stage.odometry[-1].twist.twist.linear.y > 0.0, "motion")
+    assert stage.observer.change_state("stage", "deactivate")
+    outcome = stage.finish(handle)
+    assert outcome.status == GoalStatus.STATUS_ABORTED
+    assert "stopped at" in outcome.result.message
+    assert "inactive" in stage.move(0.1, 0.1).result.message
+    assert stage.observer.change_state("stage", "activate")
+
+
+def test_interrupt_in_a_move_exits_clean(stage: Stage) -> None:
+    stage.start(0.0, 0.01)
+    assert stage.process.interrupt() == 0
+    assert "Traceback" not in stage.process.output
