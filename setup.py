@@ -24,7 +24,7 @@ setup(
     package_dir={"eschorty_ros.config": "config"},
     package_data={"eschorty_ros.config": ["*.yaml"]},
     install_requires=REQUIREMENTS,
-    extras_require={"mesh": ["open3d>=0.19"]},
+    extras_require={"mesh": ["open3d>=0.19", "libusb-package"]},
     entry_points={
         "console_scripts": [
             "eschorty = eschorty_ros.cli:main",
