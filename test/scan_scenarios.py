@@ -1,0 +1,254 @@
+"""What a scan must do, asserted once: process tests and launch tests run these same functions."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionClient
+from ros_process import Observer, wait_until
+from sensor_msgs.msg import PointCloud2
+
+from eschorty_ros.action import Scan
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.cloud import POINT_DTYPE
+from eschorty_ros.msg import LaserState
+from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.cloud_messages import points_from_message
+from eschorty_ros.report.accuracy import measure, sweep_positions_mm
+from eschorty_ros.simulation.scene import named
+
+EVENTS = "qos_overrides./eschorty/camera/events"
+SCENE = "steps"
+CALIBRATION = "config_3"
+START_M, STOP_M, SPEED_M_S, FREQUENCY_HZ = 0.020, 0.040, 0.050, 70.0
+SCAN_DEADLINE_S = 90.0
+
+
+def node_parameters(laser_log: Path) -> dict[str, dict[str, Any]]:
+    """Modules and parameters of the five nodes of a simulated scan."""
+    return {
+        "eschorty_ros.nodes.laser": {"fake_log": laser_log},
+        "eschorty_ros.nodes.stage": {},
+        "eschorty_ros.nodes.camera": {
+            "scene": SCENE,
+            "calibration": CALIBRATION,
+            "seed": 7,
+            f"{EVENTS}.publisher.reliability": "reliable",
+        },
+        "eschorty_ros.nodes.reconstruction": {
+            "calibration": CALIBRATION,
+            f"{EVENTS}.subscription.reliability": "reliable",
+        },
+        # A loaded test machine stalls for longer than an instrument may.
+        "eschorty_ros.nodes.scanner": {"node_timeout": 60.0, "events_timeout": 3.0},
+    }
+
+
+class Bench:
+    """The test's view of the instrument."""
+
+    def __init__(self, observer: Observer, laser_log: Path) -> None:
+        self.observer = observer
+        self._laser_log = laser_log
+        self.clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
+        self.laser = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
+        self.odometry = observer.collect(Odometry, "stage/odom", qos.stream())
+        self._action = ActionClient(observer.node, Scan, "scan")
+        self.feedback: list[Any] = []
+
+    def start(self, **goal: float) -> Any:
+        """Send a goal; the accepted handle."""
+        wait_until(self._action.server_is_ready, "the scan action", SCAN_DEADLINE_S)
+        self.feedback.clear()
+        values = {"start": START_M, "stop": STOP_M, "speed": SPEED_M_S, "frequency": FREQUENCY_HZ}
+        sent = self._action.send_goal_async(
+            Scan.Goal(**{**values, **goal}),
+            feedback_callback=lambda message: self.feedback.append(message.feedback),
+        )
+        wait_until(sent.done, "an answer to the goal")
+        return sent.result()
+
+    def result(self, handle: Any) -> tuple[int, Any]:
+        """Status and result of a goal."""
+        future = handle.get_result_async()
+        wait_until(future.done, "the scan's end", SCAN_DEADLINE_S)
+        return future.result().status, future.result().result
+
+    def scan(self, **goal: float) -> tuple[int, Any]:
+        """Send a goal and wait for its end."""
+        return self.result(self.start(**goal))
+
+    def wait_for_sweep(self) -> None:
+        """Wait until points of the sweep have been reconstructed."""
+        wait_until(
+            lambda: any(f.phase == "sweeping" and f.progress > 0.25 and f.points for f in
+                        list(self.feedback)),
+            "a quarter of the sweep",
+            SCAN_DEADLINE_S,
+        )  # fmt: skip
+
+    def cloud_after(self, count: int) -> np.ndarray:
+        """Points of the scan published after ``count`` clouds were there."""
+        wait_until(lambda: len(self.clouds) > count, "a cloud on scan/points")
+        message = self.clouds[-1]
+        assert message.header.frame_id == "eschorty_base"
+        seen = points_from_message(message)
+        assert seen.dtype.names == POINT_DTYPE.names
+        return seen.astype(POINT_DTYPE)
+
+    def output_lines(self) -> list[str]:
+        """ON and OFF in the order of the emulator's own log."""
+        return [line.split()[1] for line in self._laser_log.read_text().splitlines()]
+
+    def assert_dark_and_at_rest(self) -> None:
+        """Laser off by the emulator's own log and by the node; stage not moving."""
+        wait_until(lambda: self.output_lines()[-1] == "OFF", "OFF in the emulator's log", 5.0)
+        seen = len(self.laser)
+        wait_until(lambda: len(self.laser) > seen, "a new laser/state")
+        assert self.laser[-1].output == LaserState.OUTPUT_OFF
+        seen = len(self.odometry)
+        wait_until(lambda: len(self.odometry) > seen + 5, "new odometry")
+        assert {m.twist.twist.linear.y for m in self.odometry[-3:]} == {0.0}
+
+
+@contextlib.contextmanager
+def bench(domain: int, laser_log: Path) -> Iterator[Bench]:
+    """A bench over an observer of its own."""
+    with Observer(domain) as observer:
+        yield Bench(observer, laser_log)
+
+
+def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: float) -> None:
+    """The project's bounds on errors, and at least ``completeness`` of the lit columns."""
+    calibration = load_calibration(CALIBRATION)
+    accuracy = measure(points, named(SCENE), calibration.model(), positions_mm)
+    print(accuracy)
+    assert accuracy.completeness >= completeness, accuracy
+    assert accuracy.error_median_mm <= 0.7, accuracy
+    assert accuracy.error_p95_mm <= 2.5, accuracy
+
+
+def full_scan(bench: Bench) -> None:
+    """A scan to its end gives the expected cloud."""
+    before = len(bench.clouds)
+    status, result = bench.scan()
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert result.success, result.message
+    points = bench.cloud_after(before)
+    assert len(points) == result.points
+    assert result.packets_lost == 0
+    positions = sweep_positions_mm(START_M * 1e3, STOP_M * 1e3, SPEED_M_S * 1e3, FREQUENCY_HZ)
+    assert abs(result.profiles - len(positions)) <= 2
+    assert_accurate(points, positions, 0.98)
+    _assert_in_order(points)
+    sweep_s = (
+        result.sweep_stop.sec - result.sweep_start.sec
+        + 1e-9 * (result.sweep_stop.nanosec - result.sweep_start.nanosec)
+    )  # fmt: skip
+    assert math.isclose(sweep_s, (STOP_M - START_M) / SPEED_M_S, rel_tol=0.02)
+    assert [f.phase for f in bench.feedback if f.phase == "sweeping"]
+    assert 0.0 < result.sigma_median < 2e-3
+    bench.assert_dark_and_at_rest()
+
+
+def cancel_scan(bench: Bench) -> None:
+    """Cancel in the middle: light off, stage stopped, what there is published."""
+    before = len(bench.clouds)
+    handle = bench.start(stop=0.120)
+    bench.wait_for_sweep()
+    canceled = handle.cancel_goal_async()
+    wait_until(canceled.done, "an answer to the cancel request")
+    status, result = bench.result(handle)
+    assert status == GoalStatus.STATUS_CANCELED, result.message
+    assert not result.success
+    bench.assert_dark_and_at_rest()
+    assert bench.odometry[-1].pose.pose.position.y < 0.120
+    _assert_partial(bench.cloud_after(before), result, 0.120)
+
+
+def bad_goals(bench: Bench) -> None:
+    """Each bad value is refused, its name and the remedy in the message; no light."""
+    lines = len(bench.output_lines())
+    for goal, words in (
+        ({"start": -0.01}, ("start", "-0.01", "travel")),
+        ({"stop": 0.5}, ("stop", "0.5", "travel")),
+        ({"stop": START_M}, ("start and stop",)),
+        ({"speed": 0.0}, ("speed", "m/s")),
+        ({"speed": 9.0}, ("speed", "9")),
+        ({"frequency": 5.0}, ("frequency", "5 Hz", "16")),
+        ({"frequency": 1e6}, ("frequency", "20000")),
+        ({"duty": 1.5}, ("duty", "1.5")),
+        ({"start": math.nan}, ("start", "nan")),
+    ):
+        status, result = bench.scan(**goal)
+        assert status == GoalStatus.STATUS_ABORTED, goal
+        assert not result.success
+        for word in words:
+            assert word in result.message, (goal, result.message)
+    assert len(bench.output_lines()) == lines
+
+
+def bad_parameters(bench: Bench) -> None:
+    """A bad value is refused with a reason, and the old one stays."""
+    for node, name, value, word in (
+        ("reconstruction", "centroid", "magic", "mode_mean"),
+        ("reconstruction", "events_min", 0, "range"),
+        ("reconstruction", "frequency", 5.0, "16"),
+        ("reconstruction", "calibration", "config_1", "read"),
+        ("scanner", "speed_max", 1.0, "read"),
+        ("laser", "frequency", 1.0, "range"),
+    ):
+        accepted, reason = bench.observer.set_parameter(node, name, value)
+        assert not accepted, (node, name)
+        assert word in reason, (node, name, reason)
+    accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", 5)
+    assert accepted, reason
+    accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", 4)
+    assert accepted, reason
+
+
+def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
+    """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
+    before = len(bench.clouds)
+    handle = bench.start(stop=0.200, speed=0.03)
+    bench.wait_for_sweep()
+    kill()
+    killed_s = time.monotonic()
+    status, result = bench.result(handle)
+    print(f"goal ended {time.monotonic() - killed_s:.1f} s after the camera: {result.message}")
+    assert status == GoalStatus.STATUS_ABORTED
+    assert result.message.startswith("camera"), result.message
+    bench.assert_dark_and_at_rest()
+    assert bench.odometry[-1].pose.pose.position.y < 0.195
+    _assert_partial(bench.cloud_after(before), result, 0.200)
+
+
+def _assert_partial(points: np.ndarray, result: Any, stop_m: float) -> None:
+    assert len(points) == result.points > 0
+    reached_m = float(points["y"].max())
+    assert START_M - 1e-6 <= points["y"].min()
+    assert reached_m < stop_m
+    period_mm = 1e3 * (reached_m - float(points["y"].min())) / max(result.profiles - 1, 1)
+    positions = float(points["y"].min()) * 1e3 + period_mm * np.arange(result.profiles)
+    # The last periods are cut by the way to a stop.
+    assert_accurate(points, positions, 0.9)
+    _assert_in_order(points)
+
+
+def _assert_in_order(points: np.ndarray) -> None:
+    """By period, then column; ``t`` begins at the stamp."""
+    assert points["t"].min() == 0.0
+    begins = np.flatnonzero(np.diff(points["column"].astype(int)) <= 0)
+    profile = np.zeros(len(points), int)
+    profile[begins + 1] = 1
+    profile = np.cumsum(profile)
+    middle = np.bincount(profile, points["t"]) / np.bincount(profile)
+    assert (np.diff(middle) > 0.0).all()
