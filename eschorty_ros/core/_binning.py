@@ -16,7 +16,7 @@ from eschorty_ros.core._centroid_kernels import (
     _estimate_column,
     _sigma2,
 )
-from eschorty_ros.core.smoothing import _reject_isolated, _smooth
+from eschorty_ros.core._smoothing_kernels import _reject_isolated, _smooth
 
 # state, int64
 S_INDEX, S_EDGE, S_OPEN, S_HALF, S_POINTS, S_SIZE = 0, 1, 2, 3, 4, 5

@@ -6,9 +6,23 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from eschorty_ros.core._phase_kernels import (
+    C_BRIDGED,
+    COUNTERS,
+    S_ANCHOR,
+    S_INDEX,
+    S_LAST,
+    S_MISSED,
+    S_REST,
+    S_SIZE,
+    S_STEP,
+    S_TRIGGERED,
+    S_WHOLE,
+    TOLERANCE_SHARE,
+    _schedule,
+)
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 
@@ -16,85 +30,10 @@ from eschorty_ros.core.modulation import Modulation
 EDGES_MAX = 1 << 14
 # Gaps longer than this many periods are jumped over instead of counted through.
 JUMP_PERIODS = 4096
-# Predicted edges without a trigger before any trigger is taken as the new phase.
-MISSED_MAX = 3
-_TOLERANCE_SHARE = 4
-
-S_ANCHOR, S_STEP, S_WHOLE, S_REST, S_INDEX, S_LAST, S_TRIGGERED, S_MISSED, S_SIZE = range(9)
-COUNTERS = ("triggers_used", "triggers_spurious", "edges_bridged", "phase_locks")
-C_USED, C_SPURIOUS, C_BRIDGED, C_LOCKS = range(len(COUNTERS))
-
 _HISTOGRAM_BINS = 200
 _RAYLEIGH_MIN = 30.0
 WINDOW_PERIODS = 4
 WINDOW_EVENTS = 2048
-
-
-@njit(cache=True, nogil=True)
-def _rounded(whole, rest, denominator):
-    """``whole + rest / denominator`` to the nearest integer, half to even."""
-    twice = 2 * rest
-    if twice > denominator or (twice == denominator and whole & 1):
-        return whole + 1
-    return whole
-
-
-@njit(cache=True, nogil=True)
-def _schedule(state, step, part, denominator, every, triggers, first, watermark, edges, indices, c):
-    """Edges that are certain once everything before ``watermark`` is known.
-
-    Returns the number of edges written, the first trigger not used, and the time before which
-    events may be assigned.
-    """
-    tolerance = max((step + 1) // _TOLERANCE_SHARE, 1)
-    n = 0
-    trigger = first
-    while True:
-        whole = state[S_WHOLE] + step
-        rest = state[S_REST] + part
-        if rest >= denominator:
-            rest -= denominator
-            whole += 1
-        predicted = state[S_ANCHOR] + _rounded(whole, rest, denominator)
-        if n == edges.size:
-            return n, trigger, min(watermark, state[S_LAST])
-        locked = state[S_TRIGGERED] != 0 and state[S_MISSED] < MISSED_MAX
-        deadline = predicted + tolerance if state[S_TRIGGERED] != 0 else predicted
-        if trigger < triggers.size and triggers[trigger] <= deadline:
-            t = triggers[trigger]
-            trigger += 1
-            if locked and t < predicted - tolerance:
-                c[C_SPURIOUS] += 1
-                continue
-            if not locked:
-                c[C_LOCKS] += 1
-            c[C_USED] += 1
-            state[S_TRIGGERED] = 1
-            state[S_MISSED] = 0
-            state[S_ANCHOR] = t
-            state[S_STEP] = 0
-            state[S_WHOLE] = 0
-            state[S_REST] = 0
-            if not locked and t - state[S_LAST] < tolerance:
-                # The edge just predicted was this one: later edges count from the trigger.
-                continue
-            edge = t
-        elif deadline < watermark:
-            state[S_STEP] += 1
-            state[S_WHOLE] = whole
-            state[S_REST] = rest
-            if state[S_TRIGGERED] != 0:
-                state[S_MISSED] += 1
-                c[C_BRIDGED] += 1
-            edge = predicted
-        else:
-            return n, trigger, min(watermark, predicted)
-        state[S_INDEX] += 1
-        state[S_LAST] = edge
-        if state[S_INDEX] % every == 0:
-            edges[n] = edge
-            indices[n] = state[S_INDEX]
-            n += 1
 
 
 class EdgeSchedule:
@@ -149,7 +88,7 @@ class EdgeSchedule:
             self._triggers = np.concatenate([self._triggers, t_us])
 
     def anchor(self, edge_us: int, start_us: int) -> None:
-        """Fix the phase: one edge at ``edge_us``; the first edge out is the last until ``start_us``.
+        """Fix the phase: one edge at ``edge_us``; the first one out is the last until ``start_us``.
 
         With ``every`` > 1 it is the last one whose index is a multiple of it.
         """
@@ -181,7 +120,7 @@ class EdgeSchedule:
 
     def watermark_after(self, newest_us: int) -> int:
         """Watermark that makes everything up to ``newest_us`` certain, and nothing later."""
-        waits = int(self._state[S_TRIGGERED]) * max((self._step + 1) // _TOLERANCE_SHARE, 1)
+        waits = int(self._state[S_TRIGGERED]) * max((self._step + 1) // TOLERANCE_SHARE, 1)
         return newest_us + 1 + waits
 
     def advance(self, watermark_us: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -209,7 +148,7 @@ class EdgeSchedule:
         return self._edges[:n], self._indices[:n]
 
     def _step_at(self, t_us: int) -> int:
-        """Number of the last edge, counted from the anchor, at or before ``t_us``."""
+        """Count edges from the anchor to the last one at or before ``t_us``."""
         elapsed = t_us - int(self._state[S_ANCHOR])
         step = int(elapsed / self.period) + 1
         while round(step * self.period) > elapsed:

@@ -75,7 +75,7 @@ class Profiles:
         )
 
     def select(self, mask: ArrayLike) -> Profiles:
-        """The points a boolean mask, slice or index array picks."""
+        """Pick points by a boolean mask, a slice or an index array."""
         picked = mask if isinstance(mask, slice) else np.asarray(mask)
         return Profiles(**{item.name: getattr(self, item.name)[picked] for item in fields(self)})
 

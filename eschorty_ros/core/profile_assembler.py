@@ -1,0 +1,166 @@
+"""Columns of the open period and the points of the closed ones."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core import _binning as binning
+from eschorty_ros.core import _centroid_kernels as kernels
+from eschorty_ros.core.centroid import check_method, half_width_fixed, method_factor
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.settings import Settings
+
+_OUTPUT_PROFILES = 64
+
+
+class ProfileAssembler:
+    """Takes events and edges in time order, gives profiles.
+
+    All memory the compiled pass works on lives here and is reused from period to period.
+
+    Parameters
+    ----------
+    settings : Settings
+    model : RangeModel
+
+    Raises
+    ------
+    ArgumentError
+        When the sensor has more rows than an event's packed form can hold.
+    """
+
+    def __init__(self, settings: Settings, model: RangeModel) -> None:
+        if model.rows > kernels.ROW_LAST + 1:
+            raise ArgumentError(
+                f"rows is {model.rows}; the reconstruction takes {kernels.ROW_LAST + 1} at most"
+            )
+        self._model = model
+        self._done: list[Profiles] = []
+        self._half_max = half_width_fixed(settings.line_width_px)
+        self.points = 0
+        self.points_beyond_pole = 0
+        self._counts = np.zeros(len(binning.COUNTERS), dtype=np.int64)
+        columns = model.columns
+        self._lists = np.empty((columns, settings.column_limit + kernels.BLOCK), dtype=np.uint32)
+        self._column_counts = np.zeros(columns, dtype=np.uint32)
+        self._seeds = np.full(columns, -1, dtype=np.int64)
+        self._state = np.zeros(binning.S_SIZE, dtype=np.int64)
+        self._work = np.zeros((4, columns))
+        self._work_int = np.zeros((3, columns), dtype=np.int64)
+        self._scratch = np.zeros(1 << kernels.ROW_BITS, dtype=np.int64)
+        self._whole, self._fractional = _parameters(settings, model.rows)
+        size = _OUTPUT_PROFILES * columns
+        self._whole_out = np.empty((3, size), dtype=np.int64)
+        self._column_out = np.empty(size, dtype=np.uint16)
+        self._row_out = np.empty((2, size))
+        self._events_out = np.empty(size, dtype=np.uint32)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the open period, the seeds and the line's width."""
+        self._state[binning.S_OPEN] = 0
+        self._state[binning.S_HALF] = self._half_max
+        self._column_counts[:] = 0
+        self._seeds[:] = -1
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts by name."""
+        return dict(zip(binning.COUNTERS, self._counts.tolist(), strict=True))
+
+    def merge(
+        self,
+        t: NDArray[np.int64],
+        x: NDArray[np.uint16],
+        y: NDArray[np.uint16],
+        edges: NDArray[np.int64],
+        indices: NDArray[np.int64],
+        first_edge: int,
+        drain: bool,
+    ) -> int:
+        """Assign events to periods and close the periods whose end is reached.
+
+        Parameters
+        ----------
+        t, x, y : int64, uint16, uint16, equal length
+            Events in time order.
+        edges, indices : int64, equal length
+            Times and numbers of the periods' beginnings; those before ``first_edge`` are done.
+        drain : bool
+            No more events come before the last edge: deal with all edges.
+
+        Returns
+        -------
+        int
+            First edge not dealt with.
+        """
+        out = (*self._whole_out, self._column_out, *self._row_out, self._events_out)
+        first, edge, stop = 0, first_edge, len(t)
+        while True:
+            first, edge = binning._bin(
+                t, x, y, first, stop, edges, indices, edge, len(edges), drain, self._lists,
+                self._column_counts, self._seeds, self._state, self._whole, self._fractional,
+                self._work, self._work_int, self._scratch, self._counts, out,
+            )  # fmt: skip
+            if first == stop and (edge == len(edges) or not drain):
+                return int(edge)
+            self._collect()
+
+    def close(self) -> None:
+        """Close the open period if it holds events; it stays open for further ones."""
+        if self._state[binning.S_OPEN] == 2:
+            none = np.empty(0, dtype=np.int64)
+            nowhere = np.empty(0, dtype=np.uint16)
+            edge, index = self._state[[binning.S_EDGE]], self._state[[binning.S_INDEX]]
+            self.merge(none, nowhere, nowhere, edge, index, 0, True)
+
+    def take(self) -> Profiles:
+        """Points of the periods closed since the last call."""
+        self._collect()
+        done, self._done = self._done, []
+        return done[0] if len(done) == 1 else Profiles.concatenate(done)
+
+    def _collect(self) -> None:
+        """Turn the output buffer's rows into ranges and empty it."""
+        n = int(self._state[binning.S_POINTS])
+        self._state[binning.S_POINTS] = 0
+        if n == 0:
+            return
+        period, edge, t_us = self._whole_out[:, :n].copy()
+        row, sigma = self._row_out[:, :n].copy()
+        profiles = Profiles(
+            period,
+            edge,
+            t_us,
+            self._column_out[:n].copy(),
+            row,
+            sigma,
+            self._model.range_mm(row),
+            self._model.range_sigma_mm(row, sigma),
+            self._events_out[:n].copy(),
+        )
+        valid = np.isfinite(profiles.range_mm)
+        if not valid.all():
+            self.points_beyond_pole += int(n - valid.sum())
+            profiles = profiles.select(valid)
+        self.points += len(profiles)
+        self._done.append(profiles)
+
+
+def _parameters(settings: Settings, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    whole = np.zeros(binning.P_SIZE, dtype=np.int64)
+    whole[binning.P_METHOD] = check_method(settings.centroid)
+    whole[binning.P_EVENTS_MIN] = settings.events_min
+    whole[binning.P_HALF_MAX] = half_width_fixed(settings.line_width_px)
+    whole[binning.P_ROWS] = rows
+    whole[binning.P_SMOOTH] = settings.smoothing_half_width
+    whole[binning.P_WEAK] = settings.isolation_events
+    fractional = np.zeros(binning.F_SIZE)
+    fractional[binning.F_FACTOR] = method_factor(settings.centroid, settings.sigma_factor)
+    fractional[binning.F_FLOOR] = settings.sigma_floor_px
+    fractional[binning.F_GATE] = settings.smoothing_gate_px
+    fractional[binning.F_ISOLATION] = settings.isolation_gate_px
+    return whole, fractional

@@ -1,0 +1,286 @@
+"""From the camera's bytes to profiles."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from eschorty_ros.core import _centroid_kernels as kernels
+from eschorty_ros.core.calibration import Calibration
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.evt3 import Decoder, Events
+from eschorty_ros.core.held_events import HeldEvents
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.noise import ActivityFilter
+from eschorty_ros.core.phase import (
+    EDGES_MAX,
+    EdgeSchedule,
+    PhaseEstimate,
+    decide_window,
+    estimate_phase,
+)
+from eschorty_ros.core.profile_assembler import ProfileAssembler
+from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.settings import Settings
+
+PIECE_BYTES = 1 << 17
+_FLUSH_US = 1 << 61
+_HELD_EVENTS_MAX = 1 << 22
+
+
+class Reconstructor:
+    """Bytes in, profiles out; the same points however the bytes are split.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    modulation : Modulation
+        Periods are cut at the rising edges of the camera's trigger input when there are any, else
+        from ``on_edge_us``, else at a phase estimated from the first events (which are held back
+        meanwhile, not lost).
+    settings : Settings
+
+    Raises
+    ------
+    ArgumentError
+        When the profile is longer than the 4.19 s an event's time within it can count.
+    """
+
+    def __init__(
+        self, calibration: Calibration, modulation: Modulation, settings: Settings | None = None
+    ) -> None:
+        self.settings = settings = settings or Settings()
+        self.model = calibration.model()
+        self._decoder = Decoder(self.model.columns, self.model.rows)
+        self._filter = (
+            ActivityFilter(self.model.columns, self.model.rows)
+            if settings.noise_filter == "activity"
+            else None
+        )
+        self._assembler = ProfileAssembler(settings, self.model)
+        self._held = HeldEvents()
+        self._counts: dict[str, int] = dict.fromkeys(
+            ("events", "events_filtered", "events_outside_phase"), 0
+        )
+        self._schedule_counts: dict[str, int] = {}
+        self.first_t_us: int | None = None
+        self.newest_t_us: int | None = None
+        self._begin(modulation)
+
+    def _begin(self, modulation: Modulation) -> None:
+        """Start over with the phase; counters and the decoder go on."""
+        longest_us = modulation.period_us * (self.settings.periods_per_profile + 1)
+        if longest_us >= kernels.TIME_LIMIT_US:
+            raise ArgumentError(
+                f"periods_per_profile is {self.settings.periods_per_profile}; "
+                f"{modulation.frequency_hz:g} Hz allows "
+                f"{int(kernels.TIME_LIMIT_US / modulation.period_us) - 1}"
+            )
+        self._modulation = modulation
+        self._schedule = EdgeSchedule(modulation, self.settings.periods_per_profile)
+        self._assembler.restart()
+        self.phase: PhaseEstimate | None = None
+        self._phase_missing = False
+
+    @property
+    def modulation(self) -> Modulation:
+        """The modulation data are cut by now."""
+        return self._modulation
+
+    @property
+    def time_us(self) -> int | None:
+        """Sensor time up to which the stream has been read, events or not; ``None`` at first."""
+        return self._decoder.time_us
+
+    @property
+    def phase_missing(self) -> bool:
+        """Whether a flush found no phase and cut from the first event's time on."""
+        return self._phase_missing
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts since construction, by name.
+
+        ``events`` (decoded) = ``events_filtered`` + ``events_binned`` +
+        ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_phase`` +
+        ``events_held`` (not assigned yet).
+        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
+        ``decoder_*`` come from the decoder.
+        """
+        counts = dict(self._counts)
+        bins = self._assembler.counters
+        counts["events_outside_phase"] += bins.pop("events_before_first_edge")
+        counts.update(bins)
+        counts["points"] = self._assembler.points
+        counts["points_beyond_pole"] = self._assembler.points_beyond_pole
+        counts["events_held"] = len(self._held)
+        counts["events_dropped"] = (
+            counts["events_over_column_limit"]
+            + counts["events_outside_sensor"]
+            + counts["events_outside_phase"]
+        )
+        for name, value in self._schedule.counters.items():
+            counts[name] = value + self._schedule_counts.get(name, 0)
+        counts["periods_empty"] += (
+            self._schedule.periods_jumped + self._schedule_counts.get("periods_jumped", 0)
+        )
+        decoder = self._decoder.counters
+        counts["sensor_drop_words"] = decoder.sensor_drop_words
+        counts.update({f"decoder_{k}": int(v) for k, v in asdict(decoder).items()})
+        return counts
+
+    def push(self, data: bytes | bytearray | memoryview) -> Profiles:
+        """Take the next bytes of the stream and return the profiles they complete.
+
+        Parameters
+        ----------
+        data : bytes-like
+            EVT3, cut anywhere.
+        """
+        view = memoryview(data).cast("B")
+        for begin in range(0, len(view), PIECE_BYTES):
+            events = self._decoder.decode(view[begin : begin + PIECE_BYTES])
+            now_us = self._decoder.time_us
+            if now_us is not None:
+                self._absorb(events, now_us)
+        return self._assembler.take()
+
+    def flush(self) -> Profiles:
+        """Close the open period; call at the end of the stream.
+
+        Without any phase until here the periods are cut from the first event's time on and
+        ``phase_missing`` is set.
+        """
+        self._drain()
+        return self._assembler.take()
+
+    def note_gap(self) -> None:
+        """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""
+        self._decoder.note_gap()
+
+    def set_modulation(self, modulation: Modulation) -> None:
+        """Use ``modulation`` for data pushed afterwards; the open period is closed first."""
+        if modulation == self._modulation:
+            return
+        self._drain()
+        counts = self._schedule.counters
+        counts["periods_jumped"] = self._schedule.periods_jumped
+        self._begin(modulation)
+        for name, value in counts.items():
+            self._schedule_counts[name] = self._schedule_counts.get(name, 0) + value
+
+    def _absorb(self, events: Events, now_us: int) -> None:
+        self._counts["events"] += len(events)
+        triggers = events.triggers
+        if len(triggers):
+            self._schedule.add_triggers(triggers.t[triggers.edge == 1])
+        if len(events):
+            if self.first_t_us is None:
+                self.first_t_us = int(events.t[0])
+            self.newest_t_us = int(events.t[-1])
+        if self._filter is not None:
+            decoded = len(events)
+            events = self._filter.filter(events)
+            self._counts["events_filtered"] += decoded - len(events)
+        if not self._schedule.anchored:
+            self._held.append(events.t, events.x, events.y, events.p)
+            if not self._find_phase(now_us):
+                return
+            self._assign(None, now_us)
+        else:
+            self._assign(events, now_us)
+
+    def _find_phase(self, now_us: int, last: bool = False) -> bool:
+        """Anchor the schedule as soon as the held events allow; drops windows beyond the limit."""
+        held = self._held
+        if len(held) == 0:
+            return False
+        first_us = int(held.t[0])
+        if self._modulation.on_edge_us is not None:
+            self._schedule.anchor(self._modulation.on_edge_us, first_us)
+            return True
+        begin = held.refused
+        while True:
+            decided = decide_window(held.t[begin:], now_us, self._modulation)
+            size, end_us = decided or (0, _FLUSH_US)
+            trigger = self._schedule.first_trigger_us
+            if trigger is not None and trigger <= end_us:
+                self._schedule.anchor(trigger, min(first_us, trigger))
+                return True
+            if decided is None:
+                break
+            window = slice(begin, begin + size)
+            estimate = estimate_phase(held.t[window], held.p[window], self._modulation)
+            if estimate.found:
+                return self._anchor_estimate(estimate, first_us)
+            begin += size
+            held.refused = begin
+            if begin > _HELD_EVENTS_MAX:
+                self._counts["events_outside_phase"] += begin
+                held.drop(begin)
+                begin = 0
+                if len(held) == 0:
+                    return False
+                first_us = int(held.t[0])
+        if last:
+            estimate = estimate_phase(held.t, held.p, self._modulation)
+            if estimate.found:
+                return self._anchor_estimate(estimate, first_us)
+            self._phase_missing = True
+            self._schedule.anchor(first_us, first_us)
+        return last
+
+    def _anchor_estimate(self, estimate: PhaseEstimate, first_us: int) -> bool:
+        self.phase = estimate
+        self._schedule.anchor(estimate.edge_us, first_us)
+        return True
+
+    def _assign(self, events: Events | None, watermark_us: int) -> None:
+        """Put everything certain before ``watermark_us`` into periods; hold the rest back."""
+        held = self._held
+        first, count = 0, 0 if events is None else len(events)
+        more = True
+        while more:
+            if len(held):
+                self._schedule.jump(int(held.t[0]))
+            elif events is not None and first < count:
+                self._schedule.jump(int(events.t[first]))
+            edges, indices = self._schedule.advance(watermark_us)
+            more = len(edges) == EDGES_MAX
+            safe_us = self._schedule.safe_us
+            edge = 0
+            stop = int(np.searchsorted(held.t, safe_us))
+            waiting = stop < len(held)
+            last = 0
+            if events is not None and not waiting:
+                last = max(int(np.searchsorted(events.t, safe_us)), first)
+            if stop:
+                edge = self._assembler.merge(
+                    held.t[:stop], held.x[:stop], held.y[:stop], edges, indices, edge, last <= first
+                )
+                held.drop(stop)
+            if events is not None and last > first:
+                new = slice(first, last)
+                edge = self._assembler.merge(
+                    events.t[new], events.x[new], events.y[new], edges, indices, edge, True
+                )
+                first = last
+            if edge < len(edges):
+                none = slice(0, 0)
+                self._assembler.merge(
+                    held.t[none], held.x[none], held.y[none], edges, indices, edge, True
+                )
+        if events is not None and first < count:
+            held.append(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
+
+    def _drain(self) -> None:
+        if self._schedule.anchored or self._find_phase(_FLUSH_US, last=True):
+            self._finish()
+
+    def _finish(self) -> None:
+        """Assign what is held back and close the open period."""
+        newest = self.newest_t_us
+        if newest is not None:
+            self._assign(None, self._schedule.watermark_after(newest))
+        self._assembler.close()

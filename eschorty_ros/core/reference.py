@@ -1,0 +1,112 @@
+"""The paper's processing in plain numpy, for comparison.
+
+Per window: accumulate all events by column, take the mean row as the line and the standard
+deviation as the confidence, and turn rows into ranges with Eq. 2. No phase gate, no outlier
+rejection, no streaming: background anywhere in a column pulls its mean.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.profiles import Profiles
+
+
+def decode_all(
+    data: bytes, width: int = 1280, height: int = 720
+) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16]]:
+    """Decode a whole EVT3 stream into times (us), columns and rows."""
+    events = Decoder(width, height).decode(data)
+    return events.t.copy(), events.x.copy(), events.y.copy()
+
+
+def reconstruct(
+    t_us: ArrayLike,
+    column: ArrayLike,
+    row: ArrayLike,
+    model: RangeModel,
+    modulation: Modulation,
+    events_min: int = 4,
+) -> Profiles:
+    """Column means of every modulation period.
+
+    Parameters
+    ----------
+    t_us : array_like of int64, shape (n,)
+        Times, never falling.
+    column, row : array_like of integer, shape (n,)
+    model : RangeModel
+    modulation : Modulation
+        ``on_edge_us`` gives the periods' phase; the first event's time when it is ``None``.
+    events_min : int
+        Columns with fewer events give no point.
+
+    Returns
+    -------
+    Profiles
+        ``sigma_row`` is the plain standard deviation of the column, as in the paper.
+
+    Raises
+    ------
+    ArgumentError
+        When the three arrays differ in length.
+    """
+    times = np.asarray(t_us, dtype=np.int64)
+    x, y = np.asarray(column), np.asarray(row)
+    if not times.shape == x.shape == y.shape:
+        raise ArgumentError(
+            f"t_us, column and row have {times.size}, {x.size} and {y.size} entries; "
+            "give equal numbers"
+        )
+    if times.size == 0:
+        return Profiles.empty()
+    origin = int(times[0]) if modulation.on_edge_us is None else modulation.on_edge_us
+    anchored = Modulation(modulation.frequency_hz, modulation.duty, modulation.waveform, origin)
+    first = int((int(times[0]) - origin) // modulation.period_us)
+    last = int((int(times[-1]) - origin) // modulation.period_us) + 1
+    edges = np.array([anchored.edge_us(k) for k in range(first, last + 1)], dtype=np.int64)
+    cuts = np.searchsorted(times, edges)
+    windows = [
+        _window(times[a:b], x[a:b], y[a:b], model, first + k, int(edges[k]), events_min)
+        for k, (a, b) in enumerate(pairwise(cuts))
+        if b > a
+    ]
+    return Profiles.concatenate(windows)
+
+
+def _window(
+    t_us: NDArray[np.int64],
+    x: NDArray[np.integer],
+    y: NDArray[np.integer],
+    model: RangeModel,
+    period: int,
+    edge_us: int,
+    events_min: int,
+) -> Profiles:
+    columns = model.columns
+    count = np.bincount(x, minlength=columns)
+    lit = np.flatnonzero(count >= events_min)
+    n = count[lit]
+    mean = np.bincount(x, weights=y, minlength=columns)[lit] / n
+    offset = y - np.bincount(x, weights=y, minlength=columns)[x] / count[x]
+    variance = np.bincount(x, weights=offset * offset, minlength=columns)[lit] / n
+    mean_dt = np.bincount(x, weights=t_us - edge_us, minlength=columns)[lit] / n
+    sigma = np.sqrt(variance)
+    return Profiles(
+        np.full(lit.size, period, dtype=np.int64),
+        np.full(lit.size, edge_us, dtype=np.int64),
+        edge_us + np.rint(mean_dt).astype(np.int64),
+        lit.astype(np.uint16),
+        mean,
+        sigma,
+        model.range_mm(mean),
+        model.range_sigma_mm(mean, sigma),
+        n.astype(np.uint32),
+    )
