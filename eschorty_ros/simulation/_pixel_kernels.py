@@ -32,10 +32,9 @@ PIXEL_DTYPE = np.dtype(
 
 # An exponential this far gone is below half a unit in the last place of what it is added to.
 _SETTLED = 38.0
-_JITTER_UNIT = math.sqrt(3.0) / 65536.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mix(value):
     """One round of splitmix64: 64 well mixed bits from a counter."""
     value = np.uint64(value) + np.uint64(0x9E3779B97F4A7C15)
@@ -44,144 +43,243 @@ def _mix(value):
     return value ^ (value >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
-def _readout_key(t_us, column, row, polarity, slot_us):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _readout_key(t_us, column, row, polarity, slots):
     """Event as one sortable integer: time of the row's next readout slot, row, polarity, column.
 
-    Every row is read at a fixed phase of the slot, so that neighbours are read one after another.
+    ``slots`` holds per row the phase of its slots (rows take turns), and last the slot's length
+    and one over it.
     """
-    phase = (row * 7) % slot_us
-    slot = (np.int64(math.ceil(t_us)) - phase + slot_us - 1) // slot_us
-    return ((slot * slot_us + phase) << 22) | (row << 12) | (polarity << 11) | column
+    slot_us, per_us = slots[np.uintp(slots.size - 2)], slots[np.uintp(slots.size - 1)]
+    phase = slots[np.uintp(row)]
+    t = np.int64(np.ceil((t_us - phase) * per_us) * slot_us + phase)
+    return (t << 22) | (row << 12) | (polarity << 11) | column
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _latency_us(t_us, column, row, seed, timing):
     """Latency of one event: a Gaussian (sum of four uniforms) drawn from what the event is."""
-    place = np.uint64((column << 12) | row) ^ np.uint64(seed)
-    bits = _mix(_mix(place) ^ np.uint64(np.int64(t_us * 1024.0)))
-    total = 0.0
-    for _ in range(4):
-        total += np.float64(bits & np.uint64(0xFFFF))
-        bits >>= np.uint64(16)
-    return max(1.0, timing[0] + timing[1] * (total - 131070.0) * _JITTER_UNIT)
+    place = np.uint64((column << 12) | row) * np.uint64(0xD6E8FEB86659FD93)
+    bits = _mix((place ^ np.uint64(seed)) + np.uint64(np.int64(t_us * 1024.0)))
+    low = np.uint64(0x0000FFFF0000FFFF)
+    pairs = (bits & low) + ((bits >> np.uint64(16)) & low)
+    total = np.int64(pairs & np.uint64(0xFFFFFFFF)) + np.int64(pairs >> np.uint64(32))
+    return max(1.0, timing[0] + timing[1] * (np.float64(total) - 131070.0))
 
 
-@njit(cache=True, nogil=True)
-def _arm(pixel):
-    """Predict the next threshold crossing from the anchor."""
-    on_level = pixel.u_ref * pixel.on_factor
-    off_level = pixel.u_ref * pixel.off_factor
-    if pixel.u_settled < on_level:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crossing_us(u, on_level, off_level, settled, t_us, tau_us):
+    """When ``u``, at ``t_us`` and heading for ``settled``, leaves the comparator's band."""
+    if settled < on_level:
         level = on_level
-        passed = pixel.u <= level
-    elif pixel.u_settled > off_level:
+        if u <= level:
+            return t_us
+    elif settled > off_level:
         level = off_level
-        passed = pixel.u >= level
+        if u >= level:
+            return t_us
     else:
-        pixel.t_next = np.inf
-        return
-    if passed:
-        pixel.t_next = pixel.t
-    else:
-        share = (level - pixel.u) / (pixel.u - pixel.u_settled)
-        pixel.t_next = pixel.t - math.log1p(share) / pixel.rate
+        return np.inf
+    ratio = (level - settled) / (u - settled)
+    # log1p where the ratio's own rounding would show, the faster log elsewhere (2e-14 at worst).
+    if ratio > 0.99:
+        return t_us - tau_us * math.log1p((level - u) / (u - settled))
+    return t_us - tau_us * math.log(ratio)
 
 
-@njit(cache=True, nogil=True)
-def _advance(pixel, t_us):
-    """Move the anchor to ``t_us`` under constant light."""
-    x = pixel.rate * (t_us - pixel.t)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _response(u, settled, x):
+    """Photoreceptor after ``x`` time constants of constant light."""
     if x > _SETTLED:
-        pixel.u = pixel.u_settled
-    else:
-        pixel.u -= (pixel.u_settled - pixel.u) * math.expm1(-x)
-    pixel.t = t_us
+        return settled
+    if x > 0.01:
+        return settled + (u - settled) * math.exp(-x)
+    return u + (u - settled) * math.expm1(-x)
 
 
-@njit(cache=True, nogil=True)
-def _run(pixel, until_us, column, row, seed, timing, out, n):
-    """Everything the pixel does by itself up to ``until_us``; returns the grown output."""
-    while pixel.t_next <= until_us:
-        now = pixel.t_next
-        if pixel.refractory:
-            _advance(pixel, now)
-            pixel.u_ref = pixel.u
-            pixel.refractory = 0
-            _arm(pixel)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _live(
+    pixels,
+    column,
+    lo,
+    hi,
+    until_us,
+    base,
+    value,
+    ratio,
+    step_ratio,
+    omega,
+    seed,
+    timing,
+    slots,
+    out,
+    n,
+):
+    """Let rows [lo, hi) do what is due up to ``until_us``, then change their light.
+
+    The new light is ``base`` plus a Gaussian by recurrence: ``value`` at ``lo``, times ``ratio``,
+    which shrinks by ``step_ratio``, from row to row. ``base`` 0 leaves the light as it is.
+    Returns the number of events in ``out`` and the earliest time something is due in these rows.
+    """
+    earliest = np.inf
+    inverse_omega = 1.0 / omega
+    refractory_us = timing[2]
+    for row in range(lo, hi):
+        pixel = pixels[np.uintp(column), np.uintp(row)]
+        t_next = pixel.t_next
+        light = base + value
+        value *= ratio
+        ratio *= step_ratio
+        if t_next > until_us and base == 0.0:
+            earliest = min(earliest, t_next)
             continue
-        rising = pixel.u_settled < pixel.u
-        if n >= out.size:
-            grown = np.empty(2 * out.size, np.int64)
-            grown[: out.size] = out
-            out = grown
-        late = _latency_us(now, column, row, seed, timing)
-        out[n] = _readout_key(now + late, column, row, np.int64(rising), np.int64(timing[3]))
-        n += 1
-        if now > pixel.t:
-            pixel.u = pixel.u_ref * (pixel.on_factor if rising else pixel.off_factor)
-            pixel.t = now
-        pixel.refractory = 1
-        pixel.t_next = now + timing[2]
-    return out, n
+        # Locals: the compiler cannot know that ``out`` and the pixel do not overlap.
+        u, t, settled, rate, u_ref = pixel.u, pixel.t, pixel.u_settled, pixel.rate, pixel.u_ref
+        on_factor, off_factor = np.float64(pixel.on_factor), np.float64(pixel.off_factor)
+        refractory = pixel.refractory
+        tau_us = settled * inverse_omega
+        while t_next <= until_us:
+            if refractory:
+                u = _response(u, settled, (t_next - t) * rate)
+                t = t_next
+                u_ref = u
+                refractory = 0
+                t_next = _crossing_us(u, u_ref * on_factor, u_ref * off_factor, settled, t, tau_us)
+                continue
+            rising = settled < u
+            late_us = _latency_us(t_next, column, row, seed, timing)
+            out[np.uintp(n)] = _readout_key(t_next + late_us, column, row, np.int64(rising), slots)
+            n += 1
+            if t_next > t:
+                u = u_ref * (on_factor if rising else off_factor)
+                t = t_next
+            refractory = 1
+            t_next = t + refractory_us
+        if base > 0.0:
+            u = _response(u, settled, (until_us - t) * rate)
+            t = until_us
+            settled = 1.0 / light
+            pixel.u_settled = settled
+            pixel.rate = light * omega
+            if not refractory:
+                tau_us = settled * inverse_omega
+                t_next = _crossing_us(u, u_ref * on_factor, u_ref * off_factor, settled, t, tau_us)
+        pixel.u = u
+        pixel.t = t
+        pixel.u_ref = u_ref
+        pixel.refractory = refractory
+        pixel.t_next = t_next
+        earliest = min(earliest, t_next)
+    return n, earliest
 
 
-@njit(cache=True, nogil=True)
-def _light(pixel, intensity, omega, t_us, column, row, seed, timing, out, n):
-    """Change a pixel's light at ``t_us``."""
-    out, n = _run(pixel, t_us, column, row, seed, timing, out, n)
-    _advance(pixel, t_us)
-    pixel.u_settled = 1.0 / intensity
-    pixel.rate = omega * intensity
-    if not pixel.refractory:
-        _arm(pixel)
-    return out, n
+@njit(cache=True, nogil=True, error_model="numpy")
+def _window(line_row, contrast, sigma, least, rows):
+    """Rows [lo, hi) in which a line adds at least ``least``."""
+    if not (contrast > least and abs(line_row) < 1e6):
+        return 0, 0
+    half = sigma * math.sqrt(2.0 * math.log(contrast / least))
+    lo = min(max(0, math.ceil(line_row - half)), rows)
+    return lo, max(lo, min(rows, math.floor(line_row + half) + 1))
 
 
-@njit(cache=True, nogil=True)
-def _relight(pixels, spans, due, columns, line_row, contrast, optics, t_us, seed, timing, out, n):
-    """Put the line at ``line_row`` in some columns from ``t_us`` on.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _relight(
+    pixels,
+    spans,
+    due,
+    columns,
+    begin,
+    line_row,
+    contrast,
+    optics,
+    t_us,
+    seed,
+    timing,
+    slots,
+    out,
+    n,
+):
+    """Put the line at ``line_row`` in ``columns[begin:]`` from ``t_us`` on.
 
     ``spans`` holds per column the lit rows [0, 1) and the rows with something pending [2, 3);
     ``due`` the earliest pending time. ``optics`` = sigma (rows), least contrast drawn, background
-    intensity, omega0 (per us). ``contrast`` 0 leaves the column dark.
+    intensity, omega0 (per us), most events of a pixel between two changes of its light.
+    ``contrast`` 0 leaves the column dark. Stops where the output might not suffice; returns the
+    next column to do and the number of events.
     """
-    sigma, least, background, omega = optics[0], optics[1], optics[2], optics[3]
+    sigma, background, omega = optics[0], optics[2], optics[3]
     rows = pixels.shape[1]
     step_ratio = math.exp(-1.0 / (sigma * sigma))
-    for k in range(columns.size):
+    for k in range(begin, columns.size):
         column = columns[k]
-        lo = 0
-        hi = 0
-        if contrast[k] > least and line_row[k] > -1e6 and line_row[k] < 1e6:
-            half = sigma * math.sqrt(2.0 * math.log(contrast[k] / least))
-            lo = min(max(0, math.ceil(line_row[k] - half)), rows)
-            hi = max(lo, min(rows, math.floor(line_row[k] + half) + 1))
+        lo, hi = _window(line_row[k], contrast[k], sigma, optics[1], rows)
         old_lo, old_hi = spans[column, 0], spans[column, 1]
-        first = rows
-        last = 0
-        earliest = due[column]
-        for row in range(old_lo, old_hi):
-            if row < lo or row >= hi:
-                pixel = pixels[column, row]
-                out, n = _light(pixel, background, omega, t_us, column, row, seed, timing, out, n)
-                earliest = min(earliest, pixel.t_next)
-                first = min(first, row)
-                last = max(last, row + 1)
-        if hi > lo:
-            offset = lo - line_row[k]
-            value = contrast[k] * math.exp(-0.5 * offset * offset / (sigma * sigma))
-            ratio = math.exp(-(offset + 0.5) / (sigma * sigma))
-            for row in range(lo, hi):
-                pixel = pixels[column, row]
-                out, n = _light(
-                    pixel, background + value, omega, t_us, column, row, seed, timing, out, n
-                )
-                earliest = min(earliest, pixel.t_next)
-                value *= ratio
-                ratio *= step_ratio
-            first = min(first, lo)
-            last = max(last, hi)
+        if out.size - n < (hi - lo + old_hi - old_lo) * optics[4]:
+            return k, n
+        # Rows the line leaves: below and above the new window.
+        leave_to, leave_from = min(old_hi, lo), max(old_lo, hi)
+        if hi == lo:
+            leave_to, leave_from = old_hi, old_hi
+        n, a = _live(
+            pixels,
+            column,
+            old_lo,
+            leave_to,
+            t_us,
+            background,
+            0.0,
+            0.0,
+            0.0,
+            omega,
+            seed,
+            timing,
+            slots,
+            out,
+            n,
+        )
+        n, b = _live(
+            pixels,
+            column,
+            leave_from,
+            old_hi,
+            t_us,
+            background,
+            0.0,
+            0.0,
+            0.0,
+            omega,
+            seed,
+            timing,
+            slots,
+            out,
+            n,
+        )
+        offset = lo - line_row[k]
+        value = contrast[k] * math.exp(-0.5 * offset * offset / (sigma * sigma))
+        ratio = math.exp(-(offset + 0.5) / (sigma * sigma))
+        n, c = _live(
+            pixels,
+            column,
+            lo,
+            hi,
+            t_us,
+            background,
+            value,
+            ratio,
+            step_ratio,
+            omega,
+            seed,
+            timing,
+            slots,
+            out,
+            n,
+        )
+        first, last = lo, hi
+        if old_hi > old_lo:
+            first = min(first, old_lo) if hi > lo else old_lo
+            last = max(last, old_hi)
+        earliest = min(min(due[column], a), min(b, c))
         if due[column] == np.inf:
             spans[column, 2], spans[column, 3] = first, last
         else:
@@ -189,41 +287,58 @@ def _relight(pixels, spans, due, columns, line_row, contrast, optics, t_us, seed
             spans[column, 3] = max(spans[column, 3], last)
         due[column] = earliest
         spans[column, 0], spans[column, 1] = lo, hi
-    return out, n
+    return columns.size, n
 
 
-@njit(cache=True, nogil=True)
-def _run_columns(pixels, spans, due, until_us, seed, timing, out, n):
-    """Everything that is due up to ``until_us`` in all columns."""
-    for column in range(pixels.shape[0]):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run_columns(pixels, spans, due, begin, until_us, optics, seed, timing, slots, out, n):
+    """Everything that is due up to ``until_us`` in the columns from ``begin`` on.
+
+    Stops where the output might not suffice; returns the next column and the number of events.
+    """
+    omega = optics[3]
+    for column in range(begin, pixels.shape[0]):
         if due[column] > until_us:
             continue
-        earliest = np.inf
-        for row in range(spans[column, 2], spans[column, 3]):
-            pixel = pixels[column, row]
-            if pixel.t_next <= until_us:
-                out, n = _run(pixel, until_us, column, row, seed, timing, out, n)
-            earliest = min(earliest, pixel.t_next)
-        due[column] = earliest
-    return out, n
+        if out.size - n < (spans[column, 3] - spans[column, 2]) * optics[4]:
+            return column, n
+        n, due[column] = _live(
+            pixels,
+            column,
+            spans[column, 2],
+            spans[column, 3],
+            until_us,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            omega,
+            seed,
+            timing,
+            slots,
+            out,
+            n,
+        )
+    return pixels.shape[0], n
 
 
-@njit(cache=True, nogil=True)
-def _background(process, rate_per_us, until_us, columns, rows, seed, slot_us, out, n):
-    """Poisson events over the whole sensor; ``process`` = time of the next one, count so far."""
-    while process[0] <= until_us:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _background(process, rate_per_us, until_us, columns, rows, seed, slots, out, n):
+    """Poisson events over the whole sensor; ``process`` = time of the next one, count so far.
+
+    Stops at a full output; returns the number of events.
+    """
+    while process[0] <= until_us and n < out.size:
         count = np.uint64(process[1])
         bits = _mix(np.uint64(seed) ^ (np.uint64(2) * count))
         place = np.int64((bits >> np.uint64(1)) % np.uint64(columns * rows))
-        if n >= out.size:
-            grown = np.empty(2 * out.size, np.int64)
-            grown[: out.size] = out
-            out = grown
         polarity = np.int64(bits & np.uint64(1))
-        out[n] = _readout_key(process[0], place % columns, place // columns, polarity, slot_us)
+        out[np.uintp(n)] = _readout_key(
+            process[0], place % columns, place // columns, polarity, slots
+        )
         n += 1
         draw = _mix(np.uint64(seed) ^ (np.uint64(2) * count + np.uint64(1)))
         uniform = (np.float64(draw >> np.uint64(11)) + 0.5) * 2.0**-53
         process[0] -= math.log(uniform) / rate_per_us
         process[1] += 1.0
-    return out, n
+    return n

@@ -96,6 +96,12 @@ class PixelParameters:
         lowest = min(self.threshold_on, self.threshold_off) * (1.0 - 6.0 * self.threshold_mismatch)
         return 0.5 * self.background_intensity * math.expm1(max(lowest, self.threshold_min))
 
+    @property
+    def events_per_change(self) -> int:
+        """Most events a pixel makes under constant light: each takes a threshold of log swing."""
+        swing = math.log1p(self.amplitude / self.background_intensity)
+        return int(swing / self.threshold_min) + 2
+
 
 class PixelArray:
     """All pixels of a sensor and the events they have made.
@@ -136,11 +142,19 @@ class PixelArray:
         self._due = np.full(columns, np.inf)
         p = parameters
         self._optics = np.array(
-            [p.sigma_rows, p.least_contrast, p.background_intensity, p.omega_per_us]
+            [
+                p.sigma_rows,
+                p.least_contrast,
+                p.background_intensity,
+                p.omega_per_us,
+                p.events_per_change,
+            ]
         )
-        self._timing = np.array(
-            [p.latency_us, p.latency_jitter_us, p.refractory_us, float(p.row_slot_us)]
-        )
+        # The kernel draws jitter as the sum of four 16-bit numbers.
+        jitter_us = p.latency_jitter_us * math.sqrt(3.0) / 65536.0
+        self._timing = np.array([p.latency_us, jitter_us, p.refractory_us])
+        phases = np.arange(rows) * 7 % p.row_slot_us
+        self._slots = np.concatenate((phases, [p.row_slot_us, 1.0 / p.row_slot_us]))
         self._background_per_us = background_hz * columns * rows * 1e-6
         first = np.random.default_rng(self._seeds).exponential()
         silent = self._background_per_us == 0.0
@@ -160,44 +174,66 @@ class PixelArray:
         Three vectors of one length. A row that is NaN or a reflectance of 0 leaves the column
         dark. Times must not fall from call to call.
         """
-        self._keys, self._count = _relight(
-            self._pixels,
-            self._spans,
-            self._due,
-            columns,
-            line_row,
-            reflectance * self.parameters.amplitude,
-            self._optics,
-            float(t_us),
-            self._seeds[0],
-            self._timing,
-            self._keys,
-            self._count,
-        )
+        if reflectance.size and not reflectance.max() <= 1.0:
+            raise ArgumentError(f"reflectance reaches {reflectance.max()}; choose 0 to 1")
+        contrast = reflectance * self.parameters.amplitude
+        begin = 0
+        while True:
+            begin, self._count = _relight(
+                self._pixels,
+                self._spans,
+                self._due,
+                columns,
+                begin,
+                line_row,
+                contrast,
+                self._optics,
+                float(t_us),
+                self._seeds[0],
+                self._timing,
+                self._slots,
+                self._keys,
+                self._count,
+            )
+            if begin == columns.size:
+                return
+            self._grow()
 
     def run_until(self, t_us: int) -> None:
         """Let the pixels and the background activity do what is due up to ``t_us``."""
-        self._keys, self._count = _run_columns(
-            self._pixels,
-            self._spans,
-            self._due,
-            float(t_us),
-            self._seeds[0],
-            self._timing,
-            self._keys,
-            self._count,
-        )
-        self._keys, self._count = _background(
-            self._process,
-            self._background_per_us,
-            float(t_us),
-            self.columns,
-            self.rows,
-            self._seeds[1],
-            self.parameters.row_slot_us,
-            self._keys,
-            self._count,
-        )
+        begin = 0
+        while True:
+            begin, self._count = _run_columns(
+                self._pixels,
+                self._spans,
+                self._due,
+                begin,
+                float(t_us),
+                self._optics,
+                self._seeds[0],
+                self._timing,
+                self._slots,
+                self._keys,
+                self._count,
+            )
+            if begin == self.columns:
+                break
+            self._grow()
+        while True:
+            self._count = _background(
+                self._process,
+                self._background_per_us,
+                float(t_us),
+                self.columns,
+                self.rows,
+                self._seeds[1],
+                self._slots,
+                self._keys,
+                self._count,
+            )
+            if self._process[0] > t_us:
+                return
+            self._grow()
 
     def take(self, before_us: int) -> NDArray[np.int64]:
         """Keys of the events read out before ``before_us``, sorted, each pixel once per time.
@@ -218,6 +254,9 @@ class PixelArray:
             np.not_equal(taken[1:], taken[:-1], out=fresh[1:])
             taken = taken[fresh]
         return taken
+
+    def _grow(self) -> None:
+        self._keys = np.concatenate((self._keys, np.empty_like(self._keys)))
 
     def _settled(self, rng: np.random.Generator) -> NDArray[np.void]:
         """Pixels at rest in the background light, with their thresholds drawn."""
