@@ -66,8 +66,8 @@ class MotionPlan:
         times = np.asarray(t_ns, dtype=np.int64)
         ended = times >= self.end_ns
         elapsed_s = np.where(ended, np.inf, np.maximum((times - self.start_ns) * 1e-9, 0.0))
-        position = np.full(elapsed_s.shape, self.position_mm)
-        velocity = np.full(elapsed_s.shape, self.velocity_mm_s)
+        position = np.full(elapsed_s.shape, self.position_mm, dtype=np.float64)
+        velocity = np.full(elapsed_s.shape, self.velocity_mm_s, dtype=np.float64)
         began_s = 0.0
         for duration_s, acceleration in zip(
             self.durations_s, self.accelerations_mm_s2, strict=True
