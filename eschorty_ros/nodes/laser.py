@@ -253,7 +253,12 @@ class LaserNode(DeviceNode):
     def _report(self) -> diagnostics.Report:
         with self._lock:
             laser = self._laser
-            output = laser.readback().output if laser is not None else LaserOutput.OFF
+            output = LaserOutput.OFF
+            if laser is not None:
+                try:
+                    output = laser.readback().output
+                except EschortyError:
+                    output = LaserOutput.UNKNOWN
             values = {
                 "device": laser.identity.model if laser is not None else "",
                 "state": self.state_label,

@@ -206,7 +206,11 @@ class StageNode(DeviceNode):
         stage = self._stage
         if stage is None:
             return
-        state = stage.state()
+        try:
+            state = stage.state()
+        except EschortyError as error:
+            self.fault(f"stage lost: {error}")
+            return
         message = Odometry(child_frame_id=self.parameters["stage_frame"])
         message.header.frame_id = self.parameters["base_frame"]
         message.header.stamp = stamp_from_ns(state.t_ns)
@@ -235,7 +239,7 @@ class StageNode(DeviceNode):
 
     def _report(self) -> diagnostics.Report:
         stage = self._stage
-        if stage is None:
+        if stage is None or self.failure:
             level = diagnostics.ERROR if self.failure else diagnostics.OK
             return level, self.failure or self.state_label, {"state": self.state_label}
         state = stage.state()
@@ -249,8 +253,6 @@ class StageNode(DeviceNode):
             "flags": " ".join(state.flags),
             "moves": self.moves,
         }
-        if self.failure:
-            return diagnostics.ERROR, self.failure, values
         if self.active and not state.homed:
             return diagnostics.WARN, "not homed", values
         return diagnostics.OK, "moving" if state.moving else "at rest", values

@@ -1,5 +1,6 @@
 """The camera node beside laser and stage, each its own process: it sees both exactly."""
 
+
 from __future__ import annotations
 
 import time
@@ -12,6 +13,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
+from eschorty_ros.action import MoveStage
+from eschorty_ros.msg import LaserState, StageMotion
 from event_camera_msgs.msg import EventPacket
 from rclpy.action import ActionClient
 from rclpy.qos import ReliabilityPolicy
@@ -20,11 +23,9 @@ from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from eschorty_ros.action import MoveStage
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.hardware.protocols import LaserOutput
-from eschorty_ros.msg import LaserState, StageMotion
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import ns_from_stamp
 from eschorty_ros.nodes.device_messages import plan_from_motion, readback_from_state

@@ -1,5 +1,6 @@
 """The stage node as a process: odometry, planned motion, moves and their refusals."""
 
+
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -11,12 +12,12 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
 from action_msgs.msg import GoalStatus
+from eschorty_ros.action import MoveStage
+from eschorty_ros.msg import StageMotion
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 from ros_process import NodeProcess, Observer, free_domain, wait_until
 
-from eschorty_ros.action import MoveStage
-from eschorty_ros.msg import StageMotion
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import ns_from_stamp
 from eschorty_ros.nodes.device_messages import plan_from_motion
