@@ -141,8 +141,12 @@ class ScannerNode(Node):
             self._last += f": {outcome.message}"
         if not self.context.ok():
             return result
-        log = self.get_logger().error if outcome.end is End.ABORTED else self.get_logger().info
-        log(f"{self._last}; {result.points} points")
+        line = f"{self._last}; {result.points} points"
+        # Two calls: rclpy's logger refuses a call site that changes its severity.
+        if outcome.end is End.ABORTED:
+            self.get_logger().error(line)
+        else:
+            self.get_logger().info(line)
         _close(goal, outcome.end)
         return result
 

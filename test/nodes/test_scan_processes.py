@@ -1,5 +1,6 @@
 """Scans over real DDS, each node a process of its own."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -42,5 +43,5 @@ def test_bad_parameters_are_refused(instrument):
 
 def test_killed_camera_ends_the_scan(instrument):
     bench, running = instrument
-    scenarios.camera_killed(bench, running["camera"].kill)
+    scenarios.camera_killed(bench, lambda: running["camera"].send(signal.SIGKILL))
     assert all(process.running() for name, process in running.items() if name != "camera")
