@@ -106,33 +106,33 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
     truth = scenes.named(request.scene)
     model, direction = calibration.model(), calibration.stage_direction
     error_mm = accuracy.range_error_mm(outcome.points, truth, model, direction)
-    positions = accuracy.sweep_positions_mm(
+    sweep = accuracy.Sweep(
         request.start_mm, request.stop_mm, request.speed_mm_s, request.frequency_hz
     )
-    measured = accuracy.measure(outcome.points, truth, model, positions, direction, error_mm)
+    measured = accuracy.measure(outcome.points, truth, model, sweep, direction, error_mm)
     title = (
         f"{request.scene}: {request.frequency_hz:g} Hz, {request.speed_mm_s:g} mm/s, "
         f"{request.calibration}; median |error| {measured.error_median_mm:.2f} mm"
     )
     figures.save(figures.scan_figure(outcome.points, error_mm, title, direction), out / "scan.png")
-    _print(request, outcome, measured, out)
+    _print(outcome, measured, sweep.seconds, out)
 
 
-def _print(request: OneScan, outcome: Outcome, measured: Accuracy, out: Path) -> None:
+def _print(outcome: Outcome, measured: Accuracy, seconds: float, out: Path) -> None:
     lost = outcome.packets_lost
     pairs(
         f"{out / 'scan.pcd'}, {out / 'scan.png'}",
         {
-            "profiles": f"{outcome.profiles:,} of {measured.profiles:,}",
-            "points": f"{measured.points:,} of {measured.expected_points:,}",
-            "complete": f"{measured.completeness:.2%}",
+            "profiles": f"{outcome.profiles:,}",
+            "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
+            "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole periods",
             "median |range error|": f"{measured.error_median_mm:.3f} mm",
             "95th percentile": f"{measured.error_p95_mm:.3f} mm",
             "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, "
             f"{measured.within_2_sigma:.1%}",
             "events": f"{outcome.events:,} ({outcome.events_dropped:,} dropped, "
             f"{lost:,} packets lost)",
-            "seconds of sweep": f"{request.sweep_s:.2f}",
+            "seconds of sweep": f"{seconds:.2f}",
         },
     )
 

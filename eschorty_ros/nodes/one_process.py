@@ -180,12 +180,18 @@ def instrument(scan: OneScan) -> Iterator[Instrument]:
         file = Path(folder) / "parameters.yaml"
         file.write_text(_parameter_file(parameters(scan)))
         rclpy.init(
-            args=["--ros-args", "-r", f"__ns:={NAMESPACE}", "--params-file", str(file)],
+            args=[
+                "--ros-args",
+                *("-r", f"__ns:={NAMESPACE}"),
+                *("--params-file", str(file)),
+                *("--log-level", "warn"),
+            ],
             domain_id=None if os.environ.get("ROS_DOMAIN_ID") else free_domain(),
             signal_handler_options=SignalHandlerOptions.NO,
         )
         executor = MultiThreadedExecutor(THREADS)
-        thread = threading.Thread(target=_spin, args=(executor,), name="nodes")
+        ending = threading.Event()
+        thread = threading.Thread(target=_spin, args=(executor, ending), name="nodes")
         try:
             for factory in NODES.values():
                 nodes.append(factory())
@@ -198,9 +204,10 @@ def instrument(scan: OneScan) -> Iterator[Instrument]:
         finally:
             with undisturbed():
                 make_safe(nodes)
-                executor.shutdown(timeout_sec=2.0)
+                ending.set()
                 if thread.is_alive():
                     thread.join(5.0)
+                executor.shutdown(timeout_sec=2.0)
                 for node in nodes:
                     node.destroy_node()
                 rclpy.try_shutdown()
@@ -226,9 +233,10 @@ def _parameter_file(values: dict[str, dict[str, Any]]) -> str:
     )
 
 
-def _spin(executor: MultiThreadedExecutor) -> None:
-    with contextlib.suppress(rclpy.executors.ExternalShutdownException):
-        executor.spin()
+def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
+    # Shutting an executor down while it spins raises in this thread, so it is asked to end.
+    while not ending.is_set():
+        executor.spin_once(timeout_sec=0.1)
 
 
 def _wait(condition: Callable[[], Any], limit_s: float, fault: str) -> None:

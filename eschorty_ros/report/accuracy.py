@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.report.profiles import profile_index
 
 
 class KnownScene(Protocol):
@@ -22,15 +24,50 @@ class KnownScene(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Sweep:
+    """A sweep of the stage at constant speed under a modulated laser.
+
+    Raises
+    ------
+    ArgumentError
+        When speed or frequency is not positive.
+    """
+
+    start_mm: float
+    stop_mm: float
+    speed_mm_s: float
+    frequency_hz: float
+
+    def __post_init__(self) -> None:
+        for name in ("speed_mm_s", "frequency_hz"):
+            if not getattr(self, name) > 0.0:
+                raise ArgumentError(f"{name} is {getattr(self, name)!r}; choose a positive value")
+
+    @property
+    def pitch_mm(self) -> float:
+        """Stage travel per period, negative when the sweep runs backwards."""
+        return math.copysign(self.speed_mm_s / self.frequency_hz, self.stop_mm - self.start_mm)
+
+    @property
+    def seconds(self) -> float:
+        """Time from start to stop."""
+        return abs(self.stop_mm - self.start_mm) / self.speed_mm_s
+
+
+@dataclass(frozen=True, slots=True)
 class Accuracy:
     """A cloud against its scene.
 
     Attributes
     ----------
-    profiles, points, expected_points : int
-        Modulation periods within the sweep, points found and lit columns times those periods.
+    periods : int
+        Modulation periods wholly within the sweep.
+    points : int
+        All points of the cloud.
+    expected_points, found_points : int
+        Lit columns summed over those periods, and points there.
     completeness : float
-        ``points / expected_points``.
+        ``found_points / expected_points``.
     error_median_mm, error_p95_mm : float
         Median and 95th percentile of the absolute range error.
     bias_mm : float
@@ -41,9 +78,10 @@ class Accuracy:
         Points where the scene holds nothing; they enter no error statistic.
     """
 
-    profiles: int
+    periods: int
     points: int
     expected_points: int
+    found_points: int
     completeness: float
     error_median_mm: float
     error_p95_mm: float
@@ -112,17 +150,6 @@ def true_range_mm(
     return truth
 
 
-def sweep_positions_mm(
-    start_mm: float, stop_mm: float, speed_mm_s: float, frequency_hz: float
-) -> NDArray[np.float64]:
-    """Stage position at the middle of each modulation period of a sweep at constant speed."""
-    if not speed_mm_s > 0.0:
-        raise ArgumentError(f"speed_mm_s is {speed_mm_s!r}; choose a positive speed")
-    periods = round(abs(stop_mm - start_mm) / speed_mm_s * frequency_hz)
-    step = (stop_mm - start_mm) / max(periods, 1)
-    return np.asarray(start_mm + step * (np.arange(periods) + 0.5))
-
-
 def lit_columns(
     scene: KnownScene, model: RangeModel, positions_mm: NDArray[np.float64]
 ) -> NDArray[np.int64]:
@@ -148,11 +175,49 @@ def range_error_mm(
     return np.asarray(range_mm - true_range_mm(scene, model, stage_mm, points["column"]))
 
 
+def whole_periods(
+    points: NDArray[np.void],
+    sweep: Sweep,
+    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Find the modulation periods that lie within the sweep from one end to the other.
+
+    The points place one period on the stage; the others follow one pitch apart, whether they
+    have points or not. Without any point the periods are taken to begin with the sweep.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    sweep : Sweep
+    stage_direction : tuple of float
+
+    Returns
+    -------
+    positions_mm : ndarray of float64
+        Stage position at the middle of the events of each period.
+    member : ndarray of bool, shape (n,)
+        Whether a point belongs to one of them.
+    """
+    pitch = sweep.pitch_mm
+    low, high = sorted((sweep.start_mm, sweep.stop_mm))
+    if len(points) == 0:
+        count = int((high - low) / abs(pitch))
+        return sweep.start_mm + pitch * (np.arange(count) + 0.5), np.zeros(0, dtype=np.bool_)
+    stage_mm, _ = stage_and_range_mm(points, stage_direction)
+    index = profile_index(points, 1.0 / sweep.frequency_hz)
+    offset = float(np.median(stage_mm - pitch * index))
+    half = 0.5 * abs(pitch)
+    ends = sorted(((low + half - offset) / pitch, (high - half - offset) / pitch))
+    first, last = int(np.ceil(ends[0])), int(np.floor(ends[1]))
+    positions = offset + pitch * np.arange(first, last + 1)
+    return positions, (index >= first) & (index <= last)
+
+
 def measure(
     points: NDArray[np.void],
     scene: KnownScene,
     model: RangeModel,
-    positions_mm: NDArray[np.float64],
+    sweep: Sweep,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
     error_mm: NDArray[np.float64] | None = None,
 ) -> Accuracy:
@@ -163,8 +228,7 @@ def measure(
     points : ndarray of POINT_DTYPE, shape (n,)
     scene : KnownScene
     model : RangeModel
-    positions_mm : ndarray of float64
-        Stage position of every modulation period of the sweep; see `sweep_positions_mm`.
+    sweep : Sweep
     stage_direction : tuple of float
     error_mm : ndarray of float64, shape (n,), optional
         Result of `range_error_mm` when it is already known.
@@ -175,18 +239,21 @@ def measure(
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
-    expected = int(lit_columns(scene, model, positions_mm).sum())
+    positions, member = whole_periods(points, sweep, stage_direction)
+    expected = int(lit_columns(scene, model, positions).sum())
     known = np.isfinite(error_mm)
+    found = int(np.count_nonzero(known & member))
     error = error_mm[known]
     size = np.abs(error)
     ratio = size / (points["sigma"][known].astype(np.float64) * 1e3)
-    empty = error.size == 0
     nan = float("nan")
+    empty = error.size == 0
     return Accuracy(
-        profiles=len(positions_mm),
+        periods=len(positions),
         points=len(points),
         expected_points=expected,
-        completeness=error.size / expected if expected else nan,
+        found_points=found,
+        completeness=found / expected if expected else nan,
         error_median_mm=nan if empty else float(np.median(size)),
         error_p95_mm=nan if empty else float(np.percentile(size, 95.0)),
         bias_mm=nan if empty else float(np.median(error)),

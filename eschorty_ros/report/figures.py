@@ -114,8 +114,7 @@ def scan_figure(
     axes.set_title("Depth map")
     _view_3d(figure.add_subplot(rows, 2, 2, projection="3d"), points, range_mm, limits)
     if error_mm is not None:
-        size_mm = np.abs(error_mm[np.isfinite(error_mm)])
-        bound = max(float(np.percentile(size_mm, 99.0)), 1e-3) if size_mm.size else 1.0
+        bound = _error_bound(error_mm)
         axes = figure.add_subplot(rows, 2, 3)
         _map(
             axes,
@@ -194,6 +193,12 @@ def _central(values: NDArray[np.float64]) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
+def _error_bound(error_mm: NDArray[np.float64]) -> float:
+    """Symmetric limit that shows the noise; depth edges saturate it."""
+    size_mm = np.abs(error_mm[np.isfinite(error_mm)])
+    return max(3.0 * float(np.percentile(size_mm, 68.0)), 1e-3) if size_mm.size else 1.0
+
+
 def _map(
     axes: Axes,
     grid: Grid,
@@ -219,7 +224,7 @@ def _map(
     )
     axes.set_facecolor("0.85")
     axes.set(xlabel="column (px)", ylabel="stage position (mm)")
-    axes.figure.colorbar(artist, ax=axes, label=label)
+    axes.figure.colorbar(artist, ax=axes, label=label, extend="both")
 
 
 def _view_3d(
@@ -228,14 +233,16 @@ def _view_3d(
     range_mm: NDArray[np.float64],
     limits: tuple[float, float],
 ) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     shown = np.flatnonzero((range_mm >= limits[0]) & (range_mm <= limits[1]))
     if shown.size > POINTS_IN_3D:
         shown = np.random.default_rng(0).choice(shown, POINTS_IN_3D, replace=False)
     cloud = points[shown]
     axes.scatter(
-        cloud["y"] * 1e3,
-        cloud["x"] * 1e3,
         cloud["z"] * 1e3,
+        cloud["x"] * 1e3,
+        cloud["y"] * 1e3,
         c=range_mm[shown],
         cmap="viridis",
         vmin=limits[0],
@@ -244,9 +251,14 @@ def _view_3d(
         linewidths=0.0,
         depthshade=False,
     )
-    axes.set(xlabel="y, stage (mm)", ylabel="x, range (mm)", zlabel="z, line (mm)")
-    axes.set_title("Point cloud" + (f" ({shown.size} points shown)"))
-    axes.view_init(elev=22.0, azim=-58.0)
+    axes.set(xlabel="z, line (mm)", ylabel="x, range (mm)", zlabel="y, stage (mm)")
+    axes.set_title(f"Point cloud ({shown.size:,} points shown)")
+    spans = [max(float(np.ptp(cloud[name])) * 1e3, 1.0) for name in "zxy"]
+    axes.set_box_aspect(spans, zoom=0.85)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(4))
+        axis.labelpad = 8
+    axes.view_init(elev=28.0, azim=-62.0)
 
 
 def _histogram(

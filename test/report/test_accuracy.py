@@ -10,6 +10,8 @@ from eschorty_ros.report import accuracy, profiles
 
 MODEL = load_calibration("config_3").model()
 PERIOD_S = 1.0 / 70.0
+PITCH_MM = 50.0 * PERIOD_S
+SWEEP = accuracy.Sweep(-0.5 * PITCH_MM - 0.01, 19.5 * PITCH_MM + 0.01, 50.0, 70.0)
 
 
 class Wedge:
@@ -47,10 +49,9 @@ def test_statistics_of_a_known_error():
     rng = np.random.default_rng(11)
     error = rng.normal(0.2, 0.5, 20_000)
     points = cloud(error)
-    positions = accuracy.sweep_positions_mm(0.0, 20 * PERIOD_S * 50.0, 50.0, 70.0)
-    result = accuracy.measure(points, Wedge(), MODEL, positions)
-    assert result.profiles == 20
-    assert (result.points, result.expected_points, result.completeness) == (20_000, 20_000, 1.0)
+    result = accuracy.measure(points, Wedge(), MODEL, SWEEP)
+    assert (result.periods, result.points, result.completeness) == (20, 20_000, 1.0)
+    assert result.expected_points == result.found_points == 20_000
     assert result.error_median_mm == pytest.approx(np.median(np.abs(error)), abs=1e-3)
     assert result.error_p95_mm == pytest.approx(np.percentile(np.abs(error), 95), abs=1e-3)
     assert result.bias_mm == pytest.approx(0.2, abs=0.02)
@@ -61,8 +62,7 @@ def test_statistics_of_a_known_error():
 def test_points_where_the_scene_is_empty_are_counted_not_measured():
     points = cloud(0.0)
     points["column"][:50] = 1100
-    positions = accuracy.sweep_positions_mm(0.0, 20 * PERIOD_S * 50.0, 50.0, 70.0)
-    result = accuracy.measure(points, Wedge(), MODEL, positions)
+    result = accuracy.measure(points, Wedge(), MODEL, SWEEP)
     assert result.off_target == 50
     assert result.completeness == pytest.approx(19_950 / 20_000)
     assert result.error_p95_mm < 2e-4
@@ -70,8 +70,7 @@ def test_points_where_the_scene_is_empty_are_counted_not_measured():
 
 def test_missing_points_lower_the_completeness():
     points = cloud(0.0)[::2]
-    positions = accuracy.sweep_positions_mm(0.0, 20 * PERIOD_S * 50.0, 50.0, 70.0)
-    assert accuracy.measure(points, Wedge(), MODEL, positions).completeness == 0.5
+    assert accuracy.measure(points, Wedge(), MODEL, SWEEP).completeness == 0.5
 
 
 def test_columns_out_of_the_sensors_view_are_not_expected():
@@ -83,8 +82,7 @@ def test_columns_out_of_the_sensors_view_are_not_expected():
 
 
 def test_an_empty_cloud_gives_nan_not_a_crash():
-    positions = accuracy.sweep_positions_mm(0.0, 1.0, 50.0, 700.0)
-    result = accuracy.measure(np.empty(0, POINT_DTYPE), Wedge(), MODEL, positions)
+    result = accuracy.measure(np.empty(0, POINT_DTYPE), Wedge(), MODEL, SWEEP)
     assert result.points == 0
     assert result.completeness == 0.0
     assert np.isnan(result.error_median_mm)
@@ -95,12 +93,31 @@ def test_a_stage_that_moves_within_the_sheet_is_refused():
         accuracy.stage_and_range_mm(cloud(0.0), (1.0, 0.0, 0.0))
 
 
-def test_sweep_positions_lie_in_the_middle_of_each_period():
-    positions = accuracy.sweep_positions_mm(10.0, 0.0, 50.0, 70.0)
-    assert len(positions) == 14
-    assert positions[0] == pytest.approx(10.0 - 10.0 / 28)
-    with pytest.raises(ArgumentError, match="speed"):
-        accuracy.sweep_positions_mm(0.0, 1.0, 0.0, 70.0)
+@pytest.mark.parametrize("backwards", [False, True])
+def test_periods_that_the_ends_cut_do_not_count(backwards):
+    points = cloud(0.0)
+    ends = (0.3 * PITCH_MM, 10.3 * PITCH_MM)
+    if backwards:
+        points["y"] *= -1.0
+        ends = (-ends[0], -ends[1])
+    sweep = accuracy.Sweep(*ends, 50.0, 70.0)
+    positions, member = accuracy.whole_periods(points, sweep)
+    np.testing.assert_allclose(np.abs(positions), np.arange(1, 10) * PITCH_MM, atol=0.01)
+    assert member.sum() == 9000
+
+
+def test_periods_without_any_point_count_as_missing():
+    points = cloud(0.0)
+    line = np.rint(points["t"] / PERIOD_S)
+    result = accuracy.measure(points[(line != 7) & (line > 1)], Wedge(), MODEL, SWEEP)
+    assert result.periods == 20
+    assert result.completeness == pytest.approx(17 / 20)
+
+
+def test_a_sweep_has_a_speed():
+    with pytest.raises(ArgumentError, match="speed_mm_s"):
+        accuracy.Sweep(0.0, 1.0, 0.0, 70.0)
+    assert accuracy.Sweep(10.0, 0.0, 50.0, 100.0).pitch_mm == -0.5
 
 
 def test_periods_are_recovered_from_the_points_alone():

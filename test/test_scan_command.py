@@ -1,0 +1,132 @@
+"""`eschorty scan` over real DDS: cloud, picture, figures, and a dark laser however it ends."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from expected_scan import assert_accurate
+
+from eschorty_ros.cli import INTERRUPTED
+from eschorty_ros.core.cloud import read_cloud
+from eschorty_ros.report.accuracy import Sweep
+
+pytest.importorskip("rclpy", reason="needs the package rclpy")
+
+ROOT = Path(__file__).resolve().parents[1]
+LOGGED = """
+import sys
+from eschorty_ros.nodes import one_process
+made = one_process.parameters
+log = sys.argv.pop(1)
+one_process.parameters = lambda scan: made(scan) | {"laser": {"fake_log": log}}
+from eschorty_ros.cli import main
+main(prog_name="eschorty")
+"""
+
+
+@pytest.fixture
+def command(tmp_path):
+    """Starts `eschorty scan` as a process; the simulated laser logs to `laser.log`."""
+    started = []
+    environment = {key: value for key, value in os.environ.items() if key != "ROS_DOMAIN_ID"}
+
+    def start(*arguments):
+        process = subprocess.Popen(
+            [sys.executable, "-c", LOGGED, tmp_path / "laser.log", "scan", *map(str, arguments)],
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def outputs(log):
+    """States in the simulated laser's log, in order."""
+    return re.findall(r"\b(on|off)\b", log.read_text().lower()) if log.exists() else []
+
+
+def test_a_scan_reaches_its_accuracy_and_ends_dark(command, tmp_path):
+    process = command("--stop", 40, "--out", tmp_path / "scan")
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 0, stderr
+    points = read_cloud(tmp_path / "scan" / "scan.pcd")
+    measured = assert_accurate(points, Sweep(10.0, 40.0, 50.0, 70.0))
+    assert f"{measured.error_median_mm:.3f} mm" in stdout
+    assert f"{measured.error_p95_mm:.3f} mm" in stdout
+    assert (tmp_path / "scan" / "scan.png").read_bytes().startswith(b"\x89PNG")
+    assert outputs(tmp_path / "laser.log")[-1] == "off"
+    assert "on" in outputs(tmp_path / "laser.log")
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, 128 + signal.SIGTERM)]
+)
+def test_a_signal_ends_the_scan_dark_without_a_traceback(command, tmp_path, number, code):
+    process = command("--speed", 2, "--out", tmp_path / "scan")
+    deadline = time.monotonic() + 60
+    while "on" not in outputs(tmp_path / "laser.log"):
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == code, stderr
+    assert "Traceback" not in stderr
+    assert outputs(tmp_path / "laser.log")[-1] == "off"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--stop", "900"), "stop"),
+        (("--speed", "5000"), "speed"),
+        (("--scene", "teapot"), "teapot"),
+        (("--calibration", "config_9"), "config_9"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_exit_code_1(command, tmp_path, arguments, named):
+    process = command(*arguments, "--out", tmp_path / "scan")
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1, stderr
+    assert stdout == ""
+    said = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
+    assert len(said) == 1
+    assert named in said[0]
+    assert "Traceback" not in stderr
+    assert "on" not in outputs(tmp_path / "laser.log")
+
+
+def test_without_ros_it_says_what_to_do():
+    blocked = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "rclpy":
+            raise ImportError("No module named 'rclpy'")
+sys.meta_path.insert(0, Blocked())
+from eschorty_ros.cli import main
+main(prog_name="eschorty")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", blocked, "scan"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "make scan" in done.stderr
