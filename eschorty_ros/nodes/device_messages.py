@@ -15,7 +15,7 @@ from eschorty_ros.nodes.conversions import (
 
 
 def readback_from_state(message: LaserState) -> LaserReadback:
-    """What the generator said, from ``laser/state``."""
+    """Take what the generator said from ``laser/state``."""
     modulation, _ = modulation_from_laser_state(message)
     return LaserReadback(
         LaserOutput(message.output),

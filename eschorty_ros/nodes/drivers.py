@@ -61,7 +61,7 @@ STAGES: Registry[LinearStage] = {"fake": _fake_stage}
 
 
 def make(registry: Registry[Device], parameters: Mapping[str, Any], clock_ns: ClockNs) -> Device:
-    """The device the ``driver`` parameter names.
+    """Make the device the ``driver`` parameter names.
 
     Raises
     ------

@@ -49,15 +49,15 @@ class LaserGate:
         self._armed_s = self._now_s()
 
     def beat(self) -> None:
-        """A heartbeat has arrived."""
+        """Note that a heartbeat has arrived."""
         self._heartbeat_s = self._now_s()
 
     def switched_on(self) -> None:
-        """The output has been switched on."""
+        """Note that the output has been switched on."""
         self._on_s = self._now_s()
 
     def switched_off(self) -> None:
-        """The output has been switched off: disarmed too."""
+        """Note that the output has been switched off: disarmed too."""
         self._on_s = self._armed_s = None
 
     def refusal(self) -> str | None:

@@ -99,7 +99,7 @@ class DeviceNode(LifecycleNode):
         self._fault_guard.trigger()
 
     def now_ns(self) -> int:
-        """The node's ROS time, int64 nanoseconds."""
+        """Read the node's ROS time, int64 nanoseconds."""
         return int(self.get_clock().now().nanoseconds)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:

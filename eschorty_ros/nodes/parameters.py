@@ -55,7 +55,7 @@ class Param:
     dynamic: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
-        """The ROS descriptor: description with unit, range, constraint, read-only flag."""
+        """Make the ROS descriptor: description with unit, range, constraint, read-only flag."""
         descriptor = ParameterDescriptor(
             name=self.name,
             description=f"{self.description} [{self.unit}]" if self.unit else self.description,
@@ -154,7 +154,7 @@ class Parameters(Mapping[str, Any]):
         return len(self._table)
 
     def settings(self, settings_class: type[Any]) -> Any:
-        """An instance of the dataclass ``from_settings`` made parameters of."""
+        """Build the dataclass ``from_settings`` made parameters of."""
         names = {field.name for field in dataclasses.fields(settings_class)}
         return settings_class(**{name: value for name, value in self.items() if name in names})
 
@@ -201,7 +201,7 @@ def _declare(node: Node, param: Param) -> None:
 
 
 def _given_integer(node: Node, param: Param) -> float:
-    """The whole number given at start where a float was declared."""
+    """Take the whole number given at start where a float was declared."""
     probe = ParameterDescriptor(dynamic_typing=True)
     given = node.declare_parameter(param.name, param.default, probe).value
     node.undeclare_parameter(param.name)

@@ -49,9 +49,7 @@ def undisturbed() -> Iterator[None]:
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
-def run(
-    *factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None
-) -> int:
+def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None) -> int:
     """Build the nodes, spin them until a signal, make the hardware safe; returns the exit code.
 
     Parameters

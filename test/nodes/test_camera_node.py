@@ -1,6 +1,5 @@
 """The camera node beside laser and stage, each its own process: it sees both exactly."""
 
-
 from __future__ import annotations
 
 import time

@@ -1,6 +1,5 @@
 """The laser node as a process: its emulator's own log says when there was light."""
 
-
 from __future__ import annotations
 
 import signal
@@ -192,9 +191,7 @@ def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_switches_off_and_exits_clean(
-    number: int, tmp_path: Path
-) -> None:
+def test_signal_switches_off_and_exits_clean(number: int, tmp_path: Path) -> None:
     with Observer(free_domain(), "signal_observer") as own:
         bench = Bench(tmp_path / "laser.log", own.domain, own)
         try:

@@ -1,6 +1,5 @@
 """The stage node as a process: odometry, planned motion, moves and their refusals."""
 
-
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -86,8 +85,10 @@ def test_odometry_lies_on_the_planned_motion(stage: Stage) -> None:
     stage.move(0.05, 0.1)
     stage.move(0.03, 0.2)
     wait_until(
-        lambda: ns_from_stamp(stage.motions[-1].header.stamp)
-        > ns_from_stamp(stage.odometry[-2].header.stamp),
+        lambda: (
+            ns_from_stamp(stage.motions[-1].header.stamp)
+            > ns_from_stamp(stage.odometry[-2].header.stamp)
+        ),
         "motion newer than odometry",
     )
     plans = sorted(
