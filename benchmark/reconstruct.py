@@ -1,0 +1,134 @@
+"""Speed of the reconstruction from EVT3 bytes to points, and its error, on a simulated line.
+
+Usage: python benchmark/reconstruct.py [--seconds S] [--repeats N]
+
+Every row is one pass over the same bytes on one core; the best of the repeats counts. The plain
+numpy reference decodes with the same decoder and then averages columns as the paper does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from eschorty_ros.core import reference
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.simulation.scene import Plane
+from eschorty_ros.simulation.world import World
+
+SEED = 1
+RANGE_MM = 1320.0
+CHUNK_BYTES = 1 << 20
+BACKGROUND_SHARE = 0.05
+CALIBRATION = load_calibration("config_3")
+CASES = {
+    "ours (mode_mean)": Settings(),
+    "mean": Settings(centroid="mean"),
+    "median": Settings(centroid="median"),
+    "ours + activity filter": Settings(noise_filter="activity"),
+}
+
+
+def cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), "?")
+
+
+def simulated(modulation: Modulation, seconds: float) -> tuple[bytes, int]:
+    """Bytes and event count of a plane at 1.32 m, 1280 lit columns, 5 % background events."""
+    quiet = World(Plane(RANGE_MM), CALIBRATION, seed=SEED, background_hz=0.0)
+    quiet.set_laser(0, True, modulation)
+    quiet.advance(int(0.3e6))
+    signal_hz = quiet.events / 0.3
+    pixels = quiet.columns * quiet.rows
+    background_hz = signal_hz * BACKGROUND_SHARE / (1 - BACKGROUND_SHARE) / pixels
+    world = World(Plane(RANGE_MM), CALIBRATION, seed=SEED, background_hz=background_hz)
+    world.set_laser(0, True, modulation)
+    data = world.advance(int(seconds * 1e6))
+    return data, world.events
+
+
+def best(task: Callable[[], Profiles], repeats: int) -> tuple[float, Profiles]:
+    task()
+    shortest, result = float("inf"), Profiles.empty()
+    for _ in range(repeats):
+        began = time.perf_counter()
+        result = task()
+        shortest = min(shortest, time.perf_counter() - began)
+    return shortest, result
+
+
+def ours(data: bytes, modulation: Modulation, settings: Settings) -> Profiles:
+    reconstructor = Reconstructor(CALIBRATION, modulation, settings)
+    parts = [
+        reconstructor.push(data[k : k + CHUNK_BYTES]) for k in range(0, len(data), CHUNK_BYTES)
+    ]
+    return Profiles.concatenate([*parts, reconstructor.flush()])
+
+
+def plain(data: bytes, modulation: Modulation) -> Profiles:
+    t, x, y = reference.decode_all(data)
+    return reference.reconstruct(t, x, y, CALIBRATION.model(), modulation)
+
+
+def decode(data: bytes) -> Profiles:
+    decoder = Decoder()
+    for k in range(0, len(data), 1 << 17):
+        decoder.decode(data[k : k + (1 << 17)])
+    return Profiles.empty()
+
+
+def table(frequency_hz: float, seconds: float, repeats: int) -> None:
+    modulation = Modulation(frequency_hz, on_edge_us=0)
+    data, events = simulated(modulation, seconds)
+    periods = int(seconds * frequency_hz)
+    print(
+        f"\n{frequency_hz:g} Hz, {seconds:g} s, {events / 1e6:.2f} Mevents "
+        f"({events / periods / 1280:.1f} per column and period), {len(data) / events:.2f} B/event"
+    )
+    print(
+        f"{'method':<24}{'Mev/s':>8}{'us/profile':>12}{'median mm':>11}{'p95 mm':>9}"
+        f"{'points %':>10}{'x reference':>13}"
+    )
+    base_s, base = best(lambda: plain(data, modulation), max(repeats // 3, 1))
+    rows = [("numpy reference", base_s, base)]
+    for name, settings in CASES.items():
+        rows.append((name, *best(lambda s=settings: ours(data, modulation, s), repeats)))
+    for name, spent_s, found in rows:
+        error_mm = np.abs(found.range_mm - RANGE_MM)
+        print(
+            f"{name:<24}{events / spent_s / 1e6:>8.1f}{spent_s / periods * 1e6:>12.0f}"
+            f"{np.median(error_mm):>11.3f}{np.quantile(error_mm, 0.95):>9.3f}"
+            f"{100 * len(found) / periods / 1280:>10.2f}{base_s / spent_s:>13.1f}"
+        )
+    spent_s, _ = best(lambda: decode(data), repeats)
+    print(f"{'(decoding alone)':<24}{events / spent_s / 1e6:>8.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=1.5, help="length of the 70 Hz stream")
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    print(
+        f"{cpu_name()}; Python {platform.python_version()}, numpy {np.__version__}, "
+        f"numba {numba.__version__}; seed {SEED}"
+    )
+    table(70.0, arguments.seconds, arguments.repeats)
+    table(1000.0, arguments.seconds / 10, arguments.repeats)
+
+
+if __name__ == "__main__":
+    main()
