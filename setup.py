@@ -20,9 +20,13 @@ setup(
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     python_requires=">=3.11",
-    packages=[*find_packages(include=["eschorty_ros", "eschorty_ros.*"]), "eschorty_ros.config"],
-    package_dir={"eschorty_ros.config": "config"},
-    package_data={"eschorty_ros.config": ["*.yaml"]},
+    packages=find_packages(include=["eschorty_ros", "eschorty_ros.*"]),
+    data_files=[
+        (
+            "share/eschorty_ros/config",
+            sorted(str(p.relative_to(HERE)) for p in HERE.glob("config/*.yaml")),
+        )
+    ],
     install_requires=REQUIREMENTS,
     extras_require={"mesh": ["open3d>=0.19", "libusb-package"]},
     entry_points={
