@@ -192,7 +192,7 @@ def test_view_writes_a_picture(cloud, tmp_path):
 def test_design_prints_the_nominal_build_and_plots_it(tmp_path):
     result = run("design", "--out", tmp_path / "design.png")
     assert result.exit_code == 0, result.output
-    assert "810.4" in result.output
+    assert "810.5 to 2404.8 mm" in result.output
     assert "mm/row" in result.output
     assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
 

@@ -81,6 +81,7 @@ def command(
     if start == stop:
         raise click.UsageError(f"--start and --stop are both {start:g} mm; give a distance")
     one_process = _nodes()
+    _check(scene, calibration)
     request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed)
     out.mkdir(parents=True, exist_ok=True)
     previous = signal.signal(signal.SIGTERM, _terminated)
@@ -90,6 +91,15 @@ def command(
     finally:
         signal.signal(signal.SIGTERM, previous)
     finish(request, outcome, out)
+
+
+def _check(scene: str, calibration: str) -> None:
+    """Refuse what is no scene or calibration before any node starts."""
+    from eschorty_ros.core.calibration import load_calibration
+    from eschorty_ros.simulation.scene import named
+
+    named(scene)
+    load_calibration(calibration)
 
 
 def finish(request: OneScan, outcome: Outcome, out: Path) -> None:

@@ -19,7 +19,7 @@ import rclpy
 import yaml
 from numpy.typing import NDArray
 from rclpy.action import ActionClient
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
@@ -205,12 +205,13 @@ def instrument(scan: OneScan) -> Iterator[Instrument]:
             with undisturbed():
                 make_safe(nodes)
                 ending.set()
+                # An ended context also ends callbacks that wait, such as homing.
+                rclpy.try_shutdown()
                 if thread.is_alive():
                     thread.join(5.0)
                 executor.shutdown(timeout_sec=2.0)
                 for node in nodes:
                     node.destroy_node()
-                rclpy.try_shutdown()
 
 
 def free_domain() -> int:
@@ -235,8 +236,9 @@ def _parameter_file(values: dict[str, dict[str, Any]]) -> str:
 
 def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
     # Shutting an executor down while it spins raises in this thread, so it is asked to end.
-    while not ending.is_set():
-        executor.spin_once(timeout_sec=0.1)
+    with contextlib.suppress(ExternalShutdownException):
+        while not ending.is_set():
+            executor.spin_once(timeout_sec=0.1)
 
 
 def _wait(condition: Callable[[], Any], limit_s: float, fault: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 import time
@@ -108,7 +109,9 @@ class StageNode(DeviceNode):
 
     def destroy_node(self) -> None:
         """Destroy the action server first: the node does not know it."""
-        self._move.destroy()
+        # rclpy 9.1 drops the future of an answered result request twice and raises.
+        with contextlib.suppress(ValueError):
+            self._move.destroy()
         super().destroy_node()
 
     def _opened(self) -> LinearStage:
