@@ -22,7 +22,8 @@ from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.packets import SIZE_MAX_BYTES, Packetizer
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
-from eschorty_ros.simulation.devices import FakeCamera
+from eschorty_ros.simulation.fake_camera import FakeCamera
+from eschorty_ros.simulation.world import BACKGROUND_HZ
 
 READ_TIMEOUT_S = 0.02
 STOP_TIMEOUT_S = 3.0
@@ -30,7 +31,17 @@ REPORT_DEPTH = 1000
 
 TABLE = (
     drivers.DRIVER,
-    *drivers.CAMERA_TABLE,
+    Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
+    Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
+    Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
+    Param(
+        "background_rate",
+        BACKGROUND_HZ,
+        "fake camera: background events of one pixel",
+        "Hz",
+        0.0,
+        100.0,
+    ),
     Param("frame_id", "eschorty_optical", "frame of the packets' headers"),
     Param("event_message_time_threshold", 0.004, "age at which a packet leaves", "s", 0.0, 1.0),
     Param(

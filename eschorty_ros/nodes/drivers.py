@@ -1,17 +1,16 @@
-"""Driver names of the ``driver`` parameter and what makes each of them."""
+"""Driver names of the ``driver`` parameter and what makes each of them.
+
+A driver is imported when it is asked for: a laser node does not load the simulated world.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.hardware.protocols import EventSource, LaserModulator, LinearStage
 from eschorty_ros.nodes.parameters import Param
-from eschorty_ros.simulation.devices import FakeCamera, FakeLaser, FakeStage
-from eschorty_ros.simulation.scene import named
-from eschorty_ros.simulation.world import BACKGROUND_HZ, World
 
 ClockNs = Callable[[], int]
 Device = TypeVar("Device")
@@ -19,25 +18,17 @@ Registry = dict[str, Callable[[Mapping[str, Any], ClockNs], Device]]
 
 DRIVER = Param("driver", "fake", "device driver; 'fake' simulates the device")
 
-CAMERA_TABLE = (
-    Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
-    Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
-    Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
-    Param(
-        "background_rate",
-        BACKGROUND_HZ,
-        "fake camera: background events of one pixel",
-        "Hz",
-        0.0,
-        100.0,
-    ),
-)
 LASER_TABLE = (
     Param("fake_log", "", "fake laser: file that gets one line per change of the output"),
 )
 
 
 def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
+    from eschorty_ros.core.calibration import load_calibration
+    from eschorty_ros.simulation.fake_camera import FakeCamera
+    from eschorty_ros.simulation.scene import named
+    from eschorty_ros.simulation.world import World
+
     world = World(
         named(parameters["scene"]),
         load_calibration(parameters["calibration"]),
@@ -48,10 +39,14 @@ def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSourc
 
 
 def _fake_laser(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
+    from eschorty_ros.simulation.fake_laser import FakeLaser
+
     return FakeLaser(clock_ns, log_path=parameters["fake_log"] or None)
 
 
 def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
+    from eschorty_ros.simulation.fake_stage import FakeStage
+
     return FakeStage(clock_ns)
 
 
