@@ -135,11 +135,11 @@ class FakeCamera:
         return self._zero_ns
 
     def observe_laser(self, readback: LaserReadback, confirmed_ns: int) -> None:
-        """Learn that the laser is as in ``readback`` and that this is all up to ``confirmed_ns``."""
+        """Learn that the laser is as in ``readback``, with nothing more up to ``confirmed_ns``."""
         self._report(readback, confirmed_ns)
 
     def observe_stage(self, plan: MotionPlan, confirmed_ns: int) -> None:
-        """Learn that the stage follows ``plan`` and that this is all up to ``confirmed_ns``."""
+        """Learn that the stage follows ``plan``, with nothing more up to ``confirmed_ns``."""
         self._report(plan, confirmed_ns)
 
     def read(self, timeout_s: float) -> bytes:
@@ -166,7 +166,7 @@ class FakeCamera:
                     self._news.wait(min(_POLL_S, left_s))
 
     def statistics(self) -> dict[str, float]:
-        """Count events, bytes, sensor time, lag behind the clock, silences, late and stray reports."""
+        """Count events, bytes, sensor time, lag behind the clock, silences and late reports."""
         now_us = self._world.now_us
         behind_us = (self._clock_ns() - self._zero_ns) // 1000 - now_us
         return {

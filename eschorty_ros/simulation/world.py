@@ -128,14 +128,14 @@ class World:
             self._follow(end_us)
             self._pixels.run_until(end_us)
             keys = self._pixels.take(end_us)
+            if self._encoder.time_us is None:
+                parts.append(self._encoder.advance(0))
             self.events += keys.size
             parts.append(self._encoder.encode(*unpack(keys)))
             # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
-            parts.append(
-                self._encoder.advance(end_us // _TIME_HIGH_US * _TIME_HIGH_US)
-                if self._idle(end_us)
-                else b""
-            )
+            step_us = end_us - end_us % _TIME_HIGH_US
+            if step_us > (self._encoder.time_us or 0):
+                parts.append(self._encoder.advance(step_us))
             self._now_us = end_us
             self._laser.forget_before(self._handled_us)
             self._stage.forget_before(self._handled_us)
@@ -169,10 +169,6 @@ class World:
             raise ArgumentError(
                 f"{name} is {t_us} us and {self._now_us} us are simulated; give a later time"
             )
-
-    def _idle(self, end_us: int) -> bool:
-        reached = self._encoder.time_us
-        return reached is None or end_us // _TIME_HIGH_US > reached // _TIME_HIGH_US
 
     def _follow(self, end_us: int) -> None:
         """Apply every change of light before ``end_us``."""

@@ -1,0 +1,268 @@
+"""The pixel model against its closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.simulation._pixel_kernels import _crossing_us, _response
+from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
+
+SEED = 7
+CENTRE = 40.0
+ROWS = 81
+
+
+def flash(
+    pixels: PixelArray, frequency_hz: float, seconds: float, row: float = CENTRE
+) -> tuple[np.ndarray, ...]:
+    """Events of a square wave of duty 1/2 on all columns: t, x, y, p."""
+    columns = np.arange(pixels.columns)
+    line = np.full(pixels.columns, row)
+    half_us = 5e5 / frequency_hz
+    for k in range(round(2 * frequency_hz * seconds)):
+        pixels.relight(round(k * half_us), columns, line, np.full(pixels.columns, 1.0 - k % 2))
+    end_us = round(2 * frequency_hz * seconds) * half_us
+    pixels.run_until(round(end_us))
+    return unpack(pixels.take(round(end_us)))
+
+
+def closed_form(
+    frequency_hz: float, rows: np.ndarray, p: PixelParameters
+) -> tuple[np.ndarray, ...]:
+    """Steady u at the end of the bright and of the dark half, per row."""
+    intensity = 1.0 + p.amplitude * np.exp(-0.5 * ((rows - CENTRE) / p.sigma_rows) ** 2)
+    omega = 2.0 * math.pi * p.bandwidth_hz
+    a = np.exp(-omega * intensity / (2.0 * frequency_hz))
+    c = np.exp(-omega / (2.0 * frequency_hz))
+    bright = ((1.0 - a) / intensity + a * (1.0 - c)) / (1.0 - a * c)
+    dark = ((1.0 - c) + c * (1.0 - a) / intensity) / (1.0 - a * c)
+    return bright, dark
+
+
+@pytest.mark.parametrize("frequency_hz", [70.0, 1000.0, 10_000.0])
+def test_photoreceptor_swings_as_the_closed_form_says(frequency_hz: float) -> None:
+    blind = PixelParameters(threshold_on=50.0, threshold_off=50.0, threshold_min=0.25)
+    # The window is drawn as if the comparator were the default one.
+    object.__setattr__(blind, "threshold_mismatch", 0.165)
+    pixels = PixelArray(1, ROWS, blind, SEED)
+    column, line = np.array([0]), np.array([CENTRE])
+    half_us = round(5e5 / frequency_hz)
+    actual_hz = 5e5 / half_us
+    rows = np.arange(29, 52)
+    edges = 2 * math.ceil(40_000 / half_us)
+    for k in range(edges):
+        pixels.relight(k * half_us, column, line, np.array([1.0 - k % 2]))
+    pixels.relight(edges * half_us, column, line, np.array([1.0]))
+    dark_u = pixels._pixels["u"][0, rows].copy()
+    pixels.relight((edges + 1) * half_us, column, line, np.array([0.0]))
+    bright_u = pixels._pixels["u"][0, rows]
+    bright, dark = closed_form(actual_hz, rows, blind)
+    lit = pixels._spans[0, 2:]
+    inside = (rows >= lit[0]) & (rows < lit[1])
+    assert inside.sum() >= 15
+    assert np.max(np.abs(bright_u / bright - 1.0)[inside]) < 1e-12
+    assert np.max(np.abs(dark_u / dark - 1.0)[inside]) < 1e-12
+
+
+def test_step_response_keeps_13_digits_from_tiny_to_huge_steps() -> None:
+    mpmath.mp.dps = 50
+    rng = np.random.default_rng(SEED)
+    for x in 10.0 ** np.linspace(-14, 3, 400):
+        u, settled = rng.uniform(0.1, 1.0, 2)
+        exact = mpmath.mpf(settled) + (mpmath.mpf(u) - settled) * mpmath.exp(-mpmath.mpf(x))
+        assert abs(_response(u, settled, x) - exact) < 1e-13 * abs(exact)
+        change = (mpmath.mpf(u) - settled) * mpmath.expm1(-mpmath.mpf(x))
+        got = _response(u, settled, x) - u
+        # u itself is rounded to 1e-16: the change is as good as that allows.
+        assert abs(got - change) < 1e-13 * abs(change) + 2.3e-16
+
+
+def test_crossing_time_keeps_13_digits() -> None:
+    mpmath.mp.dps = 50
+    for share in 10.0 ** np.linspace(-12, -1e-3, 200):
+        u, settled, tau_us = 1.0, 0.15, 24.5
+        level = u - share * (u - settled)
+        exact = -tau_us * mpmath.log(
+            (mpmath.mpf(level) - settled) / (mpmath.mpf(u) - mpmath.mpf(settled))
+        )
+        got = _crossing_us(u, level, 2.0, settled, 0.0, tau_us)
+        assert abs(got - exact) < 1e-13 * abs(exact) * max(1.0, 1e-3 / share)
+        assert _crossing_us(settled, 0.0, settled + share * (u - settled), u, 0.0, tau_us) > 0.0
+    assert _crossing_us(1.0, 0.5, 2.0, 0.6, 0.0, 1.0) == np.inf
+
+
+def test_first_events_come_at_the_crossing_times() -> None:
+    exact = PixelParameters(
+        threshold_mismatch=0.0, latency_us=0.0, latency_jitter_us=0.0, row_slot_us=1
+    )
+    t, x, y, p = flash(PixelArray(1, ROWS, exact, SEED), 70.0, 1 / 70)
+    assert not x.any()
+    half_us = 5e5 / 70
+    omega = exact.omega_per_us
+    for row in np.unique(y):
+        intensity = 1.0 + 5.5 * math.exp(-0.5 * ((row - CENTRE) / 4.1) ** 2)
+        on_us = -math.log((math.exp(-0.25) - 1 / intensity) / (1 - 1 / intensity))
+        on_us /= omega * intensity
+        # The reference is re-sampled 0.7 ms after the event; the fall starts from 1 / I.
+        settle = math.exp(-omega * intensity * (0.7e3 + on_us))
+        reference = 1 / intensity + (1 - 1 / intensity) * settle
+        bright = 1 / intensity
+        off_us = -math.log((reference * math.exp(0.25) - 1) / (bright - 1)) / omega
+        here = y == row
+        assert p[here].tolist() == [1, 0], row
+        # A request takes at least 1 us and is read out at the next whole microsecond.
+        assert 1.0 <= t[here][0] - on_us <= 2.001
+        assert 1.0 <= t[here][1] - round(half_us) - off_us <= 2.001
+
+
+def test_line_is_20_rows_wide_and_gives_40_events_a_period() -> None:
+    t, _, y, p = flash(PixelArray(64, ROWS, PixelParameters(), SEED), 70.0, 0.5)
+    per_row = np.bincount(y, minlength=ROWS) / 64 / 35
+    plateau = np.sort(per_row)[-3:].mean()
+    assert plateau == pytest.approx(2.0, abs=0.02)
+    assert (per_row >= 0.5 * plateau).sum() in (19, 20, 21)
+    width = per_row.sum() / plateau
+    closed = 2 * 4.1 * math.sqrt(2 * math.log(5.5 / math.expm1(0.25)))
+    # A marginal pixel fires only when both of its thresholds are low: a little narrower.
+    assert closed - 0.8 < width < closed + 0.1
+    assert p.mean() == pytest.approx(0.5, abs=0.01)
+    assert t.min() > 0
+
+
+def test_counts_grow_linearly_to_500_hz_and_saturate_beyond() -> None:
+    rate = {}
+    for f in (50.0, 200.0, 500.0, 1000.0, 5000.0):
+        t, _, _, _ = flash(PixelArray(32, ROWS, PixelParameters(), SEED), f, 0.2)
+        rate[f] = t.size / 32 / 0.2
+    # The same model with noise, leak and follower gives 2179, 8428 and 19617 per second.
+    assert rate[50.0] == pytest.approx(2179, rel=0.15)
+    assert rate[200.0] == pytest.approx(8428, rel=0.15)
+    assert rate[500.0] == pytest.approx(19617, rel=0.15)
+    assert rate[1000.0] < 1.4 * rate[500.0]
+    assert rate[5000.0] < 1.4 * rate[500.0]
+
+
+@pytest.mark.parametrize("frequency_hz", [500.0, 4000.0, 12_000.0])
+def test_rows_fire_where_the_closed_form_swing_exceeds_the_threshold(frequency_hz: float) -> None:
+    quick = PixelParameters(
+        threshold_mismatch=0.0,
+        refractory_us=1.0,
+        latency_us=0.0,
+        latency_jitter_us=0.0,
+        row_slot_us=1,
+    )
+    t, _, y, _ = flash(PixelArray(1, ROWS, quick, SEED), frequency_hz, 0.05)
+    settled = t > 30_000
+    fired = np.zeros(ROWS, dtype=bool)
+    fired[np.unique(y[settled])] = True
+    bright, dark = closed_form(frequency_hz, np.arange(ROWS), quick)
+    swing = np.log(dark / bright)
+    assert (swing > 0.55).sum() >= 3
+    # Between one and two thresholds it depends on where the reference came to rest.
+    assert fired[swing > 0.5 + 0.02].all()
+    assert not fired[swing < 0.25 - 0.02].any()
+
+
+def test_no_pixel_fires_within_its_refractory_time() -> None:
+    prompt = PixelParameters(latency_us=0.0, latency_jitter_us=0.0, row_slot_us=1)
+    t, x, y, _ = flash(PixelArray(16, ROWS, prompt, SEED), 900.0, 0.1)
+    pixel = x.astype(np.int64) * ROWS + y
+    order = np.lexsort((t, pixel))
+    same = np.diff(pixel[order]) == 0
+    assert np.diff(t[order])[same].min() >= 699
+
+
+def test_latency_has_the_promised_mean_and_jitter() -> None:
+    common = {"threshold_mismatch": 0.0, "row_slot_us": 1}
+    t_late = flash(PixelArray(1280, ROWS, PixelParameters(**common), SEED), 70.0, 1 / 140)
+    prompt = PixelParameters(**common, latency_us=0.0, latency_jitter_us=0.0)
+    t_prompt = flash(PixelArray(1280, ROWS, prompt, SEED), 70.0, 1 / 140)
+    late = t_late[0][t_late[2] == 40]
+    assert late.size == 1280
+    late = late - t_prompt[0][t_prompt[2] == 40].mean() + 1.0
+    assert late.mean() == pytest.approx(100.0, abs=3.0)
+    assert late.std() == pytest.approx(30.0, abs=2.0)
+
+
+def test_rows_are_read_out_in_slots() -> None:
+    t, _, y, _ = flash(PixelArray(256, ROWS, PixelParameters(), SEED), 70.0, 0.05)
+    for row in (38, 39, 40):
+        assert np.unique(t[y == row] % 10).size == 1
+    assert np.unique(t[y == 39] % 10) != np.unique(t[y == 40] % 10)
+
+
+def test_row_position_is_found_between_rows() -> None:
+    offsets = np.linspace(0.0, 1.0, 21)
+    error = []
+    for offset in offsets:
+        _, _, y, _ = flash(PixelArray(64, ROWS, PixelParameters(), SEED), 70.0, 0.05, 40.0 + offset)
+        error.append(y.mean() - 40.0 - offset)
+    # Whole rows fire or not: a quarter row at worst for one position, nothing on average.
+    assert np.max(np.abs(error)) < 0.3
+    assert abs(np.mean(error)) < 0.03
+
+
+def test_dark_columns_stay_silent_and_untouched() -> None:
+    pixels = PixelArray(8, ROWS, PixelParameters(), SEED)
+    before = pixels._pixels.copy()
+    columns = np.arange(8)
+    for k in range(20):
+        pixels.relight(k * 7000, columns, np.full(8, np.nan), np.ones(8))
+        pixels.run_until(k * 7000 + 6999)
+    assert pixels.take(10**6).size == 0
+    assert np.array_equal(pixels._pixels, before)
+
+
+def test_a_jumping_line_leaves_the_old_rows_and_lights_the_new() -> None:
+    pixels = PixelArray(1, 200, PixelParameters(), SEED)
+    column, full = np.array([0]), np.array([1.0])
+    for t_us, row in ((0, 50.0), (5000, 150.0), (10_000, 52.0), (15_000, np.nan)):
+        pixels.relight(t_us, column, np.array([row]), full)
+    pixels.run_until(25_000)
+    t, _, y, p = unpack(pixels.take(25_000))
+    late = (t > 5000) & (t < 10_000)
+    assert set(p[late & (y < 100)]) == {0}
+    assert set(p[late & (y > 100)]) == {1}
+    assert set(p[(t > 15_000) & (y < 100)]) == {0}
+    assert np.isinf(pixels._due).all()
+
+
+def test_output_grows_when_it_must() -> None:
+    # Tiny thresholds and no refractory time: dozens of events per pixel and edge.
+    eager = PixelParameters(threshold_on=0.03, threshold_off=0.03, refractory_us=1.0)
+    small, large = (PixelArray(64, ROWS, eager, SEED, 50.0) for _ in range(2))
+    large._keys = np.empty(1 << 22, dtype=np.int64)
+    small._keys = np.empty(16, dtype=np.int64)
+    events = flash(small, 70.0, 0.1)
+    assert all(np.array_equal(*pair) for pair in zip(events, flash(large, 70.0, 0.1), strict=True))
+    assert events[0].size > 300_000
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("sigma_rows", 0.0),
+        ("threshold_on", -0.1),
+        ("amplitude", math.nan),
+        ("refractory_us", 0.5),
+        ("row_slot_us", 2.5),
+        ("latency_us", -1.0),
+    ],
+)
+def test_impossible_parameters_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ArgumentError, match=name):
+        PixelParameters(**{name: value})
+
+
+def test_impossible_arrays_are_refused() -> None:
+    with pytest.raises(ArgumentError, match="2048 x 1024"):
+        PixelArray(4096, 10, PixelParameters())
+    with pytest.raises(ArgumentError, match="background_hz"):
+        PixelArray(8, 8, PixelParameters(), background_hz=-1.0)
+    with pytest.raises(ArgumentError, match="reflectance"):
+        PixelArray(8, 8, PixelParameters()).relight(0, np.array([0]), np.ones(1), np.full(1, 2.0))
