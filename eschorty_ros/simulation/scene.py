@@ -7,6 +7,7 @@ At stage position ``s`` the sheet is a fan of rays from ``(-b, s, 0)`` with the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -149,7 +150,7 @@ class Sphere(UniformReflectance):
         return np.fmin(near, self.backdrop_mm)
 
 
-_BUILDERS = {
+_BUILDERS: dict[str, Callable[[], Scene]] = {
     "steps": Steps,
     "plane": Plane,
     "tilted": lambda: Plane(slope_stage=0.5, slope_column=0.25, pivot_mm=50.0),

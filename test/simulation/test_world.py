@@ -17,7 +17,7 @@ from eschorty_ros.simulation.pixel import PixelParameters
 from eschorty_ros.simulation.recorder import simulate_recording
 from eschorty_ros.simulation.scene import Plane, Sphere, Steps
 from eschorty_ros.simulation.timeline import Gate, LaserTimeline, StageTimeline
-from eschorty_ros.simulation.world import World
+from eschorty_ros.simulation.world import STEP_MM, World
 
 SEED = 11
 FULL = load_calibration("config_3")
@@ -178,6 +178,7 @@ def test_moving_surface_is_followed_within_a_lit_phase() -> None:
     level = scene.range_mm([0.0], np.arange(96), model)[0]
     row_at = model.row(level[x] + 210e-6 * t)
     started, lead, found, expected = [], [], 0, 0.0
+    redraw_us = int(STEP_MM / 210e-6)
     for k in range(1, 28):
         edge = wave.edge_us(k)
         fall_us = edge + 7143
@@ -186,7 +187,8 @@ def test_moving_surface_is_followed_within_a_lit_phase() -> None:
         under_way = (p == 1) & (t > edge + 1500) & (t < fall_us)
         lead.extend(y[under_way] - row_at[under_way])
         found += int(under_way.sum())
-        ends = model.row(level + 210e-6 * np.array([[edge + 1500], [fall_us]]))
+        # Redrawn every 1190 us: the first step lies before the count, the sixth has no time left.
+        ends = model.row(level + 210e-6 * (edge + redraw_us * np.array([[1], [5]])))
         expected += float(np.diff(ends, axis=0).sum())
     assert abs(np.mean(started)) < 0.1
     # While the line moves, each row it newly reaches fires once, at the line's leading flank.
