@@ -50,13 +50,15 @@ TABLE = (
           "s", 0.0, 60.0),
     Param("stage_gap", 0.5, "longest distance of two stage samples that is bridged; 0 bridges any",
           "s", 0.0, 1e6, dynamic=True),
-    Param("stage_timeout", 2.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
+    # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.
+    Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
     Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
     Param("publish_tf", True, "publish /tf and /tf_static"),
 )  # fmt: skip
 
 _STAGE_DEPTH = 2000
+_CONNECT_S = 3.0
 
 
 class ReconstructionNode(Node):
@@ -66,6 +68,9 @@ class ReconstructionNode(Node):
     """
 
     def __init__(self, **kwargs: Any) -> None:
+        # Before anything can fail: a half-built node is destroyed, too.
+        self._closing = threading.Event()
+        self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
         super().__init__("reconstruction", **kwargs)
         table = (*TABLE, *from_settings(Settings, dynamic=True))
         self.parameters = Parameters(self, table, self._on_change)
@@ -86,24 +91,24 @@ class ReconstructionNode(Node):
         self._faults = 0
         self._rate = diagnostics.Rate()
         self._diagnostics_rate = diagnostics.Rate()
-        self._closing = threading.Event()
         self._make_interfaces()
-        self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
         self._worker.start()
 
     def _make_interfaces(self) -> None:
         override = {"qos_overriding_options": qos.overridable()}
         bulk = MutuallyExclusiveCallbackGroup()
         waiting = MutuallyExclusiveCallbackGroup()
-        self.create_subscription(EventPacket, "camera/events", self._on_packet, qos.events(),
-                                 callback_group=bulk, **override)  # fmt: skip
+        packets = self.create_subscription(EventPacket, "camera/events", self._on_packet,
+                                           qos.events(), callback_group=bulk,
+                                           **override)  # fmt: skip
         self.create_subscription(TimeReference, "camera/clock", self._on_clock, qos.latched())
         self.create_subscription(
             LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )
-        self.create_subscription(
+        odometry = self.create_subscription(
             Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
         )
+        self._sources = (packets, odometry)
         self._state = self.create_publisher(ReconstructionState, "reconstruction/state", 10)
         if self.parameters["publish_tf"]:
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
@@ -122,7 +127,8 @@ class ReconstructionNode(Node):
     def destroy_node(self) -> None:
         """Stop the worker, then the node."""
         self._closing.set()
-        self._worker.join(timeout=5.0)
+        if self._worker.is_alive():
+            self._worker.join(timeout=5.0)
         super().destroy_node()
 
     # Callbacks: queue and return.
@@ -161,6 +167,16 @@ class ReconstructionNode(Node):
             self._tf.publish(TFMessage(transforms=[carriage]))
 
     def _on_begin(self, request: Any, response: Any) -> Any:
+        # A publisher may know this node's subscriptions before they know the publisher; whoever
+        # begins a scan must be able to rely on every message sent from then on.
+        missing = self._unconnected()
+        deadline_s = time.monotonic() + _CONNECT_S
+        while missing and time.monotonic() < deadline_s and not self._closing.wait(0.02):
+            missing = self._unconnected()
+        if missing:
+            response.success = False
+            response.message = f"nobody publishes {' and '.join(missing)}; start camera and stage"
+            return response
         begin = partial(
             self._pipeline.begin_scan,
             request.scan_id,
@@ -169,6 +185,9 @@ class ReconstructionNode(Node):
         )
         response.success, response.message = self._in_worker(begin)
         return response
+
+    def _unconnected(self) -> list[str]:
+        return [source.topic_name for source in self._sources if not source.get_publisher_count()]
 
     def _on_end(self, request: Any, response: Any) -> Any:
         finished = threading.Event()
