@@ -1,0 +1,64 @@
+"""How fast is the simulated world? Events per second and real-time factor against lit columns.
+
+Run: python benchmark/simulation.py [--seconds 0.5] [--repeats 3]
+One core; thread time, best of the repeats, the stage moving at 50 mm/s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.motion import plan_move
+from eschorty_ros.simulation.scene import named
+from eschorty_ros.simulation.world import BACKGROUND_HZ, World
+
+CASES = [
+    ("steps", 0, 70.0),
+    ("steps", 160, 70.0),
+    ("steps", 640, 70.0),
+    ("steps", 1280, 70.0),
+    ("tilted", 1280, 70.0),
+    ("sphere", 1280, 70.0),
+    ("steps", 1280, 500.0),
+    ("steps", 160, 5000.0),
+]
+
+
+def run(scene: str, lit: int, frequency_hz: float, seconds: float) -> tuple[float, int, int]:
+    """Thread seconds, events and bytes; a dark run has the whole sensor and no laser."""
+    calibration = load_calibration("config_3").model_copy(
+        update={"columns": lit or 1280, "principal_column": (lit or 1280) / 2 - 0.5}
+    )
+    world = World(named(scene), calibration, seed=1, background_hz=BACKGROUND_HZ)
+    if lit:
+        world.set_laser(0, True, Modulation(frequency_hz, 0.5, "square", 0))
+    world.set_stage(plan_move(0, 10.0, 210.0, 50.0, 2000.0))
+    begun = time.thread_time()
+    size = len(world.advance(round(seconds * 1e6)))
+    return time.thread_time() - begun, world.events, size
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=0.5, help="sensor time of one run")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    run("tilted", 8, 70.0, 0.05)
+    print(
+        f"{'scene':8}{'lit columns':>12}{'Hz':>7}{'Mev/s sensor':>14}{'Mev/s CPU':>11}"
+        f"{'B/event':>9}{'x real time':>13}"
+    )
+    for scene, lit, frequency_hz in CASES:
+        results = [run(scene, lit, frequency_hz, options.seconds) for _ in range(options.repeats)]
+        spent, events, size = min(results)
+        print(
+            f"{scene:8}{lit:12}{frequency_hz:7.0f}{events / options.seconds / 1e6:14.2f}"
+            f"{events / spent / 1e6:11.1f}{size / events:9.2f}{options.seconds / spent:13.1f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
