@@ -14,6 +14,9 @@ from eschorty_ros.core.errors import ArgumentError
 _HIGH, _LOW, _T_US, _Y, _BASE, _VPOL = range(6)
 _NONE = -1
 
+_SINGLES_MAX = 3
+"""A vector group costs three words after another one, four otherwise: more events must share it."""
+
 _IDLE_MAX_US = 3_600_000_000
 """Longest silence filled with TIME_HIGH words: one hour, 1.8 MB."""
 
@@ -86,7 +89,7 @@ def _put_row(k, end, x, y, p, width, s, words, n):
         count = np.uint64(0)
         if base >= 0 and base + 32 <= width:
             count, mask = _group(x, k, end, base)
-        if count <= np.uint64(3 if chained else 4):
+        if count <= np.uint64(_SINGLES_MAX if chained else _SINGLES_MAX + 1):
             words[n] = np.uint16(0x2000 | (p << 11) | first)
             n += np.uint64(1)
             k += np.uint64(1)
@@ -124,9 +127,22 @@ def _encode(t, x, y, p, trigger_t, trigger_edge, width, s, words):
         last = k + np.uint64(1)
         while last < end and t[last] == t[k] and y[last] == y[k] and p[last] == p[k]:
             last += np.uint64(1)
-        n = _put_time(t[k], s, words, n)
-        n = _put_row(k, last, x, np.int64(y[k]), np.int64(p[k]), width, s, words, n)
-        k = last
+        if t[k] != s[_T_US]:
+            n = _put_time(t[k], s, words, n)
+        if last - k > np.uint64(_SINGLES_MAX):
+            n = _put_row(k, last, x, np.int64(y[k]), np.int64(p[k]), width, s, words, n)
+            k = last
+            continue
+        # Too few for a vector; no call, since each costs more than the words themselves.
+        if s[_Y] != np.int64(y[k]):
+            s[_Y] = np.int64(y[k])
+            s[_BASE] = _NONE
+            words[n] = y[k]
+            n += np.uint64(1)
+        while k < last:
+            words[n] = np.uint16(0x2000 | np.int64(p[k]) << 11 | np.int64(x[k]))
+            n += np.uint64(1)
+            k += np.uint64(1)
     return n
 
 

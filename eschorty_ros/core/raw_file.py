@@ -85,7 +85,7 @@ class RawReader:
             self._warn("holds a header and no events")
 
     def chunks(self, size: int = CHUNK_BYTES) -> Iterator[bytes]:
-        """The words' bytes in pieces of ``size`` bytes, the last one shorter.
+        """Iterate over the words' bytes in pieces of ``size`` bytes, the last one shorter.
 
         Raises
         ------
