@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
+from eschorty_ros.action import Scan
+from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 from ros_process import Observer, wait_until
 from sensor_msgs.msg import PointCloud2
 
-from eschorty_ros.action import Scan
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.cloud import POINT_DTYPE
-from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.cloud_messages import points_from_message
 from eschorty_ros.report.accuracy import lit_columns, range_error_mm
@@ -239,7 +239,7 @@ def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
 def _assert_partial(points: np.ndarray, result: Any, stop_m: float) -> None:
     assert len(points) == result.points > 0
     reached_m = float(points["y"].max())
-    assert START_M - 1e-6 <= points["y"].min()
+    assert points["y"].min() >= START_M - 1e-6
     assert reached_m < stop_m
     period_mm = 1e3 * (reached_m - float(points["y"].min())) / max(result.profiles - 1, 1)
     positions = float(points["y"].min()) * 1e3 + period_mm * np.arange(result.profiles)

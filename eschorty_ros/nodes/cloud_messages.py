@@ -46,7 +46,7 @@ _POINT_FIELD_TYPES = {
 def _bytes_field(values: NDArray[Any]) -> array[int]:
     """Copy an array's bytes into the one type a message field takes at full speed."""
     data = array("B")
-    data.frombytes(memoryview(np.ascontiguousarray(values)).cast("B"))
+    data.frombytes(np.ascontiguousarray(values).data.cast("B"))
     return data
 
 
@@ -58,7 +58,8 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
     message.height = 1
     message.width = len(points)
     dtype = points.dtype
-    assert dtype.names is not None and dtype.fields is not None
+    assert dtype.names is not None
+    assert dtype.fields is not None
     message.fields = [
         PointField(
             name=name,
@@ -78,7 +79,7 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
 
 
 def points_from_message(message: PointCloud2) -> NDArray[Any]:
-    """Structured array over the bytes of an unorganised cloud; a view, fields as the message has them."""
+    """View an unorganised cloud as a structured array, fields as the message has them."""
     codes = {datatype: "<" + code for code, datatype in _POINT_FIELD_TYPES.items()}
     dtype = np.dtype(
         {

@@ -1,4 +1,4 @@
-"""Between ROS units and messages and the package's own: seconds and metres, nanoseconds and millimetres."""
+"""Between ROS messages in SI units and the package's own nanoseconds and millimetres."""
 
 from __future__ import annotations
 

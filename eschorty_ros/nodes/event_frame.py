@@ -31,7 +31,7 @@ class EventFrame:
         self._newest_us[events.y, events.x] = events.t
 
     def render(self) -> NDArray[np.uint8]:
-        """The picture now, (rows, columns) uint8."""
+        """Draw the picture now, (rows, columns) uint8."""
         now_us = self._decoder.time_us
         if now_us is None:
             return np.zeros(self._newest_us.shape, dtype=np.uint8)

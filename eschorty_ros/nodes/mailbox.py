@@ -42,7 +42,7 @@ class Mailbox:
         return self._append(job, True)
 
     def take(self, timeout_s: float) -> Job | None:
-        """The oldest job, ``None`` when none comes within ``timeout_s``."""
+        """Return the oldest job, ``None`` when none comes within ``timeout_s``."""
         with self._arrived:
             if not self._jobs and not self._arrived.wait_for(lambda: bool(self._jobs), timeout_s):
                 return None

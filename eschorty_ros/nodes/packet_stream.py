@@ -21,7 +21,7 @@ _TIME_HIGH = 0x8
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One ``EventPacket``: ``data`` is a buffer of EVT3 words, ``stamp_ns`` its ROS arrival time."""
+    """One ``EventPacket``: ``data`` is a buffer of EVT3 words, ``stamp_ns`` its arrival time."""
 
     seq: int
     stamp_ns: int
@@ -128,7 +128,7 @@ class PacketStream:
         return total
 
     def announce_zero(self, zero_ns: int) -> None:
-        """The camera says its sensor time 0 was ROS time ``zero_ns``."""
+        """Take the camera's word that its sensor time 0 was ROS time ``zero_ns``."""
         if self._announced and self._clock is not None and self._clock.zero_ns == zero_ns:
             self._clock_used = False
             return
@@ -138,7 +138,7 @@ class PacketStream:
         self._clock_used = False
 
     def set_laser(self, modulation: Modulation, epoch_ns: int | None) -> None:
-        """The modulation and the ROS time of one rising edge, for packets processed later."""
+        """Use this modulation and ROS time of one rising edge for packets processed later."""
         if (modulation, epoch_ns) == self._laser:
             return
         self._laser = modulation, epoch_ns
@@ -229,7 +229,7 @@ class PacketStream:
         self.packets += 1
 
     def _missed_wraps(self, packet: Packet, high_us: int | None) -> int:
-        """Wraps of the sensor's time before this packet that a fresh decoder does not know of."""
+        """Count the wraps before this packet that a fresh decoder does not know of."""
         if packet.seq == 0 or not self._announced or high_us is None:
             return 0
         assert self._clock is not None
@@ -245,9 +245,7 @@ class PacketStream:
         modulation, epoch_ns = self._laser
         if epoch_ns is None or not self._announced or self._clock is None:
             return modulation
-        return replace(
-            modulation, on_edge_us=self._clock.to_us(epoch_ns) - self._wraps * WRAP_US
-        )
+        return replace(modulation, on_edge_us=self._clock.to_us(epoch_ns) - self._wraps * WRAP_US)
 
     def _retire(self) -> None:
         """Close the open period and keep the counters of the reconstructor that ends here."""

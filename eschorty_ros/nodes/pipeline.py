@@ -1,4 +1,4 @@
-"""All of the reconstruction node's work on data, without ROS: packets and stage samples to scans."""
+"""The reconstruction node's work without ROS: packets and stage samples to scans."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ class Outputs:
                 self._last_profile_ns = edge_ns
                 t_ns = timed.t_ns[start:stop]
                 stamp_ns = int(t_ns.min())
-                points = place_link(timed.profiles.select(slice(start, stop)), self._model)
+                points = place_link(timed.profiles.select(np.arange(start, stop)), self._model)
                 self._profile.publish(
                     cloud_message(live_points(points, t_ns, stamp_ns), stamp_ns, LINK)
                 )

@@ -23,7 +23,7 @@ class TimedPacket:
 
 
 def timed_packets(reader: RawReader) -> Iterator[TimedPacket]:
-    """The stream in packets of at most 256 kB and about 10 ms; concatenated they are the file."""
+    """Cut the stream into packets of at most 256 kB and about 10 ms; joined they are the file."""
     decoder = Decoder(reader.header.width, reader.header.height)
     pending: list[bytes] = []
     size = 0

@@ -131,9 +131,7 @@ class ReplayNode(Node):
         lost_before = self._lost
         last_us = self._publish_stream()
         self._publish_rows(np.iinfo(np.int64).max)
-        self._wait(
-            lambda: self._until_ns >= self._ns(last_us), "the reconstruction stands still"
-        )
+        self._await_processed(last_us)
         for warning in self._reader.warnings:
             self.get_logger().warning(warning)
         answer = self._call(self._end, EndScan.Request(scan_id=name))
@@ -211,12 +209,7 @@ class ReplayNode(Node):
             if row >= 0:
                 ahead = max(min(int(rows_us[row]), until_us), ahead if ahead is not None else 0)
             if ahead is not None:
-                target_ns = self._ns(ahead)
-                self._advanced_s = time.monotonic()
-                self._wait(
-                    lambda target_ns=target_ns: self._until_ns >= target_ns,
-                    "the reconstruction stands still",
-                )
+                self._await_processed(ahead)
         return until_us
 
     def _pace(self, began_s: float, elapsed_s: float, rate: float) -> None:
@@ -239,6 +232,10 @@ class ReplayNode(Node):
             self._next_row += 1
             if t_us >= until_us:
                 break
+
+    def _await_processed(self, t_us: int) -> None:
+        self._advanced_s = time.monotonic()
+        self._wait(lambda: self._until_ns >= self._ns(t_us), "the reconstruction stands still")
 
     def _ns(self, t_us: int) -> int:
         return self._zero_ns + t_us * NS_PER_US

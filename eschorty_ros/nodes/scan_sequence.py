@@ -12,7 +12,7 @@ from eschorty_ros.core.errors import ArgumentError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 
 
-class ScanFailure(EschortyError):
+class ScanFailure(EschortyError):  # noqa: N818 - named as the other failures are told
     """A scan that cannot go on; the message begins with the culprit."""
 
 
@@ -185,7 +185,7 @@ def run_scan(rig: Rig, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
 def _finish(
     rig: Rig, request: ScanRequest, limits: ScanLimits, outcome: ScanOutcome, collecting: bool
 ) -> None:
-    """The way out of every scan: light off first."""
+    """Leave every scan the same way: light off first."""
     rig.shield()
     rig.watch(False)
     _attempt(outcome, rig.laser_off)

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -222,7 +223,7 @@ def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | 
 
     ``None`` when the samples do not cross it.
     """
-    for (t0_ns, p0_mm), (t1_ns, p1_mm) in zip(samples, samples[1:], strict=False):
+    for (t0_ns, p0_mm), (t1_ns, p1_mm) in pairwise(samples):
         if p0_mm != p1_mm and min(p0_mm, p1_mm) <= level_mm <= max(p0_mm, p1_mm):
             return t0_ns + round((t1_ns - t0_ns) * (level_mm - p0_mm) / (p1_mm - p0_mm))
     return None

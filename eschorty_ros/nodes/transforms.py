@@ -17,7 +17,7 @@ OPTICAL = "eschorty_optical"
 def carriage(
     t_ns: int, position_mm: float, direction: tuple[float, float, float]
 ) -> TransformStamped:
-    """Base to carriage at ROS time ``t_ns``: along the unit vector ``direction``."""
+    """Place the carriage in the base at ROS time ``t_ns``: along the unit vector ``direction``."""
     transform = _between(BASE, STAGE, t_ns)
     position_m = m_from_mm(position_mm)
     transform.transform.translation.x = position_m * direction[0]
@@ -27,7 +27,7 @@ def carriage(
 
 
 def mounts(t_ns: int) -> list[TransformStamped]:
-    """The static ones: carriage to link (same axes), link to optical (z forward, x along the line).
+    """Make the static ones: carriage to link (same axes), link to optical (z forward).
 
     The optical frame shares the link's origin: it is a change of axes, x right along increasing
     columns, y down, z along the range axis.

@@ -69,6 +69,7 @@ def test_missing_recording_is_one_line(tmp_path):
     try:
         assert replay.wait(20.0) == 1
         lines = [line for line in replay.output.splitlines() if line.strip()]
-        assert len(lines) == 1 and "none" in lines[0], replay.output
+        assert len(lines) == 1, replay.output
+        assert "none" in lines[0]
     finally:
         replay.kill()
