@@ -27,7 +27,9 @@ class Gate:
     """
 
     modulation: Modulation
-    _period: Fraction = field(init=False, repr=False, compare=False)
+    _period: tuple[int, int] = field(init=False, repr=False, compare=False)
+    _duty: tuple[int, int] = field(init=False, repr=False, compare=False)
+    _origin_us: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.modulation.on_edge_us is None:
@@ -36,21 +38,30 @@ class Gate:
             raise ArgumentError(
                 f"waveform is {self.modulation.waveform!r}; the simulation renders 'square' only"
             )
-        object.__setattr__(self, "_period", 1_000_000 / Fraction(self.modulation.frequency_hz))
+        # Integers throughout: edges are asked for in the inner loop, Fraction objects are slow.
+        period = 1_000_000 / Fraction(self.modulation.frequency_hz)
+        object.__setattr__(self, "_period", period.as_integer_ratio())
+        object.__setattr__(self, "_duty", Fraction(self.modulation.duty).as_integer_ratio())
+        object.__setattr__(self, "_origin_us", self.modulation.on_edge_us)
 
     def rise_us(self, index: int) -> int:
         """Rising edge ``index``, us."""
-        return self.modulation.edge_us(index)
+        numerator, denominator = self._period
+        return self._origin_us + _round_ratio(index * numerator, denominator)
 
     def fall_us(self, index: int) -> int:
         """Falling edge of period ``index``, us; at least 1 us from both rising edges."""
-        duty = Fraction(self.modulation.duty)
-        fall = (self.modulation.on_edge_us or 0) + round((index + duty) * self._period)
+        numerator, denominator = self._period
+        share, whole = self._duty
+        fall = self._origin_us + _round_ratio(
+            (index * whole + share) * numerator, whole * denominator
+        )
         return max(self.rise_us(index) + 1, min(fall, self.rise_us(index + 1) - 1))
 
     def index(self, t_us: int) -> int:
         """Index of the period that holds ``t_us``."""
-        index = int((t_us - (self.modulation.on_edge_us or 0)) / self._period)
+        numerator, denominator = self._period
+        index = (t_us - self._origin_us) * denominator // numerator
         while self.rise_us(index) > t_us:
             index -= 1
         while self.rise_us(index + 1) <= t_us:
@@ -66,6 +77,13 @@ class Gate:
         index = self.index(t_us)
         fall = self.fall_us(index)
         return fall if t_us < fall else self.rise_us(index + 1)
+
+
+def _round_ratio(numerator: int, denominator: int) -> int:
+    """Nearest integer to a ratio, halves to even, as ``round`` of a Fraction."""
+    whole, rest = divmod(numerator, denominator)
+    up = 2 * rest > denominator or (2 * rest == denominator and whole % 2 == 1)
+    return whole + up
 
 
 class LaserTimeline:
