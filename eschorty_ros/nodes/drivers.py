@@ -27,11 +27,14 @@ def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSourc
     from eschorty_ros.core.calibration import load_calibration
     from eschorty_ros.simulation.fake_camera import FakeCamera
     from eschorty_ros.simulation.scene import named
+    from eschorty_ros.simulation.warm_up import warm_up
     from eschorty_ros.simulation.world import World
 
+    calibration = load_calibration(parameters["calibration"])
+    warm_up(calibration)
     world = World(
         named(parameters["scene"]),
-        load_calibration(parameters["calibration"]),
+        calibration,
         seed=parameters["seed"],
         background_hz=parameters["background_rate"],
     )

@@ -45,7 +45,7 @@ NODES = {
     "scanner": ScannerNode,
 }
 THREADS = 12
-START_S = 30.0
+START_S = 60.0
 SLACK_S = 60.0
 _POLL_S = 0.02
 

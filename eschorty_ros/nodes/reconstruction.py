@@ -21,41 +21,24 @@ from tf2_msgs.msg import TFMessage
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.errors import ArgumentError, EschortyError
-from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
 from eschorty_ros.core.reconstruction import Settings
-from eschorty_ros.msg import LaserState, ReconstructionState
+from eschorty_ros.core.warm_up import warm_up
+from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, qos, transforms
 from eschorty_ros.nodes.conversions import (
     mm_from_m,
     modulation_from_laser_state,
     ns_from_stamp,
-    stamp_from_ns,
 )
 from eschorty_ros.nodes.mailbox import Mailbox
 from eschorty_ros.nodes.packet_stream import Packet
-from eschorty_ros.nodes.parameters import Param, Parameters, from_settings
+from eschorty_ros.nodes.parameters import Parameters, from_settings
 from eschorty_ros.nodes.pipeline import Pipeline, ScanReport
 from eschorty_ros.nodes.reconstruction_outputs import Outputs
+from eschorty_ros.nodes.reconstruction_parameters import TABLE, modulation_override
+from eschorty_ros.nodes.reconstruction_reports import Reports, fill_end_scan
 from eschorty_ros.nodes.spin import run
 from eschorty_ros.srv import BeginScan, EndScan
-
-TABLE = (
-    Param("calibration", "config_3", "calibration: a name in config/ or a file's path"),
-    Param("frequency", 0.0, "modulation frequency; 0 takes the laser node's settings", "Hz",
-          0.0, FREQUENCY_MAX_HZ, dynamic=True),
-    Param("duty", 0.5, "duty where frequency is given", "", 0.001, 0.999, dynamic=True),
-    Param("waveform", "square", "waveform where frequency is given",
-          choices=WAVEFORMS, dynamic=True),
-    Param("clock_timeout", 2.0, "wait for camera/clock before the packets' stamps serve instead",
-          "s", 0.0, 60.0),
-    Param("stage_gap", 0.5, "longest distance of two stage samples that is bridged; 0 bridges any",
-          "s", 0.0, 1e6, dynamic=True),
-    # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.
-    Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
-    Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
-    Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
-    Param("publish_tf", True, "publish /tf and /tf_static"),
-)  # fmt: skip
 
 _STAGE_DEPTH = 2000
 _CONNECT_S = 3.0
@@ -75,7 +58,8 @@ class ReconstructionNode(Node):
         table = (*TABLE, *from_settings(Settings, dynamic=True))
         self.parameters = Parameters(self, table, self._on_change)
         self.calibration = load_calibration(self.parameters["calibration"])
-        self._override = _override(self.parameters)
+        warm_up(self.calibration)
+        self._override = modulation_override(self.parameters)
         self._pipeline = Pipeline(
             self.calibration,
             self.parameters.settings(Settings),
@@ -88,9 +72,7 @@ class ReconstructionNode(Node):
         self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
         self._mailbox = Mailbox(self.parameters["packets_max"])
         self._ending: tuple[Callable[[ScanReport], None], ...] = ()
-        self._faults = 0
-        self._rate = diagnostics.Rate()
-        self._diagnostics_rate = diagnostics.Rate()
+        self._reports = Reports(self, self._pipeline, self._mailbox)
         self._make_interfaces()
         self._worker.start()
 
@@ -109,7 +91,6 @@ class ReconstructionNode(Node):
             Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
         )
         self._sources = (packets, odometry)
-        self._state = self.create_publisher(ReconstructionState, "reconstruction/state", 10)
         if self.parameters["publish_tf"]:
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
             self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
@@ -121,8 +102,8 @@ class ReconstructionNode(Node):
         ):
             self.create_service(kind, name, callback, callback_group=waiting)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(0.1, self._publish_state, clock=steady)
-        self._diagnostics = diagnostics.Diagnostics(self, self._report)
+        self.create_timer(0.1, self._reports.publish_state, clock=steady)
+        self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
 
     def destroy_node(self) -> None:
         """Stop the worker, then the node."""
@@ -208,7 +189,7 @@ class ReconstructionNode(Node):
             response.success = False
             response.message = "the scan was not assembled in time; see the node's log"
             return response
-        _fill(response, reports[0])
+        fill_end_scan(response, reports[0])
         return response
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
@@ -242,7 +223,7 @@ class ReconstructionNode(Node):
                 # The context is invalid after a signal; a failure then is no news.
                 if self._closing.is_set() or not self.context.ok():
                     return
-                self._faults += 1
+                self._reports.faults += 1
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
 
     def _take_packet(self, packet: Packet) -> None:
@@ -266,84 +247,12 @@ class ReconstructionNode(Node):
     def _on_change(self, values: dict[str, Any]) -> None:
         names = Settings.__dataclass_fields__
         settings = Settings(**{name: values[name] for name in names if name in values})
-        override = _override(values)
+        override = modulation_override(values)
         self._mailbox.post(partial(self._pipeline.stream.set_settings, settings))
         self._mailbox.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
         self._override = override
         if override is not None:
             self._mailbox.post(partial(self._pipeline.stream.set_laser, override, None))
-
-    # Reports.
-
-    def _publish_state(self) -> None:
-        pipeline = self._pipeline
-        counters = pipeline.stream.counters
-        until_ns = pipeline.stream.processed_until_ns
-        state = ReconstructionState()
-        state.header.stamp = self.get_clock().now().to_msg()
-        if until_ns is not None:
-            state.processed_until = stamp_from_ns(until_ns)
-        state.events = counters["events"]
-        state.events_per_second = self._rate.read(counters["events"])
-        state.profiles = pipeline.profiles
-        state.points = pipeline.points
-        state.packets_lost = pipeline.stream.packets_lost
-        state.events_dropped = counters["events_dropped"]
-        state.sensor_drop_words = counters["sensor_drop_words"]
-        state.points_without_stage = pipeline.placer.points_without_stage
-        state.scan_id = pipeline.scan_id
-        state.calibration = self.calibration.name
-        self._state.publish(state)
-
-    def _report(self) -> diagnostics.Report:
-        stream, placer = self._pipeline.stream, self._pipeline.placer
-        residual_ns = stream.clock_residual_ns
-        values: dict[str, Any] = {
-            "packets": stream.packets,
-            "packets_lost": stream.packets_lost,
-            "packets_refused_queue_full": self._mailbox.overflows,
-            "packets_held": stream.held,
-            "stream_restarts": stream.restarts,
-            "queue": len(self._mailbox),
-            "events_per_second": self._diagnostics_rate.read(stream.counters["events"]),
-            "clock": "announced" if stream.clock_announced else "from packet stamps",
-            "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
-            "profiles": self._pipeline.profiles,
-            "points": self._pipeline.points,
-            "points_waiting_for_stage": placer.waiting,
-            "points_without_stage": placer.points_without_stage,
-            "stage_samples_late": placer.late_samples,
-            "faults": self._faults,
-            **{f"reconstructor_{k}": v for k, v in sorted(stream.counters.items())},
-        }
-        if self._faults:
-            return diagnostics.ERROR, "internal errors; see the log", values
-        if stream.held:
-            return diagnostics.WARN, f"packets wait for the {stream.waits_for}", values
-        if stream.packets_lost or placer.points_without_stage:
-            return diagnostics.WARN, "packets or points were lost", values
-        return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
-
-
-def _override(values: Any) -> Modulation | None:
-    if not values["frequency"]:
-        return None
-    return Modulation(values["frequency"], values["duty"], values["waveform"])
-
-
-def _fill(response: Any, report: ScanReport) -> None:
-    response.profiles = report.scan.profiles
-    response.points = len(report.scan.points)
-    response.events = report.events
-    response.packets_lost = report.packets_lost
-    response.events_dropped = report.events_dropped
-    response.sigma_median = report.scan.sigma_median_m
-    notes = []
-    if report.points_without_stage:
-        notes.append(f"{report.points_without_stage} points had no stage position")
-    if report.points_over_limit:
-        notes.append(f"{report.points_over_limit} points were over the scan's limit")
-    response.message = "; ".join(notes)
 
 
 def main() -> int:

@@ -46,7 +46,8 @@ TABLE = (
     Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),
     Param("acceleration", 2.0, "the stage's, from which the run-up follows", "m/s^2", 1e-3, 100.0),
     Param("approach_speed", 0.1, "speed towards the start", "m/s", 1e-6, 1.0),
-    Param("node_timeout", 10.0, "longest wait for the other nodes", "s", 0.1, 600.0),
+    # A machine's first run compiles for some 20 s before the nodes answer.
+    Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
     Param("events_timeout", 1.0, "longest pause of the events while the laser is on", "s",
           0.1, 60.0),
@@ -159,7 +160,7 @@ class ScannerNode(Node):
     def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:
         sent_s = -math.inf
         sent_phase = ""
-        before = self._rig.reconstruction
+        before = self._rig.monitor.reconstruction
         points_before = before.points if before is not None else 0
         profiles_before = before.profiles if before is not None else 0
 
@@ -169,10 +170,10 @@ class ScannerNode(Node):
             if phase == sent_phase and now_s - sent_s < _FEEDBACK_S:
                 return
             sent_s, sent_phase = now_s, phase
-            position_mm = self._rig.position_mm
+            position_mm = self._rig.monitor.position_mm
             feedback = Scan.Feedback(phase=phase, progress=_progress(phase, position_mm, request))
             feedback.position = m_from_mm(position_mm)
-            state = self._rig.reconstruction
+            state = self._rig.monitor.reconstruction
             if state is not None:
                 feedback.points = max(state.points - points_before, 0)
                 feedback.profiles = max(state.profiles - profiles_before, 0)
@@ -194,7 +195,7 @@ class ScannerNode(Node):
             events_dropped=summary.events_dropped,
             sigma_median=summary.sigma_median_m,
         )
-        samples = list(self._rig.samples)
+        samples = list(self._rig.monitor.samples)
         if samples:
             start_ns = crossing_ns(samples, request.start_mm)
             stop_ns = crossing_ns(samples, request.stop_mm)

@@ -1,0 +1,39 @@
+"""Compiling the kernels before data arrive."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eschorty_ros.core.calibration import Calibration
+from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.reconstructor import Reconstructor
+
+FREQUENCY_HZ = 1000.0
+
+
+def warm_up(calibration: Calibration) -> None:
+    """Run a few events through a reconstruction of its own.
+
+    The first run on a machine compiles for some seconds; later runs load what that left in
+    numba's cache. A node does this before it takes data, which would pile up meanwhile.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    """
+    periods, columns, events = 4, 8, 6
+    modulation = Modulation(FREQUENCY_HZ, on_edge_us=0)
+    t, column, event = np.meshgrid(
+        np.arange(periods) * 1000 + 100, np.arange(columns), np.arange(events), indexing="ij"
+    )
+    row = calibration.rows // 2 + event
+    data = Encoder(calibration.columns, calibration.rows).encode(
+        t.ravel().astype(np.int64),
+        column.ravel().astype(np.uint16),
+        row.ravel().astype(np.uint16),
+        np.ones(t.size, np.uint8),
+    )
+    reconstructor = Reconstructor(calibration, modulation)
+    reconstructor.push(data)
+    reconstructor.flush()
