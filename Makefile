@@ -68,7 +68,7 @@ clean:
 
 $(BUILD)/run.stamp: requirements/run.txt requirements/ros.txt requirements/constraints.txt
 	@echo "Installing Python packages into .venv"
-	@$(PYTHON) -m venv $(VENV_FLAGS) $(VENV)
+	@[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV_FLAGS) $(VENV)
 	@$(PIP) $(RUN_REQUIREMENTS)
 	@mkdir -p $(BUILD) && touch $@
 
