@@ -33,7 +33,7 @@ endif
 provided = $(strip $(foreach prefix,$(subst :, ,$(UNDERLAY)),$(wildcard $(prefix)/share/$(1)/package.xml)))
 EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(package)),,$(package)))
 
-INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/*) \
+INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
 .PHONY: help setup scan test check lint format types contracts clean
