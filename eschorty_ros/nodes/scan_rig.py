@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.action import MoveStage
-from eschorty_ros.msg import LaserState, ReconstructionState
-from eschorty_ros.nodes import qos
-from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, ns_from_stamp, stamp_from_ns
+from eschorty_ros.msg import LaserState
+from eschorty_ros.nodes.conversions import m_from_mm, stamp_from_ns
+from eschorty_ros.nodes.scan_monitor import ScanMonitor
 from eschorty_ros.nodes.scan_sequence import (
     ScanCanceled,
     ScanFailure,
@@ -32,8 +30,6 @@ from eschorty_ros.srv import BeginScan, EndScan
 
 _TICK_S = 0.02
 _HEARTBEAT_S = 0.1
-_STALE_S = 1.0
-_SAMPLES_MAX = 500_000
 
 
 class RosRig:
@@ -60,19 +56,8 @@ class RosRig:
         self._service_timeout_s = service_timeout_s
         self._events_timeout_s = events_timeout_s
         group = ReentrantCallbackGroup()
-        self._laser: tuple[float, LaserState | None] = (0.0, None)
-        self._reconstruction: tuple[float, ReconstructionState | None] = (0.0, None)
-        self._until_ns = 0
-        self._advanced_s = 0.0
-        self._odometry: tuple[float, float] = (0.0, float("nan"))
-        self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
-        node.create_subscription(LaserState, "laser/state", self._on_laser,
-                                 qos.latched(qos.STATE_HISTORY), callback_group=group)  # fmt: skip
-        node.create_subscription(ReconstructionState, "reconstruction/state",
-                                 self._on_reconstruction, 10, callback_group=group)  # fmt: skip
-        node.create_subscription(
-            Odometry, "stage/odom", self._on_stage, qos.stream(), callback_group=group
-        )
+        # In a group of its own, one message at a time, so that samples stay in order.
+        self.monitor = ScanMonitor(node, MutuallyExclusiveCallbackGroup())
         self._heartbeat = node.create_publisher(Header, "laser/heartbeat", 10)
         self._clients = {
             name: node.create_client(kind, name, callback_group=group)
@@ -95,22 +80,12 @@ class RosRig:
         self._feedback: Callable[[str], None] = lambda phase: None
         self._phase = ""
 
-    @property
-    def position_mm(self) -> float:
-        """Newest stage position, NaN when none was ever received."""
-        return self._odometry[1]
-
-    @property
-    def reconstruction(self) -> ReconstructionState | None:
-        """Newest state of the reconstruction."""
-        return self._reconstruction[1]
-
     def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
         """Reset for a new scan; both callables are used at every ``pause``."""
         self._canceled, self._feedback = canceled, feedback
         self._watching = self._shielded = False
         self._phase = "preparing"
-        self.samples.clear()
+        self.monitor.samples.clear()
 
     def end(self) -> None:
         """Make every wait fail from now on."""
@@ -120,16 +95,18 @@ class RosRig:
 
     def check_nodes(self) -> None:
         """See ``Rig``."""
-        begun_ns = self._until_ns
+        begun_ns = self.monitor.until_ns
         for what, there in (
             *((name, client.service_is_ready) for name, client in self._clients.items()),
             ("stage/move", self._stage.server_is_ready),
         ):
             self._wait(there, self._node_timeout_s, f"{what.split('/')[0]}: no {what}")
-        self._wait(lambda: self._age_s(self._odometry[0]) < _STALE_S, self._node_timeout_s,
-                   "stage: no odometry")  # fmt: skip
-        self._wait(lambda: self._laser[1] is not None, self._node_timeout_s, "laser: no state")
-        self._wait(lambda: self._until_ns > begun_ns, self._node_timeout_s, self._no_events)
+        for there, failure in (
+            (lambda: self.monitor.stage_heard, lambda: "stage: no odometry"),
+            (lambda: self.monitor.laser is not None, lambda: "laser: no state"),
+            (lambda: self.monitor.until_ns > begun_ns, self.monitor.why_no_progress),
+        ):
+            self._wait(there, self._node_timeout_s, failure)
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """See ``Rig``."""
@@ -145,7 +122,7 @@ class RosRig:
                 raise ScanFailure(f"laser: {result.reason}")
 
         def applied() -> bool:
-            state = self._laser[1]
+            state = self.monitor.laser
             return state is not None and all(
                 abs(getattr(state, name) - value) <= 1e-3 * value for name, value in wanted.items()
             )
@@ -155,7 +132,7 @@ class RosRig:
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
         """See ``Rig``."""
-        self.samples.clear()
+        self.monitor.samples.clear()
         goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
         # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
         self._sent = self._stage.send_goal_async(goal)
@@ -168,8 +145,7 @@ class RosRig:
         future = handle.get_result_async()
         while not future.done():
             self._pause()
-            if self._age_s(self._odometry[0]) > _STALE_S:
-                raise ScanFailure(f"stage: no odometry for {_STALE_S:g} s")
+            self.monitor.check_stage()
         self._sent = None
         answer = future.result()
         if answer.status != GoalStatus.STATUS_SUCCEEDED or not answer.result.success:
@@ -219,7 +195,7 @@ class RosRig:
             answer = self._call(name, request)
             if not answer.success:
                 raise ScanFailure(f"laser: {answer.message}")
-        self._wait(lambda: self._output() == LaserState.OUTPUT_ON, self._service_timeout_s,
+        self._wait(lambda: self.monitor.output == LaserState.OUTPUT_ON, self._service_timeout_s,
                    "laser: its output does not read back on")  # fmt: skip
 
     def laser_off(self) -> None:
@@ -229,7 +205,7 @@ class RosRig:
                 answer = self._call("laser/enable", SetBool.Request(data=False))
                 if not answer.success:
                     raise ScanFailure(f"laser: {answer.message}")
-                self._wait(lambda: self._output() == LaserState.OUTPUT_OFF,
+                self._wait(lambda: self.monitor.output == LaserState.OUTPUT_OFF,
                            self._service_timeout_s,
                            "laser: its output does not read back off")  # fmt: skip
         finally:
@@ -238,7 +214,7 @@ class RosRig:
 
     def watch(self, enabled: bool) -> None:
         """See ``Rig``."""
-        self._advanced_s = time.monotonic()
+        self.monitor.restart_patience()
         self._watching = enabled
 
     def shield(self) -> None:
@@ -248,11 +224,10 @@ class RosRig:
     def drain(self, no_progress_s: float) -> None:
         """See ``Rig``."""
         target_ns = self._node.get_clock().now().nanoseconds
-        self._advanced_s = time.monotonic()
-        while self._until_ns < target_ns:
+        self.monitor.restart_patience()
+        while self.monitor.until_ns < target_ns:
             self._pause()
-            if self._age_s(self._advanced_s) > no_progress_s:
-                raise ScanFailure(self._no_events(no_progress_s))
+            self.monitor.check_progress(no_progress_s)
 
     def report(self, phase: str) -> None:
         """See ``Rig``."""
@@ -272,28 +247,11 @@ class RosRig:
             self._heartbeat.publish(Header(stamp=stamp))
         self._feedback(self._phase)
         if self._watching:
-            self._check_running()
+            self.monitor.check_laser()
+            self.monitor.check_progress(self._events_timeout_s)
         if not self._shielded and self._canceled():
             raise ScanCanceled
         time.sleep(_TICK_S)
-
-    def _check_running(self) -> None:
-        state = self._laser[1]
-        if state is None or self._age_s(self._laser[0]) > _STALE_S:
-            raise ScanFailure(f"laser: no state for {_STALE_S:g} s")
-        if state.output != LaserState.OUTPUT_ON:
-            raise ScanFailure(f"laser: went off: {state.reason}")
-        if self._age_s(self._advanced_s) > self._events_timeout_s:
-            raise ScanFailure(self._no_events(self._events_timeout_s))
-
-    def _no_events(self, timeout_s: float | None = None) -> str:
-        """Who is to blame when the reconstruction does not advance."""
-        if self._age_s(self._reconstruction[0]) > _STALE_S:
-            return f"reconstruction: no state for {_STALE_S:g} s"
-        for_s = f" for {timeout_s:g} s" if timeout_s is not None else ""
-        if self._node.count_publishers(self._node.resolve_topic_name("camera/events")) == 0:
-            return f"camera: its events stopped{for_s}; the node is gone"
-        return f"camera: no events reach the reconstruction{for_s}"
 
     def _wait(
         self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
@@ -312,28 +270,3 @@ class RosRig:
 
     def _call(self, name: str, request: Any, patience_s: float | None = None) -> Any:
         return self._answer(self._clients[name].call_async(request), name, patience_s)
-
-    @staticmethod
-    def _age_s(at_s: float) -> float:
-        return time.monotonic() - at_s
-
-    def _output(self) -> int | None:
-        state = self._laser[1]
-        return state.output if state is not None else None
-
-    # Subscriptions
-
-    def _on_laser(self, message: LaserState) -> None:
-        self._laser = time.monotonic(), message
-
-    def _on_reconstruction(self, message: ReconstructionState) -> None:
-        now_s = time.monotonic()
-        until_ns = ns_from_stamp(message.processed_until)
-        if until_ns != self._until_ns:
-            self._until_ns, self._advanced_s = until_ns, now_s
-        self._reconstruction = now_s, message
-
-    def _on_stage(self, message: Odometry) -> None:
-        position_mm = mm_from_m(message.pose.pose.position.y)
-        self._odometry = time.monotonic(), position_mm
-        self.samples.append((ns_from_stamp(message.header.stamp), position_mm))
