@@ -40,14 +40,9 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
 def _open_window(points: object, title: str) -> None:
     import numpy as np
 
-    from eschorty_ros.core.errors import ArgumentError
+    from eschorty_ros.simulation.open3d_module import load_open3d
 
-    try:
-        import open3d
-    except ImportError as error:
-        raise ArgumentError(
-            "Open3D is not installed; run `pip install open3d` or leave --window out"
-        ) from error
+    open3d = load_open3d("--window")
     xyz = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)  # type: ignore[index]
     shape = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz))
     open3d.visualization.draw_geometries([shape], window_name=title)

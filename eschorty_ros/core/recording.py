@@ -33,7 +33,7 @@ TRUTH_FILE = "truth.csv"
 
 STAGE_DTYPE = np.dtype([("t_us", "<i8"), ("position_mm", "<f8")])
 TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")])
-"""One row per modulation period and lit column: sensor time of the rising edge, column, range."""
+"""One row per modulation period and lit column: the time is the middle of the lit phase."""
 
 _LINES_AT_ONCE = 65_536
 

@@ -3,27 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.errors import EschortyError, FormatError
+from eschorty_ros.core.errors import FormatError
 from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.simulation.open3d_module import load_open3d
 from eschorty_ros.simulation.scene import Array, UniformReflectance, sheet
-
-
-def _open3d() -> ModuleType:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise EschortyError(
-            f"a mesh scene needs open3d, which does not import here ({error}); "
-            "install it with: pip install open3d"
-        ) from error
-    module: ModuleType = open3d
-    return module
 
 
 class Mesh(UniformReflectance):
@@ -49,7 +37,7 @@ class Mesh(UniformReflectance):
         faces: NDArray[np.uint32] = np.ascontiguousarray(triangles, dtype=np.uint32)
         if faces.size == 0:
             raise FormatError(f"{name} holds no triangles; give a triangle mesh in metres")
-        o3d = _open3d()
+        o3d = load_open3d("a mesh scene")
         self._tensor: Any = o3d.core.Tensor
         self._caster: Any = o3d.t.geometry.RaycastingScene()
         self._caster.add_triangles(
@@ -60,7 +48,7 @@ class Mesh(UniformReflectance):
     @classmethod
     def from_file(cls, path: str | Path) -> Mesh:
         """Mesh from any file Open3D reads (.ply, .stl, .obj, .off, .gltf)."""
-        o3d = _open3d()
+        o3d = load_open3d("a mesh scene")
         if not Path(path).is_file():
             raise FormatError(f"mesh {str(path)!r} does not exist; give the path of a mesh file")
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -13,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.cloud import POINT_DTYPE, Points, read_cloud, write_cloud
-from eschorty_ros.core.errors import ArgumentError, FormatError
+from eschorty_ros.core.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.simulation.open3d_module import load_open3d
 
 EXTENSIONS = [".pcd", ".ply"]
 
@@ -34,17 +33,10 @@ def coordinates(points: Points) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def open3d() -> ModuleType:
-    with suppress(ImportError):
-        # Open3D links libusb, which a bare machine lacks; this package brings one along.
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    module: ModuleType = pytest.importorskip(
-        "open3d",
-        reason="open3d does not import: pip install open3d libusb-package",
-        exc_type=ImportError,
-    )
-    return module
+    try:
+        return load_open3d("this test")
+    except EschortyError as error:
+        pytest.skip(str(error))
 
 
 def test_point_layout() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.simulation.open3d_module import load_open3d
 from eschorty_ros.simulation.scene import NAMES, Plane, Sphere, Steps, named
 
 MODEL = load_calibration("config_3").model_copy(update={"b_mm": 7.0}).model()
@@ -122,7 +123,10 @@ def test_a_mesh_without_open3d_names_the_package(tmp_path, monkeypatch) -> None:
 
 def open3d():
     """Open3D, or a skip that names it."""
-    return pytest.importorskip("open3d", reason="open3d does not import here", exc_type=ImportError)
+    try:
+        return load_open3d("this test")
+    except EschortyError as error:
+        pytest.skip(str(error))
 
 
 def test_mesh_agrees_with_the_analytic_plane() -> None:
