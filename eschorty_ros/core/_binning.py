@@ -14,7 +14,10 @@ from eschorty_ros.core._centroid_kernels import (
     ROW_BITS,
     TIME_LIMIT_US,
     _estimate_column,
+    _mean_shift,
+    _pad,
     _sigma2,
+    _variance,
 )
 from eschorty_ros.core._smoothing_kernels import _reject_isolated, _smooth
 
@@ -49,11 +52,12 @@ _HALF_PER_SIGMA = 1.3 * 2.3548200450309493 * FRACTION
 _WIDTH_MIN_DOF = 64
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
     """Append events before time ``limit``; returns the first event left."""
     columns = np.uintp(counts.size)
-    room = np.uint32(lists.shape[1] - BLOCK)
+    stride = np.uintp(lists.size) // columns
+    room = np.uint32(stride - np.uintp(BLOCK))
     i = np.uintp(first)
     end = np.uintp(stop)
     over = 0
@@ -65,7 +69,7 @@ def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
         if c < columns and r < rows:
             n = counts[c]
             if n < room:
-                lists[c, np.uintp(n)] = np.uint32(
+                lists[c * stride + np.uintp(n)] = np.uint32(
                     (np.uint32(min(dt, TIME_LIMIT_US - 1)) << np.uint32(ROW_BITS)) | r
                 )
                 counts[c] = n + np.uint32(1)
@@ -80,7 +84,7 @@ def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
     return np.int64(i)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _estimate_period(
     lists, counts, seeds, whole, fractional, half, work, work_int, scratch, counters
 ):
@@ -91,25 +95,39 @@ def _estimate_period(
     squares = 0.0
     freedom = 0
     neighbour = np.int64(-1)
+    stride = lists.size // counts.size
+    method, events_min = whole[P_METHOD], whole[P_EVENTS_MIN]
+    factor, floor = fractional[F_FACTOR], fractional[F_FLOOR]
     for c in range(counts.size):
         n = np.int64(counts[c])
         counts[c] = 0
         row[c] = np.nan
-        if n < whole[P_EVENTS_MIN]:
+        if n < events_min:
             if n > 0:
                 counters[C_FEW] += 1
             continue
+        start = c * stride
         seed = seeds[c] if seeds[c] >= 0 else neighbour
-        status, r, used, variance, sum_time, centre = _estimate_column(
-            lists[c], n, whole[P_METHOD], seed, half, rows, whole[P_EVENTS_MIN], scratch
-        )
-        if status != FOUND:
-            counters[C_AMBIGUOUS if status == AMBIGUOUS else C_FEW] += 1
-            continue
+        used = np.int64(0)
+        if method == MODE_MEAN and seed >= 0:
+            used, low, sum_d, sum_d2, sum_time, centre = _mean_shift(
+                lists, start, _pad(lists, start, n), seed, half
+            )
+        if used >= events_min and 2 * used > n:
+            # No window elsewhere can hold more: the seed was right.
+            r = (used * low + sum_d) / used
+            variance = _variance(used, sum_d, sum_d2)
+        else:
+            status, r, used, variance, sum_time, centre = _estimate_column(
+                lists, start, n, method, half, rows, events_min, scratch
+            )
+            if status != FOUND:
+                counters[C_AMBIGUOUS if status == AMBIGUOUS else C_FEW] += 1
+                continue
         row[c] = r
-        sigma2[c] = _sigma2(variance, used, r, rows, fractional[F_FACTOR], fractional[F_FLOOR])
+        sigma2[c] = _sigma2(variance, used, r, rows, factor, floor)
         events[c] = used
-        mean_dt[c] = (2 * sum_time + used) // (2 * used)
+        mean_dt[c] = np.int64(np.rint(sum_time / used))
         seeds[c] = centre
         neighbour = centre
         squares += variance * (used - 1)
@@ -117,7 +135,7 @@ def _estimate_period(
     return squares, freedom
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _adapted_half(half, squares, freedom, half_max):
     """Window for the next period: 1.3 x the width that this period's rows show, averaged."""
     if freedom < _WIDTH_MIN_DOF:
@@ -126,7 +144,7 @@ def _adapted_half(half, squares, freedom, half_max):
     return np.int64(min(max(np.rint(0.5 * (half + wanted)), _HALF_MIN), half_max))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scratch, counters, out):
     """Turn the open period into points behind ``state[S_POINTS]``."""
     counters[C_CLOSED] += 1
@@ -164,7 +182,7 @@ def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scrat
     state[S_POINTS] = k
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bin(
     t, x, y, first, stop, edges, indices, edge, edge_count, drain, lists, counts, seeds, state,
     whole, fractional, work, work_int, scratch, counters, out,

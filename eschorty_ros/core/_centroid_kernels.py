@@ -1,8 +1,9 @@
 """Compiled column estimators on packed events.
 
-An event of a column is one uint32: the row in the low 10 bits, the time within the window
-(microseconds) in the upper 22. A list is padded with ``PAD`` to a multiple of ``BLOCK`` entries, so
-that the inner loops run on whole vector registers without a remainder.
+A column's events are the ``n`` entries of ``packed`` from ``start`` on, each one uint32: the row in
+the low 10 bits, the time within the window (microseconds) in the upper 22. They are padded with
+``PAD`` to a multiple of ``BLOCK`` entries, so that the inner loops run on whole vector registers
+without a remainder.
 
 All sums are integers, hence exact, independent of the events' order and of the row they are counted
 from. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places, rounded half to
@@ -38,71 +39,56 @@ TOO_FEW = 1
 AMBIGUOUS = 2
 
 
-@njit(cache=True, nogil=True)
-def _pad(packed, n):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pad(packed, start, n):
     """Fill the last block behind ``n`` entries; returns the number of blocks."""
     blocks = (n + BLOCK - 1) // BLOCK
     for i in range(n, blocks * BLOCK):
-        packed[i] = PAD
+        packed[start + i] = PAD
     return blocks
 
 
-@njit(cache=True, nogil=True)
-def _window_spread(packed, blocks, low, high):
-    """Sums of d squared (d = row - low) and of times over rows low..high."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _window_sums(packed, start, blocks, low, high):
+    """Count, sum of d, of d squared (d = row - low) and of times over rows low..high.
+
+    Count and sum of d grow in one register lane: a chunk's sum of d stays below ``_ONE``.
+    """
     base = np.uint32(low)
     span = np.uint32(high - low)
+    count = np.int64(0)
+    sum_d = np.int64(0)
     sum_d2 = np.int64(0)
     sum_time = np.int64(0)
-    padded = np.uintp(blocks) * np.uintp(BLOCK)
-    begin = np.uintp(0)
+    begin = np.uintp(start)
+    padded = begin + np.uintp(blocks) * np.uintp(BLOCK)
     while begin < padded:
         end = min(begin + _CHUNK, padded)
+        both = np.uint32(0)
         d2 = np.uint32(0)
         ts = np.uint32(0)
         for i in range(begin, end):
             v = packed[i]
             d = np.uint32((v & ROW_MASK) - base)
             inside = d <= span
+            both = np.uint32(both + (np.uint32(d + _ONE) if inside else np.uint32(0)))
             d2 = np.uint32(d2 + (np.uint32(d * d) if inside else np.uint32(0)))
             ts = np.uint32(ts + ((v >> np.uint32(ROW_BITS)) if inside else np.uint32(0)))
+        count += np.int64(both >> _ONE_BITS)
+        sum_d += np.int64(both & (_ONE - np.uint32(1)))
         sum_d2 += np.int64(d2)
         sum_time += np.int64(ts)
         begin = end
-    return sum_d2, sum_time
+    return count, sum_d, sum_d2, sum_time
 
 
-@njit(cache=True, nogil=True)
-def _window_mean(packed, blocks, low, high):
-    """Count and sum of d (d = row - low) over rows low..high.
-
-    Both grow in one register lane: a chunk's sum of d stays below ``_ONE``.
-    """
+@njit(cache=True, nogil=True, error_model="numpy")
+def _window_count(packed, start, blocks, low, high):
     base = np.uint32(low)
     span = np.uint32(high - low)
     count = np.int64(0)
-    sum_d = np.int64(0)
-    padded = np.uintp(blocks) * np.uintp(BLOCK)
-    begin = np.uintp(0)
-    while begin < padded:
-        end = min(begin + _CHUNK, padded)
-        both = np.uint32(0)
-        for i in range(begin, end):
-            d = np.uint32((packed[i] & ROW_MASK) - base)
-            both = np.uint32(both + (np.uint32(d + _ONE) if d <= span else np.uint32(0)))
-        count += np.int64(both >> _ONE_BITS)
-        sum_d += np.int64(both & (_ONE - np.uint32(1)))
-        begin = end
-    return count, sum_d
-
-
-@njit(cache=True, nogil=True)
-def _window_count(packed, blocks, low, high):
-    base = np.uint32(low)
-    span = np.uint32(high - low)
-    count = np.int64(0)
-    padded = np.uintp(blocks) * np.uintp(BLOCK)
-    begin = np.uintp(0)
+    begin = np.uintp(start)
+    padded = begin + np.uintp(blocks) * np.uintp(BLOCK)
     while begin < padded:
         end = min(begin + _CHUNK, padded)
         c = np.uint32(0)
@@ -114,7 +100,7 @@ def _window_count(packed, blocks, low, high):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _limits(centre, half):
     """First and last whole row within ``half`` of ``centre`` (both fixed point)."""
     low = (centre - half + FRACTION - 1) >> FRACTION_BITS
@@ -122,37 +108,37 @@ def _limits(centre, half):
     return max(low, 0), min(high, ROW_LAST)
 
 
-@njit(cache=True, nogil=True)
-def _mean_shift(packed, blocks, centre, half):
-    """Move a window to the mean of its events until it stays or ``ITERATIONS_MAX`` is reached.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mean_shift(packed, start, blocks, centre, half):
+    """Move a window to the mean of its events, ``ITERATIONS_MAX`` times at most.
 
-    Returns the sums of the last window, its low row and the fixed-point mean.
+    It has arrived when the mean lies within a sixteenth of the half width: what a window of three
+    standard deviations would still gain is below a hundredth of one. Returns the sums of the last
+    window, its low row and the fixed-point mean.
     """
     low, high = _limits(centre, half)
-    count, sum_d = _window_mean(packed, blocks, low, high)
+    count, sum_d, sum_d2, sum_time = _window_sums(packed, start, blocks, low, high)
     for _ in range(ITERATIONS_MAX - 1):
         if count == 0:
             break
-        centre = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
-        next_low, next_high = _limits(centre, half)
-        if next_low == low and next_high == high:
+        moved = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
+        step = abs(moved - centre)
+        centre = moved
+        if step * 16 <= half:
             break
-        low, high = next_low, next_high
-        count, sum_d = _window_mean(packed, blocks, low, high)
-    if count > 0:
-        centre = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
-    sum_d2, sum_time = _window_spread(packed, blocks, low, high)
+        low, high = _limits(centre, half)
+        count, sum_d, sum_d2, sum_time = _window_sums(packed, start, blocks, low, high)
     return count, low, sum_d, sum_d2, sum_time, centre
 
 
-@njit(cache=True, nogil=True)
-def _densest_pairwise(packed, n, blocks, radius):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _densest_pairwise(packed, start, n, blocks, radius):
     best = np.int64(0)
     lowest = np.int64(ROW_LAST)
     highest = np.int64(0)
     for i in range(n):
-        row = np.int64(packed[i] & ROW_MASK)
-        support = _window_count(packed, blocks, max(row - radius, 0), min(row + radius, ROW_LAST))
+        row = np.int64(packed[start + i] & ROW_MASK)
+        support = _window_count(packed, start, blocks, max(row - radius, 0), min(row + radius, ROW_LAST))
         if support > best:
             best, lowest, highest = support, row, row
         elif support == best:
@@ -161,12 +147,12 @@ def _densest_pairwise(packed, n, blocks, radius):
     return lowest, highest
 
 
-@njit(cache=True, nogil=True)
-def _densest_histogram(packed, n, radius):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _densest_histogram(packed, start, n, radius):
     size = 1 << ROW_BITS
     below = np.zeros(size + 1, np.int64)
     for i in range(n):
-        below[(packed[i] & ROW_MASK) + np.uint32(1)] += 1
+        below[(packed[start + i] & ROW_MASK) + np.uint32(1)] += 1
     for row in range(size):
         below[row + 1] += below[row]
     best = np.int64(0)
@@ -183,8 +169,8 @@ def _densest_histogram(packed, n, radius):
     return lowest, highest
 
 
-@njit(cache=True, nogil=True)
-def _mode_mean_search(packed, n, blocks, half):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mode_mean_search(packed, start, n, blocks, half):
     """Densest window, then mean shift; a tie is settled without preferring a direction.
 
     The lowest and the highest of the equally dense seeds are both followed. The window with more
@@ -193,13 +179,13 @@ def _mode_mean_search(packed, n, blocks, half):
     """
     radius = max(half >> (FRACTION_BITS + 1), 1)
     if n <= _PAIRWISE_MAX:
-        lowest, highest = _densest_pairwise(packed, n, blocks, radius)
+        lowest, highest = _densest_pairwise(packed, start, n, blocks, radius)
     else:
-        lowest, highest = _densest_histogram(packed, n, radius)
-    a = _mean_shift(packed, blocks, lowest * FRACTION, half)
+        lowest, highest = _densest_histogram(packed, start, n, radius)
+    a = _mean_shift(packed, start, blocks, lowest * FRACTION, half)
     if lowest == highest:
         return FOUND, a
-    b = _mean_shift(packed, blocks, highest * FRACTION, half)
+    b = _mean_shift(packed, start, blocks, highest * FRACTION, half)
     if a[0] != b[0]:
         return FOUND, (a if a[0] > b[0] else b)
     spread_a = a[0] * a[3] - a[2] * a[2]
@@ -210,11 +196,11 @@ def _mode_mean_search(packed, n, blocks, half):
         return FOUND, a
     if abs(a[5] - b[5]) <= 2 * half:
         middle = np.int64(np.rint((a[5] + b[5]) / 2.0))
-        return FOUND, _mean_shift(packed, blocks, middle, half)
+        return FOUND, _mean_shift(packed, start, blocks, middle, half)
     return AMBIGUOUS, a
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _stands_out(count, n, half, rows):
     """Whether ``count`` of ``n`` events exceed what the others would put into the window.
 
@@ -228,30 +214,13 @@ def _stands_out(count, n, half, rows):
     return excess > 0.0 and excess * excess > 16.0 * expected
 
 
-@njit(cache=True, nogil=True)
-def _mode_mean(packed, n, blocks, seed, half, rows, events_min):
-    """Windowed mean from ``seed`` (fixed point, < 0: none), or from the densest window.
-
-    A seed is trusted only where its window holds most of the column's events: no window elsewhere
-    can then hold more.
-    """
-    if seed >= 0:
-        found = _mean_shift(packed, blocks, seed, half)
-        if found[0] >= events_min and 2 * found[0] > n:
-            return FOUND, found
-    status, found = _mode_mean_search(packed, n, blocks, half)
-    if status == FOUND and (found[0] < events_min or not _stands_out(found[0], n, half, rows)):
-        status = TOO_FEW
-    return status, found
-
-
-@njit(cache=True, nogil=True)
-def _median_row(packed, n, counts):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _median_row(packed, start, n, counts):
     """Middle row, or the mean of the two middle rows; ``counts`` is zeroed scratch of 1024."""
     low = np.int64(ROW_LAST)
     high = np.int64(0)
     for i in range(n):
-        row = np.int64(packed[i] & ROW_MASK)
+        row = np.int64(packed[start + i] & ROW_MASK)
         counts[row] += 1
         low = min(low, row)
         high = max(high, row)
@@ -268,7 +237,7 @@ def _median_row(packed, n, counts):
     return (lower + upper) / 2.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _variance(count, sum_d, sum_d2):
     """Sample variance; the numerator is an exact integer, so a constant column gives 0."""
     if count < 2:
@@ -276,7 +245,7 @@ def _variance(count, sum_d, sum_d2):
     return (count * sum_d2 - sum_d * sum_d) / (float(count) * (count - 1))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sigma2(variance, count, row, rows, factor, floor):
     """Variance of the estimated row, px squared.
 
@@ -292,25 +261,28 @@ def _sigma2(variance, count, row, rows, factor, floor):
     return sigma2
 
 
-@njit(cache=True, nogil=True)
-def _estimate_column(packed, n, method, seed, half, rows, events_min, counts):
-    """One column: status, row, events used, variance, sum of times, fixed-point mean."""
-    blocks = _pad(packed, n)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _estimate_column(packed, start, n, method, half, rows, events_min, counts):
+    """One column by itself: status, row, events used, variance, sum of times, fixed-point mean."""
+    blocks = _pad(packed, start, n)
     status = FOUND
     if method == MODE_MEAN:
-        status, found = _mode_mean(packed, n, blocks, seed, half, rows, events_min)
+        status, found = _mode_mean_search(packed, start, n, blocks, half)
+        count, low, sum_d, sum_d2, sum_time, centre = found
+        if not _stands_out(count, n, half, rows):
+            status = TOO_FEW
     else:
-        count, sum_d = _window_mean(packed, blocks, 0, ROW_LAST)
-        sum_d2, sum_time = _window_spread(packed, blocks, 0, ROW_LAST)
-        found = (count, np.int64(0), sum_d, sum_d2, sum_time, np.int64(-1))
-    count, low, sum_d, sum_d2, sum_time, centre = found
-    if count < events_min or count == 0:
-        return TOO_FEW, np.nan, count, 0.0, sum_time, centre
-    row = _median_row(packed, n, counts) if method == MEDIAN else (count * low + sum_d) / count
+        count, sum_d, sum_d2, sum_time = _window_sums(packed, start, blocks, 0, ROW_LAST)
+        low, centre = np.int64(0), np.int64(-1)
+    if count < events_min:
+        status = TOO_FEW
+    row = (count * low + sum_d) / count
+    if method == MEDIAN:
+        row = _median_row(packed, start, n, counts)
     return status, row, count, _variance(count, sum_d, sum_d2), sum_time, centre
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _estimate_lists(
     packed, offsets, method, half, rows, events_min, factor, floor, scratch, out_row, out_sigma,
     out_variance, out_events, out_status,
@@ -328,7 +300,7 @@ def _estimate_lists(
             continue
         scratch[:n] = packed[offsets[column] : offsets[column + 1]]
         status, row, count, variance, _, _ = _estimate_column(
-            scratch, n, method, -1, half, rows, events_min, counts
+            scratch, 0, n, method, half, rows, events_min, counts
         )
         out_status[column] = status
         if status != FOUND:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _smooth(row, sigma2, half_width, gate, out_row, out_sigma2):
     """Mean over symmetric pairs of columns; returns how many columns were averaged.
 
@@ -40,7 +40,7 @@ def _smooth(row, sigma2, half_width, gate, out_row, out_sigma2):
     return smoothed
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _reject_isolated(row, events, reach, gate, events_weak, rejected):
     """Mark weak points without a neighbour near in rows; returns their number."""
     columns = row.size

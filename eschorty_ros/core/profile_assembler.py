@@ -44,7 +44,7 @@ class ProfileAssembler:
         self.points_beyond_pole = 0
         self._counts = np.zeros(len(binning.COUNTERS), dtype=np.int64)
         columns = model.columns
-        self._lists = np.empty((columns, settings.column_limit + kernels.BLOCK), dtype=np.uint32)
+        self._lists = np.empty(columns * (settings.column_limit + kernels.BLOCK), dtype=np.uint32)
         self._column_counts = np.zeros(columns, dtype=np.uint32)
         self._seeds = np.full(columns, -1, dtype=np.int64)
         self._state = np.zeros(binning.S_SIZE, dtype=np.int64)

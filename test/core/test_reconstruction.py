@@ -175,7 +175,7 @@ def test_one_event_and_constant_columns():
     assert found.column.tolist() == [5, 9]
     assert found.row.tolist() == [300.0, 400.0]
     np.testing.assert_allclose(found.sigma_row, np.sqrt(1 / 12 + 0.04))
-    assert found.t_us.tolist() == [2000, 3011]
+    assert found.t_us.tolist() == [2000, 3010]
 
 
 def test_events_over_the_column_limit_are_counted():
