@@ -1,0 +1,84 @@
+"""Placing profiles by time, and assembling a scan."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
+from eschorty_ros.nodes.scan_buffer import PlacedPoints, ScanBuffer
+from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
+
+T0_NS = 1_700_000_000_000_000_123
+
+
+def placed(stage_mm, edge_ns, columns):
+    points = np.zeros(len(columns), SCAN_DTYPE)
+    points["column"] = columns
+    points["sigma"] = 1e-3
+    edges = np.asarray(edge_ns, dtype=np.int64)
+    return PlacedPoints(points, edges + 10, edges, np.asarray(stage_mm, dtype=float))
+
+
+def timed(t_ns):
+    t_ns = np.asarray(t_ns, dtype=np.int64)
+    empty = Profiles.empty()
+    fields = {name: np.zeros(len(t_ns), getattr(empty, name).dtype) for name in Profiles.__slots__}
+    return TimedProfiles(Profiles(**fields), t_ns, t_ns)
+
+
+def test_scan_is_sorted_by_period_then_column_and_limits_are_included():
+    buffer = ScanBuffer("a", 20.0, 10.0)
+    buffer.add(placed([10.0, 20.0, 9.99, 20.01], [T0_NS, T0_NS, T0_NS, T0_NS], [7, 3, 1, 2]))
+    buffer.add(placed([15.0], [T0_NS - 1000], [9]))
+    scan = buffer.assemble()
+    assert scan.points["column"].tolist() == [9, 3, 7]
+    assert scan.profiles == 2
+    assert scan.stamp_ns == T0_NS - 990
+    np.testing.assert_allclose(scan.points["t"], [0.0, 1e-6, 1e-6], atol=1e-15)
+    assert scan.sigma_median_m == pytest.approx(1e-3)
+
+
+def test_empty_scan():
+    scan = ScanBuffer("a", 0.0, 1.0).assemble()
+    assert len(scan.points) == scan.profiles == 0
+
+
+def test_points_over_the_limit_are_counted():
+    buffer = ScanBuffer("a", 0.0, 1.0, points_max=3)
+    for _ in range(2):
+        buffer.add(placed([0.5, 0.5], [T0_NS, T0_NS], [1, 2]))
+    assert len(buffer) == 3
+    assert buffer.points_over_limit == 1
+
+
+@pytest.mark.parametrize("limits", [(np.nan, 1.0), (0.0, np.inf)])
+def test_limits_must_be_finite(limits):
+    with pytest.raises(ArgumentError, match="not finite"):
+        ScanBuffer("a", *limits)
+
+
+def test_points_wait_for_the_stage_and_are_never_extrapolated():
+    placer = StagePlacer(gap_s=0.0, timeout_s=1.0)
+    placer.add_profiles(timed([T0_NS - 1_000_000, T0_NS + 500_000, T0_NS + 2_000_000]), 0.0)
+    assert placer.ready(0.1) == []
+    placer.add_stage(T0_NS, 10.0)
+    placer.add_stage(T0_NS + 1_000_000, 11.0)
+    ((part, position_mm),) = placer.ready(0.2)
+    assert part.t_ns.tolist() == [T0_NS + 500_000]
+    np.testing.assert_allclose(position_mm, [10.5])
+    # The first was before the stage's first sample, the last still waits.
+    assert (placer.points_without_stage, placer.waiting) == (1, 1)
+    assert placer.ready(1.5) == []
+    assert (placer.points_without_stage, placer.waiting) == (2, 0)
+
+
+def test_a_gap_in_the_odometry_is_not_bridged():
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    placer.add_stage(T0_NS, 10.0)
+    placer.add_stage(T0_NS + 2_000_000_000, 12.0)
+    placer.add_profiles(timed([T0_NS + 1_000_000_000]), 0.0)
+    assert placer.ready(0.0) == []
+    assert placer.points_without_stage == 1
