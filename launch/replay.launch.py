@@ -3,6 +3,7 @@
 ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
 """
 
+import os
 from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
@@ -19,6 +20,9 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchDescription
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
+# Fast DDS 3 reads the second name and warns of the first.
+OLD_FAST_DDS = os.environ.get("ROS_DISTRO") in ("humble", "iron", "jazzy")
+PROFILE_VARIABLE = f"{'FASTRTPS' if OLD_FAST_DDS else 'FASTDDS'}_DEFAULT_PROFILES_FILE"
 NAMESPACE = "eschorty"
 EVENTS = f"/{NAMESPACE}/camera/events"
 
@@ -48,11 +52,7 @@ def generate_launch_description():
                 )
                 for name, default, description, choices in ARGUMENTS
             ),
-            # The name Fast DDS reads was changed; both are set for every version.
-            SetEnvironmentVariable("FASTDDS_DEFAULT_PROFILES_FILE", profile, condition=has_profile),
-            SetEnvironmentVariable(
-                "FASTRTPS_DEFAULT_PROFILES_FILE", profile, condition=has_profile
-            ),
+            SetEnvironmentVariable(PROFILE_VARIABLE, profile, condition=has_profile),
             Node(
                 package="eschorty_ros",
                 executable="reconstruction",

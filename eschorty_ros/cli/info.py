@@ -103,11 +103,14 @@ def _raw(path: Path) -> None:
             last_us = int(decoded.t[-1])
             events += len(decoded.t)
             on += int(np.count_nonzero(decoded.p))
-            windows, counts = np.unique(decoded.t // PEAK_WINDOW_US, return_counts=True)
+            windows, counts = np.unique(
+                (decoded.t - first_us) // PEAK_WINDOW_US, return_counts=True
+            )
             for window, count in zip(windows.tolist(), counts.tolist(), strict=True):
                 busiest[window] = busiest.get(window, 0) + count
     seconds = (last_us - first_us) * 1e-6
-    peak = max(busiest.values(), default=0) / (PEAK_WINDOW_US * 1e-6)
+    window_s = min(PEAK_WINDOW_US * 1e-6, seconds)
+    peak = max(busiest.values(), default=0) / window_s if window_s else 0.0
     rows = {
         "format": f"{header.format}, {header.width} x {header.height}",
         "events": f"{events:,} ({on:,} on, {events - on:,} off)",

@@ -202,14 +202,15 @@ def whole_periods(
     low, high = sorted((sweep.start_mm, sweep.stop_mm))
     if len(points) == 0:
         count = int((high - low) / abs(pitch))
-        return sweep.start_mm + pitch * (np.arange(count) + 0.5), np.zeros(0, dtype=np.bool_)
+        positions = np.asarray(sweep.start_mm + pitch * (np.arange(count) + 0.5))
+        return positions, np.zeros(0, dtype=np.bool_)
     stage_mm, _ = stage_and_range_mm(points, stage_direction)
     index = profile_index(points, 1.0 / sweep.frequency_hz)
     offset = float(np.median(stage_mm - pitch * index))
     half = 0.5 * abs(pitch)
     ends = sorted(((low + half - offset) / pitch, (high - half - offset) / pitch))
     first, last = int(np.ceil(ends[0])), int(np.floor(ends[1]))
-    positions = offset + pitch * np.arange(first, last + 1)
+    positions = np.asarray(offset + pitch * np.arange(first, last + 1))
     return positions, (index >= first) & (index <= last)
 
 
