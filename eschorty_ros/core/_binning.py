@@ -93,7 +93,7 @@ def _estimate_period(
     events, mean_dt = work_int[0], work_int[1]
     rows = float(whole[P_ROWS])
     squares = 0.0
-    freedom = 0
+    freedom = np.int64(0)
     neighbour = np.int64(-1)
     stride = lists.size // counts.size
     method, events_min = whole[P_METHOD], whole[P_EVENTS_MIN]

@@ -138,7 +138,8 @@ def _densest_pairwise(packed, start, n, blocks, radius):
     highest = np.int64(0)
     for i in range(n):
         row = np.int64(packed[start + i] & ROW_MASK)
-        support = _window_count(packed, start, blocks, max(row - radius, 0), min(row + radius, ROW_LAST))
+        low, high = max(row - radius, 0), min(row + radius, ROW_LAST)
+        support = _window_count(packed, start, blocks, low, high)
         if support > best:
             best, lowest, highest = support, row, row
         elif support == best:
@@ -231,9 +232,9 @@ def _median_row(packed, start, n, counts):
         seen += counts[row]
         counts[row] = 0
         if lower < 0 and 2 * seen >= n:
-            lower = row
+            lower = np.int64(row)
         if upper < 0 and 2 * seen > n:
-            upper = row
+            upper = np.int64(row)
     return (lower + upper) / 2.0
 
 

@@ -1,8 +1,8 @@
 """The paper's processing in plain numpy, for comparison.
 
-Per window: accumulate all events by column, take the mean row as the line and the standard
-deviation as the confidence, and turn rows into ranges with Eq. 2. No phase gate, no outlier
-rejection, no streaming: background anywhere in a column pulls its mean.
+Per window: accumulate all events in a frame of columns by rows, take each column's mean row as the
+line and its standard deviation as the confidence, and turn rows into ranges with Eq. 2. No phase
+gate, no outlier rejection, no streaming: background anywhere in a column pulls its mean.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ def reconstruct(
     t_us : array_like of int64, shape (n,)
         Times, never falling.
     column, row : array_like of integer, shape (n,)
+        Inside the sensor of ``model``.
     model : RangeModel
     modulation : Modulation
         ``on_edge_us`` gives the periods' phase; the first event's time when it is ``None``.
@@ -90,14 +91,17 @@ def _window(
     edge_us: int,
     events_min: int,
 ) -> Profiles:
-    columns = model.columns
-    count = np.bincount(x, minlength=columns)
+    size = model.columns * model.rows
+    address = x.astype(np.int64) * model.rows + y
+    frame = np.bincount(address, minlength=size).reshape(model.columns, model.rows)
+    count = frame.sum(axis=1)
     lit = np.flatnonzero(count >= events_min)
     n = count[lit]
-    mean = np.bincount(x, weights=y, minlength=columns)[lit] / n
-    offset = y - np.bincount(x, weights=y, minlength=columns)[x] / count[x]
-    variance = np.bincount(x, weights=offset * offset, minlength=columns)[lit] / n
-    mean_dt = np.bincount(x, weights=t_us - edge_us, minlength=columns)[lit] / n
+    seen = frame[lit].astype(np.float64)
+    rows = np.arange(model.rows, dtype=np.float64)
+    mean = seen @ rows / n
+    variance = np.einsum("cr,cr->c", seen, (rows - mean[:, None]) ** 2) / n
+    mean_dt = np.bincount(x, weights=t_us - edge_us, minlength=model.columns)[lit] / n
     sigma = np.sqrt(variance)
     return Profiles(
         np.full(lit.size, period, dtype=np.int64),

@@ -35,8 +35,9 @@ class Settings:
 
     Notes
     -----
-    The activity filter is off by default: ``mode_mean`` already leaves background out, and the
-    filter costs more time than the rest of the reconstruction together.
+    The activity filter is off by default: ``mode_mean`` already leaves background out (on a
+    simulated plane the median error is the same with and without), and the filter takes more than
+    a third of the speed.
 
     ``periods_per_profile`` is for frequencies at which a column gives fewer than ``events_min``
     events per period (above about 5 kHz).
