@@ -37,7 +37,8 @@ def _put_time(t, s, words, n):
         s[_HIGH] += 1
         words[n] = np.uint16(0x8000 | (s[_HIGH] & 0xFFF))
         n += np.uint64(1)
-        s[_LOW] = 0
+        # Said even when it is 0: not every decoder zeroes the low bits by itself.
+        s[_LOW] = _NONE
     low = t & 0xFFF
     if low != s[_LOW]:
         s[_LOW] = low
