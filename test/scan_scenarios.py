@@ -55,8 +55,9 @@ def node_parameters(laser_log: Path) -> dict[str, dict[str, Any]]:
 class Bench:
     """The test's view of the instrument."""
 
-    def __init__(self, observer: Observer, laser_log: Path) -> None:
+    def __init__(self, observer: Observer, domain: int, laser_log: Path) -> None:
         self.observer = observer
+        self.domain = domain
         self._laser_log = laser_log
         self.clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
         self.laser = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
@@ -123,7 +124,7 @@ class Bench:
 def bench(domain: int, laser_log: Path) -> Iterator[Bench]:
     """A bench over an observer of its own."""
     with Observer(domain) as observer:
-        yield Bench(observer, laser_log)
+        yield Bench(observer, domain, laser_log)
 
 
 def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: float) -> None:
@@ -218,6 +219,15 @@ def bad_parameters(bench: Bench) -> None:
     assert accepted, reason
     accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", 4)
     assert accepted, reason
+
+
+def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
+    """The scanner ends mid-scan: without its heartbeat the laser switches off."""
+    bench.start(stop=0.200, speed=0.03)
+    bench.wait_for_sweep()
+    assert bench.output_lines()[-1] == "ON"
+    interrupt()
+    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log", 5.0)
 
 
 def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:

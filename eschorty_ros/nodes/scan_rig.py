@@ -163,7 +163,11 @@ class RosRig:
         self._answer(handle.get_result_async(), "stage/move")
 
     def begin_scan(self, request: ScanRequest) -> None:
-        """See ``Rig``."""
+        """See ``Rig``. A scan that a scanner left behind is ended and published first."""
+        state = self.monitor.reconstruction
+        if state is not None and state.scan_id:
+            self._node.get_logger().warning(f"ending {state.scan_id}, which nobody ended")
+            self.end_scan(state.scan_id)
         answer = self._call(
             "reconstruction/begin_scan",
             BeginScan.Request(

@@ -8,7 +8,9 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import scan_scenarios as scenarios
-from ros_process import free_domain, processes
+from ros_process import NodeProcess, free_domain, processes
+
+SCANNER = "eschorty_ros.nodes.scanner"
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,19 @@ def test_bad_goals_are_refused(instrument):
 
 def test_bad_parameters_are_refused(instrument):
     scenarios.bad_parameters(instrument[0])
+
+
+def test_scanner_interrupted_mid_scan_leaves_the_laser_off_and_the_next_one_scans(instrument):
+    bench, running = instrument
+    first = running["scanner"]
+    scenarios.scanner_interrupted(bench, lambda: first.send(signal.SIGINT))
+    assert first.wait(10.0) == 0, first.output
+    assert "Traceback" not in first.output, first.output
+    first.kill()
+    running["scanner"] = NodeProcess(
+        SCANNER, scenarios.node_parameters(Path())[SCANNER], domain=bench.domain
+    )
+    scenarios.full_scan(bench)
 
 
 def test_killed_camera_ends_the_scan(instrument):

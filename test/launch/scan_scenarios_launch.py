@@ -1,0 +1,85 @@
+"""The scan scenarios under launch: the same assertions, the nodes started and ended by launch.
+
+For ``launch_test``; ``test_scan_launch.py`` runs it from pytest.
+"""
+
+import os
+import signal
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+
+import launch_testing.actions
+import scan_scenarios as scenarios
+from launch.actions import ExecuteProcess
+from ros_process import NAMESPACE, domain_environment, free_domain
+
+import launch
+
+LASER_LOG = Path(tempfile.mkdtemp(prefix="laser_")) / "output.log"
+DOMAIN = free_domain()
+
+
+def node_process(module, parameters):
+    """One node as launch starts it."""
+    command = [sys.executable, "-m", module, "--ros-args", "-r", f"__ns:={NAMESPACE}"]
+    for name, value in parameters.items():
+        command += ["-p", f"{name}:={value}"]
+    return ExecuteProcess(
+        cmd=command,
+        name=module.rsplit(".", 1)[-1],
+        additional_env=domain_environment(DOMAIN),
+        output="screen",
+    )
+
+
+def generate_test_description():
+    """Five nodes; the tests find the camera's process by name."""
+    nodes = {
+        module.rsplit(".", 1)[-1]: node_process(module, parameters)
+        for module, parameters in scenarios.node_parameters(LASER_LOG).items()
+    }
+    ready = launch_testing.actions.ReadyToTest()
+    return launch.LaunchDescription([*nodes.values(), ready]), {"camera": nodes["camera"]}
+
+
+class TestScan(unittest.TestCase):
+    """In the order of their names; the camera's death comes last."""
+
+    def setUp(self):
+        self._context = scenarios.bench(DOMAIN, LASER_LOG)
+        self.bench = self._context.__enter__()
+
+    def tearDown(self):
+        self._context.__exit__(None, None, None)
+
+    def test_1_full_scan(self):
+        scenarios.full_scan(self.bench)
+
+    def test_2_cancel(self):
+        scenarios.cancel_scan(self.bench)
+
+    def test_3_bad_goals_are_refused(self):
+        scenarios.bad_goals(self.bench)
+
+    def test_4_bad_parameters_are_refused(self):
+        scenarios.bad_parameters(self.bench)
+
+    def test_5_killed_camera_ends_the_scan(self, camera):
+        pid = camera.process_details["pid"]
+        scenarios.camera_killed(self.bench, lambda: os.kill(pid, signal.SIGKILL))
+
+
+@launch_testing.post_shutdown_test()
+class TestShutdown(unittest.TestCase):
+    """After launch has ended the nodes with SIGINT."""
+
+    def test_all_others_exit_cleanly(self, proc_info):
+        codes = {info.process_name: info.returncode for info in proc_info}
+        assert len(codes) == 5
+        for name, code in codes.items():
+            assert code == (-signal.SIGKILL if "camera" in name else 0), name
+
+    def test_laser_is_off(self):
+        assert LASER_LOG.read_text().splitlines()[-1].endswith("OFF")
