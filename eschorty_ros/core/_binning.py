@@ -164,8 +164,9 @@ def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scrat
             if rejected[c]:
                 row[c] = np.nan
     counters[C_SMOOTHED] += _smooth(
-        row, sigma2, whole[P_SMOOTH], fractional[F_GATE], smooth_row, smooth_sigma2
-    )
+        row, sigma2, fractional[F_FLOOR] ** 2, whole[P_SMOOTH], fractional[F_GATE], smooth_row,
+        smooth_sigma2,
+    )  # fmt: skip
     out_period, out_edge, out_t, out_column, out_row, out_sigma, out_events = out
     k = state[S_POINTS]
     for c in range(row.size):

@@ -228,7 +228,8 @@ def _median_row(packed, start, n, counts):
     seen = np.int64(0)
     lower = np.int64(-1)
     upper = np.int64(-1)
-    for row in range(low, high + 1):
+    for middle in range(low, high + 1):
+        row = np.int64(middle)
         seen += counts[row]
         counts[row] = 0
         if lower < 0 and 2 * seen >= n:

@@ -7,7 +7,7 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smooth(row, sigma2, half_width, gate, out_row, out_sigma2):
+def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
     """Mean over symmetric pairs of columns; returns how many columns were averaged.
 
     The pairs grow outwards and end at the first one that is incomplete or beyond the gate.
@@ -21,7 +21,7 @@ def _smooth(row, sigma2, half_width, gate, out_row, out_sigma2):
         if np.isnan(centre):
             continue
         total = 0.0
-        variance = sigma2[c]
+        variance = sigma2[c] - common2
         used = 1
         for j in range(1, half_width + 1):
             if c < j or c + j >= columns:
@@ -31,11 +31,11 @@ def _smooth(row, sigma2, half_width, gate, out_row, out_sigma2):
             if not (abs(left) <= gate and abs(right) <= gate):
                 break
             total += left + right
-            variance += sigma2[c - j] + sigma2[c + j]
+            variance += sigma2[c - j] + sigma2[c + j] - 2.0 * common2
             used += 2
         if used > 1:
             out_row[c] = centre + total / used
-            out_sigma2[c] = variance / (used * used)
+            out_sigma2[c] = common2 + variance / (used * used)
             smoothed += 1
     return smoothed
 

@@ -14,6 +14,7 @@ def smooth(
     sigma_row: NDArray[np.float64],
     half_width: int = 2,
     gate_px: float = 2.0,
+    common_px: float = 0.0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Average each column with symmetric pairs of neighbours.
 
@@ -26,6 +27,8 @@ def smooth(
     gate_px : float
         Both columns of a pair must be lit and this close in rows to the centre; the first pair
         that is not ends the average.
+    common_px : float
+        Part of every ``sigma_row`` that neighbours share, at most the smallest of them.
 
     Returns
     -------
@@ -34,8 +37,9 @@ def smooth(
     Notes
     -----
     Pairs leave a linear slope as it is. No average reaches across a step larger than the gate and
-    no dark column is filled. The columns' errors are independent (different pixels), so the
-    variance of the mean of n columns is the sum of theirs over n squared.
+    no dark column is filled. Beyond the common part the columns' errors are independent, so the
+    variance of the mean of n columns is the sum of theirs over n squared. The common part stays:
+    neighbours on a flat surface meet the pixel rows at the same place, and so does their error.
 
     Raises
     ------
@@ -48,10 +52,11 @@ def smooth(
         raise ArgumentError(
             f"row has shape {rows.shape} and sigma_row {sigma.shape}; give two equal axes"
         )
-    if half_width < 0 or not gate_px >= 0.0:
+    if half_width < 0 or not gate_px >= 0.0 or not common_px >= 0.0:
         raise ArgumentError(
-            f"half_width is {half_width!r} and gate_px {gate_px!r}; choose 0 or more"
+            f"half_width is {half_width!r}, gate_px {gate_px!r} and common_px {common_px!r}; "
+            "choose 0 or more"
         )
     out_row, out_sigma2 = np.empty_like(rows), np.empty_like(rows)
-    _smooth(rows, sigma * sigma, half_width, gate_px, out_row, out_sigma2)
+    _smooth(rows, sigma * sigma, common_px * common_px, half_width, gate_px, out_row, out_sigma2)
     return out_row, np.sqrt(out_sigma2)

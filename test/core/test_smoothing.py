@@ -37,6 +37,16 @@ def test_sigma_matches_the_scatter():
     assert np.std(out - 300) == pytest.approx(np.sqrt(np.mean(sigma**2)), rel=0.05)
 
 
+def test_common_part_of_the_error_does_not_average_out():
+    rng = np.random.default_rng(6)
+    common = np.repeat(rng.normal(0, 0.2, 4000), 5)
+    row = 300 + common + rng.normal(0, 0.3, common.size)
+    out, sigma = smooth(row, np.full(row.size, np.hypot(0.2, 0.3)), common_px=0.2)
+    centres = slice(2, None, 5)
+    expected = np.sqrt(np.mean(sigma[centres] ** 2))
+    assert np.std(out[centres] - 300) == pytest.approx(expected, rel=0.05)
+
+
 def test_zero_width_copies():
     row = np.array([1.0, 2.0, 3.0])
     out, sigma = smooth(row, np.ones(3), half_width=0)
