@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
@@ -159,8 +161,10 @@ class RosRig:
         handle = self._answer(sent, "stage/move")
         if not handle.accepted:
             return
-        self._answer(handle.cancel_goal_async(), "stage/move")
-        self._answer(handle.get_result_async(), "stage/move")
+        with _living_context():
+            ended = handle.cancel_goal_async(), handle.get_result_async()
+        for future in ended:
+            self._answer(future, "stage/move")
 
     def begin_scan(self, request: ScanRequest) -> None:
         """See ``Rig``. A scan that a scanner left behind is ended and published first."""
@@ -236,7 +240,9 @@ class RosRig:
     def report(self, phase: str) -> None:
         """See ``Rig``."""
         self._phase = phase
-        self._feedback(phase)
+        # On the way out after a signal there is nobody left to tell.
+        with contextlib.suppress(ScanFailure), _living_context():
+            self._feedback(phase)
 
     # Waiting
 
@@ -245,11 +251,12 @@ class RosRig:
         if self._ended.is_set() or not self._node.context.ok():
             raise ScanFailure("scanner: the node was shut down")
         now_s = time.monotonic()
-        if self._beating and now_s - self._beat_s >= _HEARTBEAT_S:
-            self._beat_s = now_s
-            stamp = stamp_from_ns(self._node.get_clock().now().nanoseconds)
-            self._heartbeat.publish(Header(stamp=stamp))
-        self._feedback(self._phase)
+        with _living_context():
+            if self._beating and now_s - self._beat_s >= _HEARTBEAT_S:
+                self._beat_s = now_s
+                stamp = stamp_from_ns(self._node.get_clock().now().nanoseconds)
+                self._heartbeat.publish(Header(stamp=stamp))
+            self._feedback(self._phase)
         if self._watching:
             self.monitor.check_laser()
             self.monitor.check_progress(self._events_timeout_s)
@@ -273,4 +280,15 @@ class RosRig:
         return future.result()
 
     def _call(self, name: str, request: Any, patience_s: float | None = None) -> Any:
-        return self._answer(self._clients[name].call_async(request), name, patience_s)
+        with _living_context():
+            future = self._clients[name].call_async(request)
+        return self._answer(future, name, patience_s)
+
+
+@contextlib.contextmanager
+def _living_context() -> Iterator[None]:
+    """Turn the errors of a context that a signal has ended into a ``ScanFailure``."""
+    try:
+        yield
+    except (_rclpy.RCLError, _rclpy.InvalidHandle) as error:
+        raise ScanFailure(f"scanner: the node was shut down: {error}") from error
