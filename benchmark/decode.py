@@ -25,11 +25,11 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "test")]
 
-from streams import line_row_events, sparse_events
+from streams import line_row_events, sparse_events  # noqa: E402
 
-from eschorty_ros.core import evt3
-from eschorty_ros.core.noise import ActivityFilter
-from eschorty_ros.core.raw_file import RawReader, RawWriter
+from eschorty_ros.core import evt3  # noqa: E402
+from eschorty_ros.core.noise import ActivityFilter  # noqa: E402
+from eschorty_ros.core.raw_file import RawReader, RawWriter  # noqa: E402
 
 PIECE_BYTES = 128 * 1024
 SEED = 20_240_601

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core import _evt3_words as w3
-from eschorty_ros.core._evt3_decode import _bounds, _decode
+from eschorty_ros.core._evt3_decode import _decode
 from eschorty_ros.core._evt3_encode import Encoder, sort_readout
+from eschorty_ros.core._evt3_rare import _bounds
 from eschorty_ros.core._evt3_words import Counters
 from eschorty_ros.core.errors import ArgumentError
 
