@@ -109,9 +109,11 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
     from eschorty_ros.report import accuracy, figures
     from eschorty_ros.simulation import scene as scenes
 
-    write_cloud(out / "scan.pcd", outcome.points)
+    if outcome.success or len(outcome.points):
+        write_cloud(out / "scan.pcd", outcome.points)
     if not outcome.success:
-        raise DeviceError(f"{outcome.message} ({len(outcome.points):,} points kept in {out})")
+        kept = f" ({len(outcome.points):,} points kept in {out / 'scan.pcd'})"
+        raise DeviceError(outcome.message + (kept if len(outcome.points) else ""))
     calibration = load_calibration(request.calibration)
     truth = scenes.named(request.scene)
     model, direction = calibration.model(), calibration.stage_direction

@@ -254,10 +254,10 @@ def _view_3d(
     axes.set(xlabel="z, line (mm)", ylabel="x, range (mm)", zlabel="y, stage (mm)")
     axes.set_title(f"Point cloud ({shown.size:,} points shown)")
     spans = [max(float(np.ptp(cloud[name])) * 1e3, 1.0) for name in "zxy"]
-    axes.set_box_aspect(spans, zoom=0.85)
+    axes.set_box_aspect(spans, zoom=0.82)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(4))
-        axis.labelpad = 8
+        axis.labelpad = 4
     axes.view_init(elev=28.0, azim=-62.0)
 
 
