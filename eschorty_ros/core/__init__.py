@@ -1,1 +1,1 @@
-"""Range model, event decoding and reconstruction: numpy and numba, no ROS, no hardware, no clock."""
+"""Range model, decoding, reconstruction: numpy and numba; no ROS, no hardware, no clock."""

@@ -9,6 +9,7 @@ from line_events import encoded, line_events
 from eschorty_ros.core import reference
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.evt3 import Decoder, Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 
@@ -19,6 +20,17 @@ MODULATION = Modulation(70.0, on_edge_us=1000)
 
 def flat(k, c):
     return np.full(c.shape, 350.0)
+
+
+def test_numpy_decodes_what_the_decoder_decodes():
+    # Across a wrap of the 24-bit sensor time.
+    t, x, y, p = line_events(np.random.default_rng(SEED), flat, periods=5)
+    data = Encoder().encode(t + (1 << 24) - 30_000, x, y, p)
+    events = Decoder().decode(data)
+    t, x, y = reference.decode_all(data)
+    np.testing.assert_array_equal(x, events.x)
+    np.testing.assert_array_equal(y, events.y)
+    np.testing.assert_array_equal(t, events.t)
 
 
 def test_same_rows_and_ranges_as_the_streaming_mean():
