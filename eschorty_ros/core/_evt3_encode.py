@@ -127,7 +127,7 @@ class Encoder:
         """
         self._refuse_fall("t_us", _checked("t_us", [t_us], np.int64, 1 << 62))
         words = np.empty(self._high_words(t_us, t_us) + 1, dtype="<u2")
-        n = _put_time(t_us, self._state, words, 0)
+        n = _put_time(t_us, True, self._state, words, 0)
         return words[:n].tobytes()
 
     def _refuse_fall(self, name: str, times: NDArray[np.int64]) -> None:

@@ -17,11 +17,15 @@ _U2 = types.Array(uint16, 1, "C", readonly=True)
 _U1 = types.Array(uint8, 1, "C", readonly=True)
 
 
-@njit(uint64(int64, int64[::1], uint16[::1], uint64), cache=True, nogil=True)
-def _put_time(t, s, words, n):
-    """Words that bring the stream's time to ``t``: every TIME_HIGH on the way, then TIME_LOW."""
-    if t == s[T_US]:
-        return n
+@njit(
+    uint64(int64, types.boolean, int64[::1], uint16[::1], uint64), cache=True, nogil=True
+)
+def _put_time(t, idle, s, words, n):
+    """Words that bring the stream's time to ``t``: every TIME_HIGH on the way, then TIME_LOW.
+
+    Before an event TIME_LOW is said even when it is 0: not every decoder zeroes the low bits by
+    itself. An idle stream that stops at a whole TIME_HIGH leaves it to what comes.
+    """
     high = t >> 12
     if s[_HIGH] == NONE:
         s[_HIGH] = high - 1
@@ -29,16 +33,16 @@ def _put_time(t, s, words, n):
         s[_HIGH] += 1
         words[n] = np.uint16(0x8000 | (s[_HIGH] & 0xFFF))
         n += np.uint64(1)
-        # Said even when it is 0: not every decoder zeroes the low bits by itself.
         s[_LOW] = NONE
     low = t & 0xFFF
-    if low != s[_LOW]:
+    if low != s[_LOW] and not (idle and low == 0):
         s[_LOW] = low
         words[n] = np.uint16(0x6000 | low)
         n += np.uint64(1)
-    s[T_US] = t
-    # A readout begins: name the row again, as the sensor does.
-    s[_Y] = NONE
+    if t != s[T_US]:
+        # A readout begins: name the row again, as the sensor does.
+        s[T_US] = t
+        s[_Y] = NONE
     return n
 
 
@@ -112,7 +116,7 @@ def _encode(t, x, y, p, trigger_t, trigger_edge, width, s, words):
     triggers = np.uint64(trigger_t.size)
     while k < end or j < triggers:
         if j < triggers and (k >= end or trigger_t[j] <= t[k]):
-            n = _put_time(trigger_t[j], s, words, n)
+            n = _put_time(trigger_t[j], False, s, words, n)
             words[n] = np.uint16(0xA000 | np.int64(trigger_edge[j]))
             n += np.uint64(1)
             j += np.uint64(1)
@@ -120,8 +124,8 @@ def _encode(t, x, y, p, trigger_t, trigger_edge, width, s, words):
         last = k + np.uint64(1)
         while last < end and t[last] == t[k] and y[last] == y[k] and p[last] == p[k]:
             last += np.uint64(1)
-        if t[k] != s[T_US]:
-            n = _put_time(t[k], s, words, n)
+        if t[k] != s[T_US] or s[_LOW] == NONE:
+            n = _put_time(t[k], False, s, words, n)
         if last - k > np.uint64(_SINGLES_MAX):
             n = _put_row(k, last, x, np.int64(y[k]), np.int64(p[k]), width, s, words, n)
             k = last

@@ -48,12 +48,19 @@ def test_vectors_end_at_the_sensors_edge() -> None:
 
 def test_advance_names_every_time_high() -> None:
     encoder = evt3.Encoder()
-    assert hex_words(encoder.advance(0)) == "8000 6000"
+    assert hex_words(encoder.advance(0)) == "8000"
     assert hex_words(encoder.advance(3 * 4096 + 1)) == "8001 8002 8003 6001"
     assert encoder.advance(3 * 4096 + 1) == b""
     decoder = evt3.Decoder()
     decoder.decode(encoder.advance(200_000_000))
     assert decoder.time_us is not None
+
+
+def test_idle_stops_do_not_show_once_events_come() -> None:
+    stopped, straight = evt3.Encoder(), evt3.Encoder()
+    data = stopped.advance(0) + stopped.advance(4096) + stopped.encode([4096], [5], [6], [1])
+    assert data == straight.advance(0) + straight.encode([4096], [5], [6], [1])
+    assert hex_words(data) == "8000 8001 6000 0006 2805"
 
 
 def test_idle_minutes_keep_the_epoch() -> None:
