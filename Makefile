@@ -36,6 +36,9 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
+# numba sees changes of a file, not of what the file imports: its cache goes when a kernel changes.
+KERNELS := $(shell grep -rl --include='*.py' 'import.*njit' eschorty_ros)
+
 .PHONY: help setup scan test check lint format types contracts clean
 
 help:
@@ -43,10 +46,10 @@ help:
 
 setup: $(SETUP)
 
-scan: $(SETUP)
+scan: $(SETUP) $(BUILD)/kernels.stamp
 	@$(ENTER) eschorty scan --out scan $(SCAN)
 
-test: $(SETUP) $(BUILD)/test.stamp
+test: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
 
 check: lint types contracts
@@ -81,6 +84,9 @@ $(BUILD)/interfaces.stamp: $(BUILD)/run.stamp $(INTERFACES)
 	@for package in $(EXTERNAL); do $(MAKE) --no-print-directory build-package SOURCE=external_msgs/$$package NAME=$$package; done
 	@$(MAKE) --no-print-directory build-package SOURCE=. NAME=eschorty_ros
 	@touch $@
+
+$(BUILD)/kernels.stamp: $(KERNELS)
+	@rm -rf $(BUILD)/numba && mkdir -p $(BUILD) && touch $@
 
 .PHONY: build-package
 build-package:
