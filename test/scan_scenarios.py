@@ -64,6 +64,7 @@ class Bench:
         self.odometry = observer.collect(Odometry, "stage/odom", qos.stream())
         self._action = ActionClient(observer.node, Scan, "scan")
         self.feedback: list[Any] = []
+        self._ended: Any = None
 
     def start(self, **goal: float) -> Any:
         """Send a goal; the accepted handle."""
@@ -75,26 +76,29 @@ class Bench:
             feedback_callback=lambda message: self.feedback.append(message.feedback),
         )
         wait_until(sent.done, "an answer to the goal")
-        return sent.result()
+        handle = sent.result()
+        self._ended = handle.get_result_async()
+        return handle
 
-    def result(self, handle: Any) -> tuple[int, Any]:
-        """Status and result of a goal."""
-        future = handle.get_result_async()
-        wait_until(future.done, "the scan's end", SCAN_DEADLINE_S)
-        return future.result().status, future.result().result
+    def result(self) -> tuple[int, Any]:
+        """Status and result of the last goal."""
+        wait_until(self._ended.done, "the scan's end", SCAN_DEADLINE_S)
+        return self._ended.result().status, self._ended.result().result
 
     def scan(self, **goal: float) -> tuple[int, Any]:
         """Send a goal and wait for its end."""
-        return self.result(self.start(**goal))
+        self.start(**goal)
+        return self.result()
 
     def wait_for_sweep(self) -> None:
         """Wait until points of the sweep have been reconstructed."""
-        wait_until(
-            lambda: any(f.phase == "sweeping" and f.progress > 0.25 and f.points for f in
-                        list(self.feedback)),
-            "a quarter of the sweep",
-            SCAN_DEADLINE_S,
-        )  # fmt: skip
+
+        def swept() -> bool:
+            assert not self._ended.done(), self._ended.result().result.message
+            return any(f.phase == "sweeping" and f.progress > 0.25 and f.points
+                       for f in list(self.feedback))  # fmt: skip
+
+        wait_until(swept, "a quarter of the sweep", SCAN_DEADLINE_S)
 
     def cloud_after(self, count: int) -> np.ndarray:
         """Points of the scan published after ``count`` clouds were there."""
@@ -172,7 +176,7 @@ def cancel_scan(bench: Bench) -> None:
     bench.wait_for_sweep()
     canceled = handle.cancel_goal_async()
     wait_until(canceled.done, "an answer to the cancel request")
-    status, result = bench.result(handle)
+    status, result = bench.result()
     assert status == GoalStatus.STATUS_CANCELED, result.message
     assert not result.success
     bench.assert_dark_and_at_rest()
@@ -233,11 +237,11 @@ def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
 def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
     before = len(bench.clouds)
-    handle = bench.start(stop=0.200, speed=0.03)
+    bench.start(stop=0.200, speed=0.03)
     bench.wait_for_sweep()
     kill()
     killed_s = time.monotonic()
-    status, result = bench.result(handle)
+    status, result = bench.result()
     print(f"goal ended {time.monotonic() - killed_s:.1f} s after the camera: {result.message}")
     assert status == GoalStatus.STATUS_ABORTED
     assert result.message.startswith("camera"), result.message
