@@ -24,7 +24,11 @@ setup(
     data_files=[
         (
             "share/eschorty_ros/config",
-            sorted(str(p.relative_to(HERE)) for p in HERE.glob("config/*.yaml")),
+            sorted(
+                str(path.relative_to(HERE))
+                for path in HERE.glob("config/*")
+                if path.suffix in (".yaml", ".xml")
+            ),
         )
     ],
     install_requires=REQUIREMENTS,

@@ -158,14 +158,18 @@ def measure(name: str, events: Batch, path: Path, repeats: int) -> bool:
     for _ in range(repeats):
         for label, run in rows.items():
             best[label] = min(best[label], seconds(run))
-    print(f"\n{name}: {count / 1e6:.1f} M events, {size_mb:.1f} MB, "
-          f"{1e6 * size_mb / count:.3f} B/event")
+    print(
+        f"\n{name}: {count / 1e6:.1f} M events, {size_mb:.1f} MB, "
+        f"{1e6 * size_mb / count:.3f} B/event"
+    )
     print(f"{'decoder':24} {'Mev/s':>8} {'MB/s':>8} {'correct':>8} {'ours / it':>10}")
     for label, spent in best.items():
         verdict = "-" if "filter" in label else ("yes" if right[label] else "NO")
         ratio = spent / best["eschorty_ros"]
-        print(f"{label:24} {count / spent / 1e6:8.1f} {size_mb / spent:8.1f} {verdict:>8} "
-              f"{ratio:10.2f}")
+        print(
+            f"{label:24} {count / spent / 1e6:8.1f} {size_mb / spent:8.1f} {verdict:>8} "
+            f"{ratio:10.2f}"
+        )
     return right["eschorty_ros"] and best["eschorty_ros"] == min(best.values())
 
 
@@ -176,10 +180,13 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     names = ("numpy", "numba", "evt3", "evutils", "expelliarmus")
-    print(f"CPU: {cpu_name()}; Python {platform.python_version()}; " + "; ".join(
-        f"{name} {version(name) or 'absent (pip install -r benchmark/requirements.txt)'}"
-        for name in names
-    ))
+    print(
+        f"CPU: {cpu_name()}; Python {platform.python_version()}; "
+        + "; ".join(
+            f"{name} {version(name) or 'absent (pip install -r benchmark/requirements.txt)'}"
+            for name in names
+        )
+    )
     print(f"seed {SEED}; at least {TARGETS} Mev/s per core of a 2.5 GHz Xeon asked for")
     rng = np.random.default_rng(SEED)
     fine = True

@@ -3,15 +3,13 @@
 ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
 """
 
-import os
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import (
     EqualsSubstitution,
     LaunchConfiguration,
-    NotEqualsSubstitution,
     PathJoinSubstitution,
 )
 from launch_ros.actions import Node
@@ -20,9 +18,6 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchDescription
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
-# Fast DDS 3 reads the second name and warns of the first.
-OLD_FAST_DDS = os.environ.get("ROS_DISTRO") in ("humble", "iron", "jazzy")
-PROFILE_VARIABLE = f"{'FASTRTPS' if OLD_FAST_DDS else 'FASTDDS'}_DEFAULT_PROFILES_FILE"
 NAMESPACE = "eschorty"
 EVENTS = f"/{NAMESPACE}/camera/events"
 
@@ -30,20 +25,12 @@ ARGUMENTS = (
     ("recording", None, "folder with events.raw, stage.csv, laser.yaml, calibration.yaml", None),
     ("rate", "1.0", "speed of the replay against real time; 0 is as fast as possible", None),
     ("rviz", "false", "true: show cloud, live profile and frames in RViz", ["true", "false"]),
-    (
-        "dds_profile",
-        str(CONFIG / "fastdds.xml"),
-        "Fast DDS profile with room for large messages; empty leaves DDS alone",
-        None,
-    ),
 )
 
 
 def generate_launch_description():
-    """Arguments, DDS profile, replay and reconstruction; RViz on request."""
+    """Arguments, replay and reconstruction; RViz on request."""
     recording = LaunchConfiguration("recording")
-    profile = LaunchConfiguration("dds_profile")
-    has_profile = IfCondition(NotEqualsSubstitution(profile, ""))
     return LaunchDescription(
         [
             *(
@@ -52,7 +39,6 @@ def generate_launch_description():
                 )
                 for name, default, description, choices in ARGUMENTS
             ),
-            SetEnvironmentVariable(PROFILE_VARIABLE, profile, condition=has_profile),
             Node(
                 package="eschorty_ros",
                 executable="reconstruction",

@@ -4,14 +4,12 @@ ros2 launch eschorty_ros scan.launch.py scene:=sphere speed:=0.02 rviz:=true
 ros2 launch eschorty_ros scan.launch.py --show-args
 """
 
-import os
 from pathlib import Path
 
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
     RegisterEventHandler,
-    SetEnvironmentVariable,
 )
 from launch.conditions import IfCondition
 from launch.event_handlers import OnProcessExit
@@ -20,7 +18,6 @@ from launch.substitutions import (
     EqualsSubstitution,
     IfElseSubstitution,
     LaunchConfiguration,
-    NotEqualsSubstitution,
 )
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -28,9 +25,6 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchDescription
 
 CONFIG = Path(__file__).resolve().parents[1] / "config"
-# Fast DDS 3 reads the second name and warns of the first.
-OLD_FAST_DDS = os.environ.get("ROS_DISTRO") in ("humble", "iron", "jazzy")
-PROFILE_VARIABLE = f"{'FASTRTPS' if OLD_FAST_DDS else 'FASTDDS'}_DEFAULT_PROFILES_FILE"
 NAMESPACE = "eschorty"
 EVENTS = f"/{NAMESPACE}/camera/events"
 
@@ -54,12 +48,6 @@ ARGUMENTS = (
     ("stop", "0.11", "stage position where the sweep ends, m", None),
     ("auto_scan", "true", "true: scan once when every node is ready", ["true", "false"]),
     ("rviz", "false", "true: show cloud, live profile and frames in RViz", ["true", "false"]),
-    (
-        "dds_profile",
-        str(CONFIG / "fastdds.xml"),
-        "Fast DDS profile with room for large messages; empty leaves DDS alone",
-        None,
-    ),
 )
 
 
@@ -118,9 +106,7 @@ def nodes():
 
 
 def generate_launch_description():
-    """Arguments, DDS profile, nodes; RViz on request, and closing it ends everything."""
-    profile = LaunchConfiguration("dds_profile")
-    has_profile = IfCondition(NotEqualsSubstitution(profile, ""))
+    """Arguments, nodes; RViz on request, and closing it ends everything."""
     rviz = Node(
         package="rviz2",
         executable="rviz2",
@@ -135,7 +121,6 @@ def generate_launch_description():
                 )
                 for name, default, description, choices in ARGUMENTS
             ),
-            SetEnvironmentVariable(PROFILE_VARIABLE, profile, condition=has_profile),
             *nodes(),
             rviz,
             RegisterEventHandler(

@@ -58,9 +58,7 @@ class SlowDecoder:
             self.vector(kind, q)
         elif kind == 6:
             self.low = q
-            self.counts["time_low_back"] += (
-                self.wrapped + self.high * 4096 + q < self.newest
-            )
+            self.counts["time_low_back"] += self.wrapped + self.high * 4096 + q < self.newest
         elif kind == 8:
             self.time_high(q)
         elif kind == 10:

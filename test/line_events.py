@@ -43,12 +43,14 @@ def line_events(
             start = edge_us + (k + (0.0 if polarity else 0.5)) * period_us
             parts.append((start + delay, x, y, np.full(x.size, polarity)))
         n = rng.poisson(events * background * columns)
-        parts.append((
-            edge_us + (k + rng.random(n)) * period_us,
-            rng.integers(0, columns, n),
-            rng.uniform(-0.5, 719.5, n),
-            rng.integers(0, 2, n),
-        ))
+        parts.append(
+            (
+                edge_us + (k + rng.random(n)) * period_us,
+                rng.integers(0, columns, n),
+                rng.uniform(-0.5, 719.5, n),
+                rng.integers(0, 2, n),
+            )
+        )
     t, x, y, p = (np.concatenate(values) for values in zip(*parts, strict=True))
     inside = (y > -0.5) & (y < 719.5)
     return sort_readout(

@@ -26,6 +26,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
+from eschorty_ros.nodes.dds import use_profile
+
 NAMESPACE = "/eschorty"
 DEADLINE_S = 30.0
 
@@ -159,6 +161,7 @@ class Observer:
 
     def __init__(self, domain: int, name: str = "observer", namespace: str = NAMESPACE) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        use_profile()
         self.domain = domain
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)

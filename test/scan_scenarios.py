@@ -47,8 +47,7 @@ def node_parameters(laser_log: Path) -> dict[str, dict[str, Any]]:
             "calibration": CALIBRATION,
             f"{EVENTS}.subscription.reliability": "reliable",
         },
-        # A loaded test machine stalls for longer than an instrument may.
-        "eschorty_ros.nodes.scanner": {"node_timeout": 60.0, "events_timeout": 3.0},
+        "eschorty_ros.nodes.scanner": {},
     }
 
 

@@ -50,9 +50,7 @@ from eschorty_ros.core._evt3_words import (
 
 
 @njit(
-    types.Tuple((uint64, uint64))(
-        WORDS, int64, int64, int64[::1], int64[::1], OUT, TRIGGERS
-    ),
+    types.Tuple((uint64, uint64))(WORDS, int64, int64, int64[::1], int64[::1], OUT, TRIGGERS),
     cache=True,
     nogil=True,
 )

@@ -17,9 +17,7 @@ _U2 = types.Array(uint16, 1, "C", readonly=True)
 _U1 = types.Array(uint8, 1, "C", readonly=True)
 
 
-@njit(
-    uint64(int64, types.boolean, int64[::1], uint16[::1], uint64), cache=True, nogil=True
-)
+@njit(uint64(int64, types.boolean, int64[::1], uint16[::1], uint64), cache=True, nogil=True)
 def _put_time(t, idle, s, words, n):
     """Words that bring the stream's time to ``t``: every TIME_HIGH on the way, then TIME_LOW.
 
@@ -104,9 +102,7 @@ def _put_row(k, end, x, y, p, width, s, words, n):
     return n
 
 
-@njit(
-    uint64(_I8, _U2, _U2, _U1, _I8, _U1, int64, int64[::1], uint16[::1]), cache=True, nogil=True
-)
+@njit(uint64(_I8, _U2, _U2, _U1, _I8, _U1, int64, int64[::1], uint16[::1]), cache=True, nogil=True)
 def _encode(t, x, y, p, trigger_t, trigger_edge, width, s, words):
     """Merge events and triggers by time (triggers first); returns the number of words."""
     n = np.uint64(0)

@@ -230,9 +230,7 @@ def _vector(mask, bits, t, y, s, c, out, n):
 
 
 @njit(
-    types.Tuple((uint64, uint64))(
-        WORDS, uint64, int64, int64, int64[::1], int64[::1], OUT, uint64
-    ),
+    types.Tuple((uint64, uint64))(WORDS, uint64, int64, int64, int64[::1], int64[::1], OUT, uint64),
     cache=True,
     nogil=True,
 )

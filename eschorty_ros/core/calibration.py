@@ -194,7 +194,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
     text = os.fspath(name_or_path)
     if not _is_bare_name(text):
         return Path(text)
-    for folder in _config_folders():
+    for folder in config_folders():
         candidate = folder / f"{text}.yaml"
         if candidate.is_file():
             return candidate
@@ -204,7 +204,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
     )
 
 
-def _config_folders() -> list[Path]:
+def config_folders() -> list[Path]:
     """List where builds may lie: source tree, inside a pip-installed package, colcon's share."""
     here = Path(__file__).absolute()
     return [

@@ -171,9 +171,7 @@ class Decoder:
         )
         t, x, y, p = self._events
         trigger_t, channel, edge = self._triggers
-        return Events(
-            t[:n], x[:n], y[:n], p[:n], Triggers(trigger_t[:m], channel[:m], edge[:m])
-        )
+        return Events(t[:n], x[:n], y[:n], p[:n], Triggers(trigger_t[:m], channel[:m], edge[:m]))
 
     def _words(self, data: Bytes) -> NDArray[np.uint16]:
         """Whole words of the carried byte and ``data``; an odd last byte is carried on."""

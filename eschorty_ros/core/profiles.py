@@ -85,9 +85,7 @@ class Profiles:
         return int(np.count_nonzero(np.diff(self.edge_us))) + 1 if len(self) else 0
 
 
-def place_link(
-    profiles: Profiles, model: RangeModel, origin_us: int = 0
-) -> NDArray[np.void]:
+def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDArray[np.void]:
     """Points in the moving frame ``eschorty_link``: x = range, z along the line, y = 0.
 
     Parameters

@@ -122,8 +122,8 @@ class Reconstructor:
         )
         for name, value in self._schedule.counters.items():
             counts[name] = value + self._schedule_counts.get(name, 0)
-        counts["periods_empty"] += (
-            self._schedule.periods_jumped + self._schedule_counts.get("periods_jumped", 0)
+        counts["periods_empty"] += self._schedule.periods_jumped + self._schedule_counts.get(
+            "periods_jumped", 0
         )
         decoder = self._decoder.counters
         counts["sensor_drop_words"] = decoder.sensor_drop_words

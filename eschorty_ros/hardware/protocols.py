@@ -123,7 +123,7 @@ class LinearStage(Protocol):
         """Position, velocity, time and flags now."""
 
     def plan(self) -> MotionPlan | None:
-        """The motion under way in host time, ``None`` when the device does not know it."""
+        """Tell the motion under way in host time, ``None`` when the device does not know it."""
 
     def close(self) -> None:
         """Stop and release; idempotent."""

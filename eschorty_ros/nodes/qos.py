@@ -10,7 +10,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 EVENT_DEPTH = 1000
 STREAM_DEPTH = 200
-STATE_HISTORY = 50
+STATE_HISTORY = 100
 
 
 def events() -> QoSProfile:

@@ -14,7 +14,9 @@ from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import mm_from_m, ns_from_stamp
 from eschorty_ros.nodes.scan_sequence import ScanFailure
 
-_STALE_S = 1.0
+# When a process dies, Fast DDS holds what others send to it for a second, and what got lost comes
+# again after 3 s.
+_STALE_S = 4.0
 _SAMPLES_MAX = 500_000
 
 

@@ -49,7 +49,7 @@ TABLE = (
     # A machine's first run compiles for some 20 s before the nodes answer.
     Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
-    Param("events_timeout", 1.0, "longest pause of the events while the laser is on", "s",
+    Param("events_timeout", 3.0, "longest pause of the events while the laser is on", "s",
           0.1, 60.0),
     Param("drain_timeout", 10.0, "longest standstill of the reconstruction after the sweep", "s",
           0.1, 600.0),

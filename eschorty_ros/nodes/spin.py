@@ -19,6 +19,7 @@ from rclpy.executors import (
 from rclpy.node import Node
 
 from eschorty_ros.core.errors import EschortyError
+from eschorty_ros.nodes.dds import use_profile
 
 
 def make_safe(nodes: Sequence[Node]) -> None:
@@ -71,6 +72,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     nodes: list[Node] = []
     executor: Executor | None = None
     code = 0
+    use_profile()
     try:
         rclpy.init(args=list(args) if args is not None else None)
         signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))

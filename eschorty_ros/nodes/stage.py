@@ -26,6 +26,8 @@ from eschorty_ros.nodes.spin import run
 MOTION_RATE_HZ = 20.0
 FEEDBACK_PERIOD_S = 0.05
 POLL_S = 0.01
+# More than DDS's heartbeat of 3 s holds: what got lost can still be repeated.
+ODOM_DEPTH = 2000
 
 TABLE = (
     drivers.DRIVER,
@@ -53,7 +55,7 @@ class StageNode(DeviceNode):
         self._stage: LinearStage | None = None
         super().__init__("stage", TABLE, **kwargs)
         self.moves = 0
-        self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(10))
+        self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(ODOM_DEPTH))
         self._motion = self.create_publisher(StageMotion, "stage/motion", qos.stream())
         self._move = ActionServer(
             self,

@@ -196,9 +196,7 @@ def test_jittered_and_missing_triggers_lose_no_event():
     rng = np.random.default_rng(SEED)
     jitter = np.cumsum(rng.integers(-30, 31, 20))
     edges = 50_000 + np.rint(np.arange(20) * 1e6 / 70).astype(int) + jitter
-    parts = [
-        line_events(rng, flat, periods=1, edge_us=int(edge), background=0.0) for edge in edges
-    ]
+    parts = [line_events(rng, flat, periods=1, edge_us=int(edge), background=0.0) for edge in edges]
     events = tuple(np.concatenate(values) for values in zip(*parts, strict=True))
     data = encoded(sort_readout(*events), np.delete(edges, [7, 8]))
     found, reconstructor = run(data, Modulation(70.0))

@@ -30,9 +30,8 @@ EXPECTED = {
         "stop",
         "rviz",
         "auto_scan",
-        "dds_profile",
     },
-    "replay.launch.py": {"recording", "rate", "rviz", "dds_profile"},
+    "replay.launch.py": {"recording", "rate", "rviz"},
 }
 
 
@@ -135,7 +134,7 @@ def test_dds_profile_has_room_for_large_messages():
     root = xml.etree.ElementTree.parse(ROOT / "config" / "fastdds.xml").getroot()
     size = root.find(".//d:segment_size", space)
     assert size is not None
-    assert int(size.text) == 128 * 2**20
+    assert int(size.text) == 32 * 2**20
     assert root.find(".//d:useBuiltinTransports", space).text == "false"
     assert root.find(".//d:participant", space).get("is_default_profile") == "true"
     transports = {node.text for node in root.findall(".//d:transport_descriptor/d:type", space)}
