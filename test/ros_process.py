@@ -20,7 +20,7 @@ import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMsg
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -211,6 +211,21 @@ class Observer:
             return future.result()
         finally:
             self.node.destroy_client(client)
+
+    def wait_for_answers(self, node: str, deadline_s: float = DEADLINE_S) -> None:
+        """Wait until ``node`` answers: a fresh server may not know yet where answers go.
+
+        Endpoints are discovered in the order of their making, so what this observer made before
+        gets its answers, too.
+        """
+
+        def answered() -> bool:
+            with contextlib.suppress(AssertionError):
+                self.call(GetParameters, f"{node}/get_parameters", deadline_s=2.0)
+                return True
+            return False
+
+        wait_until(answered, f"an answer of {node}", deadline_s)
 
     def lifecycle_state(self, node: str) -> str:
         """Label of the lifecycle state of ``node``."""

@@ -68,6 +68,7 @@ class Bench:
     def start(self, **goal: float) -> Any:
         """Send a goal; the accepted handle."""
         wait_until(self._action.server_is_ready, "the scan action", SCAN_DEADLINE_S)
+        self.observer.wait_for_answers("scanner", SCAN_DEADLINE_S)
         self.feedback.clear()
         values = {"start": START_M, "stop": STOP_M, "speed": SPEED_M_S, "frequency": FREQUENCY_HZ}
         sent = self._action.send_goal_async(
@@ -236,7 +237,8 @@ def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
 def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
     before = len(bench.clouds)
-    bench.start(stop=0.200, speed=0.03)
+    # Slow: DDS holds everybody's messages for some seconds after a process was killed.
+    bench.start(stop=0.200, speed=0.015)
     bench.wait_for_sweep()
     kill()
     killed_s = time.monotonic()

@@ -7,8 +7,8 @@ import os
 from eschorty_ros.core.calibration import config_folders
 
 PROFILE = "fastdds.xml"
-# The second name is that of Fast DDS 2, which the distributions before Kilted use.
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+# Their Fast DDS 2 spells profiles differently.
 _OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 
 
@@ -19,10 +19,10 @@ def use_profile() -> None:
     50 ms loses packets, which even reliable topics get back only at the next heartbeat, up to 3 s
     later. Must run before the first ``rclpy.init`` of the process.
     """
-    if any(name in os.environ for name in VARIABLES):
+    chosen = any(name in os.environ for name in VARIABLES)
+    if chosen or os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS:
         return
-    variable = VARIABLES[os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS]
     for folder in config_folders():
         if (folder / PROFILE).is_file():
-            os.environ[variable] = str(folder / PROFILE)
+            os.environ[VARIABLES[0]] = str(folder / PROFILE)
             return

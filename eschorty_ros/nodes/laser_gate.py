@@ -53,8 +53,9 @@ class LaserGate:
         self._heartbeat_s = self._now_s()
 
     def switched_on(self) -> None:
-        """Note that the output has been switched on."""
-        self._on_s = self._now_s()
+        """Note that the output has been switched on; asked again while on, its time runs on."""
+        if self._on_s is None:
+            self._on_s = self._now_s()
 
     def switched_off(self) -> None:
         """Note that the output has been switched off: disarmed too."""

@@ -84,14 +84,16 @@ class Pipeline:
         return fresh, placed
 
     def begin_scan(self, scan_id: str, start_mm: float, stop_mm: float) -> None:
-        """Start collecting.
+        """Start collecting; a request repeated because its answer got lost changes nothing.
 
         Raises
         ------
         ArgumentError
-            When a scan is being collected already, or for bad limits.
+            When another scan is being collected already, or for bad limits.
         """
         if self._buffer is not None:
+            if self._buffer.scan_id == scan_id:
+                return
             raise ArgumentError(
                 f"scan {self._buffer.scan_id!r} is being collected; end it before beginning "
                 f"{scan_id!r}"

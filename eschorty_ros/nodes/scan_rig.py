@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -32,6 +33,7 @@ from eschorty_ros.srv import BeginScan, EndScan
 
 _TICK_S = 0.02
 _HEARTBEAT_S = 0.1
+_RESEND_S = 2.0
 
 
 class RosRig:
@@ -274,15 +276,33 @@ class RosRig:
                 text = failure if isinstance(failure, str) else failure()
                 raise ScanFailure(f"{text} within {timeout_s:g} s; check that the node runs")
 
-    def _answer(self, future: Any, name: str, patience_s: float | None = None) -> Any:
-        timeout_s = patience_s or self._service_timeout_s
-        self._wait(future.done, timeout_s, f"{name.split('/')[0]}: no answer of {name}")
+    def _answer(self, future: Any, name: str) -> Any:
+        self._wait(
+            future.done, self._service_timeout_s, f"{name.split('/')[0]}: no answer of {name}"
+        )
         return future.result()
 
     def _call(self, name: str, request: Any, patience_s: float | None = None) -> Any:
-        with _living_context():
-            future = self._clients[name].call_async(request)
-        return self._answer(future, name, patience_s)
+        """Answer of a service; asked again meanwhile unless ``patience_s`` is given.
+
+        A server that has just discovered this node may not know yet where to send its answer.
+        All requests but the one that takes patience may be carried out twice.
+        """
+        futures: list[Any] = []
+        sent_s = -math.inf
+
+        def answered() -> bool:
+            nonlocal sent_s
+            repeat = patience_s is None or not futures
+            if repeat and time.monotonic() - sent_s > _RESEND_S:
+                sent_s = time.monotonic()
+                with _living_context():
+                    futures.append(self._clients[name].call_async(request))
+            return any(future.done() for future in futures)
+
+        timeout_s = patience_s or self._service_timeout_s
+        self._wait(answered, timeout_s, f"{name.split('/')[0]}: no answer of {name}")
+        return next(future.result() for future in futures if future.done())
 
 
 @contextlib.contextmanager
