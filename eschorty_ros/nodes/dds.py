@@ -1,4 +1,4 @@
-"""Room for large messages in DDS."""
+"""How the nodes' messages travel."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ _OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 def use_profile() -> None:
     """Make Fast DDS read ``config/fastdds.xml`` unless the user has chosen a profile.
 
-    Its default shared memory of 512 kB holds a few event packets: a host that stalls for some
-    50 ms loses packets, which even reliable topics get back only at the next heartbeat, up to 3 s
-    later. Must run before the first ``rclpy.init`` of the process.
+    With its defaults a message that got lost on a loaded host comes again only after up to 3 s,
+    even on a reliable topic. Must run before the first ``rclpy.init`` of the process.
     """
     chosen = any(name in os.environ for name in VARIABLES)
     if chosen or os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS:

@@ -14,9 +14,9 @@ from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import mm_from_m, ns_from_stamp
 from eschorty_ros.nodes.scan_sequence import ScanFailure
 
-# When a process dies, Fast DDS holds what others send to it for a second, and what got lost comes
-# again after 3 s.
+# With Fast DDS's defaults what got lost comes again after 3 s.
 _STALE_S = 4.0
+_REST_M_S = 1e-4
 _SAMPLES_MAX = 500_000
 
 
@@ -35,6 +35,7 @@ class ScanMonitor:
         self.laser: LaserState | None = None
         self.reconstruction: ReconstructionState | None = None
         self.position_mm = float("nan")
+        self.at_rest = False
         self.until_ns = 0
         self._laser_s = self._reconstruction_s = self._stage_s = self._advanced_s = 0.0
         node.create_subscription(
@@ -107,6 +108,7 @@ class ScanMonitor:
     def _on_stage(self, message: Odometry) -> None:
         self.position_mm = mm_from_m(message.pose.pose.position.y)
         self._stage_s = time.monotonic()
+        self.at_rest = abs(message.twist.twist.linear.y) < _REST_M_S
         self.samples.append((ns_from_stamp(message.header.stamp), self.position_mm))
 
 

@@ -107,6 +107,7 @@ class RosRig:
             self._wait(there, self._node_timeout_s, f"{what.split('/')[0]}: no {what}")
         for there, failure in (
             (lambda: self.monitor.stage_heard, lambda: "stage: no odometry"),
+            (lambda: self.monitor.at_rest, lambda: "stage: another move does not end"),
             (lambda: self.monitor.laser is not None, lambda: "laser: no state"),
             (lambda: self.monitor.until_ns > begun_ns, self.monitor.why_no_progress),
         ):

@@ -129,13 +129,13 @@ def test_rviz_names_frames_that_are_published():
     assert all(f'"{frame}"' in published for frame in named)
 
 
-def test_dds_profile_has_room_for_large_messages():
+def test_dds_profile_repeats_lost_messages_soon_and_shares_no_memory():
     space = {"d": "http://www.eprosima.com"}
     root = xml.etree.ElementTree.parse(ROOT / "config" / "fastdds.xml").getroot()
-    size = root.find(".//d:segment_size", space)
-    assert size is not None
-    assert int(size.text) == 32 * 2**20
-    assert root.find(".//d:useBuiltinTransports", space).text == "false"
     assert root.find(".//d:participant", space).get("is_default_profile") == "true"
-    transports = {node.text for node in root.findall(".//d:transport_descriptor/d:type", space)}
-    assert transports == {"SHM", "UDPv4"}
+    assert root.find(".//d:useBuiltinTransports", space).text == "false"
+    types = {node.text for node in root.findall(".//d:transport_descriptor/d:type", space)}
+    assert types == {"UDPv4"}
+    writer = root.find(".//d:data_writer", space)
+    assert writer.get("is_default_profile") == "true"
+    assert int(writer.find(".//d:nanosec", space).text) <= 200_000_000
