@@ -238,9 +238,15 @@ def _parameter_file(values: dict[str, dict[str, Any]]) -> str:
 
 def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
     # Shutting an executor down while it spins raises in this thread, so it is asked to end.
-    with contextlib.suppress(ExternalShutdownException):
+    try:
         while not ending.is_set():
             executor.spin_once(timeout_sec=0.1)
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A callback that publishes while the context ends fails; that is no news.
+        if not ending.is_set():
+            raise
 
 
 def _wait(condition: Callable[[], Any], limit_s: float, fault: str) -> None:
