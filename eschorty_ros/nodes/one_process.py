@@ -30,7 +30,6 @@ from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.camera import CameraNode
 from eschorty_ros.nodes.cloud_messages import points_from_message
-from eschorty_ros.nodes.dds import use_profile
 from eschorty_ros.nodes.laser import LaserNode
 from eschorty_ros.nodes.reconstruction import ReconstructionNode
 from eschorty_ros.nodes.scanner import ScannerNode
@@ -176,7 +175,6 @@ def instrument(scan: OneScan) -> Iterator[Instrument]:
     other instrument.
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    use_profile()
     nodes: list[Node] = []
     with tempfile.TemporaryDirectory(prefix="eschorty_") as folder:
         file = Path(folder) / "parameters.yaml"
