@@ -48,6 +48,7 @@ THREADS = 12
 START_S = 60.0
 SLACK_S = 60.0
 _POLL_S = 0.02
+_BREATH_S = 3e-4
 
 Feedback = Callable[[float, str], None]
 
@@ -239,6 +240,9 @@ def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
     try:
         while not ending.is_set():
             executor.spin_once(timeout_sec=0.1)
+            # While a callback runs, rclpy 9 polls for the next of its group without a pause and
+            # would keep the interpreter from the simulation and the reconstruction.
+            time.sleep(_BREATH_S)
     except ExternalShutdownException:
         pass
     except Exception:
