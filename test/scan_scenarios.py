@@ -172,7 +172,7 @@ def full_scan(bench: Bench) -> None:
 def cancel_scan(bench: Bench) -> None:
     """Cancel in the middle: light off, stage stopped, what there is published."""
     before = len(bench.clouds)
-    handle = bench.start(stop=0.120)
+    handle = bench.start(stop=0.120, speed=0.015)
     bench.wait_for_sweep()
     canceled = handle.cancel_goal_async()
     wait_until(canceled.done, "an answer to the cancel request")
@@ -227,7 +227,7 @@ def bad_parameters(bench: Bench) -> None:
 
 def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
     """The scanner ends mid-scan: without its heartbeat the laser switches off."""
-    bench.start(stop=0.200, speed=0.03)
+    bench.start(stop=0.200, speed=0.015)
     bench.wait_for_sweep()
     assert bench.output_lines()[-1] == "ON"
     interrupt()
