@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 
@@ -20,6 +21,8 @@ from rclpy.node import Node
 
 from eschorty_ros.core.errors import EschortyError
 from eschorty_ros.nodes.dds import use_profile
+
+_BREATH_S = 3e-4
 
 
 def make_safe(nodes: Sequence[Node]) -> None:
@@ -81,7 +84,10 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             node = factory()
             nodes.append(node)
             executor.add_node(node)
-        executor.spin()
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0.1)
+            # While a callback runs, rclpy 9 polls for the next of its group without a pause.
+            time.sleep(_BREATH_S)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except EschortyError as error:
