@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 POINTS_IN_3D = 30_000
 SIGMAS_SHOWN = 5.0
+DPI = 110
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,7 @@ def scan_figure(
     stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
     grid = grid_of(points, stage_mm)
     rows = 1 if error_mm is None else 2
-    figure = _figure(12.0, 4.9 * rows)
+    figure = new_figure(12.0, 4.9 * rows)
     if title:
         figure.suptitle(title)
     limits = _central(range_mm)
@@ -138,7 +139,7 @@ def design_figure(
     title: str,
 ) -> Figure:
     """Range over row, sampling and depth of field over range; all arrays of one shape, mm."""
-    figure = _figure(12.0, 4.2)
+    figure = new_figure(12.0, 4.2)
     figure.suptitle(title)
     axes = figure.add_subplot(1, 3, 1)
     axes.plot(row, range_mm)
@@ -162,6 +163,16 @@ def design_figure(
     return figure
 
 
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Empty figure that belongs to no window."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure; the extension (.png, .pdf, .svg) decides the format.
 
@@ -172,18 +183,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, dpi=DPI)
     except (OSError, ValueError) as error:
         raise ArgumentError(f"cannot write the picture {path}: {error}") from error
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _central(values: NDArray[np.float64]) -> tuple[float, float]:
