@@ -89,7 +89,7 @@ def _estimate_period(
     lists, counts, seeds, whole, fractional, half, work, work_int, scratch, counters
 ):
     """Every column's row; returns the pooled sum of squares and degrees of freedom."""
-    row, sigma2 = work[0], work[1]
+    row, sigma2, variances = work[0], work[1], work[4]
     events, mean_dt = work_int[0], work_int[1]
     rows = float(whole[P_ROWS])
     squares = 0.0
@@ -126,6 +126,7 @@ def _estimate_period(
                 continue
         row[c] = r
         sigma2[c] = _sigma2(variance, used, r, rows, factor, floor)
+        variances[c] = variance
         events[c] = used
         mean_dt[c] = np.int64(np.rint(sum_time / used))
         seeds[c] = centre
@@ -154,6 +155,7 @@ def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scrat
     if whole[P_METHOD] == MODE_MEAN:
         state[S_HALF] = _adapted_half(state[S_HALF], squares, freedom, whole[P_HALF_MAX])
     row, sigma2, smooth_row, smooth_sigma2 = work[0], work[1], work[2], work[3]
+    variances = work[4]
     events, mean_dt, rejected = work_int[0], work_int[1], work_int[2]
     isolated = _reject_isolated(
         row, events, ISOLATION_REACH, fractional[F_ISOLATION], whole[P_WEAK], rejected
@@ -167,7 +169,10 @@ def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scrat
         row, sigma2, fractional[F_FLOOR] ** 2, whole[P_SMOOTH], fractional[F_GATE], smooth_row,
         smooth_sigma2,
     )  # fmt: skip
-    out_period, out_edge, out_t, out_column, out_row, out_sigma, out_events = out
+    (
+        out_period, out_edge, out_t, out_column, out_row, out_sigma, out_width, out_events,
+        out_return,
+    ) = out  # fmt: skip
     k = state[S_POINTS]
     for c in range(row.size):
         if np.isnan(row[c]):
@@ -178,7 +183,9 @@ def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scrat
         out_column[k] = c
         out_row[k] = smooth_row[c]
         out_sigma[k] = np.sqrt(smooth_sigma2[c])
+        out_width[k] = np.sqrt(variances[c])
         out_events[k] = events[c]
+        out_return[k] = 0
         k += 1
     state[S_POINTS] = k
 

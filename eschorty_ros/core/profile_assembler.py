@@ -48,15 +48,16 @@ class ProfileAssembler:
         self._column_counts = np.zeros(columns, dtype=np.uint32)
         self._seeds = np.full(columns, -1, dtype=np.int64)
         self._state = np.zeros(binning.S_SIZE, dtype=np.int64)
-        self._work = np.zeros((4, columns))
+        self._work = np.zeros((5, columns))
         self._work_int = np.zeros((3, columns), dtype=np.int64)
         self._scratch = np.zeros(1 << kernels.ROW_BITS, dtype=np.int64)
         self._whole, self._fractional = _parameters(settings, model.rows)
         size = _OUTPUT_PROFILES * columns
         self._whole_out = np.empty((3, size), dtype=np.int64)
         self._column_out = np.empty(size, dtype=np.uint16)
-        self._row_out = np.empty((2, size))
+        self._row_out = np.empty((3, size))
         self._events_out = np.empty(size, dtype=np.uint32)
+        self._return_out = np.empty(size, dtype=np.uint8)
         self.restart()
 
     def restart(self) -> None:
@@ -97,7 +98,9 @@ class ProfileAssembler:
         int
             First edge not dealt with.
         """
-        out = (*self._whole_out, self._column_out, *self._row_out, self._events_out)
+        out = (
+            *self._whole_out, self._column_out, *self._row_out, self._events_out, self._return_out,
+        )  # fmt: skip
         first, edge, stop = 0, first_edge, len(t)
         while True:
             first, edge = binning._bin(
@@ -130,7 +133,7 @@ class ProfileAssembler:
         if n == 0:
             return
         period, edge, t_us = self._whole_out[:, :n].copy()
-        row, sigma = self._row_out[:, :n].copy()
+        row, sigma, width = self._row_out[:, :n].copy()
         profiles = Profiles(
             period,
             edge,
@@ -141,6 +144,8 @@ class ProfileAssembler:
             self._model.range_mm(row),
             self._model.range_sigma_mm(row, sigma),
             self._events_out[:n].copy(),
+            width,
+            self._return_out[:n].copy(),
         )
         valid = np.isfinite(profiles.range_mm)
         if not valid.all():

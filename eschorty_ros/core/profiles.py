@@ -22,12 +22,14 @@ _DTYPES = {
     "range_mm": np.float64,
     "sigma_mm": np.float64,
     "events": np.uint32,
+    "width_px": np.float64,
+    "return_index": np.uint8,
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profiles:
-    """Points of whole profiles as arrays of equal length, ordered by period, then column.
+    """Points of whole profiles as arrays of equal length, by period, column, return index.
 
     Attributes
     ----------
@@ -44,6 +46,10 @@ class Profiles:
         Range along the sheet (Eq. 2) and its standard deviation.
     events : uint32
         Events used.
+    width_px : float64
+        Sample standard deviation of the rows used; 0 for a single event.
+    return_index : uint8
+        Place among the points of the same profile and column, nearest range first.
     """
 
     period: NDArray[np.int64]
@@ -55,6 +61,8 @@ class Profiles:
     range_mm: NDArray[np.float64]
     sigma_mm: NDArray[np.float64]
     events: NDArray[np.uint32]
+    width_px: NDArray[np.float64]
+    return_index: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.column)

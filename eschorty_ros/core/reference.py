@@ -148,4 +148,6 @@ def _window(
         model.range_mm(mean),
         model.range_sigma_mm(mean, sigma),
         n.astype(np.uint32),
+        sigma * np.sqrt(n / np.maximum(n - 1.0, 1.0)),
+        np.zeros(lit.size, dtype=np.uint8),
     )

@@ -46,6 +46,8 @@ def test_same_rows_and_ranges_as_the_streaming_mean():
     np.testing.assert_array_equal(plain.events, ours.events)
     np.testing.assert_allclose(plain.row, ours.row, rtol=0, atol=1e-10)
     np.testing.assert_allclose(plain.range_mm, ours.range_mm, rtol=1e-12)
+    np.testing.assert_allclose(plain.width_px, ours.width_px, rtol=1e-9)
+    np.testing.assert_array_equal(plain.return_index, ours.return_index)
     assert np.abs(plain.t_us - ours.t_us).max() <= 1
 
 
