@@ -40,6 +40,7 @@ CASES = {
     "mean": Settings(centroid="mean"),
     "median": Settings(centroid="median"),
     "ours + activity filter": Settings(noise_filter="activity"),
+    "ours + phase gate": Settings(phase_gate_us=1000),
 }
 
 

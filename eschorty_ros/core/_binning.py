@@ -19,6 +19,7 @@ from eschorty_ros.core._centroid_kernels import (
     _sigma2,
     _variance,
 )
+from eschorty_ros.core._phase_gate_kernels import G_LENGTH, _outside
 from eschorty_ros.core._smoothing_kernels import _reject_isolated, _smooth
 
 # state, int64
@@ -29,6 +30,7 @@ COUNTERS = (
     "events_before_first_edge",
     "events_outside_sensor",
     "events_over_column_limit",
+    "events_gated",
     "periods_closed",
     "periods_empty",
     "columns_too_few_events",
@@ -37,8 +39,8 @@ COUNTERS = (
     "columns_smoothed",
 )
 (
-    C_BINNED, C_EARLY, C_OUTSIDE, C_OVER, C_CLOSED, C_EMPTY, C_FEW, C_AMBIGUOUS, C_ISOLATED,
-    C_SMOOTHED,
+    C_BINNED, C_EARLY, C_OUTSIDE, C_OVER, C_GATED, C_CLOSED, C_EMPTY, C_FEW, C_AMBIGUOUS,
+    C_ISOLATED, C_SMOOTHED,
 ) = range(len(COUNTERS))  # fmt: skip
 # whole-number settings
 P_METHOD, P_EVENTS_MIN, P_HALF_MAX, P_ROWS, P_SMOOTH, P_WEAK, P_SIZE = 0, 1, 2, 3, 4, 5, 6
@@ -53,8 +55,8 @@ _WIDTH_MIN_DOF = 64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
-    """Append events before time ``limit``; returns the first event left."""
+def _append(t, x, y, p, first, stop, limit, lists, counts, rows, edge, gate, counters):
+    """Append events before time ``limit`` that the gate lets through; returns the first left."""
     columns = np.uintp(counts.size)
     stride = np.uintp(lists.size) // columns
     room = np.uint32(stride - np.uintp(BLOCK))
@@ -62,13 +64,17 @@ def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
     end = np.uintp(stop)
     over = 0
     outside = 0
+    gated = 0
+    gating = gate[G_LENGTH] > 0.0
     while i < end and t[i] < limit:
         c = np.uintp(x[i])
         r = np.uint32(y[i])
         dt = t[i] - edge
         if c < columns and r < rows:
             n = counts[c]
-            if n < room:
+            if gating and _outside(dt, p[i], gate):
+                gated += 1
+            elif n < room:
                 lists[c * stride + np.uintp(n)] = np.uint32(
                     (np.uint32(min(dt, TIME_LIMIT_US - 1)) << np.uint32(ROW_BITS)) | r
                 )
@@ -78,9 +84,10 @@ def _append(t, x, y, first, stop, limit, lists, counts, rows, edge, counters):
         else:
             outside += 1
         i += np.uintp(1)
-    counters[C_BINNED] += np.int64(i) - first - over - outside
+    counters[C_BINNED] += np.int64(i) - first - over - outside - gated
     counters[C_OVER] += over
     counters[C_OUTSIDE] += outside
+    counters[C_GATED] += gated
     return np.int64(i)
 
 
@@ -192,8 +199,8 @@ def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scrat
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bin(
-    t, x, y, first, stop, edges, indices, edge, edge_count, drain, lists, counts, seeds, state,
-    whole, fractional, work, work_int, scratch, counters, out,
+    t, x, y, p, first, stop, edges, indices, edge, edge_count, drain, gate, lists, counts, seeds,
+    state, whole, fractional, work, work_int, scratch, counters, out,
 ):  # fmt: skip
     """Merge events ``first..stop`` with edges ``edge..edge_count``.
 
@@ -215,8 +222,8 @@ def _bin(
                 counters[C_EARLY] += i - begin
             else:
                 i = _append(
-                    t, x, y, i, stop, limit, lists, counts, np.uint32(whole[P_ROWS]),
-                    state[S_EDGE], counters,
+                    t, x, y, p, i, stop, limit, lists, counts, np.uint32(whole[P_ROWS]),
+                    state[S_EDGE], gate, counters,
                 )  # fmt: skip
                 state[S_OPEN] = 2
         if edge == edge_count or (i == stop and not drain):

@@ -9,7 +9,9 @@ from eschorty_ros.core import _binning as binning
 from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core.centroid import check_method, half_width_fixed, method_factor
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.phase_gate import gate_parameters
 from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.core.settings import Settings
 
@@ -40,6 +42,7 @@ class ProfileAssembler:
         self._model = model
         self._done: list[Profiles] = []
         self._half_max = half_width_fixed(settings.line_width_px)
+        self._gate_us = settings.phase_gate_us
         self.points = 0
         self.points_beyond_pole = 0
         self._counts = np.zeros(len(binning.COUNTERS), dtype=np.int64)
@@ -58,10 +61,10 @@ class ProfileAssembler:
         self._row_out = np.empty((3, size))
         self._events_out = np.empty(size, dtype=np.uint32)
         self._return_out = np.empty(size, dtype=np.uint8)
-        self.restart()
 
-    def restart(self) -> None:
-        """Forget the open period, the seeds and the line's width."""
+    def restart(self, modulation: Modulation) -> None:
+        """Forget the open period, the seeds and the line's width; gate by ``modulation``."""
+        self._gate = gate_parameters(modulation, self._gate_us)
         self._state[binning.S_OPEN] = 0
         self._state[binning.S_HALF] = self._half_max
         self._column_counts[:] = 0
@@ -77,6 +80,7 @@ class ProfileAssembler:
         t: NDArray[np.int64],
         x: NDArray[np.uint16],
         y: NDArray[np.uint16],
+        p: NDArray[np.uint8],
         edges: NDArray[np.int64],
         indices: NDArray[np.int64],
         first_edge: int,
@@ -86,7 +90,7 @@ class ProfileAssembler:
 
         Parameters
         ----------
-        t, x, y : int64, uint16, uint16, equal length
+        t, x, y, p : int64, uint16, uint16, uint8, equal length
             Events in time order.
         edges, indices : int64, equal length
             Times and numbers of the periods' beginnings; those before ``first_edge`` are done.
@@ -104,9 +108,9 @@ class ProfileAssembler:
         first, edge, stop = 0, first_edge, len(t)
         while True:
             first, edge = binning._bin(
-                t, x, y, first, stop, edges, indices, edge, len(edges), drain, self._lists,
-                self._column_counts, self._seeds, self._state, self._whole, self._fractional,
-                self._work, self._work_int, self._scratch, self._counts, out,
+                t, x, y, p, first, stop, edges, indices, edge, len(edges), drain, self._gate,
+                self._lists, self._column_counts, self._seeds, self._state, self._whole,
+                self._fractional, self._work, self._work_int, self._scratch, self._counts, out,
             )  # fmt: skip
             if first == stop and (edge == len(edges) or not drain):
                 return int(edge)
@@ -118,7 +122,7 @@ class ProfileAssembler:
             none = np.empty(0, dtype=np.int64)
             nowhere = np.empty(0, dtype=np.uint16)
             edge, index = self._state[[binning.S_EDGE]], self._state[[binning.S_INDEX]]
-            self.merge(none, nowhere, nowhere, edge, index, 0, True)
+            self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, index, 0, True)
 
     def take(self) -> Profiles:
         """Points of the periods closed since the last call."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core.calibration import Calibration
@@ -79,7 +80,7 @@ class Reconstructor:
             )
         self._modulation = modulation
         self._schedule = EdgeSchedule(modulation, self.settings.periods_per_profile)
-        self._assembler.restart()
+        self._assembler.restart(modulation)
         self.phase: PhaseEstimate | None = None
         self._phase_missing = False
 
@@ -102,7 +103,7 @@ class Reconstructor:
     def counters(self) -> dict[str, int]:
         """Counts since construction, by name.
 
-        ``events`` (decoded) = ``events_filtered`` + ``events_binned`` +
+        ``events`` (decoded) = ``events_filtered`` + ``events_gated`` + ``events_binned`` +
         ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_phase`` +
         ``events_held`` (not assigned yet).
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
@@ -256,23 +257,36 @@ class Reconstructor:
             if events is not None and not waiting:
                 last = max(int(np.searchsorted(events.t, safe_us)), first)
             if stop:
-                edge = self._assembler.merge(
-                    held.t[:stop], held.x[:stop], held.y[:stop], edges, indices, edge, last <= first
-                )
+                edge = self._merge(held, slice(0, stop), edges, indices, edge, last <= first)
                 held.drop(stop)
             if events is not None and last > first:
                 new = slice(first, last)
-                edge = self._assembler.merge(
-                    events.t[new], events.x[new], events.y[new], edges, indices, edge, True
-                )
+                edge = self._merge(events, new, edges, indices, edge, True)
                 first = last
             if edge < len(edges):
-                none = slice(0, 0)
-                self._assembler.merge(
-                    held.t[none], held.x[none], held.y[none], edges, indices, edge, True
-                )
+                self._merge(held, slice(0, 0), edges, indices, edge, True)
         if events is not None and first < count:
             held.append(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
+
+    def _merge(
+        self,
+        source: Events | HeldEvents,
+        part: slice,
+        edges: NDArray[np.int64],
+        indices: NDArray[np.int64],
+        edge: int,
+        drain: bool,
+    ) -> int:
+        return self._assembler.merge(
+            source.t[part],
+            source.x[part],
+            source.y[part],
+            source.p[part],
+            edges,
+            indices,
+            edge,
+            drain,
+        )
 
     def _drain(self) -> None:
         if self._schedule.anchored or self._find_phase(_FLUSH_US, last=True):

@@ -30,7 +30,7 @@ CALIBRATION = load_calibration("config_3")
 MODEL = CALIBRATION.model()
 RAW = Settings(smoothing_half_width=0)
 PARTS = ("events_binned", "events_over_column_limit", "events_outside_sensor",
-         "events_outside_phase", "events_filtered", "events_held")  # fmt: skip
+         "events_outside_phase", "events_filtered", "events_gated", "events_held")  # fmt: skip
 
 
 def flat(k, c):
