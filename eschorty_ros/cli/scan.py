@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     "--scene",
     default="steps",
     show_default=True,
-    help="steps, plane, tilted, sphere, or a mesh file in metres (needs open3d).",
+    help="steps, plane, tilted, sphere, leaves, face, or a mesh in metres (needs open3d).",
 )
 @click.option(
     "--frequency",

@@ -15,7 +15,7 @@ from eschorty_ros.core.errors import ArgumentError
     "--scene",
     default="steps",
     show_default=True,
-    help="steps, plane, tilted, sphere, or a mesh file in metres (needs open3d).",
+    help="steps, plane, tilted, sphere, leaves, face, or a mesh in metres (needs open3d).",
 )
 @click.option(
     "--out",

@@ -150,11 +150,25 @@ class Sphere(UniformReflectance):
         return np.fmin(near, self.backdrop_mm)
 
 
+def _leaves() -> Scene:
+    from eschorty_ros.simulation.scene_leaves import Leaves
+
+    return Leaves()
+
+
+def _face() -> Scene:
+    from eschorty_ros.simulation.scene_face import Face
+
+    return Face()
+
+
 _BUILDERS: dict[str, Callable[[], Scene]] = {
     "steps": Steps,
     "plane": Plane,
     "tilted": lambda: Plane(slope_stage=0.5, slope_column=0.25, pivot_mm=50.0),
     "sphere": Sphere,
+    "leaves": _leaves,
+    "face": _face,
 }
 NAMES = tuple(_BUILDERS)
 
