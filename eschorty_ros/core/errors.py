@@ -17,5 +17,9 @@ class CalibrationError(EschortyError):
     """A calibration that is missing, malformed or does not fit the sensor."""
 
 
+class FitError(CalibrationError):
+    """Targets that do not determine the parameters asked for; names the condition number."""
+
+
 class DeviceError(EschortyError):
     """A camera, laser or stage that refused or failed."""
