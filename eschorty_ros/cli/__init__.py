@@ -15,6 +15,7 @@ COMMANDS = {
     "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
     "view": "Draw a cloud, or open it in a window.",
     "info": "Say what a file or recording holds.",
+    "report": "Rerun the experiments; a page of figures, tables and findings.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",
 }
 INTERRUPTED = 130

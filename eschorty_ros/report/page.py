@@ -1,0 +1,106 @@
+"""The report as one HTML page beside its pictures and tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from eschorty_ros.core.files import atomic_write
+from eschorty_ros.report.experiment import Finding
+from eschorty_ros.report.sections import Section
+
+TITLE = "Event-based Scheimpflug LiDAR: the report"
+PAGE = "index.html"
+
+
+def write_page(
+    folder: Path, sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0
+) -> Path:
+    """Write ``index.html``; the pictures and tables it links are there already.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder.
+    sections : sequence of Section
+        In the order of the page.
+    made_with : mapping of str to str
+        Facts for the head of the page.
+    pending : int
+        Experiments that have not run yet.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    ArgumentError
+        When the page cannot be written.
+    """
+    path = folder / PAGE
+    with atomic_write(path) as stream:
+        stream.write(page_html(sections, made_with, pending).encode())
+    return path
+
+
+def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0) -> str:
+    """Text of the page; parameters as in `write_page`."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("eschorty_ros.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"number": number, "band": band}
+    return environment.get_template("page.html.jinja").render(
+        title=TITLE,
+        sections=sections,
+        made_with=made_with,
+        pending=pending,
+        findings=sum(len(section.findings) for section in sections),
+        missed=[(section, finding) for section in sections for finding in section.missed],
+        failed=[section for section in sections if section.failure],
+        seconds=sum(section.seconds for section in sections),
+    )
+
+
+def number(value: float | int | str) -> str:
+    """Value as a reader wants it: text and whole numbers as they are, else four digits or more.
+
+    Large values keep two decimals; the CSV file has every digit.
+    """
+    if isinstance(value, str):
+        return value
+    value = float(value)
+    if math.isnan(value):
+        return "n/a"
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    if value == int(value) and abs(value) < 1e12:
+        text = f"{int(value):,}".replace(",", "\u202f")
+    elif abs(value) >= 1e6 or abs(value) < 1e-4:
+        text = f"{value:.3e}"
+    elif abs(value) >= 100.0:
+        text = f"{value:,.2f}".replace(",", "\u202f")
+    else:
+        text = f"{value:.4g}"
+    return text
+
+
+def band(finding: Finding) -> str:
+    """Band of a finding in words."""
+    low, high = number(finding.low), number(finding.high)
+    if math.isinf(finding.low) and math.isinf(finding.high):
+        return "any"
+    if math.isinf(finding.low):
+        return f"≤ {high}"
+    if math.isinf(finding.high):
+        return f"≥ {low}"
+    return low if finding.low == finding.high else f"{low} to {high}"

@@ -1,0 +1,56 @@
+"""What a report was made with."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import eschorty_ros
+from eschorty_ros.report.experiment import Effort
+
+LIBRARIES = ("numpy", "numba", "matplotlib")
+
+
+def provenance(effort: Effort) -> dict[str, str]:
+    """Versions, machine, seed and effort, as text by name."""
+    made = {
+        "Made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "eschorty_ros": eschorty_ros.__version__,
+        "Python": platform.python_version(),
+    }
+    made |= {name: _version(name) for name in LIBRARIES}
+    return made | {
+        "System": f"{platform.system()} {platform.machine()}",
+        "CPU": f"{cpu_model()}, {_usable_cores()} usable",
+        "Seed": str(effort.seed),
+        "Effort": "fast: a coarse run" if effort.fast else "full",
+    }
+
+
+def cpu_model() -> str:
+    """Name of the processor as the system gives it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        key, _, value = line.partition(":")
+        if key.strip() == "model name":
+            return value.strip()
+    return platform.processor() or "unknown"
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
