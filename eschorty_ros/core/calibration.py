@@ -141,6 +141,7 @@ class Calibration(Schema):
             columns=self.columns,
             rows=self.rows,
             principal_column=self.principal_column,
+            theta_deg=self.theta_deg,
         )
 
 

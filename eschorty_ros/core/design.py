@@ -202,6 +202,7 @@ def design(
         columns=columns,
         rows=rows,
         principal_column=(columns - 1) / 2,
+        theta_deg=theta_deg,
     )
     return Design(focal_length_mm, f_number, theta_deg, tilt_deg, model)
 

@@ -80,6 +80,9 @@ class RangeModel:
         Sensor size; columns run along the laser line, rows along the range.
     principal_column : float
         Column of zero scan angle; pixel centres are integers.
+    theta_deg : float
+        Tilt of the light sheet against the lens plane, above 0 up to 90. Ranging needs only
+        ``k`` and ``k'``; what lies off the sheet (:meth:`rows_per_mm_off_sheet`) needs it too.
 
     Raises
     ------
@@ -95,6 +98,7 @@ class RangeModel:
     columns: int = COLUMNS
     rows: int = ROWS
     principal_column: float = PRINCIPAL_COLUMN
+    theta_deg: float = 90.0
 
     def __post_init__(self) -> None:
         for name in ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "pixel_um", "principal_column"):
@@ -110,6 +114,8 @@ class RangeModel:
                 f"b_prime_px is {self.b_prime_px!r}; choose {-POLE_MARGIN_PX:g} or less, "
                 "so that row 0 lies in front of the pole"
             )
+        if not 0.0 < self.theta_deg <= 90.0:
+            raise ArgumentError(f"theta_deg is {self.theta_deg!r}; choose above 0 and up to 90")
 
     @property
     def product_mm_px(self) -> float:
@@ -176,6 +182,50 @@ class RangeModel:
         The arguments broadcast; NaN where ``range + b <= 0``.
         """
         return np.asarray(self.column_slope(column) * self._depth_mm(range_mm))
+
+    def rows_per_mm_off_sheet(self, range_mm: ArrayLike) -> Array:
+        """Rows by which a point 1 mm beside the light sheet appears nearer, px per mm.
+
+        The chief ray through a lens whose object plane is the sheet and whose image plane is the
+        sensor: with depth ``R~ = R + b``, ``z = f + R~ sin(theta)`` along the optical axis and
+        ``L = f (cot(theta) + cot|theta'|)`` from the lens to the Scheimpflug line,
+        ``-drow/dn = (k / R~)**2 (z - L sin(theta) cos(theta)) / (f p sin(theta + |theta'|))``.
+        Little more than ``k / (p R~)``, one over the lateral pitch.
+
+        Positive for a point on the sheet's far side from the lens, +y in ``eschorty_link``: its
+        row is *lower* by this number. Of a footprint that lies across the sheet, rows ``d``
+        above the centre see the surface ``d / rows_per_mm_off_sheet`` behind it (towards -y).
+
+        Parameters
+        ----------
+        range_mm : array_like, any shape
+
+        Returns
+        -------
+        ndarray of float64, shape of ``range_mm``
+            NaN where ``range + b <= 0``.
+
+        Raises
+        ------
+        ArgumentError
+            When no sensor tilt gives this ``k'`` with this lens.
+        """
+        pitch_mm = self.pixel_um * 1e-3
+        theta = math.radians(self.theta_deg)
+        focal_mm = self.k_mm * math.sin(theta)
+        sine = focal_mm / (pitch_mm * -self.k_prime_px)
+        if not sine < 1.0:
+            raise ArgumentError(
+                f"k_prime_px is {self.k_prime_px!r}: no tilt of a {self.pixel_um!r} um sensor "
+                f"gives it behind a {focal_mm:g} mm lens; check k_mm, k_prime_px and pixel_um"
+            )
+        tilt = math.asin(sine)
+        baseline_mm = focal_mm * (math.cos(theta) / math.sin(theta) + 1.0 / math.tan(tilt))
+        depth = self._depth_mm(range_mm)
+        axial = focal_mm + depth * math.sin(theta)
+        lever = axial - baseline_mm * math.sin(theta) * math.cos(theta)
+        scale = focal_mm * pitch_mm * math.sin(theta + tilt)
+        return np.asarray((self.k_mm / depth) ** 2 * lever / scale)
 
     def _image_px(self, row: ArrayLike) -> Array:
         """``row + b'``, NaN from one pixel before the pole on."""

@@ -98,39 +98,20 @@ def _response(u, settled, x):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _live(
-    pixels,
-    column,
-    lo,
-    hi,
-    until_us,
-    base,
-    value,
-    ratio,
-    step_ratio,
-    omega,
-    seed,
-    timing,
-    slots,
-    out,
-    n,
-):
-    """Let rows [lo, hi) do what is due up to ``until_us``, then change their light.
+def _live(pixels, column, lo, hi, until_us, light, omega, seed, timing, slots, out, n):
+    """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
-    The new light is ``base`` plus a Gaussian by recurrence: ``value`` at ``lo``, times ``ratio``,
-    which shrinks by ``step_ratio``, from row to row. ``base`` 0 leaves the light as it is.
-    Returns the number of events in ``out`` and the earliest time something is due in these rows.
+    An empty ``light`` leaves theirs as it is. Returns the number of events in ``out`` and the
+    earliest time something is due in these rows.
     """
     earliest = np.inf
     inverse_omega = 1.0 / omega
     refractory_us = timing[2]
+    relit = light.size > 0
     for row in range(lo, hi):
         pixel = pixels[np.uintp(column), np.uintp(row)]
         t_next = pixel.t_next
-        light = base + value
-        value *= ratio
-        ratio *= step_ratio
-        if t_next > until_us and base == 0.0:
+        if t_next > until_us and not relit:
             earliest = min(earliest, t_next)
             continue
         # Locals: the compiler cannot know that ``out`` and the pixel do not overlap.
@@ -155,12 +136,12 @@ def _live(
                 t = t_next
             refractory = 1
             t_next = t + refractory_us
-        if base > 0.0:
+        if relit:
             u = _response(u, settled, (until_us - t) * rate)
             t = until_us
-            settled = 1.0 / light
+            settled = 1.0 / light[np.uintp(row)]
             pixel.u_settled = settled
-            pixel.rate = light * omega
+            pixel.rate = light[np.uintp(row)] * omega
             if not refractory:
                 tau_us = settled * inverse_omega
                 t_next = _crossing_us(u, u_ref * on_factor, u_ref * off_factor, settled, t, tau_us)
@@ -174,112 +155,81 @@ def _live(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _window(line_row, contrast, sigma, least, rows):
-    """Rows [lo, hi) in which a line adds at least ``least``."""
+def _window(patch, sigma, least, rows):
+    """Rows [lo, hi) in which a patch adds at least ``least``; (0, 0) for none."""
+    line_row, contrast = patch[0], patch[1]
     if not (contrast > least and abs(line_row) < 1e6):
         return 0, 0
     half = sigma * math.sqrt(2.0 * math.log(contrast / least))
-    lo = min(max(0, math.ceil(line_row - half)), rows)
-    return lo, max(lo, min(rows, math.floor(line_row + half) + 1))
+    first = max(math.ceil(line_row - half), math.floor(max(patch[2] + 0.5, 0.0)))
+    last = min(math.floor(line_row + half), math.ceil(min(patch[3] - 0.5, rows - 1.0)))
+    lo = min(max(0, first), rows)
+    return (lo, min(rows, last + 1)) if lo <= last else (0, 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_patch(light, lo, hi, patch, sigma):
+    """Add a patch of the footprint to ``light`` in rows [lo, hi): a Gaussian by recurrence.
+
+    ``patch`` = row of the line, contrast there, and the rows between which it is lit; a row that
+    is lit in part gets its share.
+    """
+    offset = lo - patch[0]
+    value = patch[1] * math.exp(-0.5 * offset * offset / (sigma * sigma))
+    ratio = math.exp(-(offset + 0.5) / (sigma * sigma))
+    step_ratio = math.exp(-1.0 / (sigma * sigma))
+    for row in range(lo, hi):
+        share = min(1.0, min(row + 0.5 - patch[2], patch[3] - row + 0.5))
+        light[np.uintp(row)] += max(0.0, share) * value
+        value *= ratio
+        ratio *= step_ratio
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _relight(
-    pixels,
-    spans,
-    due,
-    columns,
-    begin,
-    line_row,
-    contrast,
-    optics,
-    t_us,
-    seed,
-    timing,
-    slots,
-    out,
-    n,
+    pixels, spans, due, columns, begin, patches, light, optics, t_us, seed, timing, slots, out, n
 ):
-    """Put the line at ``line_row`` in ``columns[begin:]`` from ``t_us`` on.
+    """Put the footprint ``patches`` (columns, patches, 4) in ``columns[begin:]`` from ``t_us`` on.
 
     ``spans`` holds per column the lit rows [0, 1) and the rows with something pending [2, 3);
     ``due`` the earliest pending time. ``optics`` = sigma (rows), least contrast drawn, background
     intensity, omega0 (per us), most events of a pixel between two changes of its light.
-    ``contrast`` 0 leaves the column dark. Stops where the output might not suffice; returns the
-    next column to do and the number of events.
+    ``light`` is room for one column. Stops where the output might not suffice; returns the next
+    column to do and the number of events.
     """
     sigma, background, omega = optics[0], optics[2], optics[3]
     rows = pixels.shape[1]
-    step_ratio = math.exp(-1.0 / (sigma * sigma))
     for k in range(begin, columns.size):
         column = columns[k]
-        lo, hi = _window(line_row[k], contrast[k], sigma, optics[1], rows)
+        lo, hi = rows, 0
+        for j in range(patches.shape[1]):
+            first, last = _window(patches[k, j], sigma, optics[1], rows)
+            if last > first:
+                lo, hi = min(lo, first), max(hi, last)
+        if hi <= lo:
+            lo, hi = spans[column, 0], spans[column, 0]
         old_lo, old_hi = spans[column, 0], spans[column, 1]
         if out.size - n < (hi - lo + old_hi - old_lo) * optics[4]:
             return k, n
-        # Rows the line leaves: below and above the new window.
-        leave_to, leave_from = min(old_hi, lo), max(old_lo, hi)
-        if hi == lo:
-            leave_to, leave_from = old_hi, old_hi
-        n, a = _live(
-            pixels,
-            column,
-            old_lo,
-            leave_to,
-            t_us,
-            background,
-            0.0,
-            0.0,
-            0.0,
-            omega,
-            seed,
-            timing,
-            slots,
-            out,
-            n,
-        )
-        n, b = _live(
-            pixels,
-            column,
-            leave_from,
-            old_hi,
-            t_us,
-            background,
-            0.0,
-            0.0,
-            0.0,
-            omega,
-            seed,
-            timing,
-            slots,
-            out,
-            n,
-        )
-        offset = lo - line_row[k]
-        value = contrast[k] * math.exp(-0.5 * offset * offset / (sigma * sigma))
-        ratio = math.exp(-(offset + 0.5) / (sigma * sigma))
-        n, c = _live(
-            pixels,
-            column,
-            lo,
-            hi,
-            t_us,
-            background,
-            value,
-            ratio,
-            step_ratio,
-            omega,
-            seed,
-            timing,
-            slots,
-            out,
-            n,
-        )
-        first, last = lo, hi
-        if old_hi > old_lo:
-            first = min(first, old_lo) if hi > lo else old_lo
-            last = max(last, old_hi)
-        earliest = min(min(due[column], a), min(b, c))
+        light[old_lo:old_hi] = background
+        light[lo:hi] = background
+        for j in range(patches.shape[1]):
+            first, last = _window(patches[k, j], sigma, optics[1], rows)
+            _add_patch(light, first, last, patches[k, j], sigma)
+        earliest = due[column]
+        # One run over both spans, unless they lie apart: the rows between are none of its business.
+        first, last = (min(lo, old_lo), max(hi, old_hi)) if hi > lo else (old_lo, old_hi)
+        if hi < old_lo or lo > old_hi:
+            n, a = _live(
+                pixels, column, old_lo, old_hi, t_us, light, omega, seed, timing, slots, out, n
+            )
+            n, b = _live(pixels, column, lo, hi, t_us, light, omega, seed, timing, slots, out, n)
+            earliest = min(earliest, min(a, b))
+        else:
+            n, a = _live(
+                pixels, column, first, last, t_us, light, omega, seed, timing, slots, out, n
+            )
+            earliest = min(earliest, a)
         if due[column] == np.inf:
             spans[column, 2], spans[column, 3] = first, last
         else:
@@ -297,27 +247,15 @@ def _run_columns(pixels, spans, due, begin, until_us, optics, seed, timing, slot
     Stops where the output might not suffice; returns the next column and the number of events.
     """
     omega = optics[3]
+    unchanged = np.empty(0)
     for column in range(begin, pixels.shape[0]):
         if due[column] > until_us:
             continue
-        if out.size - n < (spans[column, 3] - spans[column, 2]) * optics[4]:
+        lo, hi = spans[column, 2], spans[column, 3]
+        if out.size - n < (hi - lo) * optics[4]:
             return column, n
         n, due[column] = _live(
-            pixels,
-            column,
-            spans[column, 2],
-            spans[column, 3],
-            until_us,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            omega,
-            seed,
-            timing,
-            slots,
-            out,
-            n,
+            pixels, column, lo, hi, until_us, unchanged, omega, seed, timing, slots, out, n
         )
     return pixels.shape[0], n
 

@@ -140,6 +140,7 @@ class PixelArray:
         self._pixels = self._settled(np.random.default_rng(draws))
         self._spans = np.zeros((columns, 4), dtype=np.int64)
         self._due = np.full(columns, np.inf)
+        self._light = np.empty(rows)
         p = parameters
         self._optics = np.array(
             [
@@ -168,15 +169,39 @@ class PixelArray:
         columns: NDArray[np.int64],
         line_row: NDArray[np.float64],
         reflectance: NDArray[np.float64],
+        low_row: NDArray[np.float64] | None = None,
+        high_row: NDArray[np.float64] | None = None,
     ) -> None:
         """Put the line at ``line_row`` (rows) in ``columns`` from ``t_us`` on.
 
-        Three vectors of one length. A row that is NaN or a reflectance of 0 leaves the column
-        dark. Times must not fall from call to call.
+        Parameters
+        ----------
+        t_us : int
+            Must not fall from call to call.
+        columns : ndarray of int64, shape (n,)
+        line_row, reflectance : ndarray of float64, shape (n,) or (n, patches)
+            A row that is NaN or a reflectance of 0 leaves the column dark. With several patches
+            the footprint is made of parts that lie on different surfaces.
+        low_row, high_row : ndarray of float64, same shape, optional
+            Rows between which a patch is lit (edges between rows, so ``y - 0.5`` to ``y + 0.5``
+            is one row); the whole footprint when left out.
+
+        Raises
+        ------
+        ArgumentError
+            For a reflectance outside 0 to 1.
         """
-        if reflectance.size and not reflectance.max() <= 1.0:
-            raise ArgumentError(f"reflectance reaches {reflectance.max()}; choose 0 to 1")
-        contrast = reflectance * self.parameters.amplitude
+        if reflectance.size and not (reflectance.min() >= 0.0 and reflectance.max() <= 1.0):
+            raise ArgumentError(
+                f"reflectance reaches {reflectance.min()} to {reflectance.max()}; choose 0 to 1"
+            )
+        patches = np.empty((columns.size, 1 if line_row.ndim == 1 else line_row.shape[1], 4))
+        for k, (values, otherwise) in enumerate(
+            ((line_row, 0.0), (reflectance, 0.0), (low_row, -np.inf), (high_row, np.inf))
+        ):
+            wanted = otherwise if values is None else values.reshape(patches.shape[:2])
+            patches[:, :, k] = wanted
+        patches[:, :, 1] *= self.parameters.amplitude
         begin = 0
         while True:
             begin, self._count = _relight(
@@ -185,8 +210,8 @@ class PixelArray:
                 self._due,
                 columns,
                 begin,
-                line_row,
-                contrast,
+                patches,
+                self._light,
                 self._optics,
                 float(t_us),
                 self._seeds[0],

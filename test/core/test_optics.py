@@ -237,3 +237,38 @@ def test_no_warning_reaches_the_caller_for_any_row() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model("config_1").range_mm(np.linspace(-2000.0, 4000.0, 10_001))
+
+
+@pytest.mark.parametrize("build", BUILDS)
+def test_rows_beside_the_sheet_agree_with_traced_chief_rays(build: str) -> None:
+    calibration = load_calibration(build)
+    m = calibration.model()
+    theta = np.radians(calibration.theta_deg)
+    focal = calibration.focal_length_mm
+    tilt = np.arcsin(focal / (m.pixel_um * 1e-3 * -m.k_prime_px))
+    baseline = focal * (1.0 / np.tan(theta) + 1.0 / np.tan(tilt))
+
+    def row(range_mm: float, beside_mm: float) -> float:
+        # Lens at the origin, z along the axis, y towards the Scheimpflug line at y = baseline.
+        z = focal + (range_mm + m.b_mm) * np.sin(theta)
+        y = baseline - z / np.tan(theta)
+        z, y = z + beside_mm * np.cos(theta), y + beside_mm * np.sin(theta)
+        # The ray y = slope z meets the sensor, which runs through the same line.
+        behind = baseline / (1.0 / np.tan(tilt) - y / z)
+        return -(behind - focal) / (m.pixel_um * 1e-3 * np.sin(tilt)) - m.b_prime_px
+
+    for range_mm in (810.0, 1320.0, 2100.0):
+        assert row(range_mm, 0.0) == pytest.approx(float(m.row(range_mm)), abs=1e-9)
+        moved = (row(range_mm, 1e-3) - row(range_mm, -1e-3)) / 2e-3
+        assert -moved == pytest.approx(float(m.rows_per_mm_off_sheet(range_mm)), rel=1e-6)
+
+
+def test_one_millimetre_beside_the_sheet_costs_what_the_table_says() -> None:
+    m = model("nominal")
+    rows = m.rows_per_mm_off_sheet([810.0, 1320.0, 2410.0])
+    assert rows == pytest.approx([6.2, 3.8, 2.1], abs=0.05)
+    assert rows * m.range_per_row_mm([810.0, 1320.0, 2410.0]) == pytest.approx(
+        [4.6, 7.5, 13.6], abs=0.1
+    )
+    with pytest.raises(ArgumentError, match="k_prime_px is -3000"):
+        RangeModel(24.0, -3000.0, 0.0, -400.0).rows_per_mm_off_sheet(1000.0)
