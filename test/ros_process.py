@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -30,20 +28,6 @@ from eschorty_ros.nodes.dds import use_profile
 
 NAMESPACE = "/eschorty"
 DEADLINE_S = 30.0
-
-
-def free_domain() -> int:
-    """A ROS domain (1..101) nobody on this host uses: its discovery port can be bound."""
-    candidates = list(range(1, 102))
-    random.SystemRandom().shuffle(candidates)
-    for domain in candidates:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain + 10))
-            except OSError:
-                continue
-            return domain
-    raise RuntimeError("no free ROS domain between 1 and 101 on this host")
 
 
 def wait_until(

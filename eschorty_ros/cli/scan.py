@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.errors import DeviceError, EschortyError
 
 if TYPE_CHECKING:
@@ -19,35 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command("scan")
-@click.option(
-    "--scene",
-    default="steps",
-    show_default=True,
-    help="steps, plane, tilted, sphere, leaves, face, or a mesh in metres (needs open3d).",
-)
-@click.option(
-    "--frequency",
-    type=click.FloatRange(16, 20_000),
-    default=70.0,
-    show_default=True,
-    help="Modulation frequency, Hz: one profile per period.",
-)
-@click.option(
-    "--speed",
-    type=click.FloatRange(0, min_open=True),
-    default=50.0,
-    show_default=True,
-    help="Stage speed, mm/s.",
-)
-@click.option("--start", type=float, default=10.0, show_default=True, help="Stage position, mm.")
-@click.option("--stop", type=float, default=110.0, show_default=True, help="Stage position, mm.")
-@click.option(
-    "--calibration",
-    default="config_3",
-    show_default=True,
-    help="nominal, config_1, config_2, config_3, or the path of a calibration.yaml.",
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed.")
+@sweep_options
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -78,8 +51,7 @@ def command(
       eschorty scan --scene sphere --speed 20 --out sphere
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
     """  # noqa: D301
-    if start == stop:
-        raise click.UsageError(f"--start and --stop are both {start:g} mm; give a distance")
+    check_sweep(start, stop)
     one_process = _nodes()
     _check(scene, calibration)
     request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed)

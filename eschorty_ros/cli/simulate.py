@@ -7,28 +7,17 @@ from pathlib import Path
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.errors import ArgumentError
 
 
 @click.command("simulate")
-@click.option(
-    "--scene",
-    default="steps",
-    show_default=True,
-    help="steps, plane, tilted, sphere, leaves, face, or a mesh in metres (needs open3d).",
-)
+@sweep_options
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
     required=True,
     help="Folder to make; must not hold a recording yet.",
-)
-@click.option(
-    "--frequency",
-    type=click.FloatRange(16, 20_000),
-    default=70.0,
-    show_default=True,
-    help="Modulation frequency, Hz.",
 )
 @click.option(
     "--duty",
@@ -37,22 +26,6 @@ from eschorty_ros.core.errors import ArgumentError
     show_default=True,
     help="Share of the period with the laser on.",
 )
-@click.option(
-    "--speed",
-    type=click.FloatRange(0, min_open=True),
-    default=50.0,
-    show_default=True,
-    help="Stage speed, mm/s.",
-)
-@click.option("--start", type=float, default=10.0, show_default=True, help="Stage position, mm.")
-@click.option("--stop", type=float, default=110.0, show_default=True, help="Stage position, mm.")
-@click.option(
-    "--calibration",
-    default="config_3",
-    show_default=True,
-    help="nominal, config_1, config_2, config_3, or the path of a calibration.yaml.",
-)
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed.")
 def command(
     scene: str,
     out: Path,
@@ -74,8 +47,7 @@ def command(
       eschorty simulate --scene steps --out rec
       eschorty simulate --scene sphere --frequency 300 --speed 200 --seed 7 --out rec300
     """  # noqa: D301
-    if start == stop:
-        raise click.UsageError(f"--start and --stop are both {start:g} mm; give a distance")
+    check_sweep(start, stop)
     if out.is_dir() and any(out.iterdir()):
         raise ArgumentError(f"{out} is not empty; choose a new folder")
     from eschorty_ros.core.calibration import load_calibration

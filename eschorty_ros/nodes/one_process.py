@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
-import socket
 import tempfile
 import threading
 import time
@@ -30,10 +28,11 @@ from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.camera import CameraNode
 from eschorty_ros.nodes.cloud_messages import points_from_message
+from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.nodes.laser import LaserNode
 from eschorty_ros.nodes.reconstruction import ReconstructionNode
 from eschorty_ros.nodes.scanner import ScannerNode
-from eschorty_ros.nodes.spin import make_safe, undisturbed
+from eschorty_ros.nodes.spin import make_safe, turn, undisturbed
 from eschorty_ros.nodes.stage import StageNode
 
 NAMESPACE = "/eschorty"
@@ -48,7 +47,6 @@ THREADS = 12
 START_S = 60.0
 SLACK_S = 60.0
 _POLL_S = 0.02
-_BREATH_S = 3e-4
 
 Feedback = Callable[[float, str], None]
 
@@ -215,20 +213,6 @@ def instrument(scan: OneScan) -> Iterator[Instrument]:
                     node.destroy_node()
 
 
-def free_domain() -> int:
-    """Find a ROS domain (1 to 101) whose discovery port nobody on this host holds."""
-    domains = list(range(1, 102))
-    random.SystemRandom().shuffle(domains)
-    for domain in domains:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", 7400 + 250 * domain + 10))
-            except OSError:
-                continue
-            return domain
-    raise DeviceError("every ROS domain from 1 to 101 is taken on this host; set ROS_DOMAIN_ID")
-
-
 def _parameter_file(values: dict[str, dict[str, Any]]) -> str:
     return yaml.safe_dump(
         {f"{NAMESPACE}/{node}": {"ros__parameters": table} for node, table in values.items()}
@@ -239,10 +223,7 @@ def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
     # Shutting an executor down while it spins raises in this thread, so it is asked to end.
     try:
         while not ending.is_set():
-            executor.spin_once(timeout_sec=0.1)
-            # While a callback runs, rclpy 9 polls for the next of its group without a pause and
-            # would keep the interpreter from the simulation and the reconstruction.
-            time.sleep(_BREATH_S)
+            turn(executor)
     except ExternalShutdownException:
         pass
     except Exception:

@@ -53,6 +53,14 @@ def undisturbed() -> Iterator[None]:
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
+def turn(executor: Executor) -> None:
+    """One turn of a spin loop."""
+    executor.spin_once(timeout_sec=0.1)
+    # While a callback runs, rclpy 9 polls for the next of its group without a pause and would
+    # keep the interpreter from the simulation and the reconstruction.
+    time.sleep(_BREATH_S)
+
+
 def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None) -> int:
     """Build the nodes, spin them until a signal, make the hardware safe; returns the exit code.
 
@@ -85,9 +93,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             nodes.append(node)
             executor.add_node(node)
         while rclpy.ok():
-            executor.spin_once(timeout_sec=0.1)
-            # While a callback runs, rclpy 9 polls for the next of its group without a pause.
-            time.sleep(_BREATH_S)
+            turn(executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except EschortyError as error:

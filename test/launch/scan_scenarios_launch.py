@@ -13,9 +13,10 @@ from pathlib import Path
 import launch_testing.actions
 import scan_scenarios as scenarios
 from launch.actions import ExecuteProcess
-from ros_process import NAMESPACE, domain_environment, free_domain
+from ros_process import NAMESPACE, domain_environment
 
 import launch
+from eschorty_ros.nodes.domain import free_domain
 
 LASER_LOG = Path(tempfile.mkdtemp(prefix="laser_")) / "output.log"
 DOMAIN = free_domain()

@@ -17,7 +17,7 @@ from eschorty_ros.msg import LaserState, StageMotion
 from event_camera_msgs.msg import EventPacket
 from rclpy.action import ActionClient
 from rclpy.qos import ReliabilityPolicy
-from ros_process import Observer, free_domain, processes, wait_until
+from ros_process import Observer, processes, wait_until
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -28,6 +28,7 @@ from eschorty_ros.hardware.protocols import LaserOutput
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import ns_from_stamp
 from eschorty_ros.nodes.device_messages import plan_from_motion, readback_from_state
+from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.simulation.scene import named
 from eschorty_ros.simulation.world import World
 

@@ -13,11 +13,12 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import MultiThreadedExecutor
-from ros_process import Observer, free_domain, wait_until
+from ros_process import Observer, wait_until
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.nodes import drivers, qos
 from eschorty_ros.nodes.camera import CameraNode
+from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.nodes.laser import LaserNode
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.stage import StageNode

@@ -13,11 +13,12 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
 from eschorty_ros.msg import LaserState
-from ros_process import NodeProcess, Observer, free_domain, wait_until
+from ros_process import NodeProcess, Observer, wait_until
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.domain import free_domain
 
 MODULE = "eschorty_ros.nodes.laser"
 PARAMETERS = {"arm_timeout": 1.0, "heartbeat_timeout": 0.5, "max_on_time": 3.0}

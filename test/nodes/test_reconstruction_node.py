@@ -8,7 +8,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
-from ros_process import NodeProcess, Observer, free_domain, wait_until
+from ros_process import NodeProcess, Observer, wait_until
 from sensor_msgs.msg import Image, PointCloud2
 from tf2_msgs.msg import TFMessage
 
@@ -16,6 +16,7 @@ from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.cloud_messages import points_from_message
 from eschorty_ros.nodes.conversions import ns_from_stamp
+from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.simulation.recorder import simulate_recording
 from eschorty_ros.simulation.scene import named
 

@@ -5,13 +5,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from ros_process import NodeProcess, Observer, free_domain, wait_until
+from ros_process import NodeProcess, Observer, wait_until
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.cloud_messages import points_from_message
+from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.simulation.recorder import simulate_recording
 from eschorty_ros.simulation.scene import named
 

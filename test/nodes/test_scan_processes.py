@@ -8,7 +8,9 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import scan_scenarios as scenarios
-from ros_process import NodeProcess, free_domain, processes
+from ros_process import NodeProcess, processes
+
+from eschorty_ros.nodes.domain import free_domain
 
 SCANNER = "eschorty_ros.nodes.scanner"
 

@@ -15,11 +15,12 @@ from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import StageMotion
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
-from ros_process import NodeProcess, Observer, free_domain, wait_until
+from ros_process import NodeProcess, Observer, wait_until
 
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import ns_from_stamp
 from eschorty_ros.nodes.device_messages import plan_from_motion
+from eschorty_ros.nodes.domain import free_domain
 
 
 class Stage:

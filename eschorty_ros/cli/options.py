@@ -1,0 +1,59 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+_SWEEP = (
+    click.option(
+        "--scene",
+        default="steps",
+        show_default=True,
+        help="steps, plane, tilted, sphere, leaves, face, or a mesh in metres (needs open3d).",
+    ),
+    click.option(
+        "--frequency",
+        type=click.FloatRange(16, 20_000),
+        default=70.0,
+        show_default=True,
+        help="Modulation frequency, Hz: one profile per period.",
+    ),
+    click.option(
+        "--speed",
+        type=click.FloatRange(0, min_open=True),
+        default=50.0,
+        show_default=True,
+        help="Stage speed, mm/s.",
+    ),
+    click.option(
+        "--start", type=float, default=10.0, show_default=True, help="Stage position, mm."
+    ),
+    click.option(
+        "--stop", type=float, default=110.0, show_default=True, help="Stage position, mm."
+    ),
+    click.option(
+        "--calibration",
+        default="config_3",
+        show_default=True,
+        help="nominal, config_1, config_2, config_3, or the path of a calibration.yaml.",
+    ),
+    click.option(
+        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed."
+    ),
+)
+
+
+def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add what to scan and how to a command: scene, laser, stage, optical build, seed."""
+    for option in reversed(_SWEEP):
+        command = option(command)
+    return command
+
+
+def check_sweep(start_mm: float, stop_mm: float) -> None:
+    """Refuse a sweep without length as wrong usage."""
+    if start_mm == stop_mm:
+        raise click.UsageError(f"--start and --stop are both {start_mm:g} mm; give a distance")
