@@ -9,6 +9,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import rclpy
 from rclpy.executors import (
@@ -40,12 +41,29 @@ def make_safe(nodes: Sequence[Node]) -> None:
             print(f"{node.get_name()}: not safe: {error}", file=sys.stderr, flush=True)
 
 
+def _interrupt_once() -> None:
+    """Let only the first Ctrl-C interrupt: a launched node gets two, from terminal and launch."""
+    came = False
+
+    def interrupt(*_: object) -> None:
+        nonlocal came
+        if not came:
+            came = True
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+
+
+def _ignore_signals() -> dict[signal.Signals, Any]:
+    """Ignore what ends a process; returns the handlers so far."""
+    endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    return {number: signal.signal(number, signal.SIG_IGN) for number in endings}
+
+
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
     """Within it a second Ctrl-C or SIGTERM cannot interrupt the way to the safe state."""
-    kept = {}
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        kept[number] = signal.signal(number, signal.SIG_IGN)
+    kept = _ignore_signals()
     try:
         yield
     finally:
@@ -63,6 +81,8 @@ def turn(executor: Executor) -> None:
 
 def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None) -> int:
     """Build the nodes, spin them until a signal, make the hardware safe; returns the exit code.
+
+    The process is meant to end then: signals stay ignored.
 
     Parameters
     ----------
@@ -85,6 +105,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     code = 0
     use_profile()
     try:
+        _interrupt_once()
         rclpy.init(args=list(args) if args is not None else None)
         signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
         executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
@@ -105,9 +126,11 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             traceback.print_exc()
             code = 1
     finally:
-        with undisturbed():
-            make_safe(nodes)
-            _tear_down(nodes, executor)
+        # For good, as the process ends. Shutting rclpy down gives back the handlers before it.
+        _ignore_signals()
+        make_safe(nodes)
+        _tear_down(nodes, executor)
+        _ignore_signals()
     return code
 
 

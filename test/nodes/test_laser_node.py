@@ -191,13 +191,19 @@ def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
     assert set(logged) <= told
 
 
+@pytest.mark.parametrize("pause_s", [None, 0.003, 0.02], ids=["once", "rapidly", "again"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_switches_off_and_exits_clean(number: int, tmp_path: Path) -> None:
+def test_signal_switches_off_and_exits_clean(
+    number: int, pause_s: float | None, tmp_path: Path
+) -> None:
     with Observer(free_domain(), "signal_observer") as own:
         bench = Bench(tmp_path / "laser.log", own.domain, own)
         try:
             bench.switch_on()
             bench.process.send(number)
+            while pause_s is not None and bench.process.running():
+                time.sleep(pause_s)
+                bench.process.send(number)
             assert bench.process.wait() == 0
             assert bench.light() == ["OFF", "ON", "OFF"]
             assert "Traceback" not in bench.process.output
