@@ -78,14 +78,18 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     from eschorty_ros.core.cloud import write_cloud
     from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
     from eschorty_ros.core.recording import load_recording
+    from eschorty_ros.core.warm_up import warm_up
 
     target = out or recording / "cloud.pcd"
     if target.suffix not in (".pcd", ".ply"):
         raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
     chosen = Settings(**settings)
+    loaded = load_recording(recording)
     with progress_bar("reconstructing") as report:
+        report(0.0, "compiling, first run only")
+        warm_up(loaded.calibration, chosen)
         result = reconstruct_recording(
-            load_recording(recording), chosen, lambda done, total: report(done / max(total, 1), "")
+            loaded, chosen, lambda done, total: report(done / max(total, 1), "")
         )
     for warning in result.warnings:
         click.echo(f"eschorty: warning: {warning}", err=True)

@@ -8,19 +8,23 @@ from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstructor import Reconstructor
+from eschorty_ros.core.settings import Settings
 
 FREQUENCY_HZ = 1000.0
 
 
-def warm_up(calibration: Calibration) -> None:
+def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
     """Run a few events through a reconstruction of its own.
 
     The first run on a machine compiles for some seconds; later runs load what that left in
-    numba's cache. A node does this before it takes data, which would pile up meanwhile.
+    numba's cache. A node does this before it takes data, which would pile up meanwhile; a command
+    before it takes the time.
 
     Parameters
     ----------
     calibration : Calibration
+    settings : Settings, optional
+        What is to be compiled: filter and estimator.
     """
     periods, columns, events = 4, 8, 6
     modulation = Modulation(FREQUENCY_HZ, on_edge_us=0)
@@ -34,6 +38,6 @@ def warm_up(calibration: Calibration) -> None:
         row.ravel().astype(np.uint16),
         np.ones(t.size, np.uint8),
     )
-    reconstructor = Reconstructor(calibration, modulation)
+    reconstructor = Reconstructor(calibration, modulation, settings)
     reconstructor.push(data)
     reconstructor.flush()

@@ -58,7 +58,7 @@ class ReconstructionNode(Node):
         table = (*TABLE, *from_settings(Settings, dynamic=True))
         self.parameters = Parameters(self, table, self._on_change)
         self.calibration = load_calibration(self.parameters["calibration"])
-        warm_up(self.calibration)
+        warm_up(self.calibration, self.parameters.settings(Settings))
         self._override = modulation_override(self.parameters)
         self._pipeline = Pipeline(
             self.calibration,
