@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS_IN_3D = 30_000
+TICKS_IN_3D = 5
+SHORT_SIDE = 0.4
 SIGMAS_SHOWN = 5.0
 DPI = 110
 
@@ -235,16 +237,14 @@ def _view_3d(
     range_mm: NDArray[np.float64],
     limits: tuple[float, float],
 ) -> None:
-    from matplotlib.ticker import MaxNLocator
-
     shown = np.flatnonzero((range_mm >= limits[0]) & (range_mm <= limits[1]))
     if shown.size > POINTS_IN_3D:
         shown = np.random.default_rng(0).choice(shown, POINTS_IN_3D, replace=False)
     cloud = points[shown]
     axes.scatter(
-        cloud["z"] * 1e3,
-        cloud["x"] * 1e3,
         cloud["y"] * 1e3,
+        cloud["x"] * 1e3,
+        cloud["z"] * 1e3,
         c=range_mm[shown],
         cmap="viridis",
         vmin=limits[0],
@@ -253,14 +253,35 @@ def _view_3d(
         linewidths=0.0,
         depthshade=False,
     )
-    axes.set(xlabel="z, line (mm)", ylabel="x, range (mm)", zlabel="y, stage (mm)")
+    axes.set(xlabel="y, stage (mm)", ylabel="x, range (mm)", zlabel="z, line (mm)")
     axes.set_title(f"Point cloud ({shown.size:,} points shown)")
-    spans = [max(float(np.ptp(cloud[name])) * 1e3, 1.0) for name in "zxy"]
-    axes.set_box_aspect(spans, zoom=0.82)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_major_locator(MaxNLocator(4))
-        axis.labelpad = 4
-    axes.view_init(elev=28.0, azim=-62.0)
+    _true_to_scale(axes, np.stack([cloud[name] for name in "yxz"]) * 1e3)
+    # Seen from the sensor with the line upright, y runs to the left.
+    axes.invert_xaxis()
+    axes.view_init(elev=18.0, azim=-58.0)
+
+
+def _true_to_scale(axes: Any, xyz_mm: NDArray[np.floating[Any]]) -> None:
+    """Give every axis the same millimetres per inch and room for the labels of a short one."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = xyz_mm.min(axis=1), xyz_mm.max(axis=1)
+    longest = max(float(np.max(high - low)), 1.0)
+    spans = np.maximum(high - low, SHORT_SIDE * longest)
+    middle = 0.5 * (low + high)
+    low, high = middle - 0.5 * spans, middle + 0.5 * spans
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(spans, zoom=0.8)
+    for k, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+        count = max(round(TICKS_IN_3D * spans[k] / longest), 3)
+        ticks = MaxNLocator(count).tick_values(low[k], high[k])
+        # Labels of two axes would meet in a corner.
+        inner = (ticks > low[k] + 0.1 * spans[k]) & (ticks < high[k] - 0.02 * spans[k])
+        axis.set_ticks(ticks[inner])
+        axis.set_tick_params(labelsize="small")
+        axis.labelpad = 9
+    axes.zaxis.set_tick_params(pad=10)
+    axes.zaxis.labelpad = 16
 
 
 def _histogram(

@@ -41,6 +41,36 @@ def test_scan_figure_has_every_part_with_units(tmp_path):
     assert (tmp_path / "scan.png").stat().st_size < 500_000
 
 
+def thin_sheet(points):
+    """The same cloud 3 mm deep: a short side beside two long ones."""
+    flat = points.copy()
+    flat["x"] = 1.3 + (points["x"] - 1.3) * 0.03
+    return flat
+
+
+@pytest.mark.parametrize("change", [lambda points: points, thin_sheet])
+def test_labels_of_the_3d_view_are_whole_and_apart(change):
+    figure = figures.scan_figure(change(step_cloud(lines=200)[0]))
+    figure.canvas.draw()
+    view = next(axes for axes in figure.axes if hasattr(axes, "zaxis"))
+    boxes, names = [], []
+    for axis in (view.xaxis, view.yaxis, view.zaxis):
+        for text in (axis.label, *(tick.label1 for tick in axis.get_major_ticks())):
+            if text.get_visible() and text.get_text():
+                boxes.append(text.get_window_extent())
+                names.append(text.get_text())
+    assert len(names) >= 8
+    edge = figure.bbox
+    for box, name in zip(boxes, names, strict=True):
+        assert edge.x0 <= box.x0 <= box.x1 <= edge.x1, name
+        assert edge.y0 <= box.y0 <= box.y1 <= edge.y1, name
+    # Tick labels are upright; the names' boxes are those of slanted text and reach further.
+    ticks = [k for k, name in enumerate(names) if "mm" not in name]
+    for k in ticks:
+        for other in ticks:
+            assert k == other or not boxes[k].overlaps(boxes[other]), (names[k], names[other])
+
+
 def test_without_truth_there_is_no_error_map(tmp_path):
     figure = figures.scan_figure(step_cloud()[0])
     assert "range error (mm)" not in {axes.get_ylabel() for axes in figure.axes}
