@@ -72,6 +72,15 @@ def whole_vector(
     return np.ascontiguousarray(array, dtype=dtype)
 
 
+def broadcast(names: str, *arrays: NDArray[Any]) -> tuple[int, ...]:
+    """Common shape of ``arrays``."""
+    try:
+        return np.broadcast_shapes(*(array.shape for array in arrays))
+    except ValueError:
+        shapes = " and ".join(str(array.shape) for array in arrays)
+        raise ArgumentError(f"{names} have shapes {shapes}; give shapes that fit") from None
+
+
 def short(value: Any) -> str:
     """``repr`` on one line of bounded length."""
     text = " ".join(repr(value).split())

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core._checks import broadcast, number, positive, reals, whole
 from eschorty_ros.core.errors import ArgumentError
 
 Array = NDArray[np.float64]
@@ -21,11 +22,19 @@ PIXEL_UM = 4.86
 COLUMNS = 1280
 ROWS = 720
 PRINCIPAL_COLUMN = 639.5
+PIXELS_MAX = 1 << 16
+"""Most pixels along one axis of any sensor."""
 
 
 def object_scale_mm(focal_mm: float, theta_deg: float) -> float:
-    """``k = f / sin(theta)`` in mm, unrounded (Eq. 1)."""
-    return focal_mm / math.sin(math.radians(theta_deg))
+    """``k = f / sin(theta)`` in mm, unrounded (Eq. 1).
+
+    Raises
+    ------
+    ArgumentError
+        When the focal length is not positive or the tilt not between 0 and 180 degrees.
+    """
+    return positive("focal_mm", focal_mm) / _sheet_sine(theta_deg)
 
 
 def depth_of_field_mm(
@@ -53,11 +62,25 @@ def depth_of_field_mm(
     -------
     ndarray of float64, shape of ``magnification``
         The object is in focus within plus and minus this length.
+
+    Raises
+    ------
+    ArgumentError
+        When the magnification is no array of numbers or an optical constant is impossible.
     """
-    m = np.asarray(magnification, dtype=np.float64)
-    blur_mm = pixel_um * 1e-3 * math.cos(math.radians(theta_prime_deg)) * f_number
-    with np.errstate(divide="ignore"):
-        return np.asarray(blur_mm / (m * m * abs(math.sin(math.radians(theta_deg)))))
+    m = reals("magnification", magnification)
+    sine = _sheet_sine(abs(number("theta_deg", theta_deg)))
+    tilt_deg = abs(number("theta_prime_deg", theta_prime_deg, -90.0, 90.0))
+    blur_mm = positive("pixel_um", pixel_um) * 1e-3 * math.cos(math.radians(tilt_deg))
+    with np.errstate(divide="ignore", over="ignore", under="ignore"):
+        return np.asarray(blur_mm * positive("f_number", f_number) / (m * m * sine))
+
+
+def _sheet_sine(theta_deg: float) -> float:
+    sine = math.sin(math.radians(number("theta_deg", theta_deg, 0.0, 180.0)))
+    if not sine > 1e-6:
+        raise ArgumentError(f"theta_deg is {theta_deg!r}; choose a sheet tilted by some degrees")
+    return sine
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +124,12 @@ class RangeModel:
     theta_deg: float = 90.0
 
     def __post_init__(self) -> None:
-        for name in ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "pixel_um", "principal_column"):
-            if not math.isfinite(getattr(self, name)):
-                raise ArgumentError(f"{name} is {getattr(self, name)!r}; give a finite number")
-        for name in ("k_mm", "pixel_um", "columns", "rows"):
-            if not getattr(self, name) > 0:
-                raise ArgumentError(f"{name} is {getattr(self, name)!r}; choose a positive value")
+        for name in ("k_prime_px", "b_mm", "b_prime_px", "principal_column"):
+            number(name, getattr(self, name))
+        for name in ("k_mm", "pixel_um"):
+            positive(name, getattr(self, name))
+        for name in ("columns", "rows"):
+            whole(name, getattr(self, name), 1, PIXELS_MAX)
         if not self.k_prime_px < 0.0:
             raise ArgumentError(f"k_prime_px is {self.k_prime_px!r}; choose a negative value")
         if not self.b_prime_px <= -POLE_MARGIN_PX:
@@ -114,8 +137,13 @@ class RangeModel:
                 f"b_prime_px is {self.b_prime_px!r}; choose {-POLE_MARGIN_PX:g} or less, "
                 "so that row 0 lies in front of the pole"
             )
-        if not 0.0 < self.theta_deg <= 90.0:
+        if not 0.0 < number("theta_deg", self.theta_deg) <= 90.0:
             raise ArgumentError(f"theta_deg is {self.theta_deg!r}; choose above 0 and up to 90")
+        if not -math.inf < self.product_mm_px < 0.0:
+            raise ArgumentError(
+                f"k_mm is {self.k_mm!r} and k_prime_px {self.k_prime_px!r}; their product leaves "
+                "the range of numbers, choose lengths of a real lens"
+            )
 
     @property
     def product_mm_px(self) -> float:
@@ -144,35 +172,41 @@ class RangeModel:
         return np.asarray(self.product_mm_px / self._image_px(row) - self.b_mm)
 
     def row(self, range_mm: ArrayLike) -> Array:
-        """Row at which a range appears, px (Eq. 2); NaN where ``range + b <= 0``."""
-        return np.asarray(self.product_mm_px / self._depth_mm(range_mm) - self.b_prime_px)
+        """Row at which a range appears, px (Eq. 2).
+
+        NaN where ``range + b <= 0``, or so little above that no number holds the row.
+        """
+        with np.errstate(over="ignore"):
+            row = self.product_mm_px / self._depth_mm(range_mm) - self.b_prime_px
+        return np.where(np.isfinite(row), row, np.nan)
 
     def magnification(self, row: ArrayLike) -> Array:
         """Image size over object size at ``row``: ``(row + b') / k'``.
 
         A straight line in row that reaches 0 at the pole; NaN behind the pole.
         """
-        m = (np.asarray(row, dtype=np.float64) + self.b_prime_px) / self.k_prime_px
+        m = (reals("row", row) + self.b_prime_px) / self.k_prime_px
         return np.where(m >= 0.0, m, np.nan)
 
     def range_per_row_mm(self, range_mm: ArrayLike) -> Array:
         """Range step of one row, mm per px (Eq. 4); NaN where ``range + b <= 0``."""
         depth = self._depth_mm(range_mm)
-        return np.asarray(depth * depth / -self.product_mm_px)
+        with np.errstate(over="ignore"):
+            return np.asarray(depth * depth / -self.product_mm_px)
 
     def range_sigma_mm(self, row: ArrayLike, sigma_row: ArrayLike) -> Array:
         """One-sigma range error (mm) of a row known to ``sigma_row`` px (Eq. 4).
 
         ``row`` and ``sigma_row`` broadcast; NaN where :meth:`range_mm` is NaN.
         """
-        image = self._image_px(row)
-        return np.asarray(
-            -self.product_mm_px / (image * image) * np.asarray(sigma_row, dtype=np.float64)
-        )
+        image, sigma = self._image_px(row), reals("sigma_row", sigma_row)
+        broadcast("row and sigma_row", image, sigma)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(-self.product_mm_px / (image * image) * sigma)
 
     def column_slope(self, column: ArrayLike) -> Array:
         """Lateral offset per mm of depth at ``column``: ``(column - c0) p / k``, mm per mm."""
-        offset = np.asarray(column, dtype=np.float64) - self.principal_column
+        offset = reals("column", column) - self.principal_column
         return np.asarray(offset * (self.pixel_um * 1e-3 / self.k_mm))
 
     def lateral_mm(self, column: ArrayLike, range_mm: ArrayLike) -> Array:
@@ -181,7 +215,10 @@ class RangeModel:
         Image columns meet at the front focal line, so the offset grows with ``range + b``.
         The arguments broadcast; NaN where ``range + b <= 0``.
         """
-        return np.asarray(self.column_slope(column) * self._depth_mm(range_mm))
+        slope, depth = self.column_slope(column), self._depth_mm(range_mm)
+        broadcast("column and range_mm", slope, depth)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(slope * depth)
 
     def rows_per_mm_off_sheet(self, range_mm: ArrayLike) -> Array:
         """Rows by which a point 1 mm beside the light sheet appears nearer, px per mm.
@@ -225,14 +262,15 @@ class RangeModel:
         axial = focal_mm + depth * math.sin(theta)
         lever = axial - baseline_mm * math.sin(theta) * math.cos(theta)
         scale = focal_mm * pitch_mm * math.sin(theta + tilt)
-        return np.asarray((self.k_mm / depth) ** 2 * lever / scale)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray((self.k_mm / depth) ** 2 * lever / scale)
 
     def _image_px(self, row: ArrayLike) -> Array:
         """``row + b'``, NaN from one pixel before the pole on."""
-        image = np.asarray(row, dtype=np.float64) + self.b_prime_px
+        image = reals("row", row) + self.b_prime_px
         return np.where(image <= -POLE_MARGIN_PX, image, np.nan)
 
     def _depth_mm(self, range_mm: ArrayLike) -> Array:
         """``R + b``, NaN where it is not positive."""
-        depth = np.asarray(range_mm, dtype=np.float64) + self.b_mm
+        depth = reals("range_mm", range_mm) + self.b_mm
         return np.where(depth > 0.0, depth, np.nan)
