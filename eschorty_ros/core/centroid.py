@@ -40,6 +40,9 @@ class Centroids:
         Events used.
     ambiguous : bool
         Two separate, equally dense groups of events: no row is given.
+    edge : bool
+        The first or last row of the sensor cuts the footprint: the row may be off by up to 0.8 of
+        the width (half a Gaussian), which ``sigma_row`` includes.
     """
 
     row: NDArray[np.float64]
@@ -47,6 +50,7 @@ class Centroids:
     width: NDArray[np.float64]
     events: NDArray[np.int64]
     ambiguous: NDArray[np.bool_]
+    edge: NDArray[np.bool_]
 
 
 def half_width_fixed(fwhm_px: float) -> int:
@@ -132,6 +136,7 @@ def estimate(
         np.empty(columns),
         np.empty(columns, dtype=np.int64),
         np.empty(columns, dtype=np.bool_),
+        np.empty(columns, dtype=np.bool_),
     )
     status = np.empty(columns, dtype=np.uint8)
     kernels._estimate_lists(
@@ -152,6 +157,7 @@ def estimate(
     )
     np.sqrt(out.width, out=out.width)
     np.equal(status, kernels.AMBIGUOUS, out=out.ambiguous)
+    np.less(np.minimum(out.row, height - 1 - out.row), 2.0 * out.width, out=out.edge)
     return out
 
 

@@ -93,50 +93,12 @@ def test_two_equal_separate_groups_are_left_undecided():
     assert found.ambiguous[0]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_constant_column_has_no_variance_and_a_floor_in_sigma(method):
-    found = estimate([700] * 50, [0, 50], method)
-    assert found.row[0] == 700.0
-    assert found.width[0] == 0.0
-    assert found.sigma_row[0] == pytest.approx(np.sqrt(1 / 12 + 0.04))
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("row", [0, 300, 719])
-def test_single_event(method, row):
-    found = estimate([row], [0, 1], method)
-    assert found.row[0] == row
-    assert found.sigma_row[0] >= np.sqrt(1 / 12 + 0.04)
-
-
-def test_empty_columns_are_nan_without_warning():
-    found = estimate(np.empty(0, np.uint16), np.zeros(4, int))
-    assert np.isnan(found.row).all()
-    assert (found.events == 0).all()
-
-
-def test_seventy_thousand_events_on_one_pixel():
-    rows = np.concatenate([np.full(70_000, 719), np.full(10, 0)])
-    found = estimate(rows, [0, rows.size])
-    assert found.row[0] == 719.0
-    assert found.events[0] == 70_000
-
-
 def test_sigma_follows_the_error_model():
     rng = np.random.default_rng(SEED)
     rows = np.rint(rng.normal(300, 5, 50)).astype(int)
     found = estimate(rows, [0, 50], "mean")
     expected = np.sqrt(0.24**2 * rows.var(ddof=1) / 50 + 0.2**2)
     assert found.sigma_row[0] == pytest.approx(expected, rel=1e-12)
-
-
-def test_footprint_cut_by_the_sensor_has_a_wider_sigma():
-    rng = np.random.default_rng(SEED)
-    rows = np.clip(np.rint(np.abs(rng.normal(0, 8, 200))), 0, 719).astype(int)
-    inner = estimate(rows + 300, [0, 200])
-    cut = estimate(rows, [0, 200])
-    assert cut.sigma_row[0] > 5 * inner.sigma_row[0]
-    assert abs(cut.row[0]) < 3 * cut.sigma_row[0]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,192 @@
+"""Hard cases 4, 5, 6, 11, 22, 23 and 24: columns that are short, constant, hot, tied or cut."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from line_events import encoded
+
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.centroid import METHODS, SIGMA_FLOOR_PX, estimate
+from eschorty_ros.core.evt3 import sort_readout
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.reconstruction import Reconstructor, Settings
+
+SEED = 20
+LONE_SIGMA_PX = np.sqrt(1.0 / 12.0 + SIGMA_FLOOR_PX**2)
+AVERAGES = ("mean", "mode_mean")
+every_method = pytest.mark.parametrize("method", METHODS)
+
+
+def one_column(rows, method="mode_mean", **options):
+    values = np.asarray(rows)
+    return estimate(values, [0, values.size], method, **options)
+
+
+@pytest.mark.parametrize("method", AVERAGES)
+@pytest.mark.parametrize("sigma_px", [0.3, 0.05])
+@pytest.mark.parametrize("row", [700.0, 40.0])
+def test_case_04_variance_of_a_narrow_line_far_from_row_0(method, sigma_px, row, measured):
+    """In float32 E[x^2] - E[x]^2 would be wrong 12-fold and 740-fold here."""
+    rng = np.random.default_rng(SEED)
+    rows = np.rint(rng.normal(row + 0.45, sigma_px, 400)).astype(np.int64)
+    assert np.unique(rows).size > 1
+    found = one_column(rows, method)
+    n, total = rows.size, int(rows.sum())
+    exact = Fraction(n * int((rows * rows).sum()) - total * total, n * (n - 1))
+    with mpmath.workdps(50):
+        width = mpmath.sqrt(mpmath.mpf(exact.numerator) / exact.denominator)
+        error = float(abs(mpmath.mpf(float(found.width[0])) / width - 1))
+    measured("standard deviation of the rows, relative", error, 1e-15)
+    measured("mean row, relative", abs(Fraction(float(found.row[0])) * n / total - 1), 1e-15)
+
+
+@every_method
+@pytest.mark.parametrize("row", [0, 300, 719])
+@pytest.mark.parametrize("events", [1, 7])
+def test_case_05_one_event_or_one_row_has_a_floor_in_sigma(method, row, events, measured):
+    found = one_column([row] * events, method)
+    assert found.row[0] == pytest.approx(row, abs=1e-9)
+    shortfall = LONE_SIGMA_PX - float(found.sigma_row[0])
+    measured("sigma below sqrt(1/12 + floor^2), px", shortfall, 1e-15)
+
+
+@every_method
+def test_case_05_no_event_is_nan_without_warning(method):
+    found = estimate(np.empty(0, np.uint16), np.zeros(4, int), method)
+    for values in (found.row, found.sigma_row, found.width):
+        assert np.isnan(values).all()
+    assert (found.events == 0).all()
+
+
+@every_method
+@pytest.mark.parametrize("events", [2, 50, 4000])
+@pytest.mark.parametrize("row", [1, 699, 718])
+def test_case_06_constant_column_has_exactly_no_spread(method, events, row):
+    found = one_column([row] * events, method)
+    assert found.width[0] == 0.0
+    assert found.row[0] == pytest.approx(row, abs=1e-9)
+
+
+@every_method
+def test_case_11_seventy_thousand_events_on_one_pixel(method):
+    rows = np.concatenate([np.full(70_000, 719), np.full(10, 0)])
+    found = one_column(rows, method)
+    if method == "mean":
+        assert found.row[0] == 719 * 70_000 / 70_010
+        assert found.events[0] == 70_010
+    else:
+        assert found.row[0] == pytest.approx(719.0, abs=0.01)
+        assert found.events[0] >= 70_000
+
+
+def test_case_11_hot_pixel_in_a_stream_is_counted_not_wrapped():
+    """Twice more events than 16 bits hold, on one pixel, within one period."""
+    n = 140_000
+    t = np.sort(np.random.default_rng(SEED).integers(1000, 60_000, n))
+    x, y = np.full(n, 640), np.full(n, 719)
+    data = encoded(sort_readout(t, x, y, np.ones(n, np.uint8)))
+    settings_ = Settings(smoothing_half_width=0)
+    reconstructor = Reconstructor(
+        load_calibration("config_3"), Modulation(16.0, on_edge_us=500), settings_
+    )
+    first, last = reconstructor.push(data), reconstructor.flush()
+    counts = reconstructor.counters
+    assert (counts["events"], len(first) + len(last)) == (n, 1)
+    assert counts["events_over_column_limit"] == n - settings_.column_limit
+    assert (last.row[0], last.events[0]) == (719.0, settings_.column_limit)
+
+
+@every_method
+def test_case_22_rows_without_events_inside_a_footprint(method):
+    """A log fit of the histogram would take log 0; no estimator here takes logs of counts."""
+    rng = np.random.default_rng(SEED)
+    sparse = 2 * np.rint(rng.normal(150.0, 2.0, (200, 12))).astype(np.int64)
+    found = estimate(sparse.ravel(), np.arange(201) * 12, method, line_width_px=10.0)
+    assert np.isfinite(found.row).all()
+    assert np.isfinite(found.sigma_row).all()
+    assert np.abs(found.row - 300.0).max() < 8.0
+
+
+def test_case_22_gauss_ml_without_background_is_the_mean(measured):
+    """Closed form: without noise events the likelihood of a Gaussian peaks at their mean."""
+    if "gauss_ml" not in METHODS:
+        pytest.skip("no Gaussian fit in this build")
+    rng = np.random.default_rng(SEED)
+    rows = np.rint(rng.normal(350.0, 4.0, (300, 40))).astype(np.int64)
+    found = estimate(rows.ravel(), np.arange(301) * 40, "gauss_ml", line_width_px=9.4)
+    error = np.quantile(np.abs(found.row - rows.mean(axis=1)), 0.95)
+    measured("gauss_ml against the mean, no background, px (95 %)", error, 0.05)
+
+
+TIED = {
+    "two equal groups": [100, 100, 100, 600, 600, 600],
+    "two overlapping groups": [300, 300, 300, 309, 309, 309],
+    "comb": list(range(200, 320, 8)),
+    "plateau": [*range(300, 340)],
+    "pair of pairs": [200, 201, 240, 241],
+    "three groups": [100] * 4 + [300] * 4 + [500] * 4,
+    "edges of the sensor": [0, 0, 719, 719],
+}
+
+
+@every_method
+@pytest.mark.parametrize("rows", TIED.values(), ids=TIED)
+@pytest.mark.parametrize("width", [2.0, 7.0, 20.0])
+def test_case_23_ties_reverse_with_the_rows(method, rows, width, measured):
+    values = np.array(rows)
+    a = one_column(values, method, line_width_px=width)
+    b = one_column(719 - values[::-1], method, line_width_px=width)
+    assert np.isnan(a.row[0]) == np.isnan(b.row[0])
+    assert a.ambiguous[0] == b.ambiguous[0]
+    difference = np.nan_to_num(np.abs(a.row + b.row - 719.0)).max()
+    measured("reversed rows against the reversed result, px", difference, 1e-12)
+
+
+@settings(derandomize=True, max_examples=150, deadline=None)
+@given(
+    st.lists(st.sampled_from([300, 303, 306, 312, 318, 324]), min_size=2, max_size=40),
+    st.sampled_from(METHODS),
+    st.sampled_from([2.0, 5.0, 9.0]),
+    st.randoms(use_true_random=False),
+)
+def test_case_23_neither_order_nor_direction_decides(rows, method, width, random):
+    values = np.array(rows)
+    shuffled = list(rows)
+    random.shuffle(shuffled)
+    found = one_column(values, method, line_width_px=width)
+    mirrored = one_column(719 - values, method, line_width_px=width)
+    np.testing.assert_allclose(mirrored.row, 719.0 - found.row, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(one_column(shuffled, method, line_width_px=width).row, found.row)
+
+
+@pytest.mark.parametrize("edge", [0, 719])
+@pytest.mark.parametrize("sigma_px", [4.0, 8.0])
+def test_case_24_footprint_cut_in_half_is_off_by_the_truncated_normal(edge, sigma_px, measured):
+    """Half a Gaussian has its mean at sqrt(2/pi) sigma; the flag and the wider sigma say so."""
+    rng = np.random.default_rng(SEED)
+    away = np.abs(rng.normal(0.0, sigma_px, (200, 400)))
+    rows = np.abs(edge - np.clip(np.floor(away), 0, 719).astype(np.int64))
+    found = estimate(rows.ravel(), np.arange(201) * 400, "mean")
+    bias = np.abs(found.row.mean() - edge)
+    expected = np.sqrt(2.0 / np.pi) * sigma_px - 0.5
+    measured("bias against 0.8 sigma, px", abs(bias - expected), 0.02 * sigma_px)
+    assert found.edge.all()
+    assert (np.abs(found.row - edge) < 3.0 * found.sigma_row).all()
+    assert (np.abs(found.row - edge) > 0.5 * found.sigma_row).all()
+
+
+@every_method
+def test_case_24_flag_is_for_cut_footprints_only(method):
+    rng = np.random.default_rng(SEED)
+    middle = np.rint(rng.normal(350.0, 5.0, 60)).astype(int)
+    cut = np.abs(np.rint(rng.normal(0.0, 5.0, 60))).astype(int)
+    rows = np.concatenate([middle, cut, 719 - cut])
+    found = estimate(rows, [0, 60, 120, 180, 180], method)
+    assert found.edge.tolist() == [False, True, True, False]
+    assert found.sigma_row[1] > 3.0 * found.sigma_row[0]
