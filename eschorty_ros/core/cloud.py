@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,14 @@ POINT_DTYPE = np.dtype(
 )
 """Packed, 30 bytes: x y z sigma in metres, intensity in events, t in seconds, column in px."""
 
+REFLECTANCE_DTYPE = np.dtype(
+    [*POINT_DTYPE.descr, ("reflectance", "<f4"), ("reflectance_sigma", "<f4")]
+)
+"""POINT_DTYPE with the relative reflectance and its standard deviation, 38 bytes."""
+
 Points = NDArray[np.void]
+
+_DTYPES = (POINT_DTYPE, REFLECTANCE_DTYPE)
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u2": "ushort"}
 _HEADER_LIMIT = 4096
@@ -38,7 +46,7 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
     ----------
     path : path
         Ends in ``.pcd`` or ``.ply``.
-    points : ndarray of POINT_DTYPE, shape (n,)
+    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
 
     Raises
     ------
@@ -46,13 +54,13 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
         For another extension, another dtype or shape, or a path that cannot be written.
     """
     header = _header_writer(Path(path))
-    if points.dtype != POINT_DTYPE or points.ndim != 1:
+    if points.dtype not in _DTYPES or points.ndim != 1:
         raise ArgumentError(
             f"points has dtype {points.dtype} and shape {points.shape}; give a one-dimensional "
-            "array of POINT_DTYPE"
+            "array of POINT_DTYPE or REFLECTANCE_DTYPE"
         )
     with atomic_write(path) as stream:
-        stream.write(header(len(points)))
+        stream.write(header(points.dtype, len(points)))
         stream.write(np.ascontiguousarray(points).data)
 
 
@@ -61,7 +69,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
 
     Returns
     -------
-    ndarray of POINT_DTYPE, shape (n,)
+    ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
 
     Raises
     ------
@@ -79,18 +87,41 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
             f"cannot read {source}: {error.strerror or error}; check the path"
         ) from error
     count, start = _parse_header(source, data)
-    if header(count) != data[:start]:
+    dtype = next((kind for kind in _DTYPES if header(kind, count) == data[:start]), None)
+    if dtype is None:
         raise FormatError(
             f"{source}: its header is not that of an eschorty_ros cloud; expected the fields "
             f"{' '.join(POINT_DTYPE.names or ())} in binary form, convert the file first"
         )
-    expected = count * POINT_DTYPE.itemsize
+    expected = count * dtype.itemsize
     if len(data) - start != expected:
         raise FormatError(
             f"{source}: {count} points need {expected} bytes and {len(data) - start} follow the "
             "header; the file is damaged, write it again"
         )
-    return np.frombuffer(data, POINT_DTYPE, count, start).copy()
+    return np.frombuffer(data, dtype, count, start).copy()
+
+
+def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """All points of ``parts``; a field that some of them lack is NaN in theirs.
+
+    Parameters
+    ----------
+    parts : sequence of structured arrays, at least one
+        The fields of each begin with those of every shorter one.
+    """
+    widest = max((part.dtype for part in parts), key=lambda kind: kind.itemsize)
+    return np.concatenate([_widened(part, widest) for part in parts])
+
+
+def _widened(points: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    if points.dtype == dtype:
+        return points
+    wide = np.empty(len(points), dtype)
+    known = points.dtype.names or ()
+    for name in dtype.names or ():
+        wide[name] = points[name] if name in known else np.nan
+    return wide
 
 
 def _header_writer(path: Path) -> Any:
@@ -102,12 +133,12 @@ def _header_writer(path: Path) -> Any:
         ) from None
 
 
-def _fields() -> list[tuple[str, np.dtype[Any]]]:
-    return [(name, POINT_DTYPE[name]) for name in POINT_DTYPE.names or ()]
+def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
+    return [(name, dtype[name]) for name in dtype.names or ()]
 
 
-def _pcd_header(count: int) -> bytes:
-    fields = _fields()
+def _pcd_header(dtype: np.dtype[Any], count: int) -> bytes:
+    fields = _fields(dtype)
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
@@ -124,9 +155,9 @@ def _pcd_header(count: int) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _ply_header(count: int) -> bytes:
+def _ply_header(dtype: np.dtype[Any], count: int) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {_PLY_TYPES[kind.str[1:]]} {name}" for name, kind in _fields()]
+    lines += [f"property {_PLY_TYPES[kind.str[1:]]} {name}" for name, kind in _fields(dtype)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode()
 
 

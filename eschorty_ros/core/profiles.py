@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.cloud import POINT_DTYPE
+from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 
@@ -25,6 +26,7 @@ _DTYPES = {
     "width_px": np.float64,
     "return_index": np.uint8,
 }
+_REFLECTANCE = ("reflectance", "reflectance_sigma")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +52,8 @@ class Profiles:
         Sample standard deviation of the rows used; 0 for a single event.
     return_index : uint8
         Place among the points of the same profile and column, nearest range first.
+    reflectance, reflectance_sigma : float64, optional
+        Relative reflectance and its standard deviation; ``None`` where nobody asked for it.
     """
 
     period: NDArray[np.int64]
@@ -63,6 +67,8 @@ class Profiles:
     events: NDArray[np.uint32]
     width_px: NDArray[np.float64]
     return_index: NDArray[np.uint8]
+    reflectance: NDArray[np.float64] | None = None
+    reflectance_sigma: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.column)
@@ -74,18 +80,30 @@ class Profiles:
 
     @classmethod
     def concatenate(cls, parts: Iterable[Profiles]) -> Profiles:
-        """All points of ``parts`` in their order."""
+        """All points of ``parts`` in their order; NaN for a reflectance only some parts have."""
         kept = [part for part in parts if len(part)]
         if not kept:
             return cls.empty()
+        names = list(_DTYPES)
+        if any(part.reflectance is not None for part in kept):
+            names += _REFLECTANCE
+            kept = [part if part.reflectance is not None else part._unknown() for part in kept]
         return cls(
-            **{name: np.concatenate([getattr(part, name) for part in kept]) for name in _DTYPES}
+            **{name: np.concatenate([getattr(part, name) for part in kept]) for name in names}
         )
 
     def select(self, mask: ArrayLike) -> Profiles:
         """Pick points by a boolean mask, a slice or an index array."""
         picked = mask if isinstance(mask, slice) else np.asarray(mask)
-        return Profiles(**{item.name: getattr(self, item.name)[picked] for item in fields(self)})
+        chosen: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(self)}
+        for name, values in chosen.items():
+            chosen[name] = None if values is None else values[picked]
+        return Profiles(**chosen)
+
+    def _unknown(self) -> Profiles:
+        """Give the points a reflectance of NaN."""
+        nothing = np.full(len(self), np.nan)
+        return replace(self, reflectance=nothing, reflectance_sigma=nothing)
 
     @property
     def profile_count(self) -> int:
@@ -106,15 +124,20 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
     Returns
     -------
     ndarray of POINT_DTYPE, shape (len(profiles),)
-        Metres and seconds; ``sigma`` is the range's standard deviation.
+        Metres and seconds; ``sigma`` is the range's standard deviation. Of REFLECTANCE_DTYPE where
+        the profiles know their reflectance.
     """
-    points = np.zeros(len(profiles), dtype=POINT_DTYPE)
+    known = profiles.reflectance is not None
+    points = np.zeros(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
     points["x"] = profiles.range_mm * 1e-3
     points["z"] = model.lateral_mm(profiles.column, profiles.range_mm) * 1e-3
     points["intensity"] = profiles.events
     points["sigma"] = profiles.sigma_mm * 1e-3
     points["t"] = (profiles.t_us - np.int64(origin_us)) * 1e-6
     points["column"] = profiles.column
+    if known:
+        points["reflectance"] = profiles.reflectance
+        points["reflectance_sigma"] = profiles.reflectance_sigma
     return points
 
 
@@ -142,6 +165,7 @@ def place(
     Returns
     -------
     ndarray of POINT_DTYPE
+        Or of REFLECTANCE_DTYPE, as :func:`place_link` gives them.
 
     Raises
     ------

@@ -11,6 +11,7 @@ from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Events
+from eschorty_ros.core.finishing import Finisher
 from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.noise import ActivityFilter
@@ -60,6 +61,7 @@ class Reconstructor:
             else None
         )
         self._assembler = ProfileAssembler(settings, self.model)
+        self._finisher = Finisher(settings)
         self._held = HeldEvents()
         self._counts: dict[str, int] = dict.fromkeys(
             ("events", "events_filtered", "events_outside_phase"), 0
@@ -145,7 +147,7 @@ class Reconstructor:
             now_us = self._decoder.time_us
             if now_us is not None:
                 self._absorb(events, now_us)
-        return self._assembler.take()
+        return self._finisher.push(self._assembler.take())
 
     def flush(self) -> Profiles:
         """Close the open period; call at the end of the stream.
@@ -154,7 +156,7 @@ class Reconstructor:
         ``phase_missing`` is set.
         """
         self._drain()
-        return self._assembler.take()
+        return self._finisher.push(self._assembler.take())
 
     def note_gap(self) -> None:
         """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""

@@ -10,6 +10,7 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.phase_gate import GATE_MAX_US
 
 NOISE_FILTERS = ("none", "activity")
+SWITCH = ("off", "on")
 
 
 def _number(
@@ -79,6 +80,20 @@ class Settings:
     )
     isolation_events: int = _number(
         10, 0, 1000, "events", "points with fewer events than this are weak"
+    )
+    reflectance: str = _choice(
+        "off", SWITCH, "relative reflectance of every point, as two more fields of the cloud"
+    )
+    footprint_sigma_px: float = _number(
+        4.1, 0.3, 60.0, "px", "standard deviation of the laser line's intensity over the rows"
+    )
+    white_width_px: float = _number(
+        0.0,
+        0.0,
+        200.0,
+        "px",
+        "width (standard deviation of the rows) of a white target, to which reflectance refers; "
+        "0 takes the median of each profile",
     )
     sigma_factor: float = _number(
         SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"

@@ -12,17 +12,14 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from eschorty_ros.core.cloud import POINT_DTYPE
 from eschorty_ros.nodes.conversions import stamp_from_ns
 
-LIVE_DTYPE = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("intensity", "<f4"),
-        ("sigma", "<f4"),
-        ("t", "<u4"),
-        ("column", "<u2"),
-    ]
-)
+
+def live_dtype(scan_dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Layout of a live cloud whose assembled scan has ``scan_dtype``: ``t`` is uint32 instead."""
+    names = scan_dtype.names or ()
+    return np.dtype([(name, "<u4" if name == "t" else scan_dtype[name].str) for name in names])
+
+
+LIVE_DTYPE = live_dtype(POINT_DTYPE)
 """Point of a live cloud: metres, events used, metres, ns since the header's stamp, column."""
 
 SCAN_DTYPE = POINT_DTYPE
@@ -51,7 +48,7 @@ def _bytes_field(values: NDArray[Any]) -> array[int]:
 
 
 def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
-    """Unorganised ``PointCloud2`` of a structured array of ``LIVE_DTYPE`` or ``SCAN_DTYPE``."""
+    """Unorganised ``PointCloud2`` of a structured array, one field of the message per field."""
     message = PointCloud2()
     message.header.stamp = stamp_from_ns(stamp_ns)
     message.header.frame_id = frame_id
@@ -93,13 +90,14 @@ def points_from_message(message: PointCloud2) -> NDArray[Any]:
 
 
 def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
-    """Points of ``SCAN_DTYPE`` as ``LIVE_DTYPE``, ``t`` counted from ``stamp_ns``.
+    """Points of an assembled scan as those of a live one, ``t`` counted from ``stamp_ns``.
 
     All of ``t_ns`` lies within ``LIVE_SPAN_NS`` after ``stamp_ns``.
     """
-    live = np.empty(len(scan_points), LIVE_DTYPE)
-    for name in ("x", "y", "z", "intensity", "sigma", "column"):
-        live[name] = scan_points[name]
+    live = np.empty(len(scan_points), live_dtype(scan_points.dtype))
+    for name in scan_points.dtype.names or ():
+        if name != "t":
+            live[name] = scan_points[name]
     live["t"] = t_ns - stamp_ns
     return live
 

@@ -10,11 +10,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
 from eschorty_ros.core.calibration import Calibration
+from eschorty_ros.core.cloud import join_points
 from eschorty_ros.core.reconstruction import place_link
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.cloud_messages import (
     LIVE_SPAN_NS,
-    SCAN_DTYPE,
     cloud_message,
     image_message,
     live_points,
@@ -100,7 +100,7 @@ class Outputs:
         if not self._batch or now_s - self._points_at_s < _POINTS_INTERVAL_S:
             return
         self._points_at_s = now_s
-        points = np.concatenate([part.points for part in self._batch])
+        points = join_points([part.points for part in self._batch])
         t_ns = np.concatenate([part.t_ns for part in self._batch])
         self._batch.clear()
         piece = (t_ns - t_ns.min()) // LIVE_SPAN_NS
@@ -113,5 +113,4 @@ class Outputs:
     def scan(self, scan: AssembledScan, fallback_stamp_ns: int) -> None:
         """Publish an assembled scan, also an empty one."""
         stamp_ns = scan.stamp_ns if len(scan.points) else fallback_stamp_ns
-        assert scan.points.dtype == SCAN_DTYPE
         self._scan.publish(cloud_message(scan.points, stamp_ns, BASE))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.cloud import join_points
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
 
@@ -18,8 +19,8 @@ _HALF_NM = 0.5e-6
 class PlacedPoints:
     """Points in the static frame with what a scan needs to sort them; one entry per point.
 
-    ``points`` has ``SCAN_DTYPE`` (its ``t`` is not used), ``t_ns`` and ``edge_ns`` are int64 ROS
-    nanoseconds of the point and of the rising edge of its period, ``stage_mm`` is float64.
+    ``points`` is as ``place`` gives it (its ``t`` is not used), ``t_ns`` and ``edge_ns`` are int64
+    ROS nanoseconds of the point and of the rising edge of its period, ``stage_mm`` is float64.
     """
 
     points: NDArray[Any]
@@ -100,7 +101,7 @@ class ScanBuffer:
         """Everything kept so far as one cloud; an empty one when nothing was kept."""
         if not self._parts:
             return AssembledScan(np.empty(0, SCAN_DTYPE), 0, 0, float("nan"))
-        points = np.concatenate([part.points for part in self._parts])
+        points = join_points([part.points for part in self._parts])
         t_ns = np.concatenate([part.t_ns for part in self._parts])
         edge_ns = np.concatenate([part.edge_ns for part in self._parts])
         stamp_ns = int(t_ns.min())

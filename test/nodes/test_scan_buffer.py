@@ -24,8 +24,8 @@ def placed(stage_mm, edge_ns, columns):
 
 def timed(t_ns):
     t_ns = np.asarray(t_ns, dtype=np.int64)
-    empty = Profiles.empty()
-    fields = {name: np.zeros(len(t_ns), getattr(empty, name).dtype) for name in Profiles.__slots__}
+    empty = {name: getattr(Profiles.empty(), name) for name in Profiles.__slots__}
+    fields = {k: np.zeros(len(t_ns), v.dtype) for k, v in empty.items() if v is not None}
     return TimedProfiles(Profiles(**fields), t_ns, t_ns)
 
 

@@ -109,7 +109,8 @@ def test_case_19_points_are_rounded_to_float32_once(range_mm, limit_um, measured
     n = ranges.size
     t_us = 1_760_000_000_000_000 + np.arange(n)
     profiles = Profiles.empty().select(np.zeros(0, int))
-    fields = {name: np.zeros(n, getattr(profiles, name).dtype) for name in Profiles.__slots__}
+    given = {name: getattr(profiles, name) for name in Profiles.__slots__}
+    fields = {k: np.zeros(n, v.dtype) for k, v in given.items() if v is not None}
     fields.update(range_mm=ranges, t_us=t_us)
     points = place(Profiles(**fields), model("config_3"), 0.0, (0.0, 1.0, 0.0), int(t_us[0]))
     error_um = np.abs(points["x"].astype(np.float64) - ranges * 1e-3).max() * 1e6

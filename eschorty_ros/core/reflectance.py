@@ -1,0 +1,103 @@
+"""Relative reflectance of a point from how wide its line looks and how many events it gave.
+
+A logarithmic sensor sees a Gaussian footprint as far out as its contrast reaches the threshold, so
+the full width W of the lit rows obeys ``W^2 = 8 sigma^2 ln(A rho / (e^theta - 1))``: linear in
+``ln rho`` with a slope that only the optical footprint's sigma decides. At high frequencies, where
+the photoreceptor's bandwidth limits the swing, the offset changes and the slope does not. Evenly
+lit rows have the variance ``W^2 / 12`` and a number of events in proportion to W; both are used.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.errors import ArgumentError
+
+Array = NDArray[np.float64]
+
+ROOT_12 = math.sqrt(12.0)
+"""Full width over standard deviation of evenly spread rows."""
+
+_WIDTH_FLOOR_PX = 0.55
+_WIDTH_FACTOR = 0.24
+
+
+def events_per_row(width_px: Array, events: NDArray[np.uint32]) -> float:
+    """Events of one lit row: the median of events over full width, NaN without a usable point."""
+    usable = width_px > 0.0
+    if not usable.any():
+        return math.nan
+    return float(np.median(events[usable] / (ROOT_12 * width_px[usable])))
+
+
+def relative_reflectance(
+    edge_us: NDArray[np.int64],
+    width_px: Array,
+    events: NDArray[np.uint32],
+    footprint_sigma_px: float,
+    white_width_px: float = 0.0,
+) -> tuple[Array, Array]:
+    """Reflectance of each point relative to its profile's median or to a white target.
+
+    Parameters
+    ----------
+    edge_us : ndarray of int64, shape (n,)
+        Points of one profile share a value and follow each other.
+    width_px : ndarray of float64, shape (n,)
+        Sample standard deviation of the rows used, px.
+    events : ndarray of uint32, shape (n,)
+        Events used.
+    footprint_sigma_px : float
+        Standard deviation of the laser line's intensity over the rows, px.
+    white_width_px : float
+        Root mean square ``width_px`` of a white target's points; 0 for the profile's own median.
+
+    Returns
+    -------
+    reflectance, sigma : ndarray of float64, shape (n,)
+        ``sigma`` is the standard deviation of one point; the reference's is not in it.
+
+    Raises
+    ------
+    ArgumentError
+        When shapes differ, ``footprint_sigma_px`` is not positive or ``white_width_px`` negative.
+    """
+    if not edge_us.shape == width_px.shape == events.shape or edge_us.ndim != 1:
+        raise ArgumentError(
+            f"edge_us has shape {edge_us.shape}, width_px {width_px.shape} and events "
+            f"{events.shape}; give three equal axes"
+        )
+    if not 0.0 < footprint_sigma_px < math.inf:
+        raise ArgumentError(f"footprint_sigma_px is {footprint_sigma_px!r}; choose a positive one")
+    if not 0.0 <= white_width_px < math.inf:
+        raise ArgumentError(f"white_width_px is {white_width_px!r}; choose 0 or more")
+    # Full width squared per e-fold of reflectance.
+    slope = 8.0 * footprint_sigma_px * footprint_sigma_px
+    width2 = np.empty(edge_us.size)
+    reference2 = np.empty(edge_us.size)
+    starts = np.flatnonzero(np.diff(edge_us, prepend=~edge_us[:1]))
+    for begin, end in pairwise([*starts.tolist(), edge_us.size]):
+        part = slice(begin, end)
+        width2[part] = full_width2(width_px[part], events[part])
+        reference2[part] = np.median(width2[part])
+    if white_width_px > 0.0:
+        reference2[:] = 12.0 * white_width_px * white_width_px
+    reflectance = np.exp((width2 - reference2) / slope)
+    width_sigma2 = _WIDTH_FLOOR_PX**2 + _WIDTH_FACTOR**2 * 0.2 * width2 / np.maximum(events, 1)
+    return reflectance, reflectance * 2.0 * np.sqrt(width2 * width_sigma2) / slope
+
+
+def full_width2(width_px: Array, events: NDArray[np.uint32]) -> Array:
+    """Square of the full width of the lit rows of one profile's points, px squared.
+
+    The mean of what spread and number of events say; where no point has a spread, 0.
+    """
+    from_spread = 12.0 * width_px * width_px
+    per_row = events_per_row(width_px, events)
+    if math.isnan(per_row):
+        return from_spread
+    return 0.5 * (from_spread + np.square(events / per_row))
