@@ -4,29 +4,14 @@ ros2 launch eschorty_ros scan.launch.py scene:=sphere speed:=0.02 rviz:=true
 ros2 launch eschorty_ros scan.launch.py --show-args
 """
 
-from pathlib import Path
-
-from launch.actions import (
-    DeclareLaunchArgument,
-    EmitEvent,
-    RegisterEventHandler,
-)
-from launch.conditions import IfCondition
+from launch.actions import EmitEvent, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import (
-    EqualsSubstitution,
-    IfElseSubstitution,
-    LaunchConfiguration,
-)
-from launch_ros.actions import Node
+from launch.substitutions import IfElseSubstitution, LaunchConfiguration
 from launch_ros.parameter_descriptions import ParameterValue
 
+from eschorty_ros.nodes.launching import EVENTS, declare, node, number, rviz, text
 from launch import LaunchDescription
-
-CONFIG = Path(__file__).resolve().parents[1] / "config"
-NAMESPACE = "eschorty"
-EVENTS = f"/{NAMESPACE}/camera/events"
 
 ARGUMENTS = (
     (
@@ -49,16 +34,6 @@ ARGUMENTS = (
     ("auto_scan", "true", "true: scan once when every node is ready", ["true", "false"]),
     ("rviz", "false", "true: show cloud, live profile and frames in RViz", ["true", "false"]),
 )
-
-
-def number(name):
-    """Value of an argument as a float, also when it is written without a decimal point."""
-    return ParameterValue(LaunchConfiguration(name), value_type=float)
-
-
-def text(name):
-    """Value of an argument as a string, also when it looks like a number."""
-    return ParameterValue(LaunchConfiguration(name), value_type=str)
 
 
 def driver(real):
@@ -91,42 +66,13 @@ def nodes():
             "speed": number("speed"),
         },
     }
-    return [
-        Node(
-            package="eschorty_ros",
-            executable=name,
-            name=name,
-            namespace=NAMESPACE,
-            parameters=[table],
-            output="screen",
-            emulate_tty=True,
-        )
-        for name, table in parameters.items()
-    ]
+    return [node(name, table) for name, table in parameters.items()]
 
 
 def generate_launch_description():
     """Arguments, nodes; RViz on request, and closing it ends everything."""
-    rviz = Node(
-        package="rviz2",
-        executable="rviz2",
-        arguments=["-d", str(CONFIG / "scan.rviz")],
-        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("rviz"), "true")),
+    view = rviz()
+    ending = OnProcessExit(
+        target_action=view, on_exit=[EmitEvent(event=Shutdown(reason="RViz closed"))]
     )
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(
-                    name, default_value=default, description=description, choices=choices
-                )
-                for name, default, description, choices in ARGUMENTS
-            ),
-            *nodes(),
-            rviz,
-            RegisterEventHandler(
-                OnProcessExit(
-                    target_action=rviz, on_exit=[EmitEvent(event=Shutdown(reason="RViz closed"))]
-                )
-            ),
-        ]
-    )
+    return LaunchDescription([*declare(ARGUMENTS), *nodes(), view, RegisterEventHandler(ending)])

@@ -47,10 +47,12 @@ def configurations(tree):
     """Every argument name the file reads."""
     used = set()
     for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Name)
-            and node.func.id in ("LaunchConfiguration", "number", "text")
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
+            continue
+        if node.func.id == "rviz":
+            used.add("rviz")
+        elif (
+            node.func.id in ("LaunchConfiguration", "number", "text")
             and node.args
             and isinstance(node.args[0], ast.Constant)
         ):
@@ -129,13 +131,15 @@ def test_rviz_names_frames_that_are_published():
     assert all(f'"{frame}"' in published for frame in named)
 
 
-def test_dds_profile_repeats_lost_messages_soon_and_shares_no_memory():
+def test_dds_profile_repeats_lost_messages_soon_and_has_room_for_bursts():
     space = {"d": "http://www.eprosima.com"}
     root = xml.etree.ElementTree.parse(ROOT / "config" / "fastdds.xml").getroot()
     assert root.find(".//d:participant", space).get("is_default_profile") == "true"
     assert root.find(".//d:useBuiltinTransports", space).text == "false"
     types = {node.text for node in root.findall(".//d:transport_descriptor/d:type", space)}
-    assert types == {"UDPv4"}
+    assert types == {"SHM", "UDPv4"}
+    # Far above a packet of 256 kB, or bursts of them are lost.
+    assert int(root.find(".//d:segment_size", space).text) >= 100 * 262_144
     writer = root.find(".//d:data_writer", space)
     assert writer.get("is_default_profile") == "true"
     assert int(writer.find(".//d:nanosec", space).text) <= 200_000_000

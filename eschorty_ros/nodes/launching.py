@@ -1,0 +1,63 @@
+"""What the launch files share. Needs the packages launch and launch_ros."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from eschorty_ros.core.calibration import config_folders
+
+NAMESPACE = "eschorty"
+EVENTS = f"/{NAMESPACE}/camera/events"
+
+Argument = tuple[str, str | None, str, list[str] | None]
+"""Name, default (``None``: must be given), description, choices."""
+
+
+def declare(arguments: tuple[Argument, ...]) -> list[DeclareLaunchArgument]:
+    """Launch arguments from a table."""
+    return [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
+        for name, default, text, choices in arguments
+    ]
+
+
+def number(name: str) -> Any:
+    """Value of an argument as a float, also when it is written without a decimal point."""
+    return ParameterValue(LaunchConfiguration(name), value_type=float)
+
+
+def text(name: str) -> Any:
+    """Value of an argument as a string, also when it looks like a number."""
+    return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+def node(executable: str, parameters: dict[str, Any]) -> Any:
+    """One of the package's nodes, named as its executable."""
+    return Node(
+        package="eschorty_ros",
+        executable=executable,
+        name=executable,
+        namespace=NAMESPACE,
+        parameters=[parameters],
+        output="screen",
+        emulate_tty=True,
+    )
+
+
+def rviz() -> Any:
+    """RViz with the package's view, when the argument ``rviz`` is true."""
+    views = [folder / "scan.rviz" for folder in config_folders()]
+    view = next((path for path in views if path.is_file()), Path("scan.rviz"))
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", str(view)],
+        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("rviz"), "true")),
+    )
