@@ -8,7 +8,7 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
-from line_events import encoded, line_events
+from line_events import blank_profiles, encoded, line_events
 
 from eschorty_ros.core import reconstructor as reconstructor_module
 from eschorty_ros.core.calibration import load_calibration
