@@ -211,24 +211,29 @@ def _map(
     colours: str,
     limits: tuple[float, float],
 ) -> None:
-    # Even spacing is what a sweep has; a stage at rest leaves no height to draw.
-    first, last = float(grid.stage_mm[0]), float(grid.stage_mm[-1])
-    if abs(last - first) < 1e-6:
-        first, last = first - 0.5, last + 0.5
-    half = 0.5 * (last - first) / max(len(grid.stage_mm) - 1, 1)
-    artist = axes.imshow(
-        image,
+    artist = axes.pcolorfast(
+        np.arange(grid.columns + 1) - 0.5,
+        _line_edges(grid.stage_mm),
+        image if grid.stage_mm[-1] >= grid.stage_mm[0] else image[::-1],
         cmap=colours,
         vmin=limits[0],
         vmax=limits[1],
-        extent=(-0.5, grid.columns - 0.5, first - half, last + half),
-        origin="lower",
-        aspect="auto",
-        interpolation="nearest",
     )
     axes.set_facecolor("0.85")
     axes.set(xlabel="column (px)", ylabel="stage position (mm)")
     axes.figure.colorbar(artist, ax=axes, label=label, extend="both")
+
+
+def _line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rising limits of the lines of a map, one more than there are lines.
+
+    The stage accelerates, so that lines differ in height; a stage at rest leaves no height to draw.
+    """
+    at = np.sort(stage_mm)
+    if at[-1] - at[0] < 1e-6:
+        return at[0] + np.linspace(-0.5, 0.5, at.size + 1)
+    between = 0.5 * (at[1:] + at[:-1])
+    return np.concatenate(([2 * at[0] - between[0]], between, [2 * at[-1] - between[-1]]))
 
 
 def _view_3d(

@@ -1,0 +1,113 @@
+"""Points of a simulated recording against the truth: errors, gaps and gross errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.recording import Recording
+from eschorty_ros.report.accuracy import KnownScene, true_range_mm
+
+GROSS_PX = 10.0
+"""Half the line's full width at half maximum: a row this far off is not on the line."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanErrors:
+    """Errors of the points of one scan.
+
+    Attributes
+    ----------
+    error_mm : ndarray of float64, shape (points,)
+        Measured minus true range at each point's own stage position and column; NaN where the
+        scene holds nothing.
+    gross : ndarray of bool, shape (points,)
+        More than ``GROSS_PX`` rows off, or where the scene holds nothing.
+    completeness : float
+        Share of the truth's periods and columns that have a point.
+    """
+
+    error_mm: NDArray[np.float64]
+    gross: NDArray[np.bool_]
+    completeness: float
+
+    @property
+    def median_mm(self) -> float:
+        """Median absolute error."""
+        return self.quantile_mm(0.5)
+
+    @property
+    def rmse_mm(self) -> float:
+        """Root of the mean squared error, gross errors included; NaN without points."""
+        known = self.error_mm[np.isfinite(self.error_mm)]
+        return float(np.sqrt(np.mean(known * known))) if known.size else float("nan")
+
+    @property
+    def bias_mm(self) -> float:
+        """Median of the signed error."""
+        known = self.error_mm[np.isfinite(self.error_mm)]
+        return float(np.median(known)) if known.size else float("nan")
+
+    @property
+    def gross_share(self) -> float:
+        """Gross errors among all points; NaN without points."""
+        return float(np.mean(self.gross)) if self.gross.size else float("nan")
+
+    def quantile_mm(self, share: float) -> float:
+        """Quantile of the absolute error; NaN without points."""
+        size = np.abs(self.error_mm[np.isfinite(self.error_mm)])
+        return float(np.quantile(size, share)) if size.size else float("nan")
+
+
+def scan_errors(profiles: Profiles, recording: Recording, scene: KnownScene) -> ScanErrors:
+    """Compare every point with the scene at its own time, the recording's truth with the points.
+
+    Parameters
+    ----------
+    profiles : Profiles
+    recording : Recording
+        With its truth; the stage is taken from it.
+    scene : KnownScene
+        What was recorded.
+
+    Returns
+    -------
+    ScanErrors
+    """
+    model = recording.calibration.model()
+    stage_mm = np.asarray(recording.stage.position_mm(profiles.t_us))
+    truth_mm = true_range_mm(scene, model, stage_mm, profiles.column)
+    off_px = np.abs(profiles.row - model.row(truth_mm))
+    truth = recording.truth
+    assert truth is not None, "a simulated recording has its truth"
+    return ScanErrors(
+        profiles.range_mm - truth_mm,
+        ~(off_px <= GROSS_PX),
+        _completeness(profiles, truth, recording.modulation, model),
+    )
+
+
+def _completeness(
+    profiles: Profiles, truth: NDArray[np.void], modulation: Modulation, model: RangeModel
+) -> float:
+    if len(truth) == 0:
+        return float("nan")
+    expected = _keys(period_of(truth["t_us"], modulation), truth["column"], model)
+    found = _keys(period_of(profiles.t_us, modulation), profiles.column, model)
+    return float(np.mean(np.isin(expected, found)))
+
+
+def period_of(t_us: NDArray[np.int64], modulation: Modulation) -> NDArray[np.int64]:
+    """Modulation period in which a time lies, counted from the recorded rising edge."""
+    since_us = t_us - (modulation.on_edge_us or 0)
+    return np.floor(since_us / modulation.period_us).astype(np.int64)
+
+
+def _keys(period: NDArray[np.int64], column: NDArray[Any], model: RangeModel) -> NDArray[np.int64]:
+    return period * model.columns + column
