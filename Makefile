@@ -1,4 +1,5 @@
 # make scan   a simulated scan: cloud, picture, error against the truth
+# make report the paper's experiments again: report/index.html
 # make test   every test
 # make check  lint, types, import contracts
 #
@@ -39,7 +40,7 @@ INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/*
 # numba sees changes of a file, not of what the file imports: its cache goes when a kernel changes.
 KERNELS := $(shell grep -rl --include='*.py' 'import.*njit' eschorty_ros)
 
-.PHONY: help setup scan test check lint format types contracts clean
+.PHONY: help setup scan report test check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -48,6 +49,9 @@ setup: $(SETUP)
 
 scan: $(SETUP) $(BUILD)/kernels.stamp
 	@$(ENTER) eschorty scan --out scan $(SCAN)
+
+report: $(SETUP) $(BUILD)/kernels.stamp
+	@$(ENTER) eschorty report --out report $(REPORT)
 
 test: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)

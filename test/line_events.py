@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Encoder, sort_readout
+from eschorty_ros.core.profiles import Profiles
 
 Rows = Callable[[int, NDArray[np.int64]], NDArray[np.float64]]
 
@@ -72,3 +73,11 @@ def encoded(
     return Encoder().encode(
         t, x, y, p, trigger_t=triggers_us, trigger_edge=np.ones(len(triggers_us), np.uint8)
     )
+
+
+def blank_profiles(size: int, **values: NDArray[np.generic]) -> Profiles:
+    """Points whose fields are 0 unless given."""
+    blank = Profiles.empty()
+    kinds = {name: getattr(blank, name) for name in Profiles.__slots__}
+    zeros = {name: np.zeros(size, kind.dtype) for name, kind in kinds.items() if kind is not None}
+    return Profiles(**{**zeros, **values})

@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
 from eschorty_ros.core.files import atomic_write
 from eschorty_ros.report.experiment import Finding
 from eschorty_ros.report.sections import Section
@@ -48,8 +51,6 @@ def write_page(
 
 def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0) -> str:
     """Text of the page; parameters as in `write_page`."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     environment = Environment(
         loader=PackageLoader("eschorty_ros.report", "."),
         autoescape=True,
@@ -58,7 +59,7 @@ def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": number, "band": band}
+    environment.filters |= {"number": number, "band": band, "breakable": breakable}
     return environment.get_template("page.html.jinja").render(
         title=TITLE,
         sections=sections,
@@ -92,6 +93,11 @@ def number(value: float | int | str) -> str:
     else:
         text = f"{value:.4g}"
     return text
+
+
+def breakable(name: str) -> Markup:
+    """Name that may wrap after each underscore."""
+    return Markup("_<wbr>").join(name.split("_"))
 
 
 def band(finding: Finding) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -12,10 +12,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from line_events import encoded, line_events
 
-from eschorty_ros.core import reconstructor as reconstructor_module
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.evt3 import Decoder, Encoder, sort_readout
+from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import (
     Profiles,
@@ -247,35 +246,6 @@ def test_no_phase_is_said():
     assert reconstructor.phase_missing
     assert reconstructor.counters["events_binned"] == n
     assert len(found) == 0
-
-
-class LateDecoder(Decoder):
-    """A camera that has been on for 54 years."""
-
-    shift_us = 1_700_000_000_000_000
-
-    @property
-    def time_us(self):
-        now = super().time_us
-        return None if now is None else now + self.shift_us
-
-    def decode(self, data):
-        events = super().decode(data)
-        return replace(events, t=events.t + self.shift_us)
-
-
-def test_long_time_stamps_give_the_same_profiles(monkeypatch):
-    rng = np.random.default_rng(SEED)
-    data = encoded(line_events(rng, flat, frequency_hz=69.99731, periods=6, columns=200))
-    near, _ = run(data, Modulation(69.99731, on_edge_us=1000))
-    monkeypatch.setattr(reconstructor_module, "Decoder", LateDecoder)
-    shift = LateDecoder.shift_us
-    far, _ = run(data, Modulation(69.99731, on_edge_us=1000 + shift))
-    np.testing.assert_array_equal(near.row, far.row)
-    np.testing.assert_array_equal(near.t_us + shift, far.t_us)
-    np.testing.assert_array_equal(near.edge_us + shift, far.edge_us)
-    old_edge, _ = run(data, Modulation(69.99731, on_edge_us=1000))
-    assert (old_edge.t_us >= old_edge.edge_us).all()
 
 
 def test_time_wrap_of_the_sensor_inside_a_period():

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from line_events import blank_profiles
 
 from eschorty_ros.core.calibration import BUILDS, load_calibration
 from eschorty_ros.core.cloud import POINT_DTYPE
 from eschorty_ros.core.optics import RangeModel, depth_of_field_mm
-from eschorty_ros.core.profiles import Profiles, place
+from eschorty_ros.core.profiles import place
 
 ROWS = np.arange(720)
 POLE_DISTANCES_PX = np.array([1e-12, 1e-9, 1e-6, 1e-3, 0.5, 0.999999])
@@ -108,11 +109,8 @@ def test_case_19_points_are_rounded_to_float32_once(range_mm, limit_um, measured
     ranges = range_mm - np.linspace(0.0, 1.0, 4001)
     n = ranges.size
     t_us = 1_760_000_000_000_000 + np.arange(n)
-    profiles = Profiles.empty().select(np.zeros(0, int))
-    given = {name: getattr(profiles, name) for name in Profiles.__slots__}
-    fields = {k: np.zeros(n, v.dtype) for k, v in given.items() if v is not None}
-    fields.update(range_mm=ranges, t_us=t_us)
-    points = place(Profiles(**fields), model("config_3"), 0.0, (0.0, 1.0, 0.0), int(t_us[0]))
+    profiles = blank_profiles(n, range_mm=ranges, t_us=t_us)
+    points = place(profiles, model("config_3"), 0.0, (0.0, 1.0, 0.0), int(t_us[0]))
     error_um = np.abs(points["x"].astype(np.float64) - ranges * 1e-3).max() * 1e6
     measured(f"x at {range_mm / 1000:g} m, um", error_um, limit_um)
     assert POINT_DTYPE["x"] == np.dtype("<f4")
