@@ -9,8 +9,6 @@ from eschorty_ros.core import _binning as binning
 from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core.centroid import check_method, half_width_fixed, method_factor
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.evt3 import Events
-from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.phase_gate import gate_parameters
@@ -79,8 +77,10 @@ class ProfileAssembler:
 
     def merge(
         self,
-        events: Events | HeldEvents,
-        part: slice,
+        t: NDArray[np.int64],
+        x: NDArray[np.uint16],
+        y: NDArray[np.uint16],
+        p: NDArray[np.uint8],
         edges: NDArray[np.int64],
         indices: NDArray[np.int64],
         first_edge: int,
@@ -90,10 +90,8 @@ class ProfileAssembler:
 
         Parameters
         ----------
-        events : Events or HeldEvents
-            In time order.
-        part : slice
-            Those of them that are meant.
+        t, x, y, p : int64, uint16, uint16, uint8, equal length
+            Events in time order.
         edges, indices : int64, equal length
             Times and numbers of the periods' beginnings; those before ``first_edge`` are done.
         drain : bool
@@ -107,7 +105,6 @@ class ProfileAssembler:
         out = (
             *self._whole_out, self._column_out, *self._row_out, self._events_out, self._return_out,
         )  # fmt: skip
-        t, x, y, p = events.t[part], events.x[part], events.y[part], events.p[part]
         first, edge, stop = 0, first_edge, len(t)
         while True:
             first, edge = binning._bin(
@@ -122,8 +119,10 @@ class ProfileAssembler:
     def close(self) -> None:
         """Close the open period if it holds events; it stays open for further ones."""
         if self._state[binning.S_OPEN] == 2:
+            none = np.empty(0, dtype=np.int64)
+            nowhere = np.empty(0, dtype=np.uint16)
             edge, index = self._state[[binning.S_EDGE]], self._state[[binning.S_INDEX]]
-            self.merge(HeldEvents(), slice(0, 0), edge, index, 0, True)
+            self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, index, 0, True)
 
     def take(self) -> Profiles:
         """Points of the periods closed since the last call."""

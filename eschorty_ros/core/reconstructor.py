@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core.calibration import Calibration
@@ -60,7 +61,7 @@ class Reconstructor:
             else None
         )
         self._assembler = ProfileAssembler(settings, self.model)
-        self._finisher = Finisher(settings, self.model)
+        self._finisher = Finisher(settings)
         self._held = HeldEvents()
         self._counts: dict[str, int] = dict.fromkeys(
             ("events", "events_filtered", "events_outside_phase"), 0
@@ -81,7 +82,6 @@ class Reconstructor:
             )
         self._modulation = modulation
         self._schedule = EdgeSchedule(modulation, self.settings.periods_per_profile)
-        self._finisher.restart(modulation, self._assembler.take())
         self._assembler.restart(modulation)
         self.phase: PhaseEstimate | None = None
         self._phase_missing = False
@@ -117,7 +117,6 @@ class Reconstructor:
         counts.update(bins)
         counts["points"] = self._assembler.points
         counts["points_beyond_pole"] = self._assembler.points_beyond_pole
-        counts["columns_compensated"] = self._finisher.columns_compensated
         counts["events_held"] = len(self._held)
         counts["events_dropped"] = (
             counts["events_over_column_limit"]
@@ -157,8 +156,7 @@ class Reconstructor:
         ``phase_missing`` is set.
         """
         self._drain()
-        done = self._finisher.push(self._assembler.take())
-        return Profiles.concatenate([done, self._finisher.flush()])
+        return self._finisher.push(self._assembler.take())
 
     def note_gap(self) -> None:
         """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""
@@ -261,18 +259,36 @@ class Reconstructor:
             if events is not None and not waiting:
                 last = max(int(np.searchsorted(events.t, safe_us)), first)
             if stop:
-                edge = self._assembler.merge(
-                    held, slice(0, stop), edges, indices, edge, last <= first
-                )
+                edge = self._merge(held, slice(0, stop), edges, indices, edge, last <= first)
                 held.drop(stop)
             if events is not None and last > first:
                 new = slice(first, last)
-                edge = self._assembler.merge(events, new, edges, indices, edge, True)
+                edge = self._merge(events, new, edges, indices, edge, True)
                 first = last
             if edge < len(edges):
-                self._assembler.merge(held, slice(0, 0), edges, indices, edge, True)
+                self._merge(held, slice(0, 0), edges, indices, edge, True)
         if events is not None and first < count:
             held.append(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
+
+    def _merge(
+        self,
+        source: Events | HeldEvents,
+        part: slice,
+        edges: NDArray[np.int64],
+        indices: NDArray[np.int64],
+        edge: int,
+        drain: bool,
+    ) -> int:
+        return self._assembler.merge(
+            source.t[part],
+            source.x[part],
+            source.y[part],
+            source.p[part],
+            edges,
+            indices,
+            edge,
+            drain,
+        )
 
     def _drain(self) -> None:
         if self._schedule.anchored or self._find_phase(_FLUSH_US, last=True):
