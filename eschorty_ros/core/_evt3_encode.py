@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core._checks import whole
 from eschorty_ros.core._evt3_encode_kernels import NONE, T_US, _encode, _first_fall, _put_time
 from eschorty_ros.core.errors import ArgumentError
 
@@ -38,8 +39,7 @@ class Encoder:
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
         for name, size in (("width", width), ("height", height)):
-            if not 1 <= size <= 2048:
-                raise ArgumentError(f"{name} is {size!r}; choose 1 to 2048 pixels")
+            whole(name, size, 1, 2048)
         self.width = int(width)
         self.height = int(height)
         self._state = np.full(6, NONE, dtype=np.int64)
@@ -125,6 +125,7 @@ class Encoder:
         ArgumentError
             When ``t_us`` lies before the time the stream has reached, or more than an hour after.
         """
+        whole("t_us", t_us, 0, (1 << 62) - 1)
         self._refuse_fall("t_us", _checked("t_us", [t_us], np.int64, 1 << 62))
         words = np.empty(self._high_words(t_us, t_us) + 1, dtype="<u2")
         n = _put_time(t_us, True, self._state, words, 0)
@@ -156,7 +157,7 @@ def _or_none(values: ArrayLike | None) -> ArrayLike:
 def _checked(name: str, values: ArrayLike, dtype: Any, limit: int) -> NDArray[Any]:
     """``values`` as a contiguous vector of ``dtype``, each in 0..limit-1."""
     array = np.asarray(values)
-    if array.size == 0:
+    if array.size == 0 and array.ndim == 1:
         return np.empty(0, dtype=dtype)
     if array.ndim != 1 or array.dtype.kind not in "iub":
         raise ArgumentError(

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from pydantic import Field, field_validator, model_validator
 
+from eschorty_ros.core._checks import file_path
 from eschorty_ros.core.errors import CalibrationError
 from eschorty_ros.core.files import atomic_write
 from eschorty_ros.core.optics import (
@@ -192,7 +193,7 @@ def _is_bare_name(text: str) -> bool:
 
 
 def _find(name_or_path: str | os.PathLike[str]) -> Path:
-    text = os.fspath(name_or_path)
+    text = os.fspath(file_path("name_or_path", name_or_path))
     if not _is_bare_name(text):
         return Path(text)
     for folder in config_folders():

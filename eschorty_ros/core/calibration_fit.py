@@ -20,7 +20,7 @@ from eschorty_ros.core._calibration_solvers import (
     search,
     straight_line,
 )
-from eschorty_ros.core._checks import vector
+from eschorty_ros.core._checks import positive, reals, vector
 from eschorty_ros.core._least_squares import condition_number, covariance
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import RangeModel
@@ -78,11 +78,12 @@ class CalibrationFit:
     def range_sigma_mm(self, range_mm: ArrayLike) -> Array:
         """One-sigma error of a range, mm, that the fit's own uncertainty causes; any shape."""
         model = self.model
-        depth = np.asarray(range_mm, dtype=np.float64) + model.b_mm
+        depth = reals("range_mm", range_mm) + model.b_mm
         depth = np.where(depth > 0.0, depth, np.nan)
-        rows_per_mm = -model.product_mm_px / (depth * depth)
-        slope = row_jacobian(model, depth, self.free) / rows_per_mm[..., None]
-        return np.asarray(np.sqrt(np.einsum("...i,ij,...j", slope, self.covariance, slope)))
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            mm_per_row = depth * depth / -model.product_mm_px
+            slope = row_jacobian(model, depth, self.free) * mm_per_row[..., None]
+            return np.asarray(np.sqrt(np.einsum("...i,ij,...j", slope, self.covariance, slope)))
 
 
 def fit_targets(
@@ -137,8 +138,8 @@ def fit_targets(
             f"row has {rows.size} entries and range_mm {ranges.size}; give one row per range"
         )
     _check_targets(rows, ranges, design)
-    names, priors = _checked_free(free), dict(prior_sigma or {})
-    _check_priors(priors, names)
+    names = _checked_free(free)
+    priors = _checked_priors(prior_sigma, names)
     sigma_row = _spread("sigma_row_px", sigma_row_px, rows.size, zero_allowed=False)
     sigma_range = _spread("sigma_range_mm", sigma_range_mm, rows.size, zero_allowed=True)
     model = design
@@ -230,22 +231,29 @@ def _check_targets(rows: Array, ranges: Array, design: RangeModel) -> None:
 
 
 def _checked_free(free: Sequence[str]) -> tuple[str, ...]:
-    names = (free,) if isinstance(free, str) else tuple(free)
-    if not names or len(set(names)) != len(names) or not set(names) <= set(PARAMETERS):
+    names = tuple(free) if isinstance(free, list | tuple) else (free,)
+    known = all(isinstance(name, str) and name in PARAMETERS for name in names)
+    if not (names and known and len(set(names)) == len(names)):
         raise ArgumentError(f"free is {free!r}; name each once, of {', '.join(PARAMETERS)}")
     return names
 
 
-def _check_priors(priors: Mapping[str, float], names: tuple[str, ...]) -> None:
+def _checked_priors(
+    prior_sigma: Mapping[str, float] | None, names: tuple[str, ...]
+) -> dict[str, float]:
+    if not isinstance(prior_sigma, Mapping | None):
+        raise ArgumentError(f"prior_sigma is {prior_sigma!r}; give a number for each name")
+    priors = dict(prior_sigma or {})
     for name, spread in priors.items():
         if name not in names:
             raise ArgumentError(f"prior_sigma names {name!r}; free is {', '.join(names)}")
-        if not 0.0 < spread < math.inf:
-            raise ArgumentError(f"prior_sigma of {name} is {spread!r}; choose a positive number")
+        positive(f"prior_sigma of {name}", spread)
+    return priors
 
 
 def _spread(name: str, value: ArrayLike, size: int, *, zero_allowed: bool) -> Array:
-    array = vector(name, np.broadcast_to(value, size) if np.ndim(value) == 0 else value)
+    given = reals(name, value)
+    array = vector(name, np.broadcast_to(given, size) if given.ndim == 0 else given)
     if array.size != size:
         raise ArgumentError(f"{name} has {array.size} entries; give one or {size}")
     wrong = array < 0.0 if zero_allowed else array <= 0.0

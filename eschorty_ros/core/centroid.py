@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core import _centroid_kernels as kernels
+from eschorty_ros.core._checks import number, positive, whole
 from eschorty_ros.core.errors import ArgumentError
 
 METHODS = ("mode_mean", "mean", "median")
@@ -20,6 +21,7 @@ HALF_WIDTH_PER_FWHM = 1.3
 FWHM_PER_SIGMA = 2.3548200450309493
 SIGMA_FACTOR = 0.24
 SIGMA_FLOOR_PX = 0.20
+SIGMA_LIMIT = 1e6
 # The median of independent Gaussian samples scatters sqrt(pi/2) times as much as their mean.
 _MEDIAN_FACTOR = 1.2533141373155003
 
@@ -55,17 +57,20 @@ class Centroids:
 
 def half_width_fixed(fwhm_px: float) -> int:
     """Half width of the averaging window for a line of ``fwhm_px``, fixed point."""
+    positive("fwhm_px", fwhm_px)
     return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * kernels.FRACTION), 3 * kernels.FRACTION)
 
 
 def method_factor(method: str, sigma_factor: float = SIGMA_FACTOR) -> float:
     """Factor on s/sqrt(N) for ``method``."""
+    check_method(method)
+    number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT)
     return sigma_factor * (_MEDIAN_FACTOR if method == "median" else 1.0)
 
 
 def check_method(method: str) -> int:
     """Code of ``method`` for the kernels; raises ``ArgumentError`` when there is none."""
-    if method not in METHOD_CODES:
+    if not isinstance(method, str) or method not in METHOD_CODES:
         raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(METHODS)}")
     return METHOD_CODES[method]
 
@@ -123,10 +128,10 @@ def estimate(
     code = check_method(method)
     row_array = _checked_rows(rows, height)
     offset_array = _checked_offsets(offsets, row_array.size)
-    if not 0.5 <= line_width_px <= height:
+    if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
-    if events_min < 1:
-        raise ArgumentError(f"events_min is {events_min!r}; choose 1 or more")
+    whole("events_min", events_min, 1, 1 << 31)
+    number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT)
     columns = offset_array.size - 1
     longest = int(np.diff(offset_array).max(initial=0))
     scratch = np.empty(longest + kernels.BLOCK, dtype=np.uint32)
@@ -162,8 +167,7 @@ def estimate(
 
 
 def _checked_rows(rows: ArrayLike, height: int) -> NDArray[np.uint32]:
-    if not 1 <= height <= kernels.ROW_LAST + 1:
-        raise ArgumentError(f"height is {height!r}; choose 1 to {kernels.ROW_LAST + 1} rows")
+    whole("height", height, 1, kernels.ROW_LAST + 1)
     array = np.asarray(rows)
     if array.ndim != 1 or (array.size and not np.issubdtype(array.dtype, np.integer)):
         raise ArgumentError(

@@ -8,11 +8,13 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core._checks import TIME_LIMIT, reals, times, whole
 from eschorty_ros.core.errors import ArgumentError
 
 NM_PER_MM = 1_000_000
 NS_PER_US = 1_000
 POSITION_LIMIT_MM = 1e9
+_T_US_LIMIT = TIME_LIMIT // NS_PER_US
 
 
 def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np.int64]:
@@ -27,7 +29,7 @@ def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np
     ArgumentError
         When a position is not finite or farther than 1e9 mm.
     """
-    position = np.asarray(position_mm, dtype=np.float64)
+    position = reals(name, position_mm)
     wrong = ~(np.abs(position) <= POSITION_LIMIT_MM)
     if wrong.any():
         raise ArgumentError(
@@ -52,8 +54,8 @@ class StageTrack:
     """
 
     def __init__(self, max_gap_us: int | None = None) -> None:
-        if max_gap_us is not None and max_gap_us <= 0:
-            raise ArgumentError(f"max_gap_us is {max_gap_us!r}; choose a positive time or None")
+        if max_gap_us is not None:
+            whole("max_gap_us", max_gap_us, 1, TIME_LIMIT)
         self.max_gap_us = max_gap_us
         self.dropped = 0
         self._t_us = np.empty(256, np.int64)
@@ -90,18 +92,18 @@ class StageTrack:
         ArgumentError
             For fractional times, unequal lengths or positions that are not finite.
         """
-        times = np.atleast_1d(_whole_us(t_us))
+        at_us = np.atleast_1d(times("t_us", t_us))
         positions = np.atleast_1d(quantise_nm(position_mm))
-        if times.ndim != 1 or times.shape != positions.shape:
+        if at_us.ndim != 1 or at_us.shape != positions.shape:
             raise ArgumentError(
-                f"t_us has shape {times.shape} and position_mm {positions.shape}; "
+                f"t_us has shape {at_us.shape} and position_mm {positions.shape}; "
                 "give one position for each time"
             )
         floor = np.iinfo(np.int64).min if self.last_us is None else self.last_us
-        newest_before = np.maximum.accumulate(np.concatenate(([floor], times)))[:-1]
-        later = times > newest_before
+        newest_before = np.maximum.accumulate(np.concatenate(([floor], at_us)))[:-1]
+        later = at_us > newest_before
         self.dropped += int(later.size - np.count_nonzero(later))
-        self._extend(times[later], positions[later])
+        self._extend(at_us[later], positions[later])
 
     def position_mm(self, t_us: ArrayLike) -> NDArray[np.float64]:
         """Stage position at sensor times.
@@ -116,23 +118,24 @@ class StageTrack:
         ndarray of float64, shape of ``t_us``
             mm; NaN outside the samples and inside a gap longer than ``max_gap_us``.
         """
-        query = _whole_us(t_us)
-        times, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
-        if times.size == 0:
+        query = times("t_us", t_us)
+        held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
+        if held.size == 0:
             return np.full(query.shape, np.nan)
-        left = np.clip(np.searchsorted(times, query, side="right") - 1, 0, times.size - 1)
-        right = np.minimum(left + 1, times.size - 1)
-        since = query - times[left]
-        gap = times[right] - times[left]
+        left = np.clip(np.searchsorted(held, query, side="right") - 1, 0, held.size - 1)
+        right = np.minimum(left + 1, held.size - 1)
+        since = query - held[left]
+        gap = held[right] - held[left]
         step_nm = (nm[right] - nm[left]).astype(np.float64)
         position = (nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM
-        unknown = (since < 0) | (since > gap)
+        unknown = (query < held[left]) | (query > held[right])
         if self.max_gap_us is not None:
             unknown |= (gap > self.max_gap_us) & (since > 0)
         return np.where(unknown, np.nan, position)
 
     def forget_before(self, t_us: int) -> None:
         """Release samples that no query at ``t_us`` or later needs."""
+        whole("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
         held = self._t_us[self._begin : self._end]
         self._begin += max(int(np.searchsorted(held, t_us, side="right")) - 1, 0)
 
@@ -181,8 +184,9 @@ class SensorClock:
     """
 
     def __init__(self, zero_ns: int | None = None, window_ns: int = 10_000_000_000) -> None:
-        if window_ns <= 0:
-            raise ArgumentError(f"window_ns is {window_ns!r}; choose a positive time")
+        whole("window_ns", window_ns, 1, TIME_LIMIT)
+        if zero_ns is not None:
+            whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT)
         self._announced = zero_ns is not None
         self._zero_ns = zero_ns
         self._window_ns = window_ns
@@ -198,7 +202,8 @@ class SensorClock:
 
     def observe(self, t_us: int, arrival_ns: int) -> None:
         """Take note that the event of sensor time ``t_us`` arrived at ROS time ``arrival_ns``."""
-        t_us, arrival_ns = int(t_us), int(arrival_ns)
+        t_us = whole("t_us", t_us, -_T_US_LIMIT, _T_US_LIMIT)
+        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         if not self._announced:
             self._estimate(t_us, arrival_ns)
         self._last = (t_us, arrival_ns)
@@ -212,8 +217,8 @@ class SensorClock:
         """ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         zero = self._known_zero()
         if isinstance(t_us, np.ndarray):
-            return _whole_us(t_us) * NS_PER_US + zero
-        return int(t_us) * NS_PER_US + zero
+            return _within("t_us", t_us, _T_US_LIMIT) * NS_PER_US + zero
+        return whole("t_us", t_us, -_T_US_LIMIT, _T_US_LIMIT) * NS_PER_US + zero
 
     @overload
     def to_us(self, t_ns: int) -> int: ...
@@ -223,8 +228,9 @@ class SensorClock:
         """Sensor time (us, nearest, halves up) of ROS time ``t_ns``; undoes :meth:`to_ns`."""
         zero = self._known_zero()
         if isinstance(t_ns, np.ndarray):
-            return (_whole_us(t_ns) - zero + NS_PER_US // 2) // NS_PER_US
-        return (int(t_ns) - zero + NS_PER_US // 2) // NS_PER_US
+            return (_within("t_ns", t_ns, TIME_LIMIT) - zero + NS_PER_US // 2) // NS_PER_US
+        t_ns = whole("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT)
+        return (t_ns - zero + NS_PER_US // 2) // NS_PER_US
 
     def _known_zero(self) -> int:
         if self._zero_ns is None:
@@ -246,9 +252,10 @@ class SensorClock:
         self._zero_ns = self._candidates[0][1]
 
 
-def _whole_us(times: ArrayLike) -> NDArray[np.int64]:
-    """Return int64 times; fractional input is refused, since floats lose microseconds."""
-    array = np.asarray(times)
-    if array.size and array.dtype.kind not in "iu":
-        raise ArgumentError(f"times have dtype {array.dtype}; give integers")
-    return array.astype(np.int64, copy=False)
+def _within(name: str, values: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
+    """Refuse times that would leave 64 bits when they are converted."""
+    checked = times(name, values)
+    wrong = (checked > limit) | (checked < -limit)
+    if wrong.any():
+        raise ArgumentError(f"{name} holds {checked[wrong].flat[0]}; choose within {limit}")
+    return checked

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core._checks import file_path, short
 from eschorty_ros.core.errors import ArgumentError, FormatError
 from eschorty_ros.core.files import atomic_write
 
@@ -53,7 +54,9 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
     ArgumentError
         For another extension, another dtype or shape, or a path that cannot be written.
     """
-    header = _header_writer(Path(path))
+    header = _header_writer(file_path("path", path))
+    if not isinstance(points, np.ndarray):
+        raise ArgumentError(f"points is {short(points)}; give an array of POINT_DTYPE")
     if points.dtype not in _DTYPES or points.ndim != 1:
         raise ArgumentError(
             f"points has dtype {points.dtype} and shape {points.shape}; give a one-dimensional "
@@ -78,7 +81,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
     FormatError
         When the file is missing, truncated, too long, or holds other fields.
     """
-    source = Path(path)
+    source = file_path("path", path)
     header = _header_writer(source)
     try:
         data = source.read_bytes()
@@ -110,8 +113,15 @@ def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     parts : sequence of structured arrays, at least one
         The fields of each begin with those of every shorter one.
     """
+    known = isinstance(parts, list | tuple) and len(parts) > 0
+    if not known or not all(_is_points(part) for part in parts):
+        raise ArgumentError(f"parts is {short(parts)}; give a list of arrays of points")
     widest = max((part.dtype for part in parts), key=lambda kind: kind.itemsize)
     return np.concatenate([_widened(part, widest) for part in parts])
+
+
+def _is_points(part: Any) -> bool:
+    return isinstance(part, np.ndarray) and part.ndim == 1 and part.dtype.names is not None
 
 
 def _widened(points: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:

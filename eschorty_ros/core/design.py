@@ -13,10 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from eschorty_ros.core._checks import number, positive, reals, whole
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import (
     COLUMNS,
     PIXEL_UM,
+    PIXELS_MAX,
     ROWS,
     Array,
     RangeModel,
@@ -124,10 +126,11 @@ class Design:
 
     def at(self, range_mm: ArrayLike) -> DesignTable:
         """Tabulate the build at ranges (mm, any shape)."""
-        ranges = np.asarray(range_mm, dtype=np.float64)
+        ranges = reals("range_mm", range_mm)
         row = self.model.row(ranges)
         magnification = self.model.magnification(row)
-        pitch_mm = self.model.pixel_um * 1e-3 / magnification
+        with np.errstate(divide="ignore"):
+            pitch_mm = self.model.pixel_um * 1e-3 / magnification
         return DesignTable(
             range_mm=ranges,
             row=row,
@@ -184,6 +187,7 @@ def design(
         When a value is out of its range or a choice is not made exactly once.
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
+    whole("columns", columns, 1, PIXELS_MAX)
     tilt_deg = _sensor_tilt_deg(focal_length_mm, theta_deg, theta_prime_deg, baseline_mm)
     k_mm = object_scale_mm(focal_length_mm, theta_deg)
     k_prime_px = -focal_length_mm / (pixel_um * 1e-3 * math.sin(math.radians(abs(tilt_deg))))
@@ -230,11 +234,10 @@ def design_for_ranges(
         When ``0 < near + b < far + b`` does not hold or no sensor tilt reaches both ranges.
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
+    whole("rows", rows, 2, PIXELS_MAX)
     near, far = _depth("near_mm", near_mm, b_mm), _depth("far_mm", far_mm, b_mm)
     if not near < far:
         raise ArgumentError(f"far_mm is {far_mm!r}; choose more than near_mm = {near_mm!r}")
-    if rows < 2:
-        raise ArgumentError(f"rows is {rows!r}; choose 2 or more")
     product_mm_px = -(rows - 1) * near * far / (far - near)
     k_prime_px = product_mm_px / object_scale_mm(focal_length_mm, theta_deg)
     sine = -focal_length_mm / (pixel_um * 1e-3 * k_prime_px)
@@ -263,9 +266,8 @@ def _cot(angle_deg: float) -> float:
 def _check_lens(focal_length_mm: float, f_number: float, theta_deg: float, pixel_um: float) -> None:
     named = {"focal_length_mm": focal_length_mm, "f_number": f_number, "pixel_um": pixel_um}
     for name, value in named.items():
-        if not 0.0 < value < math.inf:
-            raise ArgumentError(f"{name} is {value!r}; choose a positive value")
-    if not 0.0 < theta_deg <= 90.0:
+        positive(name, value)
+    if not 0.0 < number("theta_deg", theta_deg) <= 90.0:
         raise ArgumentError(f"theta_deg is {theta_deg!r}; choose above 0 up to 90 degrees")
 
 
@@ -278,14 +280,14 @@ def _sensor_tilt_deg(
             "give exactly one of them"
         )
     if tilt_deg is not None:
-        if not 0.0 < abs(tilt_deg) < 90.0:
+        if not 1e-6 < abs(number("theta_prime_deg", tilt_deg)) < 90.0:
             raise ArgumentError(
                 f"theta_prime_deg is {tilt_deg!r}; choose 0 to 90 degrees of either sign, "
                 "without the ends"
             )
         return tilt_deg
     assert baseline_mm is not None
-    cotangent = baseline_mm / focal_length_mm - _cot(theta_deg)
+    cotangent = number("baseline_mm", baseline_mm) / focal_length_mm - _cot(theta_deg)
     if not 0.0 < cotangent < math.inf:
         raise ArgumentError(
             f"baseline_mm is {baseline_mm!r}; choose more than f cot(theta) = "
@@ -295,7 +297,6 @@ def _sensor_tilt_deg(
 
 
 def _depth(name: str, range_mm: float | None, b_mm: float) -> float:
-    assert range_mm is not None
-    if not 0.0 < range_mm + b_mm < math.inf:
+    if not 1e-6 < number(name, range_mm) + number("b_mm", b_mm) < math.inf:
         raise ArgumentError(f"{name} is {range_mm!r}; choose a range beyond -b_mm = {-b_mm:g} mm")
-    return range_mm + b_mm
+    return float(range_mm or 0.0) + b_mm

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core import _evt3_words as w3
+from eschorty_ros.core._checks import octets, whole
 from eschorty_ros.core._evt3_decode import _decode
 from eschorty_ros.core._evt3_encode import Encoder, sort_readout
 from eschorty_ros.core._evt3_rare import _bounds
 from eschorty_ros.core._evt3_words import Counters
-from eschorty_ros.core.errors import ArgumentError
 
 __all__ = [
     "EVENT_DTYPE",
@@ -99,8 +99,7 @@ class Decoder:
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
         for name, size in (("width", width), ("height", height)):
-            if not 1 <= size <= _MAX_SIZE:
-                raise ArgumentError(f"{name} is {size!r}; choose 1 to {_MAX_SIZE} pixels")
+            whole(name, size, 1, _MAX_SIZE)
         self.width = int(width)
         self.height = int(height)
         self._events = event_arrays(0)
@@ -175,12 +174,12 @@ class Decoder:
 
     def _words(self, data: Bytes) -> NDArray[np.uint16]:
         """Whole words of the carried byte and ``data``; an odd last byte is carried on."""
-        octets = np.frombuffer(data, dtype=np.uint8)
+        stream = np.frombuffer(octets("data", data), dtype=np.uint8)
         if self._odd:
-            octets = np.frombuffer(self._odd + octets.tobytes(), dtype=np.uint8)
-        whole = octets.size & ~1
-        self._odd = octets[whole:].tobytes()
-        words = octets[:whole].view("<u2")
+            stream = np.frombuffer(self._odd + stream.tobytes(), dtype=np.uint8)
+        even = stream.size & ~1
+        self._odd = stream[even:].tobytes()
+        words = stream[:even].view("<u2")
         return words if words.flags.aligned else words.copy()
 
 
@@ -188,6 +187,7 @@ def event_arrays(
     size: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]:
     """Uninitialised t, x, y, p of ``size`` events."""
+    whole("size", size, 0, 1 << 32)
     return (
         np.empty(size, dtype=np.int64),
         np.empty(size, dtype=np.uint16),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import BinaryIO
 
+from eschorty_ros.core._checks import file_path
 from eschorty_ros.core.errors import ArgumentError
 
 
@@ -20,7 +20,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     ArgumentError
         When the file cannot be written; names the path and the reason.
     """
-    target = Path(path)
+    target = file_path("path", path)
+    if not target.name:
+        raise ArgumentError(f"cannot write {target}; give the name of a file")
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         with partial.open("wb") as stream:

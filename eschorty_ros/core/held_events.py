@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core._checks import exact, whole
+
 
 class HeldEvents:
     """A growing queue of events in time order.
@@ -57,7 +59,9 @@ class HeldEvents:
         p: NDArray[np.uint8],
     ) -> None:
         """Copy events to the end."""
-        count = len(t)
+        count = exact("t", t, np.int64).size
+        x, y = exact("x", x, np.uint16, count), exact("y", y, np.uint16, count)
+        p = exact("p", p, np.uint8, count)
         if self._end + count > len(self._t):
             self._make_room(count)
         new = slice(self._end, self._end + count)
@@ -66,6 +70,7 @@ class HeldEvents:
 
     def drop(self, count: int) -> None:
         """Forget the first ``count`` events."""
+        whole("count", count, 0, len(self))
         self._first += count
         self.refused = max(self.refused - count, 0)
         if self._first == self._end:

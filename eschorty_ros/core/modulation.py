@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 
+from eschorty_ros.core._checks import TIME_LIMIT, number, whole
 from eschorty_ros.core.errors import ArgumentError
 
 WAVEFORMS = ("square", "sine")
@@ -38,13 +39,16 @@ class Modulation:
     on_edge_us: int | None = None
 
     def __post_init__(self) -> None:
-        if not FREQUENCY_MIN_HZ <= self.frequency_hz <= FREQUENCY_MAX_HZ:
+        number("duty", self.duty)
+        if not FREQUENCY_MIN_HZ <= number("frequency_hz", self.frequency_hz) <= FREQUENCY_MAX_HZ:
             raise ArgumentError(
                 f"frequency_hz is {self.frequency_hz!r}; "
                 f"choose {FREQUENCY_MIN_HZ:g} to {FREQUENCY_MAX_HZ:g} Hz"
             )
         if not 0.0 < self.duty < 1.0:
             raise ArgumentError(f"duty is {self.duty!r}; choose a value between 0 and 1")
+        if self.on_edge_us is not None:
+            whole("on_edge_us", self.on_edge_us, -TIME_LIMIT, TIME_LIMIT)
         if self.waveform not in WAVEFORMS:
             raise ArgumentError(
                 f"waveform is {self.waveform!r}; choose one of {', '.join(WAVEFORMS)}"
@@ -62,4 +66,5 @@ class Modulation:
         """
         if self.on_edge_us is None:
             raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")
+        whole("index", index, -TIME_LIMIT, TIME_LIMIT)
         return self.on_edge_us + round(index * 1_000_000 / Fraction(self.frequency_hz))

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core._checks import TIME_LIMIT, number, positive, times, vector, whole
+from eschorty_ros.core.clock import POSITION_LIMIT_MM
 from eschorty_ros.core.errors import ArgumentError
 
 
@@ -36,16 +38,20 @@ class MotionPlan:
     accelerations_mm_s2: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        whole("start_ns", self.start_ns, -TIME_LIMIT, TIME_LIMIT)
+        for name in ("position_mm", "velocity_mm_s"):
+            number(name, getattr(self, name))
+        for name in ("durations_s", "accelerations_mm_s2"):
+            vector(name, getattr(self, name))
         if len(self.durations_s) != len(self.accelerations_mm_s2):
             raise ArgumentError(
                 f"durations_s has {len(self.durations_s)} pieces and accelerations_mm_s2 "
                 f"{len(self.accelerations_mm_s2)}; give one acceleration per duration"
             )
-        numbers = (self.position_mm, self.velocity_mm_s, *self.accelerations_mm_s2)
-        if not all(math.isfinite(number) for number in numbers):
-            raise ArgumentError(f"a plan holds {numbers!r}; give finite numbers")
-        if not all(0.0 <= duration < math.inf for duration in self.durations_s):
+        if not all(duration >= 0.0 for duration in self.durations_s):
             raise ArgumentError(f"durations_s is {self.durations_s!r}; give lengths of 0 or more")
+        if not math.fsum(self.durations_s) * 1e9 <= TIME_LIMIT:
+            raise ArgumentError(f"durations_s is {self.durations_s!r}; give less than a century")
 
     @property
     def end_ns(self) -> int:
@@ -63,9 +69,10 @@ class MotionPlan:
         Before ``start_ns`` the state at ``start_ns``; from ``end_ns`` on exactly one position and
         velocity 0.
         """
-        times = np.asarray(t_ns, dtype=np.int64)
-        ended = times >= self.end_ns
-        elapsed_s = np.where(ended, np.inf, np.maximum((times - self.start_ns) * 1e-9, 0.0))
+        now_ns = times("t_ns", t_ns)
+        ended = now_ns >= self.end_ns
+        since_ns = np.maximum(now_ns, self.start_ns) - self.start_ns
+        elapsed_s = np.where(ended, np.inf, since_ns * 1e-9)
         position = np.full(elapsed_s.shape, self.position_mm, dtype=np.float64)
         velocity = np.full(elapsed_s.shape, self.velocity_mm_s, dtype=np.float64)
         began_s = 0.0
@@ -95,12 +102,9 @@ def plan_move(
         When speed or acceleration is not positive or a value is not finite.
     """
     for name, place in (("position_mm", position_mm), ("target_mm", target_mm)):
-        if not math.isfinite(place):
-            raise ArgumentError(f"{name} is {place!r}; give a finite position")
-    if not 0.0 < speed_mm_s < math.inf:
-        raise ArgumentError(f"speed_mm_s is {speed_mm_s!r}; choose a positive speed")
-    if not 0.0 < acceleration_mm_s2 < math.inf:
-        raise ArgumentError(f"acceleration_mm_s2 is {acceleration_mm_s2!r}; choose a positive one")
+        number(name, place, -POSITION_LIMIT_MM, POSITION_LIMIT_MM)
+    positive("speed_mm_s", speed_mm_s)
+    positive("acceleration_mm_s2", acceleration_mm_s2)
     distance = abs(target_mm - position_mm)
     sign = math.copysign(1.0, target_mm - position_mm)
     peak = min(speed_mm_s, math.sqrt(distance * acceleration_mm_s2))
@@ -124,8 +128,8 @@ def plan_stop(plan: MotionPlan, at_ns: int, deceleration_mm_s2: float) -> Motion
     ArgumentError
         When the deceleration is not positive.
     """
-    if not 0.0 < deceleration_mm_s2 < math.inf:
-        raise ArgumentError(f"deceleration_mm_s2 is {deceleration_mm_s2!r}; choose a positive one")
+    positive("deceleration_mm_s2", deceleration_mm_s2)
+    whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)
     position, velocity = plan.state(at_ns)
     speed = float(velocity)
     if speed == 0.0:

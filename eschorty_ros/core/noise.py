@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from eschorty_ros.core._checks import exact, whole
 from eschorty_ros.core._noise_kernels import (
     COLUMN_BITS,
     NEVER,
@@ -21,7 +22,6 @@ from eschorty_ros.core._noise_kernels import (
     STARTED,
     _filter,
 )
-from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Events, event_arrays
 
 _WINDOW_MAX_US = 1_000_000
@@ -59,10 +59,8 @@ class ActivityFilter:
 
     def __init__(self, width: int = 1280, height: int = 720, window_us: int = 500) -> None:
         for name, size in (("width", width), ("height", height)):
-            if not 1 <= size <= 2048:
-                raise ArgumentError(f"{name} is {size!r}; choose 1 to 2048 pixels")
-        if not 1 <= window_us <= _WINDOW_MAX_US:
-            raise ArgumentError(f"window_us is {window_us!r}; choose 1 to {_WINDOW_MAX_US} us")
+            whole(name, size, 1, 2048)
+        whole("window_us", window_us, 1, _WINDOW_MAX_US)
         self.width, self.height, self.window_us = int(width), int(height), int(window_us)
         # One cell of border on each side, so that no neighbour needs a check.
         self._pitch = ((self.width + 7) >> COLUMN_BITS) + 2
@@ -83,16 +81,19 @@ class ActivityFilter:
 
     def filter(self, events: Events) -> Events:
         """Supported events of ``events``: views of reused buffers, valid until the next call."""
-        size = len(events)
+        size = exact("t", events.t, np.int64).size
+        columns = exact("x", events.x, np.uint16, size)
+        rows = exact("y", events.y, np.uint16, size)
+        polarities = exact("p", events.p, np.uint8, size)
         if len(self._buffers[0]) < size + 1:
             self._buffers = event_arrays(size + 1)
         if size and not self._state[STARTED]:
             self._state[ORIGIN_US], self._state[STARTED] = events.t[0], 1
         kept, outside = _filter(
-            events.t,
-            events.x,
-            events.y,
-            events.p,
+            np.ascontiguousarray(events.t),
+            columns,
+            rows,
+            polarities,
             self._buffers,
             self._cells,
             self._state,

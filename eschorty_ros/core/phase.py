@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core._checks import TIME_LIMIT, exact, whole, whole_vector
 from eschorty_ros.core._phase_kernels import (
     C_BRIDGED,
     COUNTERS,
@@ -58,6 +59,7 @@ class EdgeSchedule:
     """
 
     def __init__(self, modulation: Modulation, every: int = 1) -> None:
+        whole("every", every, 1, 1 << 31)
         period = 1_000_000 / Fraction(modulation.frequency_hz)
         self.period = period
         self._denominator = period.denominator
@@ -84,7 +86,7 @@ class EdgeSchedule:
 
     def add_triggers(self, t_us: NDArray[np.int64]) -> None:
         """Append rising edges of the trigger input, in time order."""
-        if t_us.size:
+        if exact("t_us", t_us, np.int64).size:
             self._triggers = np.concatenate([self._triggers, t_us])
 
     def anchor(self, edge_us: int, start_us: int) -> None:
@@ -92,6 +94,8 @@ class EdgeSchedule:
 
         With ``every`` > 1 it is the last one whose index is a multiple of it.
         """
+        for name, time_us in (("edge_us", edge_us), ("start_us", start_us)):
+            whole(name, time_us, -TIME_LIMIT, TIME_LIMIT)
         self._state[:] = 0
         self._state[S_ANCHOR] = edge_us
         step = self._step_at(start_us)
@@ -103,7 +107,7 @@ class EdgeSchedule:
 
         Call with the time of the next event to be assigned.
         """
-        target = t_us
+        target = whole("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
         if self._triggers.size:
             target = min(target, int(self._triggers[0]))
         state = self._state
@@ -120,6 +124,7 @@ class EdgeSchedule:
 
     def watermark_after(self, newest_us: int) -> int:
         """Watermark that makes everything up to ``newest_us`` certain, and nothing later."""
+        whole("newest_us", newest_us, -TIME_LIMIT, TIME_LIMIT)
         waits = int(self._state[S_TRIGGERED]) * max((self._step + 1) // TOLERANCE_SHARE, 1)
         return newest_us + 1 + waits
 
@@ -129,6 +134,7 @@ class EdgeSchedule:
         ``safe_us`` is set to the time before which events may be assigned. When ``EDGES_MAX`` edges
         come back there may be more: assign the events, then call again.
         """
+        whole("watermark_us", watermark_us, -TIME_LIMIT, TIME_LIMIT)
         n, used, safe = _schedule(
             self._state,
             self._step,
@@ -214,8 +220,14 @@ def estimate_phase(
     Raises
     ------
     ArgumentError
-        When there are no events.
+        When there are no events, or they are not in time order.
     """
+    t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    fall = np.flatnonzero(np.diff(t_us) < 0)
+    if fall.size:
+        before, after = t_us[fall[0]], t_us[fall[0] + 1]
+        raise ArgumentError(f"t_us goes from {before} to {after}; sort the events by time")
+    polarity = whole_vector("polarity", polarity, np.uint8, 0, 1)
     if t_us.size == 0 or t_us.shape != polarity.shape:
         raise ArgumentError(
             f"t_us has {t_us.size} events and polarity {polarity.size}; give one polarity per event"
@@ -257,6 +269,8 @@ def decide_window(
     A window is a whole number of ``WINDOW_PERIODS`` periods from the first event on, the fewest
     that hold ``WINDOW_EVENTS`` events; only events decide it, not when they arrived.
     """
+    t_us = exact("t_us", t_us, np.int64)
+    whole("watermark_us", watermark_us, -TIME_LIMIT, TIME_LIMIT)
     if t_us.size < WINDOW_EVENTS:
         return None
     span_us = WINDOW_PERIODS * modulation.period_us

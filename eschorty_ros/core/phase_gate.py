@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core import _phase_gate_kernels as kernels
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core._checks import whole
 from eschorty_ros.core.modulation import Modulation
 
 LEAD_US = 200
@@ -40,8 +40,7 @@ def gate_parameters(modulation: Modulation, gate_us: int) -> NDArray[np.float64]
     ArgumentError
         When ``gate_us`` lies outside its range.
     """
-    if not 0 <= gate_us <= GATE_MAX_US:
-        raise ArgumentError(f"gate_us is {gate_us!r}; choose 0 to {GATE_MAX_US} us")
+    whole("gate_us", gate_us, 0, GATE_MAX_US)
     gate = np.zeros(kernels.G_SIZE)
     period_us = modulation.period_us
     length_us = LEAD_US + gate_us

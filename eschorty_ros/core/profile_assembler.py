@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core import _binning as binning
 from eschorty_ros.core import _centroid_kernels as kernels
+from eschorty_ros.core._checks import exact, whole
 from eschorty_ros.core.centroid import check_method, half_width_fixed, method_factor
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
@@ -105,7 +106,12 @@ class ProfileAssembler:
         out = (
             *self._whole_out, self._column_out, *self._row_out, self._events_out, self._return_out,
         )  # fmt: skip
-        first, edge, stop = 0, first_edge, len(t)
+        stop = exact("t", t, np.int64).size
+        t, x = np.ascontiguousarray(t), exact("x", x, np.uint16, stop)
+        y, p = exact("y", y, np.uint16, stop), exact("p", p, np.uint8, stop)
+        edges = exact("edges", edges, np.int64)
+        indices = exact("indices", indices, np.int64, edges.size)
+        first, edge = 0, whole("first_edge", first_edge, 0, edges.size)
         while True:
             first, edge = binning._bin(
                 t, x, y, p, first, stop, edges, indices, edge, len(edges), drain, self._gate,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core._checks import TIME_LIMIT, picked_of, reals, vector, whole
 from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
@@ -94,7 +95,7 @@ class Profiles:
 
     def select(self, mask: ArrayLike) -> Profiles:
         """Pick points by a boolean mask, a slice or an index array."""
-        picked = mask if isinstance(mask, slice) else np.asarray(mask)
+        picked = mask if isinstance(mask, slice) else picked_of("mask", mask, len(self))
         chosen: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(self)}
         for name, values in chosen.items():
             chosen[name] = None if values is None else values[picked]
@@ -128,6 +129,7 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
         the profiles know their reflectance.
     """
     known = profiles.reflectance is not None
+    whole("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
     points = np.zeros(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
     points["x"] = profiles.range_mm * 1e-3
     points["z"] = model.lateral_mm(profiles.column, profiles.range_mm) * 1e-3
@@ -172,13 +174,13 @@ def place(
     ArgumentError
         When the positions do not match the points or the direction is not a unit vector.
     """
-    position = np.asarray(stage_position_mm, dtype=np.float64)
+    position = reals("stage_position_mm", stage_position_mm)
     if position.ndim and position.shape != (len(profiles),):
         raise ArgumentError(
             f"stage_position_mm has shape {position.shape}; give one position for each of the "
             f"{len(profiles)} points"
         )
-    direction = np.asarray(stage_direction, dtype=np.float64)
+    direction = vector("stage_direction", stage_direction)
     if direction.shape != (3,) or not abs(float(direction @ direction) - 1.0) < 1e-6:
         raise ArgumentError(f"stage_direction is {stage_direction!r}; give a unit vector x, y, z")
     position = np.broadcast_to(position, (len(profiles),))

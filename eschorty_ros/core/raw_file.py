@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
+from eschorty_ros.core._checks import file_path, octets, whole
 from eschorty_ros.core.errors import ArgumentError, FormatError
 
 CHUNK_BYTES = 128 * 1024
@@ -68,7 +69,7 @@ class RawReader:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path = file_path("path", path)
         self.warnings: list[str] = []
         try:
             with self.path.open("rb") as file:
@@ -92,8 +93,7 @@ class RawReader:
         ArgumentError
             When ``size`` is not positive.
         """
-        if size < 1:
-            raise ArgumentError(f"size is {size!r}; choose at least 1 byte")
+        whole("size", size, 1, 1 << 40)
         return self._chunks(size)
 
     def __iter__(self) -> Iterator[bytes]:
@@ -218,14 +218,13 @@ class RawWriter:
         sensor_name: str = "IMX636",
         date: datetime.datetime | None = None,
     ) -> None:
-        if not re.fullmatch(r"[0-9a-fA-F]{8}", serial):
+        if not (isinstance(serial, str) and re.fullmatch(r"[0-9a-fA-F]{8}", serial)):
             raise ArgumentError(f"serial is {serial!r}; give 8 hexadecimal digits")
-        if not re.fullmatch(r"[!-~]+", sensor_name):
+        if not (isinstance(sensor_name, str) and re.fullmatch(r"[!-~]+", sensor_name)):
             raise ArgumentError(f"sensor_name is {sensor_name!r}; give one ASCII word")
         for name, size in (("width", width), ("height", height)):
-            if not 1 <= size <= _SIZE_MAX:
-                raise ArgumentError(f"{name} is {size!r}; choose 1 to {_SIZE_MAX} pixels")
-        self.path = Path(path)
+            whole(name, size, 1, _SIZE_MAX)
+        self.path = file_path("path", path)
         self.bytes_written = 0
         moment = date or datetime.datetime.now(datetime.UTC)
         header = {
@@ -252,11 +251,12 @@ class RawWriter:
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Append bytes of the stream; raises ``FormatError`` when the disk refuses."""
+        view = octets("data", data)
         try:
-            self._file.write(data)
+            self._file.write(view)
         except OSError as error:
             raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
-        self.bytes_written += len(data)
+        self.bytes_written += len(view)
 
     def close(self) -> None:
         """Finish the file; idempotent."""

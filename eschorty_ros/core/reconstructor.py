@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core import _centroid_kernels as kernels
+from eschorty_ros.core._checks import octets
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Events
@@ -141,7 +142,7 @@ class Reconstructor:
         data : bytes-like
             EVT3, cut anywhere.
         """
-        view = memoryview(data).cast("B")
+        view = octets("data", data)
         for begin in range(0, len(view), PIECE_BYTES):
             events = self._decoder.decode(view[begin : begin + PIECE_BYTES])
             now_us = self._decoder.time_us

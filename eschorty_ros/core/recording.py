@@ -18,6 +18,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from eschorty_ros.core._checks import file_path, whatever
 from eschorty_ros.core.calibration import Calibration, load_calibration
 from eschorty_ros.core.clock import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
 from eschorty_ros.core.errors import ArgumentError, FormatError
@@ -91,7 +92,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     FormatError, CalibrationError
         One line naming the file, the fault and the remedy.
     """
-    folder = Path(path)
+    folder = file_path("path", path)
     if not folder.is_dir():
         raise FormatError(f"{folder} is not a folder; give a recording folder")
     for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE):
@@ -178,7 +179,7 @@ def write_truth_csv(
 
 
 def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
-    arrays = {name: np.asarray(value) for name, value in values.items()}
+    arrays = {name: whatever(name, value) for name, value in values.items()}
     shapes = {array.shape for array in arrays.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         raise ArgumentError(

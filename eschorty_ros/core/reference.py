@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core._checks import TIME_LIMIT, octets, whole, whole_vector
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
@@ -27,7 +28,8 @@ def decode_all(
     Each word's time, row and vector base come from the latest word of the kind that sets them.
     No checks, no triggers: what is not well-formed belongs to ``evt3.Decoder``.
     """
-    words = np.frombuffer(data, dtype="<u2", count=len(data) // 2)
+    view = octets("data", data)
+    words = np.frombuffer(view, dtype="<u2", count=len(view) // 2)
     kind, payload = words >> 12, (words & 0xFFF).astype(np.int64)
     index = np.arange(words.size)
 
@@ -92,25 +94,31 @@ def reconstruct(
     Raises
     ------
     ArgumentError
-        When the three arrays differ in length.
+        When the three arrays differ in length, times fall or a pixel is off the sensor.
     """
-    times = np.asarray(t_us, dtype=np.int64)
-    x, y = np.asarray(column), np.asarray(row)
-    if not times.shape == x.shape == y.shape:
+    t = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    x = whole_vector("column", column, np.int64, 0, model.columns - 1)
+    y = whole_vector("row", row, np.int64, 0, model.rows - 1)
+    whole("events_min", events_min, 1, 1 << 31)
+    if not t.shape == x.shape == y.shape:
         raise ArgumentError(
-            f"t_us, column and row have {times.size}, {x.size} and {y.size} entries; "
-            "give equal numbers"
+            f"t_us, column and row have {t.size}, {x.size} and {y.size} entries; give equal numbers"
         )
-    if times.size == 0:
+    if t.size == 0:
         return Profiles.empty()
-    origin = int(times[0]) if modulation.on_edge_us is None else modulation.on_edge_us
+    fall = np.flatnonzero(np.diff(t) < 0)
+    if fall.size:
+        raise ArgumentError(
+            f"t_us goes from {t[fall[0]]} to {t[fall[0] + 1]}; sort the events by time"
+        )
+    origin = int(t[0]) if modulation.on_edge_us is None else modulation.on_edge_us
     anchored = Modulation(modulation.frequency_hz, modulation.duty, modulation.waveform, origin)
-    first = int((int(times[0]) - origin) // modulation.period_us)
-    last = int((int(times[-1]) - origin) // modulation.period_us) + 1
+    first = int((int(t[0]) - origin) // modulation.period_us)
+    last = int((int(t[-1]) - origin) // modulation.period_us) + 1
     edges = np.array([anchored.edge_us(k) for k in range(first, last + 1)], dtype=np.int64)
-    cuts = np.searchsorted(times, edges)
+    cuts = np.searchsorted(t, edges)
     windows = [
-        _window(times[a:b], x[a:b], y[a:b], model, first + k, int(edges[k]), events_min)
+        _window(t[a:b], x[a:b], y[a:b], model, first + k, int(edges[k]), events_min)
         for k, (a, b) in enumerate(pairwise(cuts))
         if b > a
     ]

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core._checks import TIME_LIMIT, number, vector, whole_vector
 from eschorty_ros.core.errors import ArgumentError
 
 Array = NDArray[np.float64]
@@ -26,18 +27,19 @@ _WIDTH_FLOOR_PX = 0.55
 _WIDTH_FACTOR = 0.24
 
 
-def events_per_row(width_px: Array, events: NDArray[np.uint32]) -> float:
+def events_per_row(width_px: Array, events: NDArray[np.integer]) -> float:
     """Events of one lit row: the median of events over full width, NaN without a usable point."""
+    width_px, counts = _checked(width_px, events)
     usable = width_px > 0.0
     if not usable.any():
         return math.nan
-    return float(np.median(events[usable] / (ROOT_12 * width_px[usable])))
+    return float(np.median(counts[usable] / (ROOT_12 * width_px[usable])))
 
 
 def relative_reflectance(
     edge_us: NDArray[np.int64],
     width_px: Array,
-    events: NDArray[np.uint32],
+    events: NDArray[np.integer],
     footprint_sigma_px: float,
     white_width_px: float = 0.0,
 ) -> tuple[Array, Array]:
@@ -64,17 +66,17 @@ def relative_reflectance(
     Raises
     ------
     ArgumentError
-        When shapes differ, ``footprint_sigma_px`` is not positive or ``white_width_px`` negative.
+        When shapes differ, ``footprint_sigma_px`` lies outside 0.1 to 1000 px or
+        ``white_width_px`` outside 0 to 1000 px.
     """
-    if not edge_us.shape == width_px.shape == events.shape or edge_us.ndim != 1:
+    edge_us = whole_vector("edge_us", edge_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    width_px, counts = _checked(width_px, events)
+    if edge_us.shape != width_px.shape:
         raise ArgumentError(
-            f"edge_us has shape {edge_us.shape}, width_px {width_px.shape} and events "
-            f"{events.shape}; give three equal axes"
+            f"edge_us has {edge_us.size} entries and width_px {width_px.size}; give equal numbers"
         )
-    if not 0.0 < footprint_sigma_px < math.inf:
-        raise ArgumentError(f"footprint_sigma_px is {footprint_sigma_px!r}; choose a positive one")
-    if not 0.0 <= white_width_px < math.inf:
-        raise ArgumentError(f"white_width_px is {white_width_px!r}; choose 0 or more")
+    number("footprint_sigma_px", footprint_sigma_px, 0.1, 1e3)
+    number("white_width_px", white_width_px, 0.0, 1e3)
     # Full width squared per e-fold of reflectance.
     slope = 8.0 * footprint_sigma_px * footprint_sigma_px
     width2 = np.empty(edge_us.size)
@@ -82,22 +84,35 @@ def relative_reflectance(
     starts = np.flatnonzero(np.diff(edge_us, prepend=~edge_us[:1]))
     for begin, end in pairwise([*starts.tolist(), edge_us.size]):
         part = slice(begin, end)
-        width2[part] = full_width2(width_px[part], events[part])
+        width2[part] = full_width2(width_px[part], counts[part])
         reference2[part] = np.median(width2[part])
     if white_width_px > 0.0:
         reference2[:] = 12.0 * white_width_px * white_width_px
     reflectance = np.exp((width2 - reference2) / slope)
-    width_sigma2 = _WIDTH_FLOOR_PX**2 + _WIDTH_FACTOR**2 * 0.2 * width2 / np.maximum(events, 1)
+    width_sigma2 = _WIDTH_FLOOR_PX**2 + _WIDTH_FACTOR**2 * 0.2 * width2 / np.maximum(counts, 1)
     return reflectance, reflectance * 2.0 * np.sqrt(width2 * width_sigma2) / slope
 
 
-def full_width2(width_px: Array, events: NDArray[np.uint32]) -> Array:
+def full_width2(width_px: Array, events: NDArray[np.integer]) -> Array:
     """Square of the full width of the lit rows of one profile's points, px squared.
 
     The mean of what spread and number of events say; where no point has a spread, 0.
     """
+    width_px, counts = _checked(width_px, events)
     from_spread = 12.0 * width_px * width_px
-    per_row = events_per_row(width_px, events)
+    per_row = events_per_row(width_px, counts)
     if math.isnan(per_row):
         return from_spread
-    return 0.5 * (from_spread + np.square(events / per_row))
+    return 0.5 * (from_spread + np.square(counts / per_row))
+
+
+def _checked(width_px: Array, events: NDArray[np.integer]) -> tuple[Array, NDArray[np.int64]]:
+    widths = vector("width_px", width_px)
+    if (widths < 0.0).any():
+        raise ArgumentError(f"width_px is {widths.min()}; choose 0 or more")
+    counts = whole_vector("events", events, np.int64, 0, TIME_LIMIT)
+    if counts.size != widths.size:
+        raise ArgumentError(
+            f"width_px has {widths.size} entries and events {counts.size}; give equal numbers"
+        )
+    return widths, counts

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from eschorty_ros.core._checks import short
 from eschorty_ros.core.centroid import METHODS, SIGMA_FACTOR, SIGMA_FLOOR_PX
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.phase_gate import GATE_MAX_US
@@ -111,7 +112,7 @@ def _check(name: str, value: Any, default: Any, metadata: Any) -> None:
     if "choices" in metadata:
         if value not in metadata["choices"]:
             raise ArgumentError(
-                f"{name} is {value!r}; choose one of {', '.join(metadata['choices'])}"
+                f"{name} is {short(value)}; choose one of {', '.join(metadata['choices'])}"
             )
         return
     low, high = metadata["range"]
@@ -120,4 +121,6 @@ def _check(name: str, value: Any, default: Any, metadata: Any) -> None:
     accepted = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
     if not accepted or not low <= value <= high:
         unit = f" {metadata['unit']}" if metadata["unit"] else ""
-        raise ArgumentError(f"{name} is {value!r}; choose {kind} from {low:g} to {high:g}{unit}")
+        raise ArgumentError(
+            f"{name} is {short(value)}; choose {kind} from {low:g} to {high:g}{unit}"
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core._checks import number, reals, whole
 from eschorty_ros.core._smoothing_kernels import _smooth
 from eschorty_ros.core.errors import ArgumentError
 
@@ -46,17 +47,17 @@ def smooth(
     ArgumentError
         When shapes differ, or a parameter is negative.
     """
-    rows = np.ascontiguousarray(row, dtype=np.float64)
-    sigma = np.ascontiguousarray(sigma_row, dtype=np.float64)
+    rows = np.ascontiguousarray(reals("row", row))
+    sigma = np.ascontiguousarray(reals("sigma_row", sigma_row))
     if rows.ndim != 1 or rows.shape != sigma.shape:
         raise ArgumentError(
             f"row has shape {rows.shape} and sigma_row {sigma.shape}; give two equal axes"
         )
-    if half_width < 0 or not gate_px >= 0.0 or not common_px >= 0.0:
-        raise ArgumentError(
-            f"half_width is {half_width!r}, gate_px {gate_px!r} and common_px {common_px!r}; "
-            "choose 0 or more"
-        )
+    if (sigma < 0.0).any():
+        raise ArgumentError(f"sigma_row is {np.nanmin(sigma)}; choose 0 or more")
+    whole("half_width", half_width, 0, 1 << 31)
+    number("gate_px", gate_px, 0.0)
+    number("common_px", common_px, 0.0)
     out_row, out_sigma2 = np.empty_like(rows), np.empty_like(rows)
     _smooth(rows, sigma * sigma, common_px * common_px, half_width, gate_px, out_row, out_sigma2)
     return out_row, np.sqrt(out_sigma2)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core._checks import reals
+from eschorty_ros.core._checks import picked_of, reals, short
 from eschorty_ros.core.errors import ArgumentError
 
 Array = NDArray[np.float64]
@@ -105,6 +105,8 @@ class Targets:
             array = np.array(np.broadcast_to(_entries(name, value, size), size))
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        if not isinstance(labels, list | tuple):
+            raise ArgumentError(f"labels is {short(labels)}; give {size} texts")
         named = tuple(labels) or tuple(str(index + 1) for index in range(size))
         if len(named) != size or not all(isinstance(label, str) for label in named):
             raise ArgumentError(f"labels holds {len(named)} entries; give {size} texts")
@@ -145,7 +147,7 @@ class Targets:
 
     def select(self, which: ArrayLike) -> Targets:
         """Targets at these indices, or where this mask is true."""
-        index = np.arange(len(self))[np.asarray(which)]
+        index = np.arange(len(self))[picked_of("which", which, len(self))]
         numbers = {name: getattr(self, name)[index] for name in _NUMBERS}
         return Targets(**numbers, labels=tuple(self.labels[i] for i in index))
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from eschorty_ros.core._checks import file_path
 from eschorty_ros.core.errors import EschortyError
 
 
@@ -46,7 +46,7 @@ def read_yaml(path: str | os.PathLike[str], error: type[EschortyError]) -> Any:
         When the file cannot be read or is not YAML.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = file_path("path", path).read_text(encoding="utf-8")
     except OSError as cause:
         raise error(f"cannot read {path}: {cause.strerror or cause}; check the path") from cause
     except UnicodeDecodeError as cause:

@@ -106,7 +106,7 @@ def test_gate_off_or_as_long_as_the_period_removes_nothing():
 
 def test_a_sine_has_no_edges_to_gate_by():
     assert not gate_parameters(Modulation(70.0, waveform="sine"), 1000).any()
-    with pytest.raises(ArgumentError, match="gate_us is -1; choose 0 to"):
+    with pytest.raises(ArgumentError, match="gate_us is -1; choose a whole number from 0 to"):
         gate_parameters(Modulation(70.0), -1)
 
 

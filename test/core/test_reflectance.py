@@ -107,7 +107,7 @@ def test_points_without_spread_and_bad_arguments():
         relative_reflectance(np.zeros(3, int), none, np.ones(3, np.uint32), 0)
     with pytest.raises(ArgumentError, match="white_width_px is -1"):
         relative_reflectance(np.zeros(3, int), none, np.ones(3, np.uint32), 1.0, -1)
-    with pytest.raises(ArgumentError, match=r"edge_us has shape \(2,\)"):
+    with pytest.raises(ArgumentError, match="edge_us has 2 entries"):
         relative_reflectance(np.zeros(2, int), none, np.ones(3, np.uint32), 1.0)
 
 

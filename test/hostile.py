@@ -1,0 +1,158 @@
+"""Hostile values by kind of argument, and the public surface they are fed to."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import pkgutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import eschorty_ros.core as core
+
+HUGE = 10**400
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Values an argument must refuse, and values it may take or refuse but not choke on."""
+
+    refused: Sequence[Any]
+    borderline: Sequence[Any] = ()
+    nan_gives_nan: bool = False
+
+
+def number(low: float = -math.inf, high: float = math.inf, *, optional: bool = False) -> Kind:
+    """A finite scalar; ``low`` and ``high`` are the first values outside or absent."""
+    wrong: list[Any] = [math.nan, math.inf, -math.inf, "3", 1 + 2j, [1.0, 2.0], HUGE]
+    wrong += [bound for bound in (low, high) if math.isfinite(bound)]
+    return Kind(wrong + ([] if optional else [None]), [1e300, -1e300, 5e-324, np.float32(3.0)])
+
+
+def whole(low: int | None = None, high: int | None = None, *, optional: bool = False) -> Kind:
+    """An integer; ``low`` and ``high`` are the first values outside or absent."""
+    wrong: list[Any] = [math.nan, math.inf, 1.5, "3", [1, 2], HUGE]
+    wrong += [bound for bound in (low, high) if bound is not None]
+    return Kind(wrong + ([] if optional else [None]), [np.int64(3), 2**62, -(2**62)])
+
+
+def text() -> Kind:
+    """A name out of a few."""
+    return Kind(["no such name", "", 3, None, math.nan, ["mean"]])
+
+
+_NO_REALS: list[Any] = [
+    "abc",
+    ["a", "b"],
+    None,
+    [None],
+    np.array([1 + 1j]),
+    [[1.0], [1.0, 2.0]],
+    object(),
+]
+
+
+def reals() -> Kind:
+    """Real numbers of any shape; NaN in, NaN out."""
+    rows = np.arange(12.0).reshape(3, 4)
+    return Kind(
+        _NO_REALS,
+        [math.inf, -math.inf, 1e308, -1e308, 5e-324, [], np.zeros((2, 0, 3)), rows[:, ::2], HUGE],
+        nan_gives_nan=True,
+    )
+
+
+def vector(*outside: float, finite: bool = True, size: int = 0, any_shape: bool = False) -> Kind:
+    """One axis of real numbers; with ``size`` a wrong length is refused."""
+    wrong: list[Any] = [*_NO_REALS, *outside_of(size, outside)]
+    wrong += [] if any_shape else [np.zeros((2, 2))]
+    if finite:
+        wrong += outside_of(size, (math.nan, math.inf, -math.inf))
+    return Kind(wrong, [np.arange(float(2 * size))[::2]] if size else [[]])
+
+
+def integers(*outside: int, size: int = 0, any_shape: bool = False) -> Kind:
+    """One axis of integers."""
+    wrong: list[Any] = [[1.5] * max(size, 1), [math.nan], "abc", ["a"], None]
+    wrong += [] if any_shape else [np.zeros((2, 2), int)]
+    wrong += [np.array([HUGE]), [1 + 1j], *outside_of(size, outside)]
+    return Kind(wrong, [np.arange(2 * size)[::2]] if size else [[]])
+
+
+def outside_of(size: int, values: Sequence[Any]) -> list[Any]:
+    return [np.full(max(size, 1), value) for value in values]
+
+
+def exactly(dtype: str, size: int, *, alone: bool = False) -> Kind:
+    """An array that compiled code takes as it is: dtype and shape must be right."""
+    other = "f8" if dtype != "f8" else "f4"
+    good = np.zeros(size, dtype)
+    wrong: list[Any] = [good.astype(other), np.zeros((2, 2), dtype), None, "abc", 3]
+    wrong += [] if alone else [good[:-1]]
+    return Kind(wrong, [np.zeros(2 * size, dtype)[::2]])
+
+
+def octets() -> Kind:
+    """Bytes of a stream."""
+    rng = np.random.default_rng(26)
+    noise = [rng.integers(0, 256, n, np.uint8).tobytes() for n in (1, 7, 5000)]
+    return Kind(["text", None, 3, [1, 2], np.zeros(3)], [b"", bytearray(b"ab"), *noise])
+
+
+def path() -> Kind:
+    """A file name."""
+    return Kind([None, 3, "no/such/folder/file.pcd", "a\0b.pcd", "/"])
+
+
+@dataclass(frozen=True)
+class Call:
+    """One public callable: how to call it, valid arguments, and what else each may be."""
+
+    make: Callable[..., Any]
+    good: dict[str, Any]
+    kinds: dict[str, Kind] = field(default_factory=dict)
+    says: dict[str, str] = field(default_factory=dict)
+
+
+def public_callables() -> Iterator[tuple[str, Any]]:
+    """Yield ``module.function``, ``module.Class`` and ``module.Class.method`` of the core."""
+    for info in pkgutil.iter_modules(core.__path__):
+        if info.name.startswith("_"):
+            continue
+        module = importlib.import_module(f"{core.__name__}.{info.name}")
+        exported = getattr(module, "__all__", ())
+        for name, item in vars(module).items():
+            home = getattr(item, "__module__", None)
+            own = home == module.__name__ or (
+                name in exported and str(home).startswith(core.__name__)
+            )
+            if name.startswith("_") or not own:
+                continue
+            if inspect.isclass(item) and not issubclass(item, Exception):
+                if home == module.__name__ or f"{core.__name__}._" in str(home):
+                    yield f"{info.name}.{name}", item
+                    yield from _methods(f"{info.name}.{name}", item)
+            elif inspect.isfunction(item) and (home == module.__name__ or "._" in str(home)):
+                yield f"{info.name}.{name}", item
+
+
+def _methods(prefix: str, owner: type) -> Iterator[tuple[str, Any]]:
+    for name, item in vars(owner).items():
+        method = inspect.isfunction(item) or isinstance(item, classmethod | staticmethod)
+        if method and not name.startswith("_") and item_module(item).startswith(core.__name__):
+            yield f"{prefix}.{name}", getattr(owner, name)
+
+
+def item_module(item: Any) -> str:
+    return str(getattr(item, "__module__", ""))
+
+
+def parameters(item: Any) -> set[str]:
+    """Names of the arguments a caller gives."""
+    kinds = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    found = inspect.signature(item).parameters.values()
+    return {p.name for p in found if p.name != "self" and p.kind not in kinds}
