@@ -196,24 +196,30 @@ class Observer:
         finally:
             self.node.destroy_client(client)
 
+    def ask(self, service_type: Any, name: str, deadline_s: float = DEADLINE_S) -> Any:
+        """Response of a service that may be called again: a first answer can get lost.
+
+        A fresh server may not know yet where its answers go.
+        """
+
+        def answered() -> Any:
+            with contextlib.suppress(AssertionError):
+                return self.call(service_type, name, deadline_s=2.0)
+            return None
+
+        return wait_until(answered, f"an answer of {name}", deadline_s)
+
     def wait_for_answers(self, node: str, deadline_s: float = DEADLINE_S) -> None:
-        """Wait until ``node`` answers: a fresh server may not know yet where answers go.
+        """Wait until ``node`` answers.
 
         Endpoints are discovered in the order of their making, so what this observer made before
         gets its answers, too.
         """
-
-        def answered() -> bool:
-            with contextlib.suppress(AssertionError):
-                self.call(GetParameters, f"{node}/get_parameters", deadline_s=2.0)
-                return True
-            return False
-
-        wait_until(answered, f"an answer of {node}", deadline_s)
+        self.ask(GetParameters, f"{node}/get_parameters", deadline_s)
 
     def lifecycle_state(self, node: str) -> str:
         """Label of the lifecycle state of ``node``."""
-        return str(self.call(GetState, f"{node}/get_state").current_state.label)
+        return str(self.ask(GetState, f"{node}/get_state").current_state.label)
 
     def wait_for_state(self, node: str, label: str, deadline_s: float = DEADLINE_S) -> None:
         """Wait until ``node`` reports lifecycle state ``label``."""

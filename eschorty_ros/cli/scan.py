@@ -56,12 +56,15 @@ def command(
     _check(scene, calibration)
     request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed)
     out.mkdir(parents=True, exist_ok=True)
-    previous = signal.signal(signal.SIGTERM, _terminated)
+    # A shell's background job starts with SIGINT ignored; a laser must go off all the same.
+    handlers = {signal.SIGTERM: _terminated, signal.SIGINT: signal.default_int_handler}
+    previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         with progress_bar("scanning") as report, one_process.instrument(request) as made:
             outcome = made.scan(request, report)
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
     finish(request, outcome, out)
 
 

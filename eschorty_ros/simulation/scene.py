@@ -162,6 +162,12 @@ def _face() -> Scene:
     return Face()
 
 
+def _posts() -> Scene:
+    from eschorty_ros.simulation.scene_posts import Posts
+
+    return Posts()
+
+
 _BUILDERS: dict[str, Callable[[], Scene]] = {
     "steps": Steps,
     "plane": Plane,
@@ -169,6 +175,7 @@ _BUILDERS: dict[str, Callable[[], Scene]] = {
     "sphere": Sphere,
     "leaves": _leaves,
     "face": _face,
+    "posts": _posts,
 }
 NAMES = tuple(_BUILDERS)
 
