@@ -1,0 +1,181 @@
+"""Clocks, motion, modulation and its phase."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from eschorty_ros.core import (
+    clock,
+    modulation,
+    motion,
+    phase,
+    phase_gate,
+)
+from hostile.kinds import (
+    Call,
+    Kind,
+    exactly,
+    integers,
+    number,
+    text,
+    vector,
+    whole,
+)
+from hostile.subjects import (
+    LASER,
+    POLARITY,
+    SIGNS,
+    T_MAX,
+    TIMES,
+    N,
+    method,
+)
+
+
+def a_track() -> clock.StageTrack:
+    track = clock.StageTrack()
+    track.append([0, 10], [0.0, 1.0])
+    return track
+
+
+def a_schedule() -> phase.EdgeSchedule:
+    schedule = phase.EdgeSchedule(LASER)
+    schedule.anchor(0, 0)
+    return schedule
+
+
+CALLS: dict[str, Call] = {
+    "clock.quantise_nm": Call(
+        partial(clock.quantise_nm, name="position_mm"),
+        {"position_mm": [1.0, 2.0]},
+        {"position_mm": vector(2e9, -2e9, size=2, any_shape=True), "name": Kind([])},
+    ),
+    "clock.StageTrack": Call(
+        clock.StageTrack, {"max_gap_us": 5}, {"max_gap_us": whole(0, optional=True)}
+    ),
+    "clock.StageTrack.append": Call(
+        method(clock.StageTrack, "append"),
+        {"t_us": TIMES, "position_mm": np.zeros(N)},
+        {"t_us": integers(2**63, size=N), "position_mm": vector(2e9, size=N)},
+    ),
+    "clock.StageTrack.position_mm": Call(
+        method(a_track, "position_mm"),
+        {"t_us": [3, 4]},
+        {"t_us": integers(2**63, size=2, any_shape=True)},
+    ),
+    "clock.StageTrack.forget_before": Call(
+        method(a_track, "forget_before"), {"t_us": 3}, {"t_us": whole()}
+    ),
+    "clock.SensorClock": Call(
+        clock.SensorClock,
+        {"zero_ns": 5, "window_ns": 10},
+        {"zero_ns": whole(optional=True), "window_ns": whole(0)},
+    ),
+    "clock.SensorClock.observe": Call(
+        method(clock.SensorClock, "observe"),
+        {"t_us": 5, "arrival_ns": 10},
+        {"t_us": whole(), "arrival_ns": whole()},
+    ),
+    "clock.SensorClock.to_ns": Call(
+        method(partial(clock.SensorClock, 7), "to_ns"), {"t_us": 3}, {"t_us": whole()}
+    ),
+    "clock.SensorClock.to_us": Call(
+        method(partial(clock.SensorClock, 7), "to_us"), {"t_ns": 3}, {"t_ns": whole()}
+    ),
+    "modulation.Modulation": Call(
+        modulation.Modulation,
+        {"frequency_hz": 70.0, "duty": 0.5, "waveform": "square", "on_edge_us": 0},
+        {
+            "frequency_hz": number(15.9, 20_001.0),
+            "duty": number(0.0, 1.0),
+            "waveform": text(),
+            "on_edge_us": whole(T_MAX + 1, -T_MAX - 1, optional=True),
+        },
+    ),
+    "modulation.Modulation.edge_us": Call(LASER.edge_us, {"index": 3}, {"index": whole()}),
+    "motion.MotionPlan": Call(
+        motion.MotionPlan,
+        {
+            "start_ns": 0,
+            "position_mm": 0.0,
+            "velocity_mm_s": 1.0,
+            "durations_s": (1.0,),
+            "accelerations_mm_s2": (2.0,),
+        },
+        {
+            "start_ns": whole(),
+            "position_mm": number(),
+            "velocity_mm_s": number(),
+            "durations_s": vector(-1.0, size=1),
+            "accelerations_mm_s2": vector(size=1),
+        },
+    ),
+    "motion.MotionPlan.state": Call(
+        motion.plan_move(0, 0.0, 5.0, 1.0, 1.0).state,
+        {"t_ns": [3, 4]},
+        {"t_ns": integers(2**63, size=2, any_shape=True)},
+    ),
+    "motion.plan_move": Call(
+        motion.plan_move,
+        {
+            "start_ns": 0,
+            "position_mm": 0.0,
+            "target_mm": 5.0,
+            "speed_mm_s": 1.0,
+            "acceleration_mm_s2": 1.0,
+        },
+        {
+            "start_ns": whole(),
+            "position_mm": number(),
+            "target_mm": number(),
+            "speed_mm_s": number(0.0),
+            "acceleration_mm_s2": number(0.0),
+        },
+    ),
+    "motion.plan_stop": Call(
+        motion.plan_stop,
+        {"plan": motion.plan_move(0, 0.0, 5.0, 1.0, 1.0), "at_ns": 10, "deceleration_mm_s2": 1.0},
+        {"at_ns": whole(), "deceleration_mm_s2": number(0.0)},
+    ),
+    "phase.EdgeSchedule": Call(
+        phase.EdgeSchedule, {"modulation": LASER, "every": 2}, {"every": whole(0)}
+    ),
+    "phase.EdgeSchedule.add_triggers": Call(
+        method(a_schedule, "add_triggers"),
+        {"t_us": TIMES},
+        {"t_us": exactly("i8", N, alone=True)},
+    ),
+    "phase.EdgeSchedule.anchor": Call(
+        method(a_schedule, "anchor"),
+        {"edge_us": 5, "start_us": 10},
+        {"edge_us": whole(T_MAX + 1), "start_us": whole(T_MAX + 1)},
+    ),
+    "phase.EdgeSchedule.jump": Call(
+        method(a_schedule, "jump"), {"t_us": 5}, {"t_us": whole(T_MAX + 1)}
+    ),
+    "phase.EdgeSchedule.watermark_after": Call(
+        method(a_schedule, "watermark_after"), {"newest_us": 5}, {"newest_us": whole(T_MAX + 1)}
+    ),
+    "phase.EdgeSchedule.advance": Call(
+        method(a_schedule, "advance"),
+        {"watermark_us": 50_000},
+        {"watermark_us": whole(T_MAX + 1)},
+    ),
+    "phase.estimate_phase": Call(
+        phase.estimate_phase,
+        {"t_us": TIMES, "polarity": SIGNS, "modulation": LASER},
+        {"t_us": integers(2**63, size=N), "polarity": POLARITY},
+    ),
+    "phase.decide_window": Call(
+        phase.decide_window,
+        {"t_us": np.arange(5000), "watermark_us": 10**6, "modulation": LASER},
+        {"t_us": exactly("i8", 5000, alone=True), "watermark_us": whole()},
+    ),
+    "phase_gate.gate_parameters": Call(
+        phase_gate.gate_parameters,
+        {"modulation": LASER, "gate_us": 1000},
+        {"gate_us": whole(-1, 100_001)},
+    ),
+}
