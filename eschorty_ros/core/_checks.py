@@ -27,6 +27,13 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
     return real
 
 
+def number_or_nan(name: str, value: Any, low: float = -math.inf) -> float:
+    """``value`` as a float from ``low`` on, NaN where it is unknown."""
+    if isinstance(value, Real) and math.isnan(_float(value)) and value != value:
+        return math.nan
+    return number(name, value, low)
+
+
 def positive(name: str, value: Any) -> float:
     """``value`` as a finite float above 0, with a finite reciprocal."""
     real = _float(value)

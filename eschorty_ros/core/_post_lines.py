@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core._checks import number, positive
+from eschorty_ros.core._checks import number, number_or_nan, positive
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.post_finder import Post
@@ -58,11 +58,12 @@ class KnownTarget:
     def __post_init__(self) -> None:
         positive("range_mm", self.range_mm)
         number("sigma_range_mm", self.sigma_range_mm, 0.0)
-        if not math.isnan(self.size_mm):
-            positive("size_mm", self.size_mm)
-        for name in ("column", "row"):
-            if math.isinf(getattr(self, name)):
-                raise ArgumentError(f"{name} is {getattr(self, name)}; give a number or NaN")
+        for name in ("size_mm", "column", "row"):
+            number_or_nan(name, getattr(self, name))
+        if self.size_mm <= 0.0:
+            raise ArgumentError(f"size_mm is {self.size_mm!r}; choose a positive number or NaN")
+        if not isinstance(self.label, str):
+            raise ArgumentError(f"label is {self.label!r}; give a text")
         if not self.label:
             object.__setattr__(self, "label", f"{self.range_mm:g} mm")
 

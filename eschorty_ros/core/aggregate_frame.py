@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core._aggregate_kernels import count_events
-from eschorty_ros.core._checks import whole
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core._checks import exact, whole
 from eschorty_ros.core.optics import PIXELS_MAX
 
 
@@ -56,14 +55,9 @@ class AggregateFrame:
         ArgumentError
             When columns and rows are not uint16 arrays of one length.
         """
-        x, y = events.x, events.y
-        for name, array in (("x", x), ("y", y)):
-            if array.dtype != np.uint16 or array.shape != (x.size,):
-                raise ArgumentError(
-                    f"{name} has dtype {array.dtype} and shape {array.shape}; give one uint16 for "
-                    "each event"
-                )
-        outside = count_events(self.counts, np.ascontiguousarray(x), np.ascontiguousarray(y))
+        x = exact("x", events.x, np.uint16)
+        y = exact("y", events.y, np.uint16, x.size)
+        outside = count_events(self.counts, x, y)
         self.outside += outside
         self.events += x.size - outside
 

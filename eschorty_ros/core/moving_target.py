@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core._checks import number, positive, reals, whole
+from eschorty_ros.core._checks import number, positive, reals, whole, whole_vector
 from eschorty_ros.core.centroid import SIGMA_FLOOR_PX
 from eschorty_ros.core.errors import ArgumentError, FitError
+from eschorty_ros.core.optics import PIXELS_MAX
 from eschorty_ros.core.post_finder import COLUMNS_MIN, GRID_SIGMA_PX
 from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.core.targets import Targets
@@ -79,6 +80,10 @@ def moving_target(
         raise ArgumentError("range_per_stage is 0; the stage must change the target's range")
     positive("sigma_stage_mm", sigma_stage_mm)
     whole("blocks", blocks, 1, 64)
+    if columns is not None:
+        ends = whole_vector("columns", columns, np.int64, 0, PIXELS_MAX)
+        if ends.size != 2 or ends[0] > ends[1]:
+            raise ArgumentError(f"columns is {columns!r}; give the first and the last one")
     used = np.isfinite(position) & np.isfinite(profiles.row) & (profiles.return_index == 0)
     profiles, position = profiles.select(used), position[used]
     low, high = columns if columns is not None else _seen_columns(profiles)

@@ -28,6 +28,12 @@ def number(low: float = -math.inf, high: float = math.inf, *, optional: bool = F
     return Kind(wrong + ([] if optional else [None]), [1e300, -1e300, 5e-324, np.float32(3.0)])
 
 
+def number_or_nan(*outside: float) -> Kind:
+    """A scalar that may be unknown."""
+    wrong: list[Any] = [math.inf, -math.inf, "3", 1 + 2j, [1.0, 2.0], HUGE, None, *outside]
+    return Kind(wrong, [math.nan, 1e300, 5e-324])
+
+
 def whole(low: int | None = None, high: int | None = None, *, optional: bool = False) -> Kind:
     """An integer; ``low`` and ``high`` are the first values outside or absent."""
     wrong: list[Any] = [math.nan, math.inf, 1.5, "3", [1, 2], HUGE]
