@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +66,18 @@ class ScanErrors:
         return float(np.quantile(size, share)) if size.size else float("nan")
 
 
-def scan_errors(profiles: Profiles, recording: Recording, scene: KnownScene) -> ScanErrors:
+def pooled(parts: Sequence[ScanErrors]) -> ScanErrors:
+    """All points of several scans together; the completeness is the mean of theirs."""
+    return ScanErrors(
+        np.concatenate([part.error_mm for part in parts]),
+        np.concatenate([part.gross for part in parts]),
+        float(np.mean([part.completeness for part in parts])),
+    )
+
+
+def scan_errors(
+    profiles: Profiles, recording: Recording, scene: KnownScene, every: int = 1
+) -> ScanErrors:
     """Compare every point with the scene at its own time, the recording's truth with the points.
 
     Parameters
@@ -75,17 +87,21 @@ def scan_errors(profiles: Profiles, recording: Recording, scene: KnownScene) -> 
         With its truth; the stage is taken from it.
     scene : KnownScene
         What was recorded.
+    every : int
+        Look at every so many columns; the truth of all of them takes longer than the scan.
 
     Returns
     -------
     ScanErrors
     """
     model = recording.calibration.model()
+    profiles = profiles.select(profiles.column % every == 0)
     stage_mm = np.asarray(recording.stage.position_mm(profiles.t_us))
     truth_mm = true_range_mm(scene, model, stage_mm, profiles.column)
     off_px = np.abs(profiles.row - model.row(truth_mm))
     truth = recording.truth
     assert truth is not None, "a simulated recording has its truth"
+    truth = truth[truth["column"] % every == 0]
     return ScanErrors(
         profiles.range_mm - truth_mm,
         ~(off_px <= GROSS_PX),
