@@ -39,6 +39,9 @@ CASES = {
     "ours (mode_mean)": Settings(),
     "mean": Settings(centroid="mean"),
     "median": Settings(centroid="median"),
+    "gauss_ml": Settings(centroid="gauss_ml"),
+    "edge_mid": Settings(centroid="edge_mid"),
+    "ours, all returns": Settings(returns="all"),
     "ours + activity filter": Settings(noise_filter="activity"),
     "ours + phase gate": Settings(phase_gate_us=1000),
 }

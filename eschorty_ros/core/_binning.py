@@ -6,21 +6,30 @@ import numpy as np
 from numba import njit
 
 from eschorty_ros.core._centroid_kernels import (
-    AMBIGUOUS,
+    GAUSS_ML,
+    MEAN,
+    MEDIAN,
+    STRONGEST,
+    _all_returns,
+    _chosen,
+    _judge,
+    _row,
+    _search,
+    _window_mean,
+)
+from eschorty_ros.core._mode_kernels import AMBIGUOUS, FOUND
+from eschorty_ros.core._phase_gate_kernels import G_LENGTH, _outside
+from eschorty_ros.core._row_kernels import HALF_PER_SIGMA, _fill_likelihood
+from eschorty_ros.core._smoothing_kernels import _reject_isolated, _smooth
+from eschorty_ros.core._window_kernels import (
     BLOCK,
-    FOUND,
     FRACTION,
-    MODE_MEAN,
     ROW_BITS,
+    ROW_LAST,
     TIME_LIMIT_US,
-    _estimate_column,
     _mean_shift,
     _pad,
-    _sigma2,
-    _variance,
 )
-from eschorty_ros.core._phase_gate_kernels import G_LENGTH, _outside
-from eschorty_ros.core._smoothing_kernels import _reject_isolated, _smooth
 
 # state, int64
 S_INDEX, S_EDGE, S_OPEN, S_HALF, S_POINTS, S_SIZE = 0, 1, 2, 3, 4, 5
@@ -37,21 +46,24 @@ COUNTERS = (
     "columns_ambiguous",
     "columns_isolated",
     "columns_smoothed",
+    "columns_two_returns",
 )
 (
     C_BINNED, C_EARLY, C_OUTSIDE, C_OVER, C_GATED, C_CLOSED, C_EMPTY, C_FEW, C_AMBIGUOUS,
-    C_ISOLATED, C_SMOOTHED,
+    C_ISOLATED, C_SMOOTHED, C_TWO,
 ) = range(len(COUNTERS))  # fmt: skip
 # whole-number settings
-P_METHOD, P_EVENTS_MIN, P_HALF_MAX, P_ROWS, P_SMOOTH, P_WEAK, P_SIZE = 0, 1, 2, 3, 4, 5, 6
+P_METHOD, P_RETURNS, P_EVENTS_MIN, P_HALF_MAX, P_ROWS, P_SMOOTH, P_WEAK, P_SIZE = range(8)
 # fractional settings
-F_FACTOR, F_FLOOR, F_GATE, F_ISOLATION, F_SIZE = 0, 1, 2, 3, 4
+F_FACTOR, F_FLOOR, F_GATE, F_ISOLATION, F_SIZE = range(5)
+# a column's numbers, one plane per return
+(W_ROW, W_SIGMA2, W_SMOOTH_ROW, W_SMOOTH_SIGMA2, W_VARIANCE, W_SIZE) = range(6)
+N_EVENTS, N_MEAN_DT, N_REJECTED, N_SIZE = range(4)
 
 ISOLATION_REACH = 2
 _HALF_MIN = 3 * FRACTION
-# 1.3 x FWHM for a Gaussian of unit standard deviation, fixed point
-_HALF_PER_SIGMA = 1.3 * 2.3548200450309493 * FRACTION
 _WIDTH_MIN_DOF = 64
+_NO_WINDOW = (np.int64(0),) * 7
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -93,53 +105,63 @@ def _append(t, x, y, p, first, stop, limit, lists, counts, rows, edge, gate, cou
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _estimate_period(
-    lists, counts, seeds, whole, fractional, half, work, work_int, scratch, counters
+    lists, counts, seeds, whole, fractional, half, work, work_int, scratch, table, counters
 ):
-    """Every column's row; returns the pooled sum of squares and degrees of freedom."""
-    row, sigma2, variances = work[0], work[1], work[4]
-    events, mean_dt = work_int[0], work_int[1]
+    """Every column's rows; returns the pooled sum of squares and degrees of freedom."""
+    row, sigma2, variances = work[W_ROW], work[W_SIGMA2], work[W_VARIANCE]
+    events, mean_dt = work_int[N_EVENTS], work_int[N_MEAN_DT]
+    row[:] = np.nan
     rows = float(whole[P_ROWS])
     squares = 0.0
     freedom = np.int64(0)
     neighbour = np.int64(-1)
     stride = lists.size // counts.size
-    method, events_min = whole[P_METHOD], whole[P_EVENTS_MIN]
+    method, returns, events_min = whole[P_METHOD], whole[P_RETURNS], whole[P_EVENTS_MIN]
     factor, floor = fractional[F_FACTOR], fractional[F_FLOOR]
+    windowed = method != MEAN and method != MEDIAN
+    size = _fill_likelihood(table, half) if method == GAUSS_ML else np.int64(0)
     for c in range(counts.size):
         n = np.int64(counts[c])
         counts[c] = 0
-        row[c] = np.nan
         if n < events_min:
             if n > 0:
                 counters[C_FEW] += 1
             continue
         start = c * stride
+        blocks = _pad(lists, start, n)
         seed = seeds[c] if seeds[c] >= 0 else neighbour
-        used = np.int64(0)
-        if method == MODE_MEAN and seed >= 0:
-            used, low, sum_d, sum_d2, sum_time, centre = _mean_shift(
-                lists, start, _pad(lists, start, n), seed, half
+        a = b = _NO_WINDOW
+        if windowed and seed >= 0:
+            a = b = _mean_shift(lists, start, blocks, seed, half, 0, ROW_LAST)
+        status, found = FOUND, 1
+        if a[0] < events_min or 2 * a[0] <= n:
+            # A window elsewhere may hold more than the seed's.
+            status, a, b = _search(lists, start, n, blocks, method, half, rows, events_min)
+        if returns != STRONGEST:
+            status, found, a, b = _all_returns(
+                lists, start, n, blocks, half, rows, events_min, status, a, b
             )
-        if used >= events_min and 2 * used > n:
-            # No window elsewhere can hold more: the seed was right.
-            r = (used * low + sum_d) / used
-            variance = _variance(used, sum_d, sum_d2)
-        else:
-            status, r, used, variance, sum_time, centre = _estimate_column(
-                lists, start, n, method, half, rows, events_min, scratch
+        if status != FOUND:
+            counters[C_AMBIGUOUS if status == AMBIGUOUS else C_FEW] += 1
+            continue
+        seeds[c] = neighbour = a[6]
+        counters[C_TWO] += found - 1
+        found, window, other = _chosen(returns, found, a, b)
+        for k in range(found):
+            r, variance = _window_mean(window)
+            if method > MEAN:
+                r = _row(lists, start, n, window, other, method, half, rows, scratch, table, size)
+            row[k, c], sigma2[k, c], cut = _judge(
+                r, variance, window, method, half, rows, factor, floor
             )
-            if status != FOUND:
-                counters[C_AMBIGUOUS if status == AMBIGUOUS else C_FEW] += 1
-                continue
-        row[c] = r
-        sigma2[c] = _sigma2(variance, used, r, rows, factor, floor)
-        variances[c] = variance
-        events[c] = used
-        mean_dt[c] = np.int64(np.rint(sum_time / used))
-        seeds[c] = centre
-        neighbour = centre
-        squares += variance * (used - 1)
-        freedom += used - 1
+            used = window[0]
+            variances[k, c] = variance
+            events[k, c] = used
+            mean_dt[k, c] = np.int64(np.rint(window[5] / used))
+            if not cut:
+                squares += variance * (used - 1)
+                freedom += used - 1
+            window, other = other, window
     return squares, freedom
 
 
@@ -148,59 +170,65 @@ def _adapted_half(half, squares, freedom, half_max):
     """Window for the next period: 1.3 x the width that this period's rows show, averaged."""
     if freedom < _WIDTH_MIN_DOF:
         return half
-    wanted = _HALF_PER_SIGMA * np.sqrt(squares / freedom)
+    wanted = HALF_PER_SIGMA * np.sqrt(squares / freedom)
     return np.int64(min(max(np.rint(0.5 * (half + wanted)), _HALF_MIN), half_max))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _close(lists, counts, seeds, state, whole, fractional, work, work_int, scratch, counters, out):
-    """Turn the open period into points behind ``state[S_POINTS]``."""
-    counters[C_CLOSED] += 1
-    squares, freedom = _estimate_period(
-        lists, counts, seeds, whole, fractional, state[S_HALF], work, work_int, scratch, counters
-    )
-    if whole[P_METHOD] == MODE_MEAN:
-        state[S_HALF] = _adapted_half(state[S_HALF], squares, freedom, whole[P_HALF_MAX])
-    row, sigma2, smooth_row, smooth_sigma2 = work[0], work[1], work[2], work[3]
-    variances = work[4]
-    events, mean_dt, rejected = work_int[0], work_int[1], work_int[2]
-    isolated = _reject_isolated(
-        row, events, ISOLATION_REACH, fractional[F_ISOLATION], whole[P_WEAK], rejected
-    )
-    if isolated > 0:
-        counters[C_ISOLATED] += isolated
-        for c in range(row.size):
-            if rejected[c]:
-                row[c] = np.nan
-    counters[C_SMOOTHED] += _smooth(
-        row, sigma2, fractional[F_FLOOR] ** 2, whole[P_SMOOTH], fractional[F_GATE], smooth_row,
-        smooth_sigma2,
-    )  # fmt: skip
+def _emit(work, work_int, state, out):
+    """Write the period's points behind ``state[S_POINTS]``, by column, nearest return first."""
     (
         out_period, out_edge, out_t, out_column, out_row, out_sigma, out_width, out_events,
         out_return,
     ) = out  # fmt: skip
-    k = state[S_POINTS]
-    for c in range(row.size):
-        if np.isnan(row[c]):
-            continue
-        out_period[k] = state[S_INDEX]
-        out_edge[k] = state[S_EDGE]
-        out_t[k] = state[S_EDGE] + mean_dt[c]
-        out_column[k] = c
-        out_row[k] = smooth_row[c]
-        out_sigma[k] = np.sqrt(smooth_sigma2[c])
-        out_width[k] = np.sqrt(variances[c])
-        out_events[k] = events[c]
-        out_return[k] = 0
-        k += 1
-    state[S_POINTS] = k
+    planes, columns = work[W_ROW].shape
+    i = state[S_POINTS]
+    for c in range(columns):
+        place = 0
+        for k in range(planes):
+            if np.isnan(work[W_ROW, k, c]):
+                continue
+            out_period[i] = state[S_INDEX]
+            out_edge[i] = state[S_EDGE]
+            out_t[i] = state[S_EDGE] + work_int[N_MEAN_DT, k, c]
+            out_column[i] = c
+            out_row[i] = work[W_SMOOTH_ROW, k, c]
+            out_sigma[i] = np.sqrt(work[W_SMOOTH_SIGMA2, k, c])
+            out_width[i] = np.sqrt(work[W_VARIANCE, k, c])
+            out_events[i] = work_int[N_EVENTS, k, c]
+            out_return[i] = place
+            place += 1
+            i += 1
+    state[S_POINTS] = i
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _close(
+    lists, counts, seeds, state, whole, fractional, work, work_int, scratch, table, counters, out
+):
+    """Turn the open period into points."""
+    counters[C_CLOSED] += 1
+    squares, freedom = _estimate_period(
+        lists, counts, seeds, whole, fractional, state[S_HALF], work, work_int, scratch, table,
+        counters,
+    )  # fmt: skip
+    if whole[P_METHOD] != MEAN and whole[P_METHOD] != MEDIAN:
+        state[S_HALF] = _adapted_half(state[S_HALF], squares, freedom, whole[P_HALF_MAX])
+    counters[C_ISOLATED] += _reject_isolated(
+        work[W_ROW], work_int[N_EVENTS], ISOLATION_REACH, fractional[F_ISOLATION], whole[P_WEAK],
+        work_int[N_REJECTED],
+    )  # fmt: skip
+    counters[C_SMOOTHED] += _smooth(
+        work[W_ROW], work[W_SIGMA2], fractional[F_FLOOR] ** 2, whole[P_SMOOTH],
+        fractional[F_GATE], work[W_SMOOTH_ROW], work[W_SMOOTH_SIGMA2],
+    )  # fmt: skip
+    _emit(work, work_int, state, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bin(
     t, x, y, p, first, stop, edges, indices, edge, edge_count, drain, gate, lists, counts, seeds,
-    state, whole, fractional, work, work_int, scratch, counters, out,
+    state, whole, fractional, work, work_int, scratch, table, counters, out,
 ):  # fmt: skip
     """Merge events ``first..stop`` with edges ``edge..edge_count``.
 
@@ -208,8 +236,7 @@ def _bin(
     through. Returns the first event and the first edge not dealt with; fewer than all when the
     output has no room for another profile.
     """
-    columns = counts.size
-    room = out[0].size
+    room = out[0].size - work[0].size
     i = first
     far = np.int64(1 << 62)
     while True:
@@ -229,11 +256,11 @@ def _bin(
         if edge == edge_count or (i == stop and not drain):
             return i, edge
         if state[S_OPEN] == 2:
-            if state[S_POINTS] + columns > room:
+            if state[S_POINTS] > room:
                 return i, edge
             _close(
-                lists, counts, seeds, state, whole, fractional, work, work_int, scratch, counters,
-                out,
+                lists, counts, seeds, state, whole, fractional, work, work_int, scratch, table,
+                counters, out,
             )  # fmt: skip
         elif state[S_OPEN] == 1:
             counters[C_EMPTY] += 1

@@ -7,54 +7,93 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
-    """Mean over symmetric pairs of columns; returns how many columns were averaged.
+def _nearest(row, c, target):
+    """Plane of column ``c`` whose row is nearest to ``target``; the first when none is."""
+    best = 0
+    for k in range(1, row.shape[0]):
+        if abs(row[k, c] - target) < abs(row[best, c] - target) or np.isnan(row[best, c]):
+            best = k
+    return best
 
-    The pairs grow outwards and end at the first one that is incomplete or beyond the gate.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _partner(row, k, c, other):
+    """Offset and plane of the return of column ``other`` that shows the surface of ``k`` of ``c``.
+
+    Each of the two is the nearest to the other among its column's returns; NaN when they are not.
     """
-    columns = row.size
+    plane = _nearest(row, other, row[k, c])
+    if _nearest(row, c, row[plane, other]) != k:
+        return np.nan, plane
+    return row[plane, other] - row[k, c], plane
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
+    """Mean over symmetric pairs of columns; returns how many points were averaged.
+
+    Arrays have one plane per return and one entry per column. The pairs grow outwards and end at
+    the first one that is incomplete or beyond the gate.
+    """
+    planes, columns = row.shape
     smoothed = 0
-    for c in range(columns):
-        out_row[c] = row[c]
-        out_sigma2[c] = sigma2[c]
-        centre = row[c]
-        if np.isnan(centre):
-            continue
-        total = 0.0
-        variance = sigma2[c] - common2
-        used = 1
-        for j in range(1, half_width + 1):
-            if c < j or c + j >= columns:
-                break
-            left = row[c - j] - centre
-            right = row[c + j] - centre
-            if not (abs(left) <= gate and abs(right) <= gate):
-                break
-            total += left + right
-            variance += sigma2[c - j] + sigma2[c + j] - 2.0 * common2
-            used += 2
-        if used > 1:
-            out_row[c] = centre + total / used
-            out_sigma2[c] = common2 + variance / (used * used)
-            smoothed += 1
+    for k in range(planes):
+        for c in range(columns):
+            out_row[k, c] = row[k, c]
+            out_sigma2[k, c] = sigma2[k, c]
+            centre = row[k, c]
+            if np.isnan(centre):
+                continue
+            total = 0.0
+            variance = sigma2[k, c] - common2
+            used = 1
+            for j in range(1, half_width + 1):
+                if c < j or c + j >= columns:
+                    break
+                before, after = 0, 0
+                left = row[0, c - j] - centre
+                right = row[0, c + j] - centre
+                if planes > 1:
+                    left, before = _partner(row, k, c, c - j)
+                    right, after = _partner(row, k, c, c + j)
+                if not (abs(left) <= gate and abs(right) <= gate):
+                    break
+                total += left + right
+                variance += sigma2[before, c - j] + sigma2[after, c + j] - 2.0 * common2
+                used += 2
+            if used > 1:
+                out_row[k, c] = centre + total / used
+                out_sigma2[k, c] = common2 + variance / (used * used)
+                smoothed += 1
     return smoothed
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _is_isolated(row, k, c, reach, gate):
+    planes, columns = row.shape
+    for other in range(max(c - reach, 0), min(c + reach + 1, columns)):
+        for plane in range(planes):
+            if other != c and abs(row[plane, other] - row[k, c]) <= gate:
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _reject_isolated(row, events, reach, gate, events_weak, rejected):
-    """Mark weak points without a neighbour near in rows; returns their number."""
-    columns = row.size
+    """Make weak points without a neighbour near in rows NaN; returns their number."""
+    planes, columns = row.shape
     count = 0
-    for c in range(columns):
-        rejected[c] = False
-        if np.isnan(row[c]) or events[c] >= events_weak:
-            continue
-        alone = True
-        for k in range(max(c - reach, 0), min(c + reach + 1, columns)):
-            if k != c and abs(row[k] - row[c]) <= gate:
-                alone = False
-                break
-        if alone:
-            rejected[c] = True
-            count += 1
+    for k in range(planes):
+        for c in range(columns):
+            rejected[k, c] = (
+                not np.isnan(row[k, c])
+                and events[k, c] < events_weak
+                and _is_isolated(row, k, c, reach, gate)
+            )
+            count += rejected[k, c]
+    if count > 0:
+        for k in range(planes):
+            for c in range(columns):
+                if rejected[k, c]:
+                    row[k, c] = np.nan
     return count

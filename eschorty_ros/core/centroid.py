@@ -9,26 +9,51 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core._checks import number, positive, whole
+from eschorty_ros.core._mode_kernels import AMBIGUOUS
+from eschorty_ros.core._row_kernels import likelihood_size
+from eschorty_ros.core._window_kernels import BLOCK, FRACTION, ROW_LAST
 from eschorty_ros.core.errors import ArgumentError
 
-METHODS = ("mode_mean", "mean", "median")
+METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
 METHOD_CODES = {
     "mode_mean": kernels.MODE_MEAN,
     "mean": kernels.MEAN,
     "median": kernels.MEDIAN,
+    "gauss_ml": kernels.GAUSS_ML,
+    "edge_mid": kernels.EDGE_MID,
+}
+WHOLE_COLUMN_METHODS = ("mean", "median")
+RETURNS = ("strongest", "first", "last", "all")
+RETURN_CODES = {
+    "strongest": kernels.STRONGEST,
+    "first": kernels.FIRST,
+    "last": kernels.LAST,
+    "all": kernels.ALL,
 }
 HALF_WIDTH_PER_FWHM = 1.3
 FWHM_PER_SIGMA = 2.3548200450309493
 SIGMA_FACTOR = 0.24
 SIGMA_FLOOR_PX = 0.20
 SIGMA_LIMIT = 1e6
-# The median of independent Gaussian samples scatters sqrt(pi/2) times as much as their mean.
-_MEDIAN_FACTOR = 1.2533141373155003
+METHOD_SIGMA = {
+    "mode_mean": (1.0, 1.0),
+    "mean": (1.0, 1.0),
+    "median": (1.2533, 1.0),
+    "gauss_ml": (1.0, 1.0),
+    "edge_mid": (1.2147, 1.0),
+}
+"""Each method's multiples of ``sigma_factor`` and ``sigma_floor_px``.
+
+The factors are the scatter of independent Gaussian samples against that of their mean: sqrt(pi/2)
+for the median, 1.2147 for the middle of the quantiles 1/8 and 7/8.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Centroids:
-    """One entry per column; NaN (and 0 events) where the column gave no row.
+    """One entry per column, shape (columns,); NaN (and 0 events) where it gave no row.
+
+    With ``returns="all"`` the arrays but ``ambiguous`` have shape (columns, 2), nearest first.
 
     Attributes
     ----------
@@ -41,10 +66,9 @@ class Centroids:
     events : int64
         Events used.
     ambiguous : bool
-        Two separate, equally dense groups of events: no row is given.
+        Two separate, equally dense groups of events where the strongest is asked for: no row.
     edge : bool
-        The first or last row of the sensor cuts the footprint: the row may be off by up to 0.8 of
-        the width (half a Gaussian), which ``sigma_row`` includes.
+        The first or last row of the sensor cuts the footprint, which ``sigma_row`` allows for.
     """
 
     row: NDArray[np.float64]
@@ -58,21 +82,39 @@ class Centroids:
 def half_width_fixed(fwhm_px: float) -> int:
     """Half width of the averaging window for a line of ``fwhm_px``, fixed point."""
     positive("fwhm_px", fwhm_px)
-    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * kernels.FRACTION), 3 * kernels.FRACTION)
+    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), 3 * FRACTION)
 
 
-def method_factor(method: str, sigma_factor: float = SIGMA_FACTOR) -> float:
-    """Factor on s/sqrt(N) for ``method``."""
+def method_sigma(
+    method: str, sigma_factor: float = SIGMA_FACTOR, sigma_floor_px: float = SIGMA_FLOOR_PX
+) -> tuple[float, float]:
+    """Factor on s/sqrt(N) and floor in px of ``method``."""
     check_method(method)
     number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT)
-    return sigma_factor * (_MEDIAN_FACTOR if method == "median" else 1.0)
+    number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT)
+    factor, floor = METHOD_SIGMA[method]
+    return factor * sigma_factor, floor * sigma_floor_px
 
 
-def check_method(method: str) -> int:
-    """Code of ``method`` for the kernels; raises ``ArgumentError`` when there is none."""
+def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
+    """Codes of a method and of the returns it reports, for the kernels.
+
+    Raises
+    ------
+    ArgumentError
+        When there is no such method or policy, or the method cannot tell returns apart.
+    """
     if not isinstance(method, str) or method not in METHOD_CODES:
         raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(METHODS)}")
-    return METHOD_CODES[method]
+    if not isinstance(returns, str) or returns not in RETURN_CODES:
+        raise ArgumentError(f"returns is {returns!r}; choose one of {', '.join(RETURNS)}")
+    if method in WHOLE_COLUMN_METHODS and returns != "strongest":
+        windowed = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]
+        raise ArgumentError(
+            f"returns is {returns!r} and {method!r} takes a column as a whole; choose "
+            f"'strongest', or one of {', '.join(windowed)} as centroid"
+        )
+    return METHOD_CODES[method], RETURN_CODES[returns]
 
 
 def estimate(
@@ -80,6 +122,7 @@ def estimate(
     offsets: ArrayLike,
     method: str = "mode_mean",
     *,
+    returns: str = "strongest",
     line_width_px: float = 20.0,
     height: int = 720,
     events_min: int = 1,
@@ -94,10 +137,16 @@ def estimate(
         Rows of the events, 0 to ``height`` - 1, grouped by column in any order.
     offsets : array of int64, shape (columns + 1,)
         Column ``c`` owns ``rows[offsets[c]:offsets[c + 1]]``.
-    method : {"mode_mean", "mean", "median"}
+    method : {"mode_mean", "mean", "median", "gauss_ml", "edge_mid"}
         ``mode_mean`` averages the densest window (half width 1.3 x ``line_width_px``, at most 5
-        mean-shift steps) and ignores background elsewhere; ``mean`` and ``median`` use the whole
-        column (``mean`` is the method of the paper).
+        mean-shift steps) and ignores background elsewhere. ``gauss_ml`` goes on from there to the
+        greatest likelihood of a Gaussian of ``line_width_px`` on uniform background; ``edge_mid``
+        takes the middle between the window's quantiles 1/8 and 7/8, the edges of the footprint.
+        ``mean`` and ``median`` use the whole column (``mean`` is the method of the paper).
+    returns : {"strongest", "first", "last", "all"}
+        What to give where a second surface stands behind the first: another window at least
+        2 x ``line_width_px`` away whose inner half holds at least half as many events, and more
+        than background explains. ``first`` is the one at the least row, hence the nearest.
     line_width_px : float
         Full width of the line at half maximum, rows.
     height : int
@@ -115,17 +164,20 @@ def estimate(
 
     Notes
     -----
-    ``mode_mean`` is exactly symmetric under mirroring and shifting of the rows and does not depend
+    Every method is exactly symmetric under mirroring and shifting of the rows and does not depend
     on their order. Of equally dense windows the one that ends with more events wins, then the
-    narrower one; overlapping ones are merged; two separate equal ones give NaN, since any choice
-    would prefer a direction.
+    narrower one; overlapping ones are merged; two separate equal ones give NaN where the strongest
+    is asked for, since any choice would prefer a direction, and are both returns otherwise.
+
+    A window that the sensor's edge cuts holds part of a Gaussian: the three windowed methods give
+    the row of the whole line (truncated normal), ``mean`` and ``median`` a sigma that covers it.
 
     Raises
     ------
     ArgumentError
         When rows, offsets or a parameter lie outside what is described above.
     """
-    code = check_method(method)
+    code, policy = check_method(method, returns)
     row_array = _checked_rows(rows, height)
     offset_array = _checked_offsets(offsets, row_array.size)
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
@@ -134,40 +186,27 @@ def estimate(
     number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT)
     columns = offset_array.size - 1
     longest = int(np.diff(offset_array).max(initial=0))
-    scratch = np.empty(longest + kernels.BLOCK, dtype=np.uint32)
-    out = Centroids(
-        np.empty(columns),
-        np.empty(columns),
-        np.empty(columns),
-        np.empty(columns, dtype=np.int64),
-        np.empty(columns, dtype=np.bool_),
-        np.empty(columns, dtype=np.bool_),
-    )
+    half = half_width_fixed(line_width_px)
+    shape = (columns, 2 if returns == "all" else 1)
+    row, sigma, variance = np.empty((3, *shape))
+    events = np.empty(shape, dtype=np.int64)
+    cut = np.empty(shape, dtype=np.bool_)
     status = np.empty(columns, dtype=np.uint8)
     kernels._estimate_lists(
-        row_array,
-        offset_array,
-        code,
-        half_width_fixed(line_width_px),
-        float(height),
-        events_min,
-        method_factor(method, sigma_factor),
-        sigma_floor_px,
-        scratch,
-        out.row,
-        out.sigma_row,
-        out.width,
-        out.events,
-        status,
-    )
-    np.sqrt(out.width, out=out.width)
-    np.equal(status, kernels.AMBIGUOUS, out=out.ambiguous)
-    np.less(np.minimum(out.row, height - 1 - out.row), 2.0 * out.width, out=out.edge)
-    return out
+        row_array, offset_array, code, policy, half, float(height), events_min,
+        *method_sigma(method, sigma_factor, sigma_floor_px),
+        np.empty(longest + BLOCK, dtype=np.uint32), np.empty(likelihood_size(half)),
+        row, sigma, variance, events, cut, status,
+    )  # fmt: skip
+    one = slice(None) if returns == "all" else 0
+    return Centroids(
+        row[:, one], sigma[:, one], np.sqrt(variance[:, one]), events[:, one],
+        status == AMBIGUOUS, cut[:, one],
+    )  # fmt: skip
 
 
 def _checked_rows(rows: ArrayLike, height: int) -> NDArray[np.uint32]:
-    whole("height", height, 1, kernels.ROW_LAST + 1)
+    whole("height", height, 1, ROW_LAST + 1)
     array = np.asarray(rows)
     if array.ndim != 1 or (array.size and not np.issubdtype(array.dtype, np.integer)):
         raise ArgumentError(

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core import _binning as binning
-from eschorty_ros.core import _centroid_kernels as kernels
+from eschorty_ros.core import _window_kernels as windows
 from eschorty_ros.core._checks import exact, whole
-from eschorty_ros.core.centroid import check_method, half_width_fixed, method_factor
+from eschorty_ros.core._row_kernels import likelihood_size
+from eschorty_ros.core.centroid import check_method, half_width_fixed, method_sigma
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
@@ -36,9 +37,9 @@ class ProfileAssembler:
     """
 
     def __init__(self, settings: Settings, model: RangeModel) -> None:
-        if model.rows > kernels.ROW_LAST + 1:
+        if model.rows > windows.ROW_LAST + 1:
             raise ArgumentError(
-                f"rows is {model.rows}; the reconstruction takes {kernels.ROW_LAST + 1} at most"
+                f"rows is {model.rows}; the reconstruction takes {windows.ROW_LAST + 1} at most"
             )
         self._model = model
         self._done: list[Profiles] = []
@@ -48,15 +49,17 @@ class ProfileAssembler:
         self.points_beyond_pole = 0
         self._counts = np.zeros(len(binning.COUNTERS), dtype=np.int64)
         columns = model.columns
-        self._lists = np.empty(columns * (settings.column_limit + kernels.BLOCK), dtype=np.uint32)
+        self._lists = np.empty(columns * (settings.column_limit + windows.BLOCK), dtype=np.uint32)
         self._column_counts = np.zeros(columns, dtype=np.uint32)
         self._seeds = np.full(columns, -1, dtype=np.int64)
         self._state = np.zeros(binning.S_SIZE, dtype=np.int64)
-        self._work = np.zeros((5, columns))
-        self._work_int = np.zeros((3, columns), dtype=np.int64)
-        self._scratch = np.zeros(1 << kernels.ROW_BITS, dtype=np.int64)
+        planes = 2 if settings.returns == "all" else 1
+        self._work = np.zeros((binning.W_SIZE, planes, columns))
+        self._work_int = np.zeros((binning.N_SIZE, planes, columns), dtype=np.int64)
+        self._scratch = np.zeros(1 << windows.ROW_BITS, dtype=np.int64)
+        self._likelihood = np.empty(likelihood_size(self._half_max))
         self._whole, self._fractional = _parameters(settings, model.rows)
-        size = _OUTPUT_PROFILES * columns
+        size = _OUTPUT_PROFILES * planes * columns
         self._whole_out = np.empty((3, size), dtype=np.int64)
         self._column_out = np.empty(size, dtype=np.uint16)
         self._row_out = np.empty((3, size))
@@ -116,7 +119,8 @@ class ProfileAssembler:
             first, edge = binning._bin(
                 t, x, y, p, first, stop, edges, indices, edge, len(edges), drain, self._gate,
                 self._lists, self._column_counts, self._seeds, self._state, self._whole,
-                self._fractional, self._work, self._work_int, self._scratch, self._counts, out,
+                self._fractional, self._work, self._work_int, self._scratch, self._likelihood,
+                self._counts, out,
             )  # fmt: skip
             if first == stop and (edge == len(edges) or not drain):
                 return int(edge)
@@ -167,15 +171,18 @@ class ProfileAssembler:
 
 def _parameters(settings: Settings, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     whole = np.zeros(binning.P_SIZE, dtype=np.int64)
-    whole[binning.P_METHOD] = check_method(settings.centroid)
+    whole[binning.P_METHOD], whole[binning.P_RETURNS] = check_method(
+        settings.centroid, settings.returns
+    )
     whole[binning.P_EVENTS_MIN] = settings.events_min
     whole[binning.P_HALF_MAX] = half_width_fixed(settings.line_width_px)
     whole[binning.P_ROWS] = rows
     whole[binning.P_SMOOTH] = settings.smoothing_half_width
     whole[binning.P_WEAK] = settings.isolation_events
     fractional = np.zeros(binning.F_SIZE)
-    fractional[binning.F_FACTOR] = method_factor(settings.centroid, settings.sigma_factor)
-    fractional[binning.F_FLOOR] = settings.sigma_floor_px
+    fractional[binning.F_FACTOR], fractional[binning.F_FLOOR] = method_sigma(
+        settings.centroid, settings.sigma_factor, settings.sigma_floor_px
+    )
     fractional[binning.F_GATE] = settings.smoothing_gate_px
     fractional[binning.F_ISOLATION] = settings.isolation_gate_px
     return whole, fractional

@@ -7,8 +7,8 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core._checks import octets
+from eschorty_ros.core._window_kernels import TIME_LIMIT_US
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Events
@@ -75,11 +75,11 @@ class Reconstructor:
     def _begin(self, modulation: Modulation) -> None:
         """Start over with the phase; counters and the decoder go on."""
         longest_us = modulation.period_us * (self.settings.periods_per_profile + 1)
-        if longest_us >= kernels.TIME_LIMIT_US:
+        if longest_us >= TIME_LIMIT_US:
             raise ArgumentError(
                 f"periods_per_profile is {self.settings.periods_per_profile}; "
                 f"{modulation.frequency_hz:g} Hz allows "
-                f"{int(kernels.TIME_LIMIT_US / modulation.period_us) - 1}"
+                f"{int(TIME_LIMIT_US / modulation.period_us) - 1}"
             )
         self._modulation = modulation
         self._schedule = EdgeSchedule(modulation, self.settings.periods_per_profile)

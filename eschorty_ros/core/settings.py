@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from eschorty_ros.core._checks import short
-from eschorty_ros.core.centroid import METHODS, SIGMA_FACTOR, SIGMA_FLOOR_PX
+from eschorty_ros.core.centroid import METHODS, RETURNS, SIGMA_FACTOR, SIGMA_FLOOR_PX, check_method
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.phase_gate import GATE_MAX_US
 
@@ -56,6 +56,9 @@ class Settings:
     """
 
     centroid: str = _choice("mode_mean", METHODS, "column estimator")
+    returns: str = _choice(
+        "strongest", RETURNS, "which of two surfaces in one column to report; first is the nearest"
+    )
     noise_filter: str = _choice("none", NOISE_FILTERS, "filter before the events are binned")
     phase_gate_us: int = _number(
         0, 0, GATE_MAX_US, "us", "keep only events this soon after their laser edge; 0 is off"
@@ -106,6 +109,7 @@ class Settings:
     def __post_init__(self) -> None:
         for item in fields(self):
             _check(item.name, getattr(self, item.name), item.default, item.metadata)
+        check_method(self.centroid, self.returns)
 
 
 def _check(name: str, value: Any, default: Any, metadata: Any) -> None:

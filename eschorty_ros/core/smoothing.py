@@ -58,6 +58,9 @@ def smooth(
     whole("half_width", half_width, 0, 1 << 31)
     number("gate_px", gate_px, 0.0)
     number("common_px", common_px, 0.0)
-    out_row, out_sigma2 = np.empty_like(rows), np.empty_like(rows)
-    _smooth(rows, sigma * sigma, common_px * common_px, half_width, gate_px, out_row, out_sigma2)
-    return out_row, np.sqrt(out_sigma2)
+    out_row, out_sigma2 = np.empty((2, 1, rows.size))
+    _smooth(
+        rows[None], (sigma * sigma)[None], common_px * common_px, half_width, gate_px, out_row,
+        out_sigma2,
+    )  # fmt: skip
+    return out_row[0], np.sqrt(out_sigma2[0])

@@ -63,14 +63,17 @@ CALLS: dict[str, Call] = {
     "centroid.half_width_fixed": Call(
         centroid.half_width_fixed, {"fwhm_px": 5.0}, {"fwhm_px": number(0.0)}
     ),
-    "centroid.method_factor": Call(
-        centroid.method_factor,
-        {"method": "mean", "sigma_factor": 0.2},
-        {"method": text(), "sigma_factor": number(-1.0)},
+    "centroid.method_sigma": Call(
+        centroid.method_sigma,
+        {"method": "mean", "sigma_factor": 0.2, "sigma_floor_px": 0.2},
+        {"method": text(), "sigma_factor": number(-1.0), "sigma_floor_px": number(-1.0)},
         {"method": "centroid"},
     ),
     "centroid.check_method": Call(
-        centroid.check_method, {"method": "mean"}, {"method": text()}, {"method": "centroid"}
+        centroid.check_method,
+        {"method": "mode_mean", "returns": "all"},
+        {"method": text(), "returns": text()},
+        {"method": "centroid"},
     ),
     "centroid.estimate": Call(
         centroid.estimate,
@@ -78,6 +81,7 @@ CALLS: dict[str, Call] = {
             "rows": ROWS,
             "offsets": [0, 1, N],
             "method": "mode_mean",
+            "returns": "last",
             "line_width_px": 20.0,
             "height": 720,
             "events_min": 1,
@@ -88,6 +92,7 @@ CALLS: dict[str, Call] = {
             "rows": integers(-1, 720, 65535, 2**40, size=N),
             "offsets": integers(-1, 5, 2**40, size=2),
             "method": text(),
+            "returns": text(),
             "line_width_px": number(0.0, 721.0),
             "height": whole(0, 5000),
             "events_min": whole(0),

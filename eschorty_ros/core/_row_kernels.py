@@ -1,0 +1,223 @@
+"""Compiled estimates of the line's row from the events of a column or a window, and their sigma."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from eschorty_ros.core._window_kernels import (
+    FRACTION,
+    ROW_LAST,
+    ROW_MASK,
+    _limits,
+)
+
+# A window's half width in standard deviations of the line: 1.3 x FWHM, fixed point.
+HALF_PER_SIGMA = 1.3 * 2.3548200450309493 * FRACTION
+EM_ITERATIONS = 4
+_WEIGHT_ONE = 1 << 20
+# Reach of the likelihood in half widths of a window: 4.3 standard deviations.
+_REACH = 1.4
+_EDGE_PART = 8
+_CUT_ITERATIONS = 30
+# Below this part of the variance to expect, a cut line is taken to be narrower than the window's.
+_NARROWER = 0.4
+# Bias of the mean of half a Gaussian, squared, over the variance of that half.
+_CUT_BIAS2 = 1.7519
+
+
+def likelihood_size(half: int) -> int:
+    """Entries of the likelihood's table for windows of ``half`` (fixed point) and narrower."""
+    return int(np.ceil(_REACH * half)) + FRACTION
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _median_row(packed, start, n, counts):
+    """Middle row, or the mean of the two middle rows; ``counts`` is zeroed scratch of 1024."""
+    low = np.int64(ROW_LAST)
+    high = np.int64(0)
+    for i in range(n):
+        row = np.int64(packed[start + i] & ROW_MASK)
+        counts[row] += 1
+        low = min(low, row)
+        high = max(high, row)
+    seen = np.int64(0)
+    lower = np.int64(-1)
+    upper = np.int64(-1)
+    for middle in range(low, high + 1):
+        row = np.int64(middle)
+        seen += counts[row]
+        counts[row] = 0
+        if lower < 0 and 2 * seen >= n:
+            lower = np.int64(row)
+        if upper < 0 and 2 * seen > n:
+            upper = np.int64(row)
+    return (lower + upper) / 2.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _quantile_edge(counts, low, high, step, total):
+    """Row from which on ``total / _EDGE_PART`` events lie behind, going from low to high.
+
+    A row is a pixel half a row to either side with its events spread evenly over it. Between two
+    rows with events the quantile may lie anywhere; the middle is taken.
+    """
+    seen = np.int64(0)
+    row = low
+    while True:
+        here = counts[row]
+        if _EDGE_PART * (seen + here) >= total and here > 0:
+            break
+        seen += here
+        row += step
+    if _EDGE_PART * (seen + here) > total:
+        return row + step * ((total / _EDGE_PART - seen) / here - 0.5)
+    other = row + step
+    while other != high and counts[other] == 0:
+        other += step
+    return (row + other) / 2.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _edge_midpoint(packed, start, n, low, high, counts):
+    """Middle between the rows below and above which an eighth of the events of low..high lies."""
+    total = np.int64(0)
+    for i in range(n):
+        row = np.int64(packed[start + i] & ROW_MASK)
+        if low <= row <= high:
+            counts[row] += 1
+            total += 1
+    below = _quantile_edge(counts, low, high, 1, total)
+    above = _quantile_edge(counts, high, low, -1, total)
+    counts[low : high + 1] = 0
+    return (below + above) / 2.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_likelihood(table, half):
+    """``exp(d^2 / 2 sigma^2)`` for distances of 0, 1, 2... fixed-point steps from the line.
+
+    Returns the entries filled; ``sigma`` is what the window of ``half`` was made for.
+    """
+    size = np.int64(np.ceil(_REACH * half)) + FRACTION
+    scale = 0.5 * (HALF_PER_SIGMA / (FRACTION * half)) ** 2
+    for d in range(size):
+        table[d] = np.exp(scale * (d * d))
+    return size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gauss_ml(packed, start, n, window, first, last, half, rows, table, size):
+    """Row of greatest likelihood for a Gaussian of known width on uniform background.
+
+    Expectation-maximisation of the row and the background's share from the window's mean on, over
+    the events of first..last within reach. The weights are whole numbers and depend on distances
+    in fixed point: the sums are exact.
+    """
+    centre = window[6]
+    line = float(window[0])
+    per_row = np.sqrt(2.0 * np.pi) * half / (HALF_PER_SIGMA * rows)
+    reach = np.int64(_REACH * half)
+    low, high = _limits(centre, reach, first, last)
+    shift = 0.0
+    for _ in range(EM_ITERATIONS):
+        centre += np.int64(np.rint(shift))
+        odds = (n - line) / line * per_row
+        weights = np.int64(0)
+        moment = np.int64(0)
+        for i in range(start, start + n):
+            row = np.int64(packed[i] & ROW_MASK)
+            if low <= row <= high:
+                d = row * FRACTION - centre
+                w = np.int64(_WEIGHT_ONE / (1.0 + odds * table[min(abs(d), size - 1)]))
+                weights += w
+                moment += w * d
+        weights = max(weights, np.int64(1))
+        line = max(weights / _WEIGHT_ONE, 1.0)
+        shift = moment / weights
+    return (centre + shift) / FRACTION
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _variance(count, sum_d, sum_d2):
+    """Sample variance; the numerator is an exact integer, so a constant column gives 0."""
+    if count < 2:
+        return 0.0
+    return (count * sum_d2 - sum_d * sum_d) / (float(count) * (count - 1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sigma2(variance, count, factor, floor):
+    """Variance of the estimated row, px squared.
+
+    Rows quantise to a twelfth when there is no spread to judge by.
+    """
+    sigma2 = factor * factor * variance / count + floor * floor
+    if count < 2 or variance == 0.0:
+        sigma2 = max(sigma2, 1.0 / 12.0 + floor * floor)
+    return sigma2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _uncut(mean, variance, sigma_max):
+    """Centre and sigma of a Gaussian whose part beyond 0 has this mean and variance.
+
+    Sigma is ``sigma_max`` unless the variance is far below what that lets expect; then both are
+    fitted. The centre is not behind 0. Returns also the part's variance over sigma squared. A part
+    that keeps 3 of its standard deviations from 0 is not cut.
+    """
+    if mean > 3.0 * np.sqrt(variance):
+        return mean, np.sqrt(variance), 1.0
+    sigma = sigma_max
+    centre = mean
+    ratio = 1.0
+    fitted = False
+    for step in range(2 * _CUT_ITERATIONS):
+        alpha = -centre / sigma
+        hazard = (
+            np.sqrt(2.0 / np.pi) * np.exp(-0.5 * alpha * alpha) / math.erfc(alpha / np.sqrt(2.0))
+        )
+        ratio = 1.0 + alpha * hazard - hazard * hazard
+        centre = max(centre + (mean - centre - sigma * hazard) / ratio, 0.0)
+        if step == _CUT_ITERATIONS:
+            fitted = variance < _NARROWER * ratio * sigma * sigma
+            if not fitted:
+                break
+        if fitted:
+            sigma = min(np.sqrt(variance / ratio), sigma_max)
+    return centre, sigma, ratio
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _uncut_row(row, sigma2, variance, window, half, rows, factor, floor):
+    """Row, its variance ``sigma2``, and whether the edge of the sensor cuts the window.
+
+    The line is taken to be centred on the sensor. What the correction adds counts half as an
+    error, and wholly at the end of that range; the more is cut off, the more the counts scatter
+    as independent ones do.
+    """
+    count = window[0]
+    reach = half / FRACTION
+    mean = (count * window[1] + window[3]) / count
+    from_low = mean + 0.5
+    from_high = rows - 0.5 - mean
+    beyond = min(from_low, from_high)
+    if beyond > reach or max(from_low, from_high) <= reach or variance == 0.0:
+        return row, sigma2, False
+    centre, sigma, ratio = _uncut(beyond, variance, reach * FRACTION / HALF_PER_SIGMA)
+    shift = beyond - centre
+    share = 1.0 if centre == 0.0 else 0.25
+    scatter2 = factor**2 + max(1.0 - factor**2, 0.0) * (1.0 - ratio)
+    wider2 = scatter2 * sigma**2 / (ratio * count) + floor**2 + share * shift**2
+    return row - shift if from_low < from_high else row + shift, max(sigma2, wider2), True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _whole_sigma2(row, variance, count, rows, factor, floor):
+    """Variance of a row estimated from a whole column, and whether the sensor's edge cuts it."""
+    sigma2 = _sigma2(variance, count, factor, floor)
+    reach = 2.0 * np.sqrt(variance)
+    cut = row < reach or rows - 1.0 - row < reach
+    return sigma2 + _CUT_BIAS2 * variance if cut else sigma2, cut
