@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from eschorty_ros.core._checks import exact, whole
+from eschorty_ros.core._checks import TIME_LIMIT, exact, whole
+from eschorty_ros.core._evt3_encode_kernels import _first_fall
 from eschorty_ros.core._noise_kernels import (
     COLUMN_BITS,
     NEVER,
@@ -22,6 +23,7 @@ from eschorty_ros.core._noise_kernels import (
     STARTED,
     _filter,
 )
+from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Events, event_arrays
 
 _WINDOW_MAX_US = 1_000_000
@@ -54,7 +56,8 @@ class ActivityFilter:
 
     Notes
     -----
-    Times must not fall, as a decoder guarantees. Triggers pass unchanged.
+    Times must not fall, from call to call either, as a decoder guarantees. Triggers pass
+    unchanged.
     """
 
     def __init__(self, width: int = 1280, height: int = 720, window_us: int = 500) -> None:
@@ -73,6 +76,7 @@ class ActivityFilter:
         self._cells = np.full(self._size, NEVER, dtype=np.int32)
         self._state = np.zeros(2, dtype=np.int64)
         self._counts = [0, 0, 0]
+        self._newest_us = -TIME_LIMIT
 
     @property
     def counters(self) -> FilterCounters:
@@ -80,17 +84,29 @@ class ActivityFilter:
         return FilterCounters(*self._counts)
 
     def filter(self, events: Events) -> Events:
-        """Supported events of ``events``: views of reused buffers, valid until the next call."""
-        size = exact("t", events.t, np.int64).size
+        """Supported events of ``events``: views of reused buffers, valid until the next call.
+
+        Raises
+        ------
+        ArgumentError
+            When the arrays are not those of a decoder, or times fall.
+        """
+        t_us = exact("t", events.t, np.int64)
+        size = t_us.size
         columns = exact("x", events.x, np.uint16, size)
         rows = exact("y", events.y, np.uint16, size)
         polarities = exact("p", events.p, np.uint8, size)
+        fall = _first_fall(t_us, self._newest_us)
+        if fall >= 0:
+            raise ArgumentError(f"t[{fall}] is {t_us[fall]} us; sort the events by time")
         if len(self._buffers[0]) < size + 1:
             self._buffers = event_arrays(size + 1)
         if size and not self._state[STARTED]:
-            self._state[ORIGIN_US], self._state[STARTED] = events.t[0], 1
+            self._state[ORIGIN_US], self._state[STARTED] = t_us[0], 1
+        if size:
+            self._newest_us = int(t_us[-1])
         kept, outside = _filter(
-            np.ascontiguousarray(events.t),
+            t_us,
             columns,
             rows,
             polarities,

@@ -11,11 +11,13 @@ import pytest
 from line_events import blank_profiles, encoded, line_events
 
 from eschorty_ros.core import reconstructor as reconstructor_module
+from eschorty_ros.core import reference
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.clock import SensorClock, StageTrack
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.evt3 import Decoder, Encoder, sort_readout
+from eschorty_ros.core.evt3 import Decoder, Encoder, Events, Triggers, sort_readout
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.noise import ActivityFilter
 from eschorty_ros.core.phase import EdgeSchedule, estimate_phase
 from eschorty_ros.core.profiles import Profiles, place
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
@@ -210,6 +212,14 @@ def test_case_10_unsorted_events_are_refused_where_order_counts():
     t = np.array([100, 150, 120])
     with pytest.raises(ArgumentError, match=r"t\[2\] is 120"):
         Encoder().encode(t, t, t, [1, 1, 1])
+    none = np.empty(0, np.int64)
+    events = Events(t, *(t.astype(kind) for kind in ("u2", "u2", "u1")), Triggers(none, none, none))
+    with pytest.raises(ArgumentError, match=r"t\[2\] is 120"):
+        ActivityFilter().filter(events)
+    with pytest.raises(ArgumentError, match="t_us goes from 150 to 120"):
+        estimate_phase(t, np.ones(3, np.uint8), Modulation(70.0))
+    with pytest.raises(ArgumentError, match="t_us goes from 150 to 120"):
+        reference.reconstruct(t, t, t, MODEL, Modulation(70.0))
     track = StageTrack()
     track.append(t, [0.0, 1.0, 9.0])
     assert (len(track), track.dropped) == (2, 1)
