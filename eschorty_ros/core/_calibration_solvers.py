@@ -3,52 +3,116 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core._calibration_model import (
+    COLUMN_TERMS,
+    PARAMETERS,
+    Observed,
+    Values,
+    values_of,
+)
 from eschorty_ros.core._least_squares import condition_number, minimise
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 
 Array = NDArray[np.float64]
 
-PARAMETERS = ("k_mm", "k_prime_px", "b_mm", "b_prime_px")
+
+class Problem:
+    """Whitened residuals of targets, then of priors, and their derivatives.
+
+    Parameters
+    ----------
+    observed : Observed
+    design : RangeModel
+        Values of parameters that stay fixed, centres of the priors.
+    names : tuple of str
+        Free parameters.
+    priors : mapping of str to float
+        Standard deviations.
+    at : Values
+        Where the targets' covariances are taken.
+    weight : ndarray, shape (n,), optional
+        Square root of each target's weight in a robust fit.
+    """
+
+    def __init__(
+        self,
+        observed: Observed,
+        design: RangeModel,
+        names: tuple[str, ...],
+        priors: Mapping[str, float],
+        at: Values,
+        weight: Array | None = None,
+    ) -> None:
+        self.observed, self.design, self.names, self.priors = observed, design, names, dict(priors)
+        root = observed.root_covariance(at)
+        self.root = root
+        self.unit_whitener = np.linalg.inv(root)
+        self.whitener = (
+            self.unit_whitener if weight is None else weight[:, None, None] * self.unit_whitener
+        )
+        self.sigma_px = np.linalg.norm(root, axis=2)
+        self._fixed = values_of(design)
+        self._centre = np.array([self._fixed[name] for name in self.priors])
+        self._spread = np.array(list(self.priors.values()))
+        self._which = [names.index(name) for name in self.priors]
+        # Channels nobody measured would only lengthen the Jacobian.
+        self._rows = observed.known.ravel()
+
+    def values(self, free: Array) -> Values:
+        return self._fixed | dict(zip(self.names, free.tolist(), strict=True))
+
+    def free(self, values: Mapping[str, float]) -> Array:
+        return np.array([values[name] for name in self.names])
+
+    def residual(self, free: Array) -> Array | None:
+        """Expected minus seen over the standard deviation; ``None`` for no possible build."""
+        p = self.values(free)
+        signs = p["k_mm"] > 0.0 > p["k_prime_px"] and p["b_prime_px"] <= -POLE_MARGIN_PX
+        seen = self.observed.residual(p) if signs else None
+        if seen is None:
+            return None
+        white = -np.einsum("nij,nj->ni", self.whitener, seen).ravel()[self._rows]
+        return np.concatenate([white, (free[self._which] - self._centre) / self._spread])
+
+    def jacobian(self, free: Array) -> Array:
+        direct = self.observed.derivative(self.values(free), self.names)
+        white = np.einsum("nij,njp->nip", self.whitener, direct)
+        held = np.zeros((len(self.priors), len(self.names)))
+        held[np.arange(len(self.priors)), self._which] = 1.0 / self._spread
+        return np.concatenate([white.reshape(-1, len(self.names))[self._rows], held])
+
+    def distance(self, values: Values) -> Array:
+        """Whitened residuals without robust weights, shape (n, 3); infinite for no build."""
+        seen = self.observed.residual(values)
+        if seen is None:
+            return np.full(self.observed.seen.shape, np.inf)
+        return np.asarray(np.einsum("nij,nj->ni", self.unit_whitener, seen))
+
+    def leverage(self, values: Values, covariance: Array) -> Array:
+        """Covariance of the whitened expected channels, shape (n, 3, 3)."""
+        direct = self.observed.derivative(values, self.names)
+        white = np.einsum("nij,njp->nip", self.unit_whitener, direct)
+        white = np.where(self.observed.known[:, :, None], white, 0.0)
+        return np.asarray(np.einsum("nip,pq,njq->nij", white, covariance, white))
+
+    def size(self) -> float:
+        """Length of the vector of fitted values, against which steps count as small."""
+        seen = np.where(self.observed.known, self.observed.seen / self.sigma_px, 0.0)
+        return float(np.linalg.norm(seen)) + math.sqrt(len(self.observed))
 
 
-def row_jacobian(model: RangeModel, depth_mm: Array, names: Sequence[str]) -> Array:
-    """Differentiate the row (Eq. 2) by the named parameters, which become the last axis."""
-    product = model.product_mm_px
-    columns = {
-        "k_mm": model.k_prime_px / depth_mm,
-        "k_prime_px": model.k_mm / depth_mm,
-        "b_mm": -product / (depth_mm * depth_mm),
-        "b_prime_px": np.full_like(depth_mm, -1.0),
-    }
-    return np.stack([columns[name] for name in names], axis=-1)
-
-
-def jacobian(
-    model: RangeModel,
-    ranges: Array,
-    sigma: Array,
-    names: tuple[str, ...],
-    priors: Mapping[str, float],
-) -> Array:
-    """Rows for targets, then for priors, each over its standard deviation."""
-    targets = row_jacobian(model, ranges + model.b_mm, names) / sigma[:, None]
-    held = np.zeros((len(priors), len(names)))
-    for index, (name, spread) in enumerate(priors.items()):
-        held[index, names.index(name)] = 1.0 / spread
-    return np.concatenate([targets, held])
-
-
-def straight_line(rows: Array, ranges: Array, sigma: Array, design: RangeModel) -> RangeModel:
+def straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Values:
     """Row = K x - b' on x = 1 / (R + b), centred: one column of condition 1."""
-    x = 1.0 / (ranges + design.b_mm)
+    rows = observed.seen[:, 0]
+    x = 1.0 / (observed.range_mm + design.b_mm)
     weight = 1.0 / (sigma * sigma)
     total = math.fsum(weight)
     x_mean, row_mean = math.fsum(weight * x) / total, math.fsum(weight * rows) / total
@@ -57,51 +121,37 @@ def straight_line(rows: Array, ranges: Array, sigma: Array, design: RangeModel) 
     product = math.fsum((u / length) * v) / length
     # What rounding left in the means comes back through the mean residual.
     rest = math.fsum(weight * (rows - row_mean - product * (x - x_mean))) / total
-    return build(design, {
+    return values_of(design) | {
         "k_prime_px": product / design.k_mm,
         "b_prime_px": product * x_mean - row_mean - rest,
-    })  # fmt: skip
+    }
 
 
-def search(
-    rows: Array,
-    ranges: Array,
-    sigma: Array,
-    start: RangeModel,
-    design: RangeModel,
-    names: tuple[str, ...],
-    priors: dict[str, float],
-) -> RangeModel:
-    centre = np.array([getattr(design, name) for name in priors])
-    spread = np.array(list(priors.values()))
-    which = [names.index(name) for name in priors]
-    straight = _Straightened(names, design, float(np.mean(ranges)))
+def search(problem: Problem, start: Values) -> Values:
+    """Values of the smallest sum of squares, from ``start`` on.
 
-    def residual(searched: Array) -> Array | None:
-        values = straight.parameters(searched)
-        p = {name: getattr(design, name) for name in PARAMETERS} | straight.named(values)
-        depth = ranges + p["b_mm"]
-        signs = p["k_mm"] > 0.0 > p["k_prime_px"] and p["b_prime_px"] <= -POLE_MARGIN_PX
-        if not (signs and depth.min() > 0.0):
-            return None
-        fitted = p["k_mm"] * p["k_prime_px"] / depth - p["b_prime_px"]
-        return np.concatenate([(fitted - rows) / sigma, (values[which] - centre) / spread])
+    Raises
+    ------
+    FitError
+        When the search does not end.
+    """
+    straight = _Straightened(problem, float(np.mean(problem.observed.range_mm)))
 
     def derivative(searched: Array) -> Array:
-        model = build(design, straight.named(straight.parameters(searched)))
-        direct = jacobian(model, ranges, sigma, names, priors)
+        direct = problem.jacobian(straight.parameters(searched))
         return np.asarray(direct @ straight.derivative(searched))
 
     begin = straight.searched(start)
-    size = float(np.linalg.norm(rows / sigma)) + math.sqrt(rows.size)
-    found = minimise(begin, residual, derivative, size)
+    found = minimise(
+        begin, lambda s: problem.residual(straight.parameters(s)), derivative, problem.size()
+    )
     if found is None:
         condition = condition_number(derivative(begin))
         raise FitError(
-            f"the search for {', '.join(names)} does not end (condition number {condition:.3g}); "
-            "add targets at other ranges or a prior_sigma"
+            f"the search for {', '.join(problem.names)} does not end (condition number "
+            f"{condition:.3g}); add targets at other ranges or a prior_sigma"
         )
-    return build(design, straight.named(straight.parameters(found)))
+    return problem.values(straight.parameters(found))
 
 
 class _Straightened:
@@ -111,53 +161,57 @@ class _Straightened:
     targets: then b is its curvature alone. Otherwise the parameters are searched as they are.
     """
 
-    def __init__(self, names: tuple[str, ...], design: RangeModel, middle_mm: float) -> None:
-        self._names, self._design, self._middle_mm = names, design, middle_mm
-        self._active = {"k_prime_px", "b_mm", "b_prime_px"} <= set(names)
+    def __init__(self, problem: Problem, middle_mm: float) -> None:
+        self._names, self._problem, self._middle_mm = problem.names, problem, middle_mm
+        self._active = {"k_prime_px", "b_mm", "b_prime_px"} <= set(problem.names)
 
-    def named(self, values: Array) -> dict[str, float]:
-        return dict(zip(self._names, values.tolist(), strict=True))
-
-    def searched(self, model: RangeModel) -> Array:
-        values = {name: getattr(model, name) for name in self._names}
+    def searched(self, start: Values) -> Array:
+        values = dict(start)
         if self._active:
-            values["b_prime_px"] = float(model.row(self._middle_mm))
-            values["k_prime_px"] = 1.0 / float(model.range_per_row_mm(self._middle_mm))
-        return np.array(list(values.values()))
+            depth = self._middle_mm + values["b_mm"]
+            product = values["k_mm"] * values["k_prime_px"]
+            values["b_prime_px"] = product / depth - values["b_prime_px"]
+            values["k_prime_px"] = -product / (depth * depth)
+        return self._problem.free(values)
 
     def parameters(self, searched: Array) -> Array:
         if not self._active:
             return searched
-        p = self.named(searched)
+        p = self._problem.values(searched)
         depth, slope = self._middle_mm + p["b_mm"], p["k_prime_px"]
-        p["k_prime_px"] = -slope * depth * depth / p.get("k_mm", self._design.k_mm)
+        p["k_prime_px"] = -slope * depth * depth / p["k_mm"]
         p["b_prime_px"] = -slope * depth - p["b_prime_px"]
-        return np.array(list(p.values()))
+        return self._problem.free(p)
 
     def derivative(self, searched: Array) -> Array:
         """Parameters (rows) by searched ones (columns)."""
         matrix = np.eye(len(self._names))
         if not self._active:
             return matrix
-        p = self.named(searched)
-        depth, slope = self._middle_mm + p["b_mm"], p["k_prime_px"]
-        k_mm = p.get("k_mm", self._design.k_mm)
+        p = self._problem.values(searched)
+        depth, slope, k_mm = self._middle_mm + p["b_mm"], p["k_prime_px"], p["k_mm"]
         at = {name: index for index, name in enumerate(self._names)}
         k_prime, b_prime, b = at["k_prime_px"], at["b_prime_px"], at["b_mm"]
         matrix[k_prime, k_prime] = -depth * depth / k_mm
         matrix[k_prime, b] = -2.0 * slope * depth / k_mm
         if "k_mm" in at:
             matrix[k_prime, at["k_mm"]] = slope * (depth / k_mm) ** 2
-        matrix[b_prime, k_prime], matrix[b_prime, b], matrix[b_prime, b_prime] = (
-            -depth,
-            -slope,
-            -1.0,
-        )
+        matrix[b_prime, k_prime] = -depth
+        matrix[b_prime, b] = -slope
+        matrix[b_prime, b_prime] = -1.0
         return matrix
 
 
-def build(design: RangeModel, values: dict[str, Any]) -> RangeModel:
+def build(design: RangeModel, values: Values) -> RangeModel:
+    """Build with these parameters.
+
+    Raises
+    ------
+    FitError
+        When there is no such build.
+    """
     try:
-        return replace(design, **values)
+        named: dict[str, Any] = {name: values[name] for name in (*PARAMETERS, *COLUMN_TERMS)}
+        return replace(design, **named)
     except ArgumentError as error:
         raise FitError(f"the targets lead to no possible build: {error}; check them") from error

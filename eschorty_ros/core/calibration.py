@@ -27,7 +27,15 @@ from eschorty_ros.core.optics import (
 from eschorty_ros.core.yaml_file import Schema, read_yaml, validate
 
 BUILDS = ("nominal", "config_1", "config_2", "config_3")
-PARAMETERS = ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "principal_column")
+PARAMETERS = (
+    "k_mm",
+    "k_prime_px",
+    "b_mm",
+    "b_prime_px",
+    "b_prime_1_px",
+    "b_prime_2_px",
+    "principal_column",
+)
 
 Positive = Annotated[float, Field(gt=0.0)]
 # A strict tuple refuses the list that YAML makes of it; its items stay strict.
@@ -55,6 +63,8 @@ class Calibration(Schema):
     k_prime_px: Annotated[float, Field(lt=0.0)]
     b_mm: float = 0.0
     b_prime_px: Annotated[float, Field(le=-POLE_MARGIN_PX)]
+    b_prime_1_px: float = 0.0
+    b_prime_2_px: float = 0.0
     columns: Annotated[int, Field(gt=0, le=2048)] = COLUMNS
     rows: Annotated[int, Field(gt=0, le=2048)] = ROWS
     principal_column: float = PRINCIPAL_COLUMN
@@ -143,6 +153,8 @@ class Calibration(Schema):
             rows=self.rows,
             principal_column=self.principal_column,
             theta_deg=self.theta_deg,
+            b_prime_1_px=self.b_prime_1_px,
+            b_prime_2_px=self.b_prime_2_px,
         )
 
 

@@ -13,17 +13,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core._calibration_solvers import (
-    PARAMETERS,
-    jacobian,
-    row_jacobian,
-    search,
-    straight_line,
+from eschorty_ros.core._calibration_checks import (
+    check_targets,
+    checked_free,
+    checked_priors,
+    refuse_singular,
 )
-from eschorty_ros.core._checks import positive, reals, vector
+from eschorty_ros.core._calibration_model import (
+    COLUMN_TERMS,
+    PARAMETERS,
+    WIDTH_BIAS,
+    Observed,
+    row_derivative,
+    values_of,
+)
+from eschorty_ros.core._calibration_solvers import Problem, build, search, straight_line
+from eschorty_ros.core._checks import broadcast, reals
 from eschorty_ros.core._least_squares import condition_number, covariance
-from eschorty_ros.core.errors import ArgumentError, FitError
+from eschorty_ros.core.errors import FitError
 from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.targets import Targets
+
+__all__ = [
+    "COLUMN_TERMS",
+    "CONDITION_WARNING",
+    "PAPER_FREE",
+    "PARAMETERS",
+    "WIDTH_BIAS",
+    "CalibrationFit",
+    "fit",
+    "fit_targets",
+]
 
 Array = NDArray[np.float64]
 
@@ -50,10 +70,16 @@ class CalibrationFit:
         Row as measured minus row as fitted.
     sigma_px : ndarray of float64, shape (n,)
         Standard deviation of each residual: row and range error together.
+    lateral_residual_px, lateral_sigma_px : ndarray of float64, shape (n, 2)
+        The same for widths and spacings; NaN where there is none or k stays fixed.
+    width_bias_px : float
+        Columns by which lit targets appear too wide; 0 unless fitted.
+    prior_sigma : dict of str to float
+        Standard deviations of the priors.
     condition_number : float
         Of the Jacobian of targets and priors with columns of unit length.
     dof : int
-        Targets plus priors minus free parameters.
+        Rows, widths, spacings and priors minus free parameters.
     chi_square : float
         Sum of squared residuals of targets and priors over their standard deviations.
     verdicts : tuple of str
@@ -65,6 +91,10 @@ class CalibrationFit:
     covariance: Array
     residual_px: Array
     sigma_px: Array
+    lateral_residual_px: Array
+    lateral_sigma_px: Array
+    width_bias_px: float
+    prior_sigma: dict[str, float]
     condition_number: float
     dof: int
     chi_square: float
@@ -75,14 +105,23 @@ class CalibrationFit:
         """``chi_square / dof``; NaN without degrees of freedom."""
         return self.chi_square / self.dof if self.dof else math.nan
 
-    def range_sigma_mm(self, range_mm: ArrayLike) -> Array:
+    @property
+    def values(self) -> dict[str, float]:
+        """Every parameter by name, fitted or not."""
+        return values_of(self.model) | {WIDTH_BIAS: self.width_bias_px}
+
+    def range_sigma_mm(self, range_mm: ArrayLike, column: ArrayLike | None = None) -> Array:
         """One-sigma error of a range, mm, that the fit's own uncertainty causes; any shape."""
-        model = self.model
+        model, p = self.model, self.values
         depth = reals("range_mm", range_mm) + model.b_mm
         depth = np.where(depth > 0.0, depth, np.nan)
+        u = np.zeros(()) if column is None else model.normalised_column(column)
+        broadcast("range_mm and column", depth, u)
+        depth, u = np.broadcast_arrays(depth, u)
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             mm_per_row = depth * depth / -model.product_mm_px
-            slope = row_jacobian(model, depth, self.free) * mm_per_row[..., None]
+            by_row = np.stack([row_derivative(p, depth, u, name) for name in self.free], axis=-1)
+            slope = by_row * mm_per_row[..., None]
             return np.asarray(np.sqrt(np.einsum("...i,ij,...j", slope, self.covariance, slope)))
 
 
@@ -96,26 +135,53 @@ def fit_targets(
     sigma_range_mm: ArrayLike = 0.0,
     prior_sigma: Mapping[str, float] | None = None,
 ) -> CalibrationFit:
-    """Weighted least squares of Eq. 2 for the parameters in ``free``.
+    """Weighted least squares of Eq. 2 on bare rows and ranges.
 
     Parameters
     ----------
-    row : array_like of float, shape (n,)
-        Where the targets appear, px, on the sensor.
-    range_mm : array_like of float, shape (n,)
-        Their ranges from the mechanical datum, mm.
+    row, range_mm : array_like of float, shape (n,)
+        Where the targets appear, px, and their ranges from the mechanical datum, mm.
+    sigma_row_px, sigma_range_mm : array_like of float, scalar or shape (n,)
+        Their standard deviations.
+    design, free, prior_sigma
+        As in `fit`, which also says what is raised.
+
+    Returns
+    -------
+    CalibrationFit
+    """
+    targets = Targets(row, range_mm, sigma_row_px, sigma_range_mm)
+    return fit(targets, design, free, prior_sigma=prior_sigma)
+
+
+def fit(
+    targets: Targets,
+    design: RangeModel,
+    free: Sequence[str] = PAPER_FREE,
+    *,
+    prior_sigma: Mapping[str, float] | None = None,
+    sized: bool | None = None,
+) -> CalibrationFit:
+    """Weighted least squares of Eq. 2, and of known sizes where k is free.
+
+    Parameters
+    ----------
+    targets : Targets
+        A row weighs with ``sigma_row^2 + (K / (R + b)^2 sigma_range)^2``; the range error that row
+        and width of one target share is accounted for.
     design : RangeModel
         Nominal build: values of the parameters that stay fixed, centres of the priors, start of
         the search.
     free : sequence of str
-        Parameters to fit, of ``k_mm``, ``k_prime_px``, ``b_mm``, ``b_prime_px``. The default is the
-        paper's method. It is solved in closed form on centred reciprocal depths with exactly
-        rounded sums: the same targets in any order give the same bits.
-    sigma_row_px, sigma_range_mm : array_like of float, scalar or shape (n,)
-        Standard deviations of rows and ranges. They weight a target with
-        ``sigma_row^2 + (K / (R + b)^2 sigma_range)^2``.
+        Parameters to fit, of ``k_mm``, ``k_prime_px``, ``b_mm``, ``b_prime_px``,
+        ``b_prime_1_px``, ``b_prime_2_px``, ``width_bias_px``. The default is the paper's method.
+        It is solved in closed form on centred reciprocal depths with exactly rounded sums: the
+        same targets in any order give the same bits.
     prior_sigma : mapping of str to float, optional
-        Standard deviations of Gaussian priors on free parameters, centred on ``design``.
+        Standard deviations of Gaussian priors on free parameters, centred on ``design``; on a
+        width bias centred on 0. Infinity means no prior.
+    sized : bool, optional
+        Whether known sizes and spacings count; by default where k or the width bias is free.
 
     Returns
     -------
@@ -124,50 +190,41 @@ def fit_targets(
     Raises
     ------
     ArgumentError
-        When an argument is not finite, of the wrong shape, or names an unknown parameter.
+        When a target lies off the sensor or behind the focal line, or a name is unknown.
     FitError
         When the targets do not determine the parameters; names the condition number.
 
     Notes
     -----
-    Ranges depend on k and k' only through their product, so freeing both needs a prior on one.
+    Ranges depend on k and k' only through their product, so freeing both needs sizes, spacings or
+    a prior on one.
     """
-    rows, ranges = vector("row", row), vector("range_mm", range_mm)
-    if rows.shape != ranges.shape:
-        raise ArgumentError(
-            f"row has {rows.size} entries and range_mm {ranges.size}; give one row per range"
-        )
-    _check_targets(rows, ranges, design)
-    names = _checked_free(free)
-    priors = _checked_priors(prior_sigma, names)
-    sigma_row = _spread("sigma_row_px", sigma_row_px, rows.size, zero_allowed=False)
-    sigma_range = _spread("sigma_range_mm", sigma_range_mm, rows.size, zero_allowed=True)
-    model = design
-    for _ in range(1 + _REWEIGHTINGS * bool(sigma_range.any())):
-        depth = ranges + model.b_mm
-        sigma = np.hypot(sigma_row, model.product_mm_px / (depth * depth) * sigma_range)
-        _refuse_singular(rows, ranges, sigma, model, names, priors)
-        if set(names) == set(PAPER_FREE) and not priors:
-            model = straight_line(rows, ranges, sigma, design)
+    names = checked_free(free)
+    priors = checked_priors(prior_sigma, names)
+    priors = {name: spread for name, spread in priors.items() if spread != math.inf}
+    check_targets(targets, design, names)
+    observed = Observed.of(targets, design)
+    if not (bool({"k_mm", WIDTH_BIAS} & set(names)) if sized is None else sized):
+        observed = observed.rows_only()
+    closed = set(names) == set(PAPER_FREE) and not priors and not observed.known[:, 1:].any()
+    values = values_of(design)
+    for _ in range(1 + _REWEIGHTINGS * bool(observed.sigma_range_mm.any())):
+        problem = Problem(observed, design, names, priors, values)
+        refuse_singular(problem, values)
+        if closed:
+            values = straight_line(observed, problem.sigma_px[:, 0], design)
         else:
-            model = search(rows, ranges, sigma, model, design, names, priors)
-    return _result(rows, ranges, sigma, model, design, names, priors)
+            values = search(problem, values)
+        model = build(design, values)
+    return _result(problem, model, values[WIDTH_BIAS])
 
 
-def _result(
-    rows: Array,
-    ranges: Array,
-    sigma: Array,
-    model: RangeModel,
-    design: RangeModel,
-    names: tuple[str, ...],
-    priors: dict[str, float],
-) -> CalibrationFit:
-    scaled = jacobian(model, ranges, sigma, names, priors)
+def _result(problem: Problem, model: RangeModel, width_bias_px: float) -> CalibrationFit:
+    values = values_of(model) | {WIDTH_BIAS: width_bias_px}
+    free = problem.free(values)
+    scaled = problem.jacobian(free)
     condition = condition_number(scaled)
-    residual = rows - model.row(ranges)
-    pulls = [(getattr(model, n) - getattr(design, n)) / s for n, s in priors.items()]
-    dof = rows.size + len(priors) - len(names)
+    dof = scaled.shape[0] - len(problem.names)
     verdicts = []
     if condition > CONDITION_WARNING:
         verdicts.append(
@@ -176,88 +233,22 @@ def _result(
         )
     if dof == 0:
         verdicts.append("no degrees of freedom: residuals say nothing; add targets")
+    seen, white = problem.observed.residual(values), problem.residual(free)
+    if seen is None or white is None:
+        raise FitError("the targets lead to no possible build; check them")
+    known = problem.observed.known[:, 1:]
     return CalibrationFit(
         model,
-        names,
+        problem.names,
         covariance(scaled),
-        residual,
-        sigma,
+        seen[:, 0],
+        problem.sigma_px[:, 0],
+        np.where(known, seen[:, 1:], np.nan),
+        np.where(known, problem.sigma_px[:, 1:], np.nan),
+        width_bias_px,
+        problem.priors,
         condition,
         dof,
-        math.fsum([*(residual / sigma) ** 2, *(pull * pull for pull in pulls)]),
+        math.fsum(white * white),
         tuple(verdicts),
     )
-
-
-def _refuse_singular(
-    rows: Array,
-    ranges: Array,
-    sigma: Array,
-    model: RangeModel,
-    names: tuple[str, ...],
-    priors: Mapping[str, float],
-) -> None:
-    """Rank test on the scaled Jacobian; says in the user's terms why it fails."""
-    free = ", ".join(names)
-    if rows.size > 1 and np.ptp(rows) == 0.0 and np.ptp(ranges) > 0.0:
-        raise FitError(
-            f"row is {rows[0]:g} for all {rows.size} targets (condition number inf); "
-            "give targets whose rows move with their range"
-        )
-    condition = condition_number(jacobian(model, ranges, sigma, names, priors))
-    if math.isfinite(condition):
-        return
-    distinct = np.unique(ranges).size
-    if {"k_mm", "k_prime_px"} <= set(names) and not {"k_mm", "k_prime_px"} & set(priors):
-        remedy = "ranges show only the product k_mm k_prime_px: fix one or give it a prior_sigma"
-    else:
-        needed = len(set(names) - set(priors))
-        remedy = f"give targets at {max(needed, 2)} different ranges or more"
-    raise FitError(
-        f"free is {free} and range_mm holds {distinct} different ranges: singular, condition "
-        f"number {condition:g}; {remedy}"
-    )
-
-
-def _check_targets(rows: Array, ranges: Array, design: RangeModel) -> None:
-    off = (rows < -0.5) | (rows > design.rows - 0.5)
-    if off.any():
-        raise ArgumentError(f"row is {rows[off][0]:g}; the sensor has rows 0 to {design.rows - 1}")
-    behind = ranges + design.b_mm <= 0.0
-    if behind.any():
-        raise ArgumentError(
-            f"range_mm is {ranges[behind][0]:g}; choose ranges beyond -b_mm = {-design.b_mm:g} mm"
-        )
-
-
-def _checked_free(free: Sequence[str]) -> tuple[str, ...]:
-    names = tuple(free) if isinstance(free, list | tuple) else (free,)
-    known = all(isinstance(name, str) and name in PARAMETERS for name in names)
-    if not (names and known and len(set(names)) == len(names)):
-        raise ArgumentError(f"free is {free!r}; name each once, of {', '.join(PARAMETERS)}")
-    return names
-
-
-def _checked_priors(
-    prior_sigma: Mapping[str, float] | None, names: tuple[str, ...]
-) -> dict[str, float]:
-    if not isinstance(prior_sigma, Mapping | None):
-        raise ArgumentError(f"prior_sigma is {prior_sigma!r}; give a number for each name")
-    priors = dict(prior_sigma or {})
-    for name, spread in priors.items():
-        if name not in names:
-            raise ArgumentError(f"prior_sigma names {name!r}; free is {', '.join(names)}")
-        positive(f"prior_sigma of {name}", spread)
-    return priors
-
-
-def _spread(name: str, value: ArrayLike, size: int, *, zero_allowed: bool) -> Array:
-    given = reals(name, value)
-    array = vector(name, np.broadcast_to(given, size) if given.ndim == 0 else given)
-    if array.size != size:
-        raise ArgumentError(f"{name} has {array.size} entries; give one or {size}")
-    wrong = array < 0.0 if zero_allowed else array <= 0.0
-    if wrong.any():
-        least = "0 or more" if zero_allowed else "a positive number"
-        raise ArgumentError(f"{name} is {array[wrong][0]:g}; choose {least}")
-    return array

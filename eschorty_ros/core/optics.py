@@ -106,6 +106,9 @@ class RangeModel:
     theta_deg : float
         Tilt of the light sheet against the lens plane, above 0 up to 90. Ranging needs only
         ``k`` and ``k'``; what lies off the sheet (:meth:`rows_per_mm_off_sheet`) needs it too.
+    b_prime_1_px, b_prime_2_px : float
+        Row offset across the columns, px: ``b'(column) = b' + b'1 u + b'2 u^2`` with ``u`` the
+        :meth:`normalised_column`. Roll of the sheet against the sensor, and smile.
 
     Raises
     ------
@@ -122,9 +125,13 @@ class RangeModel:
     rows: int = ROWS
     principal_column: float = PRINCIPAL_COLUMN
     theta_deg: float = 90.0
+    b_prime_1_px: float = 0.0
+    b_prime_2_px: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("k_prime_px", "b_mm", "b_prime_px", "principal_column"):
+        for name in (
+            "k_prime_px", "b_mm", "b_prime_px", "principal_column", "b_prime_1_px", "b_prime_2_px",
+        ):  # fmt: skip
             number(name, getattr(self, name))
         for name in ("k_mm", "pixel_um"):
             positive(name, getattr(self, name))
@@ -139,6 +146,12 @@ class RangeModel:
             )
         if not 0.0 < number("theta_deg", self.theta_deg) <= 90.0:
             raise ArgumentError(f"theta_deg is {self.theta_deg!r}; choose above 0 and up to 90")
+        edges = self.row_offset_px([0.0, self.columns - 1.0])
+        if not edges.max() <= -POLE_MARGIN_PX:
+            raise ArgumentError(
+                f"b_prime_1_px is {self.b_prime_1_px!r} and b_prime_2_px {self.b_prime_2_px!r}: "
+                "the pole comes before row 0 at the edge of the sensor; choose smaller terms"
+            )
         if not -math.inf < self.product_mm_px < 0.0:
             raise ArgumentError(
                 f"k_mm is {self.k_mm!r} and k_prime_px {self.k_prime_px!r}; their product leaves "
@@ -152,36 +165,54 @@ class RangeModel:
 
     @property
     def range_limits_mm(self) -> tuple[float, float]:
-        """Range at row 0 and at the last row, mm; infinite where the pole is on the sensor."""
+        """Range at row 0 and at the last row in the principal column, mm.
+
+        Infinite where the pole is on the sensor.
+        """
         near, far = self.range_mm([0.0, self.rows - 1.0])
         return float(near), math.inf if math.isnan(far) else float(far)
 
-    def range_mm(self, row: ArrayLike) -> Array:
+    def normalised_column(self, column: ArrayLike) -> Array:
+        """``u``: 0 at the principal column, 1 half a sensor further, any shape."""
+        return np.asarray((reals("column", column) - self.principal_column) / (0.5 * self.columns))
+
+    def row_offset_px(self, column: ArrayLike | None = None) -> Array:
+        """``b'`` in these columns, px, any shape; in the principal column by default."""
+        if column is None:
+            return np.asarray(self.b_prime_px)
+        u = self.normalised_column(column)
+        return self.b_prime_px + u * (self.b_prime_1_px + u * self.b_prime_2_px)
+
+    def range_mm(self, row: ArrayLike, column: ArrayLike | None = None) -> Array:
         """Range along the sheet from the mechanical datum (Eq. 2 inverted).
 
         Parameters
         ----------
         row : array_like, any shape
             Row coordinate, px; may lie off the sensor.
+        column : array_like, optional
+            Where the row was seen; broadcasts with ``row``. The principal column by default.
 
         Returns
         -------
-        ndarray of float64, shape of ``row``
+        ndarray of float64, shape of ``row`` and ``column``
             mm; NaN within 1 px of the pole and behind it (``row + b' > -1``).
         """
-        return np.asarray(self.product_mm_px / self._image_px(row) - self.b_mm)
+        return np.asarray(self.product_mm_px / self._image_px(row, column) - self.b_mm)
 
-    def row(self, range_mm: ArrayLike) -> Array:
-        """Row at which a range appears, px (Eq. 2).
+    def row(self, range_mm: ArrayLike, column: ArrayLike | None = None) -> Array:
+        """Row at which a range appears, px (Eq. 2); ``column`` as in :meth:`range_mm`.
 
         NaN where ``range + b <= 0``, or so little above that no number holds the row.
         """
+        depth, offset = self._depth_mm(range_mm), self.row_offset_px(column)
+        broadcast("range_mm and column", depth, offset)
         with np.errstate(over="ignore"):
-            row = self.product_mm_px / self._depth_mm(range_mm) - self.b_prime_px
+            row = self.product_mm_px / depth - offset
         return np.where(np.isfinite(row), row, np.nan)
 
     def magnification(self, row: ArrayLike) -> Array:
-        """Image size over object size at ``row``: ``(row + b') / k'``.
+        """Image size over object size at ``row`` of the principal column: ``(row + b') / k'``.
 
         A straight line in row that reaches 0 at the pole; NaN behind the pole.
         """
@@ -194,12 +225,14 @@ class RangeModel:
         with np.errstate(over="ignore"):
             return np.asarray(depth * depth / -self.product_mm_px)
 
-    def range_sigma_mm(self, row: ArrayLike, sigma_row: ArrayLike) -> Array:
+    def range_sigma_mm(
+        self, row: ArrayLike, sigma_row: ArrayLike, column: ArrayLike | None = None
+    ) -> Array:
         """One-sigma range error (mm) of a row known to ``sigma_row`` px (Eq. 4).
 
-        ``row`` and ``sigma_row`` broadcast; NaN where :meth:`range_mm` is NaN.
+        The arguments broadcast; NaN where :meth:`range_mm` is NaN.
         """
-        image, sigma = self._image_px(row), reals("sigma_row", sigma_row)
+        image, sigma = self._image_px(row, column), reals("sigma_row", sigma_row)
         broadcast("row and sigma_row", image, sigma)
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray(-self.product_mm_px / (image * image) * sigma)
@@ -265,9 +298,11 @@ class RangeModel:
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray((self.k_mm / depth) ** 2 * lever / scale)
 
-    def _image_px(self, row: ArrayLike) -> Array:
+    def _image_px(self, row: ArrayLike, column: ArrayLike | None) -> Array:
         """``row + b'``, NaN from one pixel before the pole on."""
-        image = reals("row", row) + self.b_prime_px
+        rows, offset = reals("row", row), self.row_offset_px(column)
+        broadcast("row and column", rows, offset)
+        image = rows + offset
         return np.where(image <= -POLE_MARGIN_PX, image, np.nan)
 
     def _depth_mm(self, range_mm: ArrayLike) -> Array:

@@ -148,15 +148,16 @@ class ProfileAssembler:
             return
         period, edge, t_us = self._whole_out[:, :n].copy()
         row, sigma, width = self._row_out[:, :n].copy()
+        column = self._column_out[:n].copy()
         profiles = Profiles(
             period,
             edge,
             t_us,
-            self._column_out[:n].copy(),
+            column,
             row,
             sigma,
-            self._model.range_mm(row),
-            self._model.range_sigma_mm(row, sigma),
+            self._model.range_mm(row, column),
+            self._model.range_sigma_mm(row, sigma, column),
             self._events_out[:n].copy(),
             width,
             self._return_out[:n].copy(),

@@ -155,7 +155,7 @@ class World:
         for k in range(0, len(phases), 256):
             t_us, stage_mm = zip(*phases[k : k + 256], strict=True)
             range_mm = self.scene.range_mm(np.array(stage_mm), self._every_column, self.model)
-            row = self.model.row(range_mm)
+            row = self.model.row(range_mm, self._every_column)
             phase, column = np.nonzero((row >= 0.0) & (row <= self.rows - 1.0))
             part = np.empty(phase.size, dtype=TRUTH_DTYPE)
             part["t_us"] = np.array(t_us)[phase]
@@ -194,7 +194,7 @@ class World:
         if position_mm != self._drawn_mm:
             stage = np.array([position_mm])
             range_mm = self.scene.range_mm(stage, self._every_column, self.model)[0]
-            row = self.model.row(range_mm)
+            row = self.model.row(range_mm, self._every_column)
             moved = ~(np.abs(row - self._drawn_row) <= _ROW_STEP)
             moved &= ~(np.isnan(row) & np.isnan(self._drawn_row))
             if moved.any():

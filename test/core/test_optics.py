@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import mpmath
 import numpy as np
@@ -222,3 +223,23 @@ def test_one_millimetre_beside_the_sheet_costs_what_the_table_says() -> None:
     )
     with pytest.raises(ArgumentError, match="k_prime_px is -3000"):
         RangeModel(24.0, -3000.0, 0.0, -400.0).rows_per_mm_off_sheet(1000.0)
+
+
+def test_roll_and_smile_move_the_rows_of_the_outer_columns() -> None:
+    straight = load_calibration("config_3").model()
+    bent = replace(straight, b_prime_1_px=-6.0, b_prime_2_px=2.5)
+    ranges, columns = np.linspace(800.0, 2000.0, 7)[:, None], np.array([0.0, 639.5, 1279.0])
+    u = np.array([-639.5, 0.0, 639.5]) / 640.0
+    moved = bent.row(ranges, columns) - straight.row(ranges)
+    np.testing.assert_allclose(moved, np.broadcast_to(6.0 * u - 2.5 * u * u, (7, 3)), atol=1e-9)
+    back = bent.range_mm(bent.row(ranges, columns), columns)
+    np.testing.assert_allclose(back, np.broadcast_to(ranges, (7, 3)), rtol=1e-12)
+    np.testing.assert_array_equal(bent.row(ranges), straight.row(ranges))
+    np.testing.assert_array_equal(bent.range_mm([100.0], [639.5]), straight.range_mm([100.0]))
+    assert bent.range_sigma_mm(700.0, 0.3, 1279.0) < bent.range_sigma_mm(700.0, 0.3, 0.0)
+    with pytest.raises(ArgumentError, match="row and column have shapes"):
+        bent.range_mm([1.0, 2.0], [1.0, 2.0, 3.0])
+    with pytest.raises(ArgumentError, match="b_prime_2_px is nan"):
+        replace(straight, b_prime_2_px=float("nan"))
+    with pytest.raises(ArgumentError, match="the pole comes before row 0"):
+        replace(straight, b_prime_1_px=1200.0)
