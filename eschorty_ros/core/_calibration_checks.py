@@ -8,9 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from eschorty_ros.core._calibration_model import COLUMN_TERMS, EVERY, WIDTH_BIAS
-from eschorty_ros.core._calibration_solvers import Problem
 from eschorty_ros.core._checks import positive
-from eschorty_ros.core._least_squares import condition_number
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.targets import Targets
@@ -107,31 +105,3 @@ def checked_priors(
         if spread != math.inf:
             positive(f"prior_sigma of {name}", spread)
     return priors
-
-
-def refuse_singular(problem: Problem, values: Mapping[str, float]) -> None:
-    """Rank test on the scaled Jacobian; says in the user's terms why it fails."""
-    observed, names, priors = problem.observed, set(problem.names), set(problem.priors)
-    rows, ranges = observed.seen[:, 0], observed.range_mm
-    if rows.size > 1 and np.ptp(rows) == 0.0 and np.ptp(ranges) > 0.0:
-        raise FitError(
-            f"row is {rows[0]:g} for all {rows.size} targets (condition number inf); "
-            "give targets whose rows move with their range"
-        )
-    condition = condition_number(problem.jacobian(problem.free(values)))
-    if math.isfinite(condition):
-        return
-    sized = bool(observed.known[:, 1:].any())
-    if {"k_mm", "k_prime_px"} <= names and not sized and not {"k_mm", "k_prime_px"} & priors:
-        remedy = (
-            "ranges show only the product k_mm k_prime_px: give sizes or spacings of targets, "
-            "fix one or give it a prior_sigma"
-        )
-    elif WIDTH_BIAS in names - priors and not sized:
-        remedy = "only targets of known size show a width bias: give sizes or fix width_bias_px"
-    else:
-        remedy = f"give targets at {max(len(names - priors), 2)} different ranges or more"
-    raise FitError(
-        f"free is {', '.join(problem.names)} and range_mm holds {np.unique(ranges).size} different "
-        f"ranges: singular, condition number {condition:g}; {remedy}"
-    )

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core._calibration_checks import refuse_singular
 from eschorty_ros.core._calibration_model import Observed, Values, values_of
-from eschorty_ros.core._calibration_solvers import Problem, search
+from eschorty_ros.core._calibration_solvers import Problem, refuse_singular, search
 from eschorty_ros.core._least_squares import condition_number, covariance
 from eschorty_ros.core.errors import FitError
 from eschorty_ros.core.optics import RangeModel

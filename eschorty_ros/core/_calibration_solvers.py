@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core._calibration_model import (
     COLUMN_TERMS,
     PARAMETERS,
+    WIDTH_BIAS,
     Observed,
     Values,
     values_of,
@@ -22,6 +23,10 @@ from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 
 Array = NDArray[np.float64]
+
+PAPER_FREE = ("k_prime_px", "b_prime_px")
+"""What the paper fits: k and b stay at their design values."""
+_REWEIGHTINGS = 3
 
 
 class Problem:
@@ -107,6 +112,30 @@ class Problem:
         """Length of the vector of fitted values, against which steps count as small."""
         seen = np.where(self.observed.known, self.observed.seen / self.sigma_px, 0.0)
         return float(np.linalg.norm(seen)) + math.sqrt(len(self.observed))
+
+
+def solve(
+    observed: Observed, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
+) -> tuple[Problem, Values]:
+    """Parameters of the smallest sum of squares, and the problem they solve.
+
+    Raises
+    ------
+    FitError
+        When the targets do not determine the parameters.
+    """
+    closed = set(names) == set(PAPER_FREE) and not priors and not observed.known[:, 1:].any()
+    values = values_of(design)
+    # A range error weighs with the slope of the curve, which the fit has yet to find.
+    for _ in range(1 + _REWEIGHTINGS * bool(observed.sigma_range_mm.any())):
+        problem = Problem(observed, design, names, priors, values)
+        refuse_singular(problem, values)
+        if closed:
+            values = straight_line(observed, problem.sigma_px[:, 0], design)
+        else:
+            values = search(problem, values)
+        build(design, values)
+    return problem, values
 
 
 def straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Values:
@@ -215,3 +244,31 @@ def build(design: RangeModel, values: Values) -> RangeModel:
         return replace(design, **named)
     except ArgumentError as error:
         raise FitError(f"the targets lead to no possible build: {error}; check them") from error
+
+
+def refuse_singular(problem: Problem, values: Mapping[str, float]) -> None:
+    """Rank test on the scaled Jacobian; says in the user's terms why it fails."""
+    observed, names, priors = problem.observed, set(problem.names), set(problem.priors)
+    rows, ranges = observed.seen[:, 0], observed.range_mm
+    if rows.size > 1 and np.ptp(rows) == 0.0 and np.ptp(ranges) > 0.0:
+        raise FitError(
+            f"row is {rows[0]:g} for all {rows.size} targets (condition number inf); "
+            "give targets whose rows move with their range"
+        )
+    condition = condition_number(problem.jacobian(problem.free(values)))
+    if math.isfinite(condition):
+        return
+    sized = bool(observed.known[:, 1:].any())
+    if {"k_mm", "k_prime_px"} <= names and not sized and not {"k_mm", "k_prime_px"} & priors:
+        remedy = (
+            "ranges show only the product k_mm k_prime_px: give sizes or spacings of targets, "
+            "fix one or give it a prior_sigma"
+        )
+    elif WIDTH_BIAS in names - priors and not sized:
+        remedy = "only targets of known size show a width bias: give sizes or fix width_bias_px"
+    else:
+        remedy = f"give targets at {max(len(names - priors), 2)} different ranges or more"
+    raise FitError(
+        f"free is {', '.join(problem.names)} and range_mm holds {np.unique(ranges).size} different "
+        f"ranges: singular, condition number {condition:g}; {remedy}"
+    )

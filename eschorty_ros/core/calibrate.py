@@ -115,12 +115,12 @@ class CalibrationReport:
         return self.fit.model.range_mm(self.targets.row, self._column) - self.targets.range_mm
 
     def range_sigma_mm(
-        self, row: ArrayLike, sigma_row_px: ArrayLike = 0.0, column: ArrayLike | None = None
+        self, row: ArrayLike, sigma_row: ArrayLike = 0.0, column: ArrayLike | None = None
     ) -> Array:
         """Give the standard deviation of a range by its row, mm: fit and centroid together."""
         model = self.fit.model
         own = self.fit.range_sigma_mm(model.range_mm(row, column), column)
-        return np.hypot(own, model.range_sigma_mm(row, sigma_row_px, column))
+        return np.hypot(own, model.range_sigma_mm(row, sigma_row, column))
 
     @property
     def _column(self) -> Array:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core._calibration_model import COLUMN_TERMS, WIDTH_BIAS, Observed
-from eschorty_ros.core._calibration_solvers import Problem
-from eschorty_ros.core.calibration_fit import CONDITION_WARNING, CalibrationFit, fit
+from eschorty_ros.core._calibration_solvers import Problem, solve
+from eschorty_ros.core.calibration_fit import CONDITION_WARNING, CalibrationFit
 from eschorty_ros.core.errors import FitError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.targets import Targets
@@ -57,14 +57,14 @@ def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KP
     free = tuple(name for name in found.free if name != "k_mm")
     priors = {name: value for name, value in found.prior_sigma.items() if name != "k_mm"}
     chi_square = np.full(k_mm.size, np.nan)
-    for index, value in enumerate(k_mm):
+    observed = Observed.of(targets, design)
+    for index, value in enumerate(k_mm.tolist()):
         try:
-            held = fit(
-                targets, replace(design, k_mm=float(value)), free, prior_sigma=priors, sized=True
-            )
+            problem, values = solve(observed, replace(design, k_mm=value), free, priors)
         except FitError:
             continue
-        chi_square[index] = held.chi_square
+        white = problem.residual(problem.free(values))
+        chi_square[index] = np.nan if white is None else white @ white
     delta = chi_square - np.nanmin(chi_square)
     return KProfile(k_mm, delta, _interval(k_mm, delta))
 

@@ -17,7 +17,6 @@ from eschorty_ros.core._calibration_checks import (
     check_targets,
     checked_free,
     checked_priors,
-    refuse_singular,
 )
 from eschorty_ros.core._calibration_model import (
     COLUMN_TERMS,
@@ -27,7 +26,7 @@ from eschorty_ros.core._calibration_model import (
     row_derivative,
     values_of,
 )
-from eschorty_ros.core._calibration_solvers import Problem, build, search, straight_line
+from eschorty_ros.core._calibration_solvers import PAPER_FREE, Problem, build, solve
 from eschorty_ros.core._checks import broadcast, reals
 from eschorty_ros.core._least_squares import condition_number, covariance
 from eschorty_ros.core.errors import FitError
@@ -47,10 +46,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-PAPER_FREE = ("k_prime_px", "b_prime_px")
-"""What the paper fits: k and b stay at their design values."""
 CONDITION_WARNING = 1e3
-_REWEIGHTINGS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,8 +113,9 @@ class CalibrationFit:
         depth = np.where(depth > 0.0, depth, np.nan)
         u = np.zeros(()) if column is None else model.normalised_column(column)
         broadcast("range_mm and column", depth, u)
-        depth, u = np.broadcast_arrays(depth, u)
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            # An unknown column makes an unknown depth.
+            depth, u = np.broadcast_arrays(depth + 0.0 * u, u)
             mm_per_row = depth * depth / -model.product_mm_px
             by_row = np.stack([row_derivative(p, depth, u, name) for name in self.free], axis=-1)
             slope = by_row * mm_per_row[..., None]
@@ -160,7 +157,6 @@ def fit(
     free: Sequence[str] = PAPER_FREE,
     *,
     prior_sigma: Mapping[str, float] | None = None,
-    sized: bool | None = None,
 ) -> CalibrationFit:
     """Weighted least squares of Eq. 2, and of known sizes where k is free.
 
@@ -180,8 +176,6 @@ def fit(
     prior_sigma : mapping of str to float, optional
         Standard deviations of Gaussian priors on free parameters, centred on ``design``; on a
         width bias centred on 0. Infinity means no prior.
-    sized : bool, optional
-        Whether known sizes and spacings count; by default where k or the width bias is free.
 
     Returns
     -------
@@ -204,19 +198,10 @@ def fit(
     priors = {name: spread for name, spread in priors.items() if spread != math.inf}
     check_targets(targets, design, names)
     observed = Observed.of(targets, design)
-    if not (bool({"k_mm", WIDTH_BIAS} & set(names)) if sized is None else sized):
+    if not {"k_mm", WIDTH_BIAS} & set(names):
         observed = observed.rows_only()
-    closed = set(names) == set(PAPER_FREE) and not priors and not observed.known[:, 1:].any()
-    values = values_of(design)
-    for _ in range(1 + _REWEIGHTINGS * bool(observed.sigma_range_mm.any())):
-        problem = Problem(observed, design, names, priors, values)
-        refuse_singular(problem, values)
-        if closed:
-            values = straight_line(observed, problem.sigma_px[:, 0], design)
-        else:
-            values = search(problem, values)
-        model = build(design, values)
-    return _result(problem, model, values[WIDTH_BIAS])
+    problem, values = solve(observed, design, names, priors)
+    return _result(problem, build(design, values), values[WIDTH_BIAS])
 
 
 def _result(problem: Problem, model: RangeModel, width_bias_px: float) -> CalibrationFit:

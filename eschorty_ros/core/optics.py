@@ -181,7 +181,8 @@ class RangeModel:
         if column is None:
             return np.asarray(self.b_prime_px)
         u = self.normalised_column(column)
-        return self.b_prime_px + u * (self.b_prime_1_px + u * self.b_prime_2_px)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(self.b_prime_px + u * (self.b_prime_1_px + u * self.b_prime_2_px))
 
     def range_mm(self, row: ArrayLike, column: ArrayLike | None = None) -> Array:
         """Range along the sheet from the mechanical datum (Eq. 2 inverted).

@@ -57,11 +57,11 @@ _NO_REALS: list[Any] = [
 ]
 
 
-def reals() -> Kind:
+def reals(*, optional: bool = False) -> Kind:
     """Real numbers of any shape; NaN in, NaN out."""
     rows = np.arange(12.0).reshape(3, 4)
     return Kind(
-        _NO_REALS,
+        [value for value in _NO_REALS if not optional or value is not None],
         [math.inf, -math.inf, 1e308, -1e308, 5e-324, [], np.zeros((2, 0, 3)), rows[:, ::2], HUGE],
         nan_gives_nan=True,
     )
