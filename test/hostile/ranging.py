@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from eschorty_ros.core import (
-    calibration_fit,
     design,
     optics,
     targets,
@@ -26,8 +25,9 @@ from hostile.subjects import (
 from hostile.surface import parameters
 
 
-def on_model(name: str, **arguments: Any) -> Call:
-    return Call(getattr(MODEL, name), arguments, dict.fromkeys(arguments, reals()))
+def on_model(name: str, optional: str = "", **arguments: Any) -> Call:
+    kinds = {argument: reals(optional=argument == optional) for argument in arguments}
+    return Call(getattr(MODEL, name), arguments, kinds)
 
 
 LENS = {"focal_length_mm": 24.0, "f_number": 2.0, "theta_deg": 85.87, "pixel_um": 4.86, "b_mm": 0.0}
@@ -39,37 +39,10 @@ LENS_KINDS = {
 
 SIZES = {"columns": 1280, "rows": 720}
 
-FIT = {"row": [100.0, 300.0, 500.0], "range_mm": [860.0, 1064.0, 1395.0], "design": MODEL}
-
 TARGET = dict.fromkeys(parameters(targets.Targets) - {"labels"}, 100.0)
 
 
 CALLS: dict[str, Call] = {
-    "calibration_fit.CalibrationFit.range_sigma_mm": Call(
-        calibration_fit.fit_targets(**FIT).range_sigma_mm,
-        {"range_mm": [900.0, 1300.0]},
-        {"range_mm": reals()},
-    ),
-    "calibration_fit.fit_targets": Call(
-        calibration_fit.fit_targets,
-        dict(
-            FIT,
-            free=("k_prime_px", "b_prime_px"),
-            sigma_row_px=0.3,
-            sigma_range_mm=0.0,
-            prior_sigma=None,
-        ),
-        {
-            "row": vector(-1.0, 720.0, size=3),
-            "range_mm": vector(0.0, -5.0, size=3),
-            "free": Kind([None, 3, "k", ["k_mm", "k_mm"], [], [3], [[]]]),
-            "sigma_row_px": vector(0.0, -1.0, size=3),
-            "sigma_range_mm": vector(-1.0, size=3),
-            "prior_sigma": Kind(
-                [{"k_mm": 1.0}, {"b_prime_px": 0.0}, {"b_prime_px": "a"}, 3, "k_mm"]
-            ),
-        },
-    ),
     "design.Design.at": Call(
         design.design(theta_prime_deg=-7.6, b_prime_px=-1100.0, **LENS).at,
         {"range_mm": [900.0, 1300.0]},
@@ -127,6 +100,8 @@ CALLS: dict[str, Call] = {
             "rows": 720,
             "principal_column": 639.5,
             "theta_deg": 85.87,
+            "b_prime_1_px": 0.0,
+            "b_prime_2_px": 0.0,
         },
         {
             "k_mm": number(0.0),
@@ -138,13 +113,19 @@ CALLS: dict[str, Call] = {
             "rows": whole(0),
             "principal_column": number(),
             "theta_deg": number(0.0, 91.0),
+            "b_prime_1_px": number(),
+            "b_prime_2_px": number(),
         },
     ),
-    "optics.RangeModel.range_mm": on_model("range_mm", row=[3.0]),
-    "optics.RangeModel.row": on_model("row", range_mm=[1300.0]),
+    "optics.RangeModel.range_mm": on_model("range_mm", "column", row=[3.0], column=[639.5]),
+    "optics.RangeModel.row": on_model("row", "column", range_mm=[1300.0], column=[639.5]),
     "optics.RangeModel.magnification": on_model("magnification", row=[3.0]),
     "optics.RangeModel.range_per_row_mm": on_model("range_per_row_mm", range_mm=[1300.0]),
-    "optics.RangeModel.range_sigma_mm": on_model("range_sigma_mm", row=[3.0], sigma_row=[0.3]),
+    "optics.RangeModel.range_sigma_mm": on_model(
+        "range_sigma_mm", "column", row=[3.0], sigma_row=[0.3], column=[639.5]
+    ),
+    "optics.RangeModel.normalised_column": on_model("normalised_column", column=[3.0]),
+    "optics.RangeModel.row_offset_px": on_model("row_offset_px", "column", column=[3.0]),
     "optics.RangeModel.column_slope": on_model("column_slope", column=[3.0]),
     "optics.RangeModel.lateral_mm": on_model("lateral_mm", column=[3.0], range_mm=[1300.0]),
     "optics.RangeModel.rows_per_mm_off_sheet": on_model("rows_per_mm_off_sheet", range_mm=[1300.0]),

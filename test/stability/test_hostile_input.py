@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import columns, posts, ranging, stored, streams, timing
+from hostile import calibrating, columns, posts, ranging, stored, streams, timing
 from hostile.kinds import Call
 from hostile.surface import parameters, public_callables
 
 from eschorty_ros.core.errors import EschortyError
 
 HANDED_OUT = {
+    "calibrate.CalibrationReport", "calibrate.Rejected", "calibration_diagnostics.KProfile",
     "aggregate_frame.Pixels", "calibration_fit.CalibrationFit", "centroid.Centroids",
     "design.Design", "design.DesignTable", "evt3.Counters", "evt3.Events", "evt3.Triggers",
     "noise.FilterCounters", "offline.Result", "phase.PhaseEstimate", "post_finder.Post",
@@ -30,21 +31,24 @@ HANDED_OUT = {
 TESTED_ELSEWHERE = {
     # All their arguments are objects of the package, or they take none.
     "offline.reconstruct_recording", "warm_up.warm_up", "calibration.Calibration.model",
-    "calibration.config_folders",
+    "calibration.config_folders", "calibration_diagnostics.chi_square_limit",
+    "calibration_diagnostics.k_profile", "calibration_diagnostics.leave_one_out_px",
+    "calibration_diagnostics.prior_ratios", "calibration_diagnostics.verdicts",
     # Every key of the file has its own test in test/core/test_calibration_file.py.
     "calibration.Calibration",
 }  # fmt: skip
 PACKAGE_OBJECTS = {
     "calibration", "date", "design", "drain", "error", "frame", "known", "model", "modulation",
     "nominal", "parts", "plan", "posts", "profiles", "progress", "schema", "settings",
+    "targets",
 }  # fmt: skip
 TAKES_EVENTS = {"noise.ActivityFilter.filter", "aggregate_frame.AggregateFrame.add"}
 """Their tables give the arrays of the events one by one."""
 NO_GOOD_EXAMPLE = {"recording.load_recording", "yaml_file.read_yaml", "yaml_file.validate"}
 """Their good files are read by the tests of recordings and calibrations."""
 CALLS: dict[str, Call] = {
-    **ranging.CALLS, **posts.CALLS, **columns.CALLS, **timing.CALLS, **streams.CALLS,
-    **stored.CALLS,
+    **ranging.CALLS, **calibrating.CALLS, **posts.CALLS, **columns.CALLS, **timing.CALLS,
+    **streams.CALLS, **stored.CALLS,
 }  # fmt: skip
 HOSTILE = [
     pytest.param(name, argument, id=f"{name}-{argument}")

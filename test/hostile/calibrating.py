@@ -1,0 +1,65 @@
+"""Fitting a build to targets."""
+
+from __future__ import annotations
+
+from eschorty_ros.core import calibrate, calibration, calibration_fit, targets
+from hostile.kinds import Call, Kind, reals, text, vector
+from hostile.subjects import MODEL
+
+ROWS, RANGES_MM = [100.0, 300.0, 500.0], [860.0, 1064.0, 1395.0]
+SEEN = targets.Targets(ROWS, RANGES_MM)
+NOMINAL = calibration.load_calibration("config_3")
+SOME_FREE = Kind([3, "k", ["k_mm", "k_mm"], [], [3], [[]]])
+FREE = Kind([None, *SOME_FREE.refused])
+PRIORS = Kind([{"k_mm": 1.0}, {"k_prime_px": 0.0}, {"k_prime_px": "a"}, 3, "k_mm"])
+
+CALLS: dict[str, Call] = {
+    "calibrate.calibrate": Call(
+        calibrate.calibrate,
+        {
+            "targets": SEEN,
+            "nominal": NOMINAL,
+            "method": "joint",
+            "free": ("k_prime_px", "b_prime_px"),
+            "prior_sigma": None,
+            "robust": False,
+            "date": None,
+        },
+        {"method": text(), "free": SOME_FREE, "prior_sigma": PRIORS, "robust": Kind([True])},
+    ),
+    "calibrate.CalibrationReport.range_sigma_mm": Call(
+        calibrate.calibrate(SEEN, NOMINAL).range_sigma_mm,
+        {"row": [100.0], "sigma_row": [0.3], "column": [639.5]},
+        {"row": reals(), "sigma_row": reals(), "column": reals(optional=True)},
+    ),
+    "calibration_fit.CalibrationFit.range_sigma_mm": Call(
+        calibration_fit.fit(SEEN, MODEL).range_sigma_mm,
+        {"range_mm": [900.0], "column": [639.5]},
+        {"range_mm": reals(), "column": reals(optional=True)},
+    ),
+    "calibration_fit.fit": Call(
+        calibration_fit.fit,
+        {"targets": SEEN, "design": MODEL, "free": ("k_prime_px",), "prior_sigma": None},
+        {"free": FREE, "prior_sigma": PRIORS},
+    ),
+    "calibration_fit.fit_targets": Call(
+        calibration_fit.fit_targets,
+        {
+            "row": ROWS,
+            "range_mm": RANGES_MM,
+            "design": MODEL,
+            "free": ("k_prime_px", "b_prime_px"),
+            "sigma_row_px": 0.3,
+            "sigma_range_mm": 0.0,
+            "prior_sigma": None,
+        },
+        {
+            "row": vector(-1.0, 720.0, size=3),
+            "range_mm": vector(0.0, -5.0, size=3),
+            "free": FREE,
+            "sigma_row_px": vector(0.0, -1.0, size=3),
+            "sigma_range_mm": vector(-1.0, size=3),
+            "prior_sigma": PRIORS,
+        },
+    ),
+}
