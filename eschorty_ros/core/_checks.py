@@ -29,7 +29,7 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
 
 def number_or_nan(name: str, value: Any, low: float = -math.inf) -> float:
     """``value`` as a float from ``low`` on, NaN where it is unknown."""
-    if isinstance(value, Real) and math.isnan(_float(value)) and value != value:
+    if isinstance(value, Real) and value != value:
         return math.nan
     return number(name, value, low)
 
@@ -52,7 +52,7 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
 
 def reals(name: str, values: ArrayLike) -> NDArray[np.float64]:
     """``values`` of any shape as float64; NaN and infinity pass, texts and objects do not."""
-    array = whatever(name, values)
+    array = as_array(name, values)
     if array.dtype.kind not in "iuf":
         raise ArgumentError(f"{name} has dtype {array.dtype}; give real numbers")
     return array.astype(np.float64, copy=False)
@@ -73,7 +73,7 @@ def whole_vector(
     name: str, values: ArrayLike, dtype: DTypeLike, low: int, high: int
 ) -> NDArray[Any]:
     """``values`` as a contiguous vector of ``dtype``, each from ``low`` to ``high``."""
-    array = whatever(name, values)
+    array = as_array(name, values)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise ArgumentError(
             f"{name} is {array.dtype} of shape {array.shape}; give one axis of integers"
@@ -97,7 +97,7 @@ def exact(name: str, values: Any, dtype: DTypeLike, size: int | None = None) -> 
 
 def times(name: str, values: ArrayLike) -> NDArray[np.int64]:
     """Integer times of any shape as int64; floats are refused, since they lose microseconds."""
-    array = whatever(name, values)
+    array = as_array(name, values)
     if array.size and array.dtype.kind not in "iu":
         raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
     if array.dtype == np.uint64 and array.size and int(array.max()) > TIME_LIMIT:
@@ -105,9 +105,9 @@ def times(name: str, values: ArrayLike) -> NDArray[np.int64]:
     return array.astype(np.int64, copy=False)
 
 
-def picked_of(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
+def selection(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
     """``which`` as a mask of ``size`` entries or as indices below it."""
-    array = whatever(name, which)
+    array = as_array(name, which)
     if array.size == 0:
         return np.empty(0, dtype=np.intp)
     if array.dtype == np.bool_ and array.shape == (size,):
@@ -123,7 +123,7 @@ def picked_of(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
 
 def file_path(name: str, value: Any) -> Path:
     """``value`` as a path that an operating system can be asked for."""
-    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
+    if not isinstance(value, str | os.PathLike) or "\0" in os.fsdecode(value):
         raise ArgumentError(f"{name} is {short(value)}; give the name of a file")
     return Path(value)
 
@@ -170,7 +170,7 @@ def _float(value: Any) -> float:
         return math.inf
 
 
-def whatever(name: str, values: ArrayLike) -> NDArray[Any]:
+def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
     """``values`` as an array of whatever they are; ragged nests are refused."""
     try:
         return np.asarray(values)

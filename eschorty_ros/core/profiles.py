@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core._checks import TIME_LIMIT, picked_of, reals, vector, whole
+from eschorty_ros.core._checks import TIME_LIMIT, reals, selection, vector, whole
 from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
@@ -95,7 +95,7 @@ class Profiles:
 
     def select(self, mask: ArrayLike) -> Profiles:
         """Pick points by a boolean mask, a slice or an index array."""
-        picked = mask if isinstance(mask, slice) else picked_of("mask", mask, len(self))
+        picked = mask if isinstance(mask, slice) else selection("mask", mask, len(self))
         chosen: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(self)}
         for name, values in chosen.items():
             chosen[name] = None if values is None else values[picked]

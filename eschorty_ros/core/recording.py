@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from eschorty_ros.core._checks import file_path, whatever
+from eschorty_ros.core._checks import as_array, file_path
 from eschorty_ros.core.calibration import Calibration, load_calibration
 from eschorty_ros.core.clock import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
 from eschorty_ros.core.errors import ArgumentError, FormatError
@@ -179,7 +179,7 @@ def write_truth_csv(
 
 
 def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
-    arrays = {name: whatever(name, value) for name, value in values.items()}
+    arrays = {name: as_array(name, value) for name, value in values.items()}
     shapes = {array.shape for array in arrays.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         raise ArgumentError(

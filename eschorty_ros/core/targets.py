@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core._checks import picked_of, reals, short
+from eschorty_ros.core._checks import reals, selection, short
 from eschorty_ros.core.errors import ArgumentError
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ class Targets:
 
     def select(self, which: ArrayLike) -> Targets:
         """Targets at these indices, or where this mask is true."""
-        index = np.arange(len(self))[picked_of("which", which, len(self))]
+        index = np.arange(len(self))[selection("which", which, len(self))]
         numbers = {name: getattr(self, name)[index] for name in _NUMBERS}
         return Targets(**numbers, labels=tuple(self.labels[i] for i in index))
 
