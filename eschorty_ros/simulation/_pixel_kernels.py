@@ -1,11 +1,8 @@
 """Event-driven pixels: each one is touched when its light changes or its own event is due.
 
-Notation of the photoreceptor: with ``u = exp(-v) = 1 / x`` the response to a constant relative
-photocurrent ``I`` is ``u(t) = 1/I + (u0 - 1/I) exp(-omega0 I t)``, and the comparator's levels
-``v_ref + theta_on`` and ``v_ref - theta_off`` become ``u_ref exp(-theta_on)`` and
-``u_ref exp(theta_off)``. A pixel is anchored at ``t``, the time its light last changed or its
-refractory period ended; nothing else moves the anchor, so that looking at a pixel in between
-does not change what it does.
+A pixel is anchored at ``t``, the time its light last changed or its refractory period ended;
+nothing else moves the anchor and every draw is a hash of pixel and time, so that looking at a
+pixel in between does not change what it does.
 """
 
 from __future__ import annotations
@@ -15,23 +12,35 @@ import math
 import numpy as np
 from numba import njit
 
+from eschorty_ros.simulation._response_kernels import (
+    GAP_MAX,
+    NOTHING,
+    UNKNOWN,
+    _advanced,
+    _earliest_us,
+    _fade,
+    _noiseless,
+    _noisy,
+)
+
 PIXEL_DTYPE = np.dtype(
     [
         ("u", "f8"),  # photoreceptor at the anchor
-        ("u_ref", "f8"),  # comparator reference
-        ("u_settled", "f8"),  # 1 / I: where the photoreceptor is heading
-        ("rate", "f8"),  # omega0 I, per us
+        ("y", "f8"),  # source follower at the anchor
+        ("y_ref", "f8"),  # comparator reference
+        ("u_settled", "f8"),  # 1 / I: where both are heading
         ("t", "f8"),  # anchor, us
-        ("t_next", "f8"),  # next threshold crossing or end of the refractory period, us
+        ("t_next", "f8"),  # when something is due, us; what is told by state
         ("on_factor", "f4"),  # exp(-theta_on)
         ("off_factor", "f4"),  # exp(theta_off)
-        ("refractory", "i8"),  # 1 while v_ref follows v
+        ("state", "i8"),
     ],
     align=True,
 )
 
-# An exponential this far gone is below half a unit in the last place of what it is added to.
-_SETTLED = 38.0
+# States: OFF and ON = an event at t_next; WAITS = nothing before t_next; HELD = until t_next.
+WAITS, HELD = 2, 3
+_FULL = -1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -57,56 +66,40 @@ def _readout_key(t_us, column, row, polarity, slots):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _latency_us(t_us, column, row, seed, timing):
-    """Latency of one event: a Gaussian (sum of four uniforms) drawn from what the event is."""
+def _bits(t_us, column, row, seed, purpose):
+    """64 random bits that belong to what a pixel does at a time."""
     place = np.uint64((column << 12) | row) * np.uint64(0xD6E8FEB86659FD93)
-    bits = _mix((place ^ np.uint64(seed)) + np.uint64(np.int64(t_us * 1024.0)))
+    salt = np.uint64(purpose) * np.uint64(0xA0761D6478BD642F)
+    return _mix((place ^ np.uint64(seed)) + salt + np.uint64(np.int64(t_us * 1024.0)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gaussian(bits):
+    """Sum of four 16-bit numbers, as a Gaussian of standard deviation 1 cut at 3.5."""
     low = np.uint64(0x0000FFFF0000FFFF)
     pairs = (bits & low) + ((bits >> np.uint64(16)) & low)
     total = np.int64(pairs & np.uint64(0xFFFFFFFF)) + np.int64(pairs >> np.uint64(32))
-    return max(1.0, timing[0] + timing[1] * (np.float64(total) - 131070.0))
+    return (np.float64(total) - 131070.0) * (math.sqrt(3.0) / 65536.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _crossing_us(u, on_level, off_level, settled, t_us, tau_us):
-    """When ``u``, at ``t_us`` and heading for ``settled``, leaves the comparator's band."""
-    if settled < on_level:
-        level = on_level
-        if u <= level:
-            return t_us
-    elif settled > off_level:
-        level = off_level
-        if u >= level:
-            return t_us
-    else:
-        return np.inf
-    ratio = (level - settled) / (u - settled)
-    # log1p where the ratio's own rounding would show, the faster log elsewhere (2e-14 at worst).
-    if ratio > 0.99:
-        return t_us - tau_us * math.log1p((level - u) / (u - settled))
-    return t_us - tau_us * math.log(ratio)
+def _exponential(bits):
+    """Number drawn from an exponential distribution of mean 1."""
+    return -math.log((np.float64(bits >> np.uint64(11)) + 0.5) * 2.0**-53)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _response(u, settled, x):
-    """Photoreceptor after ``x`` time constants of constant light."""
-    if x > _SETTLED:
-        return settled
-    if x > 0.01:
-        return settled + (u - settled) * math.exp(-x)
-    return u + (u - settled) * math.expm1(-x)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _live(pixels, column, lo, hi, until_us, light, omega, seed, timing, slots, out, n):
+def _live(pixels, column, lo, hi, until_us, light, model, table, seed, slots, out, n):
     """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
-    An empty ``light`` leaves theirs as it is. Returns the number of events in ``out`` and the
-    earliest time something is due in these rows.
+    An empty ``light`` leaves theirs as it is. ``model`` = omega0 (per us), follower (us), noise,
+    refractory time (us) and its relative spread, latency and its spread (us). Returns the number
+    of events in ``out`` and the earliest time something is due in these rows, ``_FULL`` when the
+    output did not suffice: call again with more room.
     """
+    omega, follower_us, noise = model[0], model[1], model[2]
+    reach = math.exp(GAP_MAX * noise)
     earliest = np.inf
-    inverse_omega = 1.0 / omega
-    refractory_us = timing[2]
     relit = light.size > 0
     for row in range(lo, hi):
         pixel = pixels[np.uintp(column), np.uintp(row)]
@@ -115,41 +108,73 @@ def _live(pixels, column, lo, hi, until_us, light, omega, seed, timing, slots, o
             earliest = min(earliest, t_next)
             continue
         # Locals: the compiler cannot know that ``out`` and the pixel do not overlap.
-        u, t, settled, rate, u_ref = pixel.u, pixel.t, pixel.u_settled, pixel.rate, pixel.u_ref
-        on_factor, off_factor = np.float64(pixel.on_factor), np.float64(pixel.off_factor)
-        refractory = pixel.refractory
-        tau_us = settled * inverse_omega
+        u, y, settled, t, y_ref = pixel.u, pixel.y, pixel.u_settled, pixel.t, pixel.y_ref
+        on_level = y_ref * np.float64(pixel.on_factor)
+        off_level = y_ref * np.float64(pixel.off_factor)
+        state = pixel.state
+        tau_us = settled / omega
+        full = False
         while t_next <= until_us:
-            if refractory:
-                u = _response(u, settled, (t_next - t) * rate)
+            if state == WAITS:
+                if noise > 0.0:
+                    budget = _exponential(_bits(t, column, row, seed, 1))
+                    after_us, what = _noisy(
+                        u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
+                        table, t_next - t, until_us - t, budget,
+                    )  # fmt: skip
+                else:
+                    after_us, what = _noiseless(
+                        u, y, settled, tau_us, follower_us, on_level, off_level
+                    )
+                if what == UNKNOWN:
+                    break
+                t_next = t + after_us
+                if what != NOTHING:
+                    state = what
+            elif state == HELD:
+                u, y = _advanced(u, y, settled, tau_us, follower_us, t_next - t)
                 t = t_next
-                u_ref = u
-                refractory = 0
-                t_next = _crossing_us(u, u_ref * on_factor, u_ref * off_factor, settled, t, tau_us)
-                continue
-            rising = settled < u
-            late_us = _latency_us(t_next, column, row, seed, timing)
-            out[np.uintp(n)] = _readout_key(t_next + late_us, column, row, np.int64(rising), slots)
-            n += 1
-            if t_next > t:
-                u = u_ref * (on_factor if rising else off_factor)
-                t = t_next
-            refractory = 1
-            t_next = t + refractory_us
-        if relit:
-            u = _response(u, settled, (until_us - t) * rate)
+                y_ref = y
+                if noise > 0.0:
+                    y_ref *= _fade(noise * _gaussian(_bits(t, column, row, seed, 2)))
+                on_level = y_ref * np.float64(pixel.on_factor)
+                off_level = y_ref * np.float64(pixel.off_factor)
+                state = WAITS
+                t_next = _earliest_us(
+                    u, y, settled, t, tau_us, follower_us, on_level, off_level, reach
+                )
+            else:
+                if n == out.size:
+                    full = True
+                    break
+                bits = _bits(t_next, column, row, seed, 3)
+                late_us = max(1.0, model[5] + model[6] * _gaussian(bits))
+                out[np.uintp(n)] = _readout_key(t_next + late_us, column, row, state, slots)
+                n += 1
+                state = HELD
+                held_us = model[3]
+                if model[4] > 0.0:
+                    held_us *= max(0.0, 1.0 + model[4] * _gaussian(_mix(bits)))
+                t_next += max(1.0, held_us)
+        if relit and not full:
+            u, y = _advanced(u, y, settled, tau_us, follower_us, until_us - t)
             t = until_us
             settled = 1.0 / light[np.uintp(row)]
             pixel.u_settled = settled
-            pixel.rate = light[np.uintp(row)] * omega
-            if not refractory:
-                tau_us = settled * inverse_omega
-                t_next = _crossing_us(u, u_ref * on_factor, u_ref * off_factor, settled, t, tau_us)
+            if state != HELD:
+                state = WAITS
+                tau_us = settled / omega
+                t_next = _earliest_us(
+                    u, y, settled, t, tau_us, follower_us, on_level, off_level, reach
+                )
         pixel.u = u
+        pixel.y = y
         pixel.t = t
-        pixel.u_ref = u_ref
-        pixel.refractory = refractory
+        pixel.y_ref = y_ref
+        pixel.state = state
         pixel.t_next = t_next
+        if full:
+            return n, _FULL
         earliest = min(earliest, t_next)
     return n, earliest
 
@@ -187,17 +212,17 @@ def _add_patch(light, lo, hi, patch, sigma):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _relight(
-    pixels, spans, due, columns, begin, patches, light, optics, t_us, seed, timing, slots, out, n
-):
+    pixels, spans, due, columns, begin, patches, light, optics, model, table, t_us, seed, slots,
+    out, n,
+):  # fmt: skip
     """Put the footprint ``patches`` (columns, patches, 4) in ``columns[begin:]`` from ``t_us`` on.
 
     ``spans`` holds per column the lit rows [0, 1) and the rows with something pending [2, 3);
     ``due`` the earliest pending time. ``optics`` = sigma (rows), least contrast drawn, background
-    intensity, omega0 (per us), most events of a pixel between two changes of its light.
-    ``light`` is room for one column. Stops where the output might not suffice; returns the next
-    column to do and the number of events.
+    intensity. ``light`` is room for one column. Stops where the output does not suffice; returns
+    the next column to do and the number of events.
     """
-    sigma, background, omega = optics[0], optics[2], optics[3]
+    sigma, background = optics[0], optics[2]
     rows = pixels.shape[1]
     for k in range(begin, columns.size):
         column = columns[k]
@@ -206,71 +231,67 @@ def _relight(
             first, last = _window(patches[k, j], sigma, optics[1], rows)
             if last > first:
                 lo, hi = min(lo, first), max(hi, last)
-        if hi <= lo:
-            lo, hi = spans[column, 0], spans[column, 0]
         old_lo, old_hi = spans[column, 0], spans[column, 1]
-        if out.size - n < (hi - lo + old_hi - old_lo) * optics[4]:
-            return k, n
+        if hi <= lo:
+            lo, hi = old_lo, old_lo
         light[old_lo:old_hi] = background
         light[lo:hi] = background
         for j in range(patches.shape[1]):
             first, last = _window(patches[k, j], sigma, optics[1], rows)
             _add_patch(light, first, last, patches[k, j], sigma)
-        earliest = due[column]
-        # One run over both spans, unless they lie apart: the rows between are none of its business.
+        # One run over both spans, unless they lie apart: what is between stays untouched.
         first, last = (min(lo, old_lo), max(hi, old_hi)) if hi > lo else (old_lo, old_hi)
-        if hi < old_lo or lo > old_hi:
-            n, a = _live(
-                pixels, column, old_lo, old_hi, t_us, light, omega, seed, timing, slots, out, n
-            )
-            n, b = _live(pixels, column, lo, hi, t_us, light, omega, seed, timing, slots, out, n)
-            earliest = min(earliest, min(a, b))
-        else:
-            n, a = _live(
-                pixels, column, first, last, t_us, light, omega, seed, timing, slots, out, n
-            )
-            earliest = min(earliest, a)
+        apart = hi < old_lo or lo > old_hi
+        n, earliest = _live(
+            pixels, column, old_lo if apart else first, old_hi if apart else last, t_us, light,
+            model, table, seed, slots, out, n,
+        )  # fmt: skip
+        if apart and earliest != _FULL:
+            n, other = _live(pixels, column, lo, hi, t_us, light, model, table, seed, slots, out, n)
+            earliest = min(earliest, other)
+        if earliest == _FULL:
+            return k, n
         if due[column] == np.inf:
             spans[column, 2], spans[column, 3] = first, last
         else:
             spans[column, 2] = min(spans[column, 2], first)
             spans[column, 3] = max(spans[column, 3], last)
-        due[column] = earliest
+        due[column] = min(due[column], earliest)
         spans[column, 0], spans[column, 1] = lo, hi
     return columns.size, n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _run_columns(pixels, spans, due, begin, until_us, optics, seed, timing, slots, out, n):
+def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, slots, out, n):
     """Everything that is due up to ``until_us`` in the columns from ``begin`` on.
 
-    Stops where the output might not suffice; returns the next column and the number of events.
+    Stops where the output does not suffice; returns the next column and the number of events.
     """
-    omega = optics[3]
     unchanged = np.empty(0)
     for column in range(begin, pixels.shape[0]):
         if due[column] > until_us:
             continue
-        lo, hi = spans[column, 2], spans[column, 3]
-        if out.size - n < (hi - lo) * optics[4]:
+        n, earliest = _live(
+            pixels, column, spans[column, 2], spans[column, 3], until_us, unchanged, model, table,
+            seed, slots, out, n,
+        )  # fmt: skip
+        if earliest == _FULL:
             return column, n
-        n, due[column] = _live(
-            pixels, column, lo, hi, until_us, unchanged, omega, seed, timing, slots, out, n
-        )
+        due[column] = earliest
     return pixels.shape[0], n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _background(process, rate_per_us, until_us, columns, rows, seed, slots, out, n):
+def _background(process, rate_per_us, off_share, until_us, columns, rows, seed, slots, out, n):
     """Poisson events over the whole sensor; ``process`` = time of the next one, count so far.
 
-    Stops at a full output; returns the number of events.
+    ``off_share`` of them are OFF. Stops at a full output; returns the number of events.
     """
     while process[0] <= until_us and n < out.size:
         count = np.uint64(process[1])
         bits = _mix(np.uint64(seed) ^ (np.uint64(2) * count))
-        place = np.int64((bits >> np.uint64(1)) % np.uint64(columns * rows))
-        polarity = np.int64(bits & np.uint64(1))
+        place = np.int64((bits >> np.uint64(24)) % np.uint64(columns * rows))
+        polarity = np.int64(np.float64(bits & np.uint64(0xFFFFFF)) >= off_share * 2.0**24)
         out[np.uintp(n)] = _readout_key(
             process[0], place % columns, place // columns, polarity, slots
         )

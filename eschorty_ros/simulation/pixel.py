@@ -1,9 +1,10 @@
 """The event pixels behind the laser line.
 
 Per pixel: relative photocurrent ``I = I_bg + A rho g(y) w(t)`` with a Gaussian ``g`` over the
-rows, a photoreceptor whose bandwidth grows with ``I``, an ON/OFF comparator with fixed mismatch,
-a refractory time during which the reference follows the signal, a latency with jitter, and a
-row-wise readout. Times of threshold crossings are solved in closed form, never stepped.
+rows, a photoreceptor whose bandwidth grows with ``I``, a source follower, comparator noise, an
+ON/OFF comparator with fixed mismatch, a refractory time during which the reference follows the
+signal, leak and background activity, a latency with jitter, and a row-wise readout. Times of
+threshold crossings are solved, never stepped through.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.simulation._noise_table import DECISION_US, noise_table
 from eschorty_ros.simulation._pixel_kernels import (
     PIXEL_DTYPE,
+    WAITS,
     _background,
     _relight,
     _run_columns,
@@ -29,7 +32,7 @@ COLUMNS_MAX, ROWS_MAX = 2048, 1024
 
 @dataclass(frozen=True, slots=True)
 class PixelParameters:
-    """Parameters of the pixel model.
+    """Parameters of the pixel model; the defaults are the set P* that fits the paper's figures.
 
     Parameters
     ----------
@@ -47,7 +50,16 @@ class PixelParameters:
         Least threshold any pixel has.
     bandwidth_hz : float
         Photoreceptor bandwidth at ``I = 1``; proportional to ``I``.
+    follower_hz : float
+        Pole of the source follower; ``inf`` for none.
+    noise : float
+        Standard deviation of the signal at the comparator, in log intensity.
     refractory_us : float
+    refractory_jitter : float
+        Relative standard deviation of the refractory time, drawn per event.
+    leak_hz : float
+        ON events per second of any pixel, lit or not, from its reference leaking away. The
+        0.1 Hz of P* are left to the background activity, of which they are a part.
     latency_us, latency_jitter_us : float
         Mean and standard deviation from crossing to readout request; never below 1 us.
     row_slot_us : int
@@ -68,17 +80,21 @@ class PixelParameters:
     threshold_mismatch: float = 0.08
     threshold_min: float = 0.03
     bandwidth_hz: float = 1000.0
+    follower_hz: float = 20_000.0
+    noise: float = 0.04
     refractory_us: float = 700.0
+    refractory_jitter: float = 0.0
+    leak_hz: float = 0.0
     latency_us: float = 100.0
     latency_jitter_us: float = 30.0
     row_slot_us: int = 10
 
     def __post_init__(self) -> None:
-        may_vanish = ("threshold_mismatch", "latency_us", "latency_jitter_us")
         for item in fields(self):
             value = getattr(self, item.name)
-            least = 0.0 if item.name in may_vanish else 1e-9
-            if not (math.isfinite(value) and value >= least):
+            least = 0.0 if item.name in _MAY_VANISH else 1e-9
+            finite = math.isfinite(value) or (item.name == "follower_hz" and value == math.inf)
+            if not (finite and value >= least):
                 raise ArgumentError(f"{item.name} is {value!r}; choose a positive number")
         if self.refractory_us < 1.0:
             raise ArgumentError(f"refractory_us is {self.refractory_us!r}; choose 1 us or more")
@@ -91,16 +107,26 @@ class PixelParameters:
         return 2.0 * math.pi * self.bandwidth_hz * 1e-6
 
     @property
-    def least_contrast(self) -> float:
-        """Contrast too small to reach even a threshold six sigma low; dimmer rows are not drawn."""
-        lowest = min(self.threshold_on, self.threshold_off) * (1.0 - 6.0 * self.threshold_mismatch)
-        return 0.5 * self.background_intensity * math.expm1(max(lowest, self.threshold_min))
+    def follower_us(self) -> float:
+        """Time constant of the source follower, us."""
+        return max(1e6 / (2.0 * math.pi * self.follower_hz), 1e-6)
 
     @property
-    def events_per_change(self) -> int:
-        """Most events a pixel makes under constant light: each takes a threshold of log swing."""
-        swing = math.log1p(self.amplitude / self.background_intensity)
-        return int(swing / self.threshold_min) + 2
+    def least_contrast(self) -> float:
+        """Contrast that hardly ever makes an event; dimmer rows are not drawn.
+
+        Reaches a threshold four sigma of mismatch low with three sigma of noise, and in any case
+        60 % of it: a row that comes into the light must not be late for its first event.
+        """
+        lowest = min(self.threshold_on, self.threshold_off) * (1.0 - 4.0 * self.threshold_mismatch)
+        swing = lowest - max(3.0 * self.noise, 0.4 * lowest)
+        return self.background_intensity * math.expm1(max(swing, self.threshold_min))
+
+
+_MAY_VANISH = (
+    "threshold_mismatch", "noise", "refractory_jitter", "leak_hz", "latency_us",
+    "latency_jitter_us",
+)  # fmt: skip
 
 
 class PixelArray:
@@ -142,21 +168,25 @@ class PixelArray:
         self._due = np.full(columns, np.inf)
         self._light = np.empty(rows)
         p = parameters
-        self._optics = np.array(
+        self._optics = np.array([p.sigma_rows, p.least_contrast, p.background_intensity])
+        self._model = np.array(
             [
-                p.sigma_rows,
-                p.least_contrast,
-                p.background_intensity,
                 p.omega_per_us,
-                p.events_per_change,
+                p.follower_us,
+                p.noise,
+                p.refractory_us,
+                p.refractory_jitter,
+                p.latency_us,
+                p.latency_jitter_us,
             ]
         )
-        # The kernel draws jitter as the sum of four 16-bit numbers.
-        jitter_us = p.latency_jitter_us * math.sqrt(3.0) / 65536.0
-        self._timing = np.array([p.latency_us, jitter_us, p.refractory_us])
+        self._noise_table = noise_table(max(p.follower_us, DECISION_US))
         phases = np.arange(rows) * 7 % p.row_slot_us
         self._slots = np.concatenate((phases, [p.row_slot_us, 1.0 / p.row_slot_us]))
-        self._background_per_us = background_hz * columns * rows * 1e-6
+        # Leaks of dark pixels come at random times too: each has its own phase and rate.
+        everywhere_hz = background_hz + p.leak_hz
+        self._background_per_us = everywhere_hz * columns * rows * 1e-6
+        self._off_share = 0.5 * background_hz / everywhere_hz if everywhere_hz else 0.0
         first = np.random.default_rng(self._seeds).exponential()
         silent = self._background_per_us == 0.0
         self._process = np.array([np.inf if silent else first / self._background_per_us, 0.0])
@@ -213,9 +243,10 @@ class PixelArray:
                 patches,
                 self._light,
                 self._optics,
+                self._model,
+                self._noise_table,
                 float(t_us),
                 self._seeds[0],
-                self._timing,
                 self._slots,
                 self._keys,
                 self._count,
@@ -234,9 +265,9 @@ class PixelArray:
                 self._due,
                 begin,
                 float(t_us),
-                self._optics,
+                self._model,
+                self._noise_table,
                 self._seeds[0],
-                self._timing,
                 self._slots,
                 self._keys,
                 self._count,
@@ -248,6 +279,7 @@ class PixelArray:
             self._count = _background(
                 self._process,
                 self._background_per_us,
+                self._off_share,
                 float(t_us),
                 self.columns,
                 self.rows,
@@ -288,9 +320,9 @@ class PixelArray:
         p = self.parameters
         shape = (self.columns, self.rows)
         pixels = np.zeros(shape, dtype=PIXEL_DTYPE)
-        for name in ("u", "u_ref", "u_settled"):
+        for name in ("u", "y", "y_ref", "u_settled"):
             pixels[name] = 1.0 / p.background_intensity
-        pixels["rate"] = p.omega_per_us * p.background_intensity
+        pixels["state"] = WAITS
         pixels["t_next"] = np.inf
         for name, threshold, sign in (
             ("on_factor", p.threshold_on, -1.0),

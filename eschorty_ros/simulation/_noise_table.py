@@ -1,0 +1,56 @@
+"""How soon Gaussian noise of a given correlation time reaches across a gap."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.simulation._response_kernels import GAP_MAX, GAP_MIN, GAP_STEPS
+
+DECISION_US = 1.0
+"""The comparator decides once in so long: it does not see what noise does in between."""
+
+
+def noise_table(correlation_us: float) -> NDArray[np.float64]:
+    """Risk of a passage against the gap between signal and level.
+
+    The noise is an Ornstein-Uhlenbeck process looked at every ``DECISION_US``. Its rate of
+    first passages out of equilibrium is one over the mean first-passage time
+    ``sqrt(2 pi) integral_0^g exp(z^2/2) Phi(z) dz`` (in correlation times); discrete looks act
+    like a level higher by ``0.5826 sqrt(2 dt / tau)`` (Siegmund's correction). Below a gap of 1
+    the rate joins on to ``1 - g``, exact at 0 and -1 (zeros of the Hermite polynomials).
+
+    Parameters
+    ----------
+    correlation_us : float
+        Time constant of the noise, positive.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 3)
+        Per gap from ``GAP_MIN`` to ``GAP_MAX`` in steps of ``1 / GAP_STEPS``: passages per us,
+        their integral from the gap to ``GAP_MAX``, and minus the log of the probability that
+        the noise is below the gap.
+    """
+    gap = GAP_MIN + np.arange(round((GAP_MAX - GAP_MIN) * GAP_STEPS) + 1) / GAP_STEPS
+    shifted = gap + 0.5826 * math.sqrt(2.0 * DECISION_US / correlation_us)
+    fine = np.linspace(0.0, 12.0, 12_001)
+    below = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in fine])
+    integrand = math.sqrt(2.0 * math.pi) * np.exp(0.5 * fine**2) * below
+    passage = np.concatenate(
+        ([0.0], np.cumsum(0.5 * (integrand[1:] + integrand[:-1]) * np.diff(fine)))
+    )
+    at_one = 1.0 / float(np.interp(1.0, fine, passage))
+    rate = np.where(
+        shifted > 1.0,
+        1.0 / np.interp(np.maximum(shifted, 1.0), fine, passage),
+        np.where(shifted > 0.0, at_one ** np.clip(shifted, 0.0, 1.0), 1.0 - shifted),
+    )
+    share = np.array([-math.log(0.5 * math.erfc(-g / math.sqrt(2.0))) for g in gap])
+    rate[-1] = 0.0
+    share[-1] = 0.0
+    rate /= correlation_us
+    above = np.concatenate((np.cumsum((0.5 * (rate[1:] + rate[:-1]))[::-1])[::-1], [0.0]))
+    return np.ascontiguousarray(np.column_stack((rate, above / GAP_STEPS, share)))
