@@ -218,6 +218,6 @@ def _uncut_row(row, sigma2, variance, window, half, rows, factor, floor):
 def _whole_sigma2(row, variance, count, rows, factor, floor):
     """Variance of a row estimated from a whole column, and whether the sensor's edge cuts it."""
     sigma2 = _sigma2(variance, count, factor, floor)
-    reach = 2.0 * np.sqrt(variance)
+    reach = 3.0 * np.sqrt(variance)
     cut = row < reach or rows - 1.0 - row < reach
     return sigma2 + _CUT_BIAS2 * variance if cut else sigma2, cut
