@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from line_events import encoded
 
+from eschorty_ros.core._row_kernels import _uncut
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.centroid import METHODS, SIGMA_FLOOR_PX, estimate
 from eschorty_ros.core.evt3 import sort_readout
@@ -115,8 +116,6 @@ def test_case_22_rows_without_events_inside_a_footprint(method):
 
 def test_case_22_gauss_ml_without_background_is_the_mean(measured):
     """Closed form: without noise events the likelihood of a Gaussian peaks at their mean."""
-    if "gauss_ml" not in METHODS:
-        pytest.skip("no Gaussian fit in this build")
     rng = np.random.default_rng(SEED)
     rows = np.rint(rng.normal(350.0, 4.0, (300, 40))).astype(np.int64)
     found = estimate(rows.ravel(), np.arange(301) * 40, "gauss_ml", line_width_px=9.4)
@@ -179,6 +178,22 @@ def test_case_24_footprint_cut_in_half_is_off_by_the_truncated_normal(edge, sigm
     assert found.edge.all()
     assert (np.abs(found.row - edge) < 3.0 * found.sigma_row).all()
     assert (np.abs(found.row - edge) > 0.5 * found.sigma_row).all()
+
+
+@pytest.mark.parametrize("sigma_px", [0.8, 4.0, 25.0])
+def test_case_24_truncated_normal_is_inverted(sigma_px, measured):
+    """Mean and variance of the visible part, with 50 digits, give the centre back."""
+    worst = 0.0
+    with mpmath.workdps(50):
+        for share in np.linspace(0.02, 1.5, 40):
+            alpha = -mpmath.mpf(float(share))
+            hazard = mpmath.npdf(alpha) / (1 - mpmath.ncdf(alpha))
+            mean = sigma_px * (hazard - alpha)
+            variance = sigma_px**2 * (1 + alpha * hazard - hazard**2)
+            centre, sigma, _ = _uncut(float(mean), float(variance), sigma_px)
+            assert sigma == sigma_px
+            worst = max(worst, abs(centre - float(share) * sigma_px) / sigma_px)
+    measured("centre of a cut Gaussian from its visible part, sigma", worst, 1e-12)
 
 
 @every_method
