@@ -1,4 +1,4 @@
-"""Hard case 25: the photoreceptor's closed form for steps far shorter and far longer than it."""
+"""Hard case 25: photoreceptor and follower for steps far shorter and far longer than they take."""
 
 from __future__ import annotations
 
@@ -6,60 +6,90 @@ import mpmath
 import numpy as np
 import pytest
 
-from eschorty_ros.simulation._pixel_kernels import _crossing_us, _response
+from eschorty_ros.simulation._response_kernels import NOTHING, OFF, ON, _advanced, _noiseless
 
 SEED = 25
+TAU_US = 159.0
 SHORT = np.geomspace(1e-18, 1e-3, 40)
 LONG = np.geomspace(1e-3, 1e5, 60)
+SWINGS = [(1.0, 1 / 6.5), (1 / 6.5, 1.0), (1.0, 0.999), (2.0, 1e-4)]
+swings = pytest.mark.parametrize(("u", "settled"), SWINGS)
 
 
 def relative(ours: float, exact: mpmath.mpf) -> float:
     return float(abs(ours - exact) / abs(exact))
 
 
-@pytest.mark.parametrize(
-    ("u", "settled"), [(1.0, 1 / 6.5), (1 / 6.5, 1.0), (1.0, 0.999), (2.0, 1e-4)]
-)
+def exact_levels(u, y, settled, follower_us, t_us):
+    """Photoreceptor and follower after ``t_us``; their time constants differ."""
+    u, y, settled, t_us = (mpmath.mpf(value) for value in (u, y, settled, t_us))
+    fade, lag = mpmath.exp(-t_us / TAU_US), mpmath.exp(-t_us / follower_us)
+    a = (u - settled) * TAU_US / (mpmath.mpf(TAU_US) - follower_us)
+    return settled + (u - settled) * fade, settled + a * fade + (y - settled - a) * lag
+
+
+@swings
 @pytest.mark.parametrize("steps", [SHORT, LONG], ids=["short", "long"])
-def test_case_25_step_of_the_photoreceptor(u, settled, steps, measured):
-    """``u <- 1/I + (u - 1/I) exp(-x)``, the exponential near 1 or gone."""
+@pytest.mark.parametrize("follower_us", [8.0, 1e-3, 600.0])
+def test_case_25_step_of_the_photoreceptor(u, settled, steps, follower_us, measured):
+    """``u <- 1/I + (u - 1/I) exp(-x)``, the exponential near 1 or gone; the follower behind it."""
+    receptor = follower = 0.0
     with mpmath.workdps(50):
-        worst = 0.0
         for x in steps:
-            drop = (mpmath.mpf(u) - mpmath.mpf(settled)) * mpmath.expm1(-mpmath.mpf(float(x)))
-            ours = _response(u, settled, float(x))
-            worst = max(worst, relative(ours, mpmath.mpf(u) + drop))
-    measured("level after a step, relative", worst, 1e-13)
+            t_us = float(x) * TAU_US
+            exact_u, exact_y = exact_levels(u, u, settled, follower_us, t_us)
+            ours_u, ours_y = _advanced(u, u, settled, TAU_US, follower_us, t_us)
+            receptor = max(receptor, relative(ours_u, exact_u))
+            follower = max(follower, relative(ours_y, exact_y))
+    measured("photoreceptor after a step, relative", receptor, 1e-13)
+    measured("follower after a step, relative", follower, 1e-13)
 
 
-@pytest.mark.parametrize("x", [700.0, 745.2, 1e4, 1e300, np.inf])
-def test_case_25_endless_step_settles_exactly(x):
-    assert _response(1.0, 0.125, x) == 0.125
-    assert _response(0.125, 1.0, x) == 1.0
+def test_case_25_equal_time_constants(measured):
+    """The two exponentials fall into one; the code keeps them a part in a million apart."""
+    worst = 0.0
+    with mpmath.workdps(50):
+        for x in np.geomspace(1e-6, 30.0, 50):
+            fade = mpmath.exp(-mpmath.mpf(float(x)))
+            exact = mpmath.mpf("0.2") + mpmath.mpf("0.8") * fade * (1 + mpmath.mpf(float(x)))
+            _, ours = _advanced(1.0, 1.0, 0.2, TAU_US, TAU_US, float(x) * TAU_US)
+            worst = max(worst, relative(ours, exact))
+    measured("follower as slow as the photoreceptor, relative", worst, 1e-6)
+
+
+@pytest.mark.parametrize("t_us", [1e5, 1e9, 1e300])
+def test_case_25_endless_step_settles_exactly(t_us):
+    assert _advanced(1.0, 0.9, 0.125, TAU_US, 8.0, t_us) == (0.125, 0.125)
+    assert _advanced(0.125, 0.2, 1.0, TAU_US, 8.0, t_us) == (1.0, 1.0)
 
 
 def test_case_25_many_short_steps_are_one_long_step(measured):
-    u = 1.0
+    u = y = 1.0
     for _ in range(100_000):
-        u = _response(u, 0.2, 1e-5)
-    measured("100 000 steps against one, relative", relative(u, _response(1.0, 0.2, 1.0)), 1e-11)
+        u, y = _advanced(u, y, 0.2, TAU_US, 8.0, 1e-5 * TAU_US)
+    once = _advanced(1.0, 1.0, 0.2, TAU_US, 8.0, TAU_US)
+    error = max(relative(a, b) for a, b in zip((u, y), once, strict=True))
+    measured("100 000 steps against one, relative", error, 1e-11)
 
 
 @pytest.mark.parametrize("rising", [True, False])
-def test_case_25_crossing_time_inverts_the_step(rising, measured):
+def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, measured):
     """Levels from one part in 1e12 of the swing to all but one part in 1e12 of it."""
     rng = np.random.default_rng(SEED)
     shares = np.concatenate([np.geomspace(1e-12, 0.5, 40), 1.0 - np.geomspace(1e-12, 0.5, 40)])
-    tau_us, worst = 159.0, 0.0
+    worst = 0.0
     with mpmath.workdps(50):
         for share in shares:
             u, settled = (1.0, rng.uniform(0.01, 0.9)) if rising else (rng.uniform(0.01, 0.9), 1.0)
             level = u + share * (settled - u)
-            way = (mpmath.mpf(level) - mpmath.mpf(u)) / (mpmath.mpf(settled) - mpmath.mpf(u))
-            if not 0 < way < 1:
-                continue
-            exact = -mpmath.mpf(tau_us) * mpmath.log1p(-way)
             band = (level, 10.0) if rising else (0.0, level)
-            ours = _crossing_us(u, *band, settled, 0.0, tau_us)
-            worst = max(worst, relative(ours, exact))
-    measured("crossing time, relative", worst, 1e-13)
+            ours_us, polarity = _noiseless(u, u, settled, TAU_US, 8.0, *band)
+            assert polarity == (ON if rising else OFF)
+            _, there = exact_levels(u, u, settled, 8.0, ours_us)
+            worst = max(worst, relative(there, mpmath.mpf(level)))
+    measured("level at the crossing found, relative", worst, 1e-13)
+
+
+def test_case_25_level_out_of_reach_is_no_event():
+    assert _noiseless(1.0, 1.0, 0.5, TAU_US, 8.0, 0.4, 2.0) == (np.inf, NOTHING)
+    assert _noiseless(1.0, 1.0, 1.0, TAU_US, 8.0, 0.4, 2.0) == (np.inf, NOTHING)
