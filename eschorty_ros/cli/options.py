@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from eschorty_ros.simulation.presets import PRESETS
+
 _SWEEP = (
     click.option(
         "--scene",
@@ -42,13 +44,20 @@ _SWEEP = (
         help="nominal, config_1, config_2, config_3, or the path of a calibration.yaml.",
     ),
     click.option(
+        "--pixels",
+        type=click.Choice(tuple(PRESETS)),
+        default="paper",
+        show_default=True,
+        help="Preset of the event pixels.",
+    ),
+    click.option(
         "--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed."
     ),
 )
 
 
 def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add what to scan and how to a command: scene, laser, stage, optical build, seed."""
+    """Add what to scan and how to a command: scene, laser, stage, optical build, pixels, seed."""
     for option in reversed(_SWEEP):
         command = option(command)
     return command

@@ -35,6 +35,7 @@ def command(
     start: float,
     stop: float,
     calibration: str,
+    pixels: str,
     seed: int,
     out: Path,
 ) -> None:
@@ -54,7 +55,7 @@ def command(
     check_sweep(start, stop)
     one_process = _nodes()
     _check(scene, calibration)
-    request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed)
+    request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed, pixels)
     out.mkdir(parents=True, exist_ok=True)
     # A shell's background job starts with SIGINT ignored; a laser must go off all the same.
     handlers = {signal.SIGTERM: _terminated, signal.SIGINT: signal.default_int_handler}

@@ -35,6 +35,7 @@ def command(
     start: float,
     stop: float,
     calibration: str,
+    pixels: str,
     seed: int,
 ) -> None:
     """Simulate a recording of a scene, with its truth. Needs no ROS.
@@ -52,6 +53,7 @@ def command(
         raise ArgumentError(f"{out} is not empty; choose a new folder")
     from eschorty_ros.core.calibration import load_calibration
     from eschorty_ros.core.modulation import Modulation
+    from eschorty_ros.simulation.presets import preset
     from eschorty_ros.simulation.recorder import simulate_recording
     from eschorty_ros.simulation.scene import named
 
@@ -65,6 +67,7 @@ def command(
             stop_mm=stop,
             speed_mm_s=speed,
             seed=seed,
+            parameters=preset(pixels),
             progress=lambda done, total: report(done / max(total, 1), ""),
         )
     truth = recording.truth

@@ -23,6 +23,7 @@ from eschorty_ros.nodes.packets import SIZE_MAX_BYTES, Packetizer
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
 from eschorty_ros.simulation.fake_camera import FakeCamera
+from eschorty_ros.simulation.presets import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
 
 READ_TIMEOUT_S = 0.02
@@ -33,6 +34,12 @@ TABLE = (
     drivers.DRIVER,
     Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
     Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
+    Param(
+        "pixels",
+        "paper",
+        "fake camera: preset of the event pixels",
+        choices=tuple(PRESETS),
+    ),
     Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
     Param(
         "background_rate",

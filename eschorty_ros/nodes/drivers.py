@@ -26,6 +26,7 @@ LASER_TABLE = (
 def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
     from eschorty_ros.core.calibration import load_calibration
     from eschorty_ros.simulation.fake_camera import FakeCamera
+    from eschorty_ros.simulation.presets import preset
     from eschorty_ros.simulation.scene import named
     from eschorty_ros.simulation.warm_up import warm_up
     from eschorty_ros.simulation.world import World
@@ -35,6 +36,7 @@ def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSourc
     world = World(
         named(parameters["scene"]),
         calibration,
+        preset(parameters["pixels"]),
         seed=parameters["seed"],
         background_hz=parameters["background_rate"],
     )

@@ -62,6 +62,7 @@ class OneScan:
     speed_mm_s: float
     frequency_hz: float
     seed: int = 0
+    pixels: str = "paper"
 
     @property
     def sweep_s(self) -> float:
@@ -90,6 +91,7 @@ def parameters(scan: OneScan) -> dict[str, dict[str, Any]]:
             "scene": scan.scene,
             "calibration": scan.calibration,
             "seed": scan.seed,
+            "pixels": scan.pixels,
             "qos_overrides": {topic: {"publisher": {"reliability": "reliable"}}},
         },
         "reconstruction": {

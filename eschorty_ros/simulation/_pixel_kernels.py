@@ -83,9 +83,15 @@ def _gaussian(bits):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _uniform(bits):
+    """Number between 0 and 1, neither included."""
+    return (np.float64(bits >> np.uint64(11)) + 0.5) * 2.0**-53
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _exponential(bits):
     """Number drawn from an exponential distribution of mean 1."""
-    return -math.log((np.float64(bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+    return -math.log(_uniform(bits))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -282,22 +288,24 @@ def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, slots,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _background(process, rate_per_us, off_share, until_us, columns, rows, seed, slots, out, n):
+def _background(process, per_us, shares, hot, until_us, columns, rows, seed, slots, out, n):
     """Poisson events over the whole sensor; ``process`` = time of the next one, count so far.
 
-    ``off_share`` of them are OFF. Stops at a full output; returns the number of events.
+    ``shares`` = those that are OFF, those of the pixels ``hot``. Stops at a full output; returns
+    the number of events.
     """
     while process[0] <= until_us and n < out.size:
         count = np.uint64(process[1])
         bits = _mix(np.uint64(seed) ^ (np.uint64(2) * count))
         place = np.int64((bits >> np.uint64(24)) % np.uint64(columns * rows))
-        polarity = np.int64(np.float64(bits & np.uint64(0xFFFFFF)) >= off_share * 2.0**24)
+        polarity = np.int64(_uniform(_mix(bits)) >= shares[0])
+        draw = _mix(np.uint64(seed) ^ (np.uint64(2) * count + np.uint64(1)))
+        if hot.size and _uniform(_mix(draw)) < shares[1]:
+            place = hot[place % hot.size]
         out[np.uintp(n)] = _readout_key(
             process[0], place % columns, place // columns, polarity, slots
         )
         n += 1
-        draw = _mix(np.uint64(seed) ^ (np.uint64(2) * count + np.uint64(1)))
-        uniform = (np.float64(draw >> np.uint64(11)) + 0.5) * 2.0**-53
-        process[0] -= math.log(uniform) / rate_per_us
+        process[0] -= math.log(_uniform(draw)) / per_us
         process[1] += 1.0
     return n

@@ -10,7 +10,6 @@ threshold crossings are solved, never stepped through.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,109 +23,13 @@ from eschorty_ros.simulation._pixel_kernels import (
     _relight,
     _run_columns,
 )
+from eschorty_ros.simulation.pixel_parameters import PixelParameters
+
+__all__ = ["PixelArray", "PixelParameters", "unpack"]
 
 T_SHIFT = 22
 """Bits below the time in an event key: row (10), polarity (1), column (11)."""
 COLUMNS_MAX, ROWS_MAX = 2048, 1024
-
-
-@dataclass(frozen=True, slots=True)
-class PixelParameters:
-    """Parameters of the pixel model; the defaults are the set P* that fits the paper's figures.
-
-    Parameters
-    ----------
-    background_intensity : float
-        Relative photocurrent ``I_bg`` without the laser.
-    amplitude : float
-        Photocurrent ``A`` the line adds at its centre on a surface of reflectance 1.
-    sigma_rows : float
-        Gaussian width of the line on the sensor, rows.
-    threshold_on, threshold_off : float
-        Comparator thresholds in log intensity.
-    threshold_mismatch : float
-        Relative standard deviation of a pixel's thresholds, fixed per pixel.
-    threshold_min : float
-        Least threshold any pixel has.
-    bandwidth_hz : float
-        Photoreceptor bandwidth at ``I = 1``; proportional to ``I``.
-    follower_hz : float
-        Pole of the source follower; ``inf`` for none.
-    noise : float
-        Standard deviation of the signal at the comparator, in log intensity.
-    refractory_us : float
-    refractory_jitter : float
-        Relative standard deviation of the refractory time, drawn per event.
-    leak_hz : float
-        ON events per second of any pixel, lit or not, from its reference leaking away. The
-        0.1 Hz of P* are left to the background activity, of which they are a part.
-    latency_us, latency_jitter_us : float
-        Mean and standard deviation from crossing to readout request; never below 1 us.
-    row_slot_us : int
-        Requests of one row that fall into one slot are read out together and share a timestamp:
-        a simple stand-in for the row arbiter that yields vectors as the sensor sends them.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
-    """
-
-    background_intensity: float = 1.0
-    amplitude: float = 5.5
-    sigma_rows: float = 4.1
-    threshold_on: float = 0.25
-    threshold_off: float = 0.25
-    threshold_mismatch: float = 0.08
-    threshold_min: float = 0.03
-    bandwidth_hz: float = 1000.0
-    follower_hz: float = 20_000.0
-    noise: float = 0.04
-    refractory_us: float = 700.0
-    refractory_jitter: float = 0.0
-    leak_hz: float = 0.0
-    latency_us: float = 100.0
-    latency_jitter_us: float = 30.0
-    row_slot_us: int = 10
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            least = 0.0 if item.name in _MAY_VANISH else 1e-9
-            finite = math.isfinite(value) or (item.name == "follower_hz" and value == math.inf)
-            if not (finite and value >= least):
-                raise ArgumentError(f"{item.name} is {value!r}; choose a positive number")
-        if self.refractory_us < 1.0:
-            raise ArgumentError(f"refractory_us is {self.refractory_us!r}; choose 1 us or more")
-        if not (isinstance(self.row_slot_us, int) and self.row_slot_us >= 1):
-            raise ArgumentError(f"row_slot_us is {self.row_slot_us!r}; choose whole microseconds")
-
-    @property
-    def omega_per_us(self) -> float:
-        """Photoreceptor rate ``omega0 = 2 pi f3`` at ``I = 1``, per us."""
-        return 2.0 * math.pi * self.bandwidth_hz * 1e-6
-
-    @property
-    def follower_us(self) -> float:
-        """Time constant of the source follower, us."""
-        return max(1e6 / (2.0 * math.pi * self.follower_hz), 1e-6)
-
-    @property
-    def least_contrast(self) -> float:
-        """Contrast that hardly ever makes an event; dimmer rows are not drawn.
-
-        Reaches a threshold four sigma of mismatch low with three sigma of noise, and in any case
-        60 % of it: a row that comes into the light must not be late for its first event.
-        """
-        lowest = min(self.threshold_on, self.threshold_off) * (1.0 - 4.0 * self.threshold_mismatch)
-        swing = lowest - max(3.0 * self.noise, 0.4 * lowest)
-        return self.background_intensity * math.expm1(max(swing, self.threshold_min))
-
-
-_MAY_VANISH = (
-    "threshold_mismatch", "noise", "refractory_jitter", "leak_hz", "latency_us",
-    "latency_jitter_us",
-)  # fmt: skip
 
 
 class PixelArray:
@@ -161,7 +64,7 @@ class PixelArray:
             raise ArgumentError(f"background_hz is {background_hz!r}; choose 0 or more")
         self.columns, self.rows = columns, rows
         self.parameters = parameters
-        draws, kernel_seeds = np.random.SeedSequence(seed).spawn(2)
+        draws, kernel_seeds, hot_seed = np.random.SeedSequence(seed).spawn(3)
         self._seeds = kernel_seeds.generate_state(2, np.uint64)
         self._pixels = self._settled(np.random.default_rng(draws))
         self._spans = np.zeros((columns, 4), dtype=np.int64)
@@ -184,9 +87,15 @@ class PixelArray:
         phases = np.arange(rows) * 7 % p.row_slot_us
         self._slots = np.concatenate((phases, [p.row_slot_us, 1.0 / p.row_slot_us]))
         # Leaks of dark pixels come at random times too: each has its own phase and rate.
-        everywhere_hz = background_hz + p.leak_hz
-        self._background_per_us = everywhere_hz * columns * rows * 1e-6
-        self._off_share = 0.5 * background_hz / everywhere_hz if everywhere_hz else 0.0
+        self._hot = np.flatnonzero(
+            np.random.default_rng(hot_seed).random(columns * rows) < p.hot_fraction
+        )
+        both_hz = background_hz * columns * rows + p.hot_hz * self._hot.size
+        total_hz = both_hz + p.leak_hz * columns * rows
+        self._background_per_us = total_hz * 1e-6
+        self._shares = np.zeros(2)
+        if total_hz:
+            self._shares[:] = 0.5 * both_hz / total_hz, p.hot_hz * self._hot.size / total_hz
         first = np.random.default_rng(self._seeds).exponential()
         silent = self._background_per_us == 0.0
         self._process = np.array([np.inf if silent else first / self._background_per_us, 0.0])
@@ -279,7 +188,8 @@ class PixelArray:
             self._count = _background(
                 self._process,
                 self._background_per_us,
-                self._off_share,
+                self._shares,
+                self._hot,
                 float(t_us),
                 self.columns,
                 self.rows,

@@ -23,6 +23,7 @@ EXPECTED = {
     "scan.launch.py": {
         "fake",
         "scene",
+        "pixels",
         "calibration",
         "frequency",
         "speed",
