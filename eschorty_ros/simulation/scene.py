@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,6 +50,30 @@ def sheet(stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> tuple[A
     """Stage positions as (n, 1) and ray slopes (mm of z per mm of depth) as (1, m)."""
     stage = np.atleast_1d(np.asarray(stage_mm, dtype=np.float64))
     return stage[:, np.newaxis], model.column_slope(np.atleast_1d(columns))[np.newaxis, :]
+
+
+class RecentRays:
+    """Result of the last query, so that range and reflectance of the same rays cost one cast."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Any, tuple[Array, NDArray[Any]]] | None = None
+
+    def get(
+        self,
+        cast: Callable[[ArrayLike, ArrayLike, RangeModel], tuple[Array, NDArray[Any]]],
+        stage_mm: ArrayLike,
+        columns: ArrayLike,
+        model: RangeModel,
+    ) -> tuple[Array, NDArray[Any]]:
+        """``cast(stage_mm, columns, model)``, its arrays made read-only."""
+        rays = (np.asarray(values, dtype=np.float64).tobytes() for values in (stage_mm, columns))
+        key = (*rays, model)
+        if self._last is None or self._last[0] != key:
+            result = cast(stage_mm, columns, model)
+            for array in result:
+                array.setflags(write=False)
+            self._last = (key, result)
+        return self._last[1]
 
 
 class UniformReflectance:

@@ -7,14 +7,14 @@ Every ray ends at the first surface it meets. That the nose may hide a cheek fro
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scene import Array, sheet
+from eschorty_ros.simulation.scene import Array, RecentRays, sheet
 
 HEAD_HALF_WIDTH_MM = 72.0
 HEAD_HALF_HEIGHT_MM = 112.0
@@ -22,9 +22,12 @@ HEAD_DEPTH_MM = 78.0
 EAR_OFF_MM = 76.0
 EAR_DEPTH_MM = 92.0
 _EAR_HALF_MM = (13.0, 31.0)
+_EAR_END_MM = EAR_OFF_MM + _EAR_HALF_MM[0]
 _EAR_LINE_MM = 2.0
 _SKIN, _LIPS, _EYES = 0.75, 0.5, 0.9
 _SOLVE_STEPS = 4
+_BELL_END = 1e-9
+"""Bumps this far down their slope change nothing by more than a millionth of a micrometre."""
 
 # Bumps: across and up from the middle of the face, their half widths, and the height; mm. Those off
 # the middle come in pairs. Up is +z.
@@ -63,6 +66,7 @@ class Face:
 
     centre_mm: float = 1000.0
     centre_stage_mm: float = 100.0
+    _recent: RecentRays = field(init=False, repr=False, compare=False, default_factory=RecentRays)
 
     def __post_init__(self) -> None:
         if not self.centre_mm > 0.0:
@@ -70,27 +74,43 @@ class Face:
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
         """See :class:`eschorty_ros.simulation.scene.Scene`; NaN beside the face."""
-        y, slope = sheet(stage_mm, columns, model)
-        x, _ = self._meet(y - self.centre_stage_mm, slope, model.b_mm)
-        return x
+        return self._recent.get(self._meet, stage_mm, columns, model)[0]
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
         """Skin, darker lips and lighter eyes, changing gradually; 0 beside the face."""
-        y, slope = sheet(stage_mm, columns, model)
+        x, z = self._recent.get(self._meet, stage_mm, columns, model)
+        y, _ = sheet(stage_mm, columns, model)
         across = y - self.centre_stage_mm
-        x, z = self._meet(across, slope, model.b_mm)
         up = np.where(np.isnan(x), 0.0, z)
         lips = _bell(across, 0.0, 18.0) * _bell(up, -48.0, 7.0)
         eyes = _bell(np.abs(across), 30.0, 7.0) * _bell(up, 21.0, 4.0)
         albedo = _SKIN + (_LIPS - _SKIN) * lips + (_EYES - _SKIN) * eyes
         return np.where(np.isnan(x), 0.0, albedo)
 
-    def _meet(self, across: Array, slope: Array, b_mm: float) -> tuple[Array, Array]:
+    def _meet(
+        self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
+    ) -> tuple[Array, Array]:
         """Range and height above the nose at which each ray meets head or ear; NaN for neither."""
-        head, up = _solve(across, slope, self.centre_mm + b_mm, _head_mm)
-        ear, ear_up = _solve(across, slope, self.centre_mm + b_mm, _ear_mm)
-        nearer = np.fmin(head, ear) - b_mm
-        return nearer, np.where(np.isnan(head), ear_up, up)
+        y, slope = sheet(stage_mm, columns, model)
+        across, depth_mm = y - self.centre_stage_mm, self.centre_mm + model.b_mm
+        x = np.full((y.size, slope.size), np.nan)
+        up = x.copy()
+        for height, columns_of, rows_of in (
+            (_head_mm, HEAD_HALF_HEIGHT_MM, (0.0, HEAD_HALF_WIDTH_MM)),
+            (_ear_mm, _EAR_LINE_MM + _EAR_HALF_MM[1], (EAR_OFF_MM - _EAR_HALF_MM[0], _EAR_END_MM)),
+        ):
+            aside = np.abs(across[:, 0])
+            rows = np.flatnonzero((aside >= rows_of[0]) & (aside <= rows_of[1]))
+            # Hits lie behind the front and so further from the axis than the ray is at the front.
+            cols = np.flatnonzero(np.abs(slope[0]) * depth_mm <= columns_of)
+            if rows.size == 0 or cols.size == 0:
+                continue
+            part = np.ix_(rows, cols)
+            found, found_up = _solve(across[rows], slope[:, cols], depth_mm, height)
+            nearer = ~(x[part] <= found - model.b_mm) & ~np.isnan(found)
+            x[part] = np.where(nearer, found - model.b_mm, x[part])
+            up[part] = np.where(nearer, found_up, up[part])
+        return x, up
 
 
 def _bell(at: Array, centre: float, half_width: float) -> Array:
@@ -104,8 +124,10 @@ def _head_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
     height = -HEAD_DEPTH_MM * np.minimum(squared, 1.5) ** 1.3
     for off, line, half_across, half_up, bump in _BUMPS:
         sides = (off, -off) if off else (0.0,)
-        bells = sum(_bell(across, side, half_across) for side in sides)
-        height = height + bump * bells * _bell(up, line, half_up)
+        bells = np.array(sum(_bell(across, side, half_across) for side in sides))
+        bells[bells < _BELL_END] = 0.0
+        if bells.any():
+            height = height + bump * bells * _bell(up, line, half_up)
     return height, squared <= 1.0
 
 

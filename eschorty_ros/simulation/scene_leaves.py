@@ -6,15 +6,15 @@ from the laser (occlusion) is not modelled, here or in any other scene.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scene import Array, sheet
+from eschorty_ros.simulation.scene import Array, RecentRays, sheet
 
 SEPARATION_MM = 2.2
 """Between neighbouring levels of a layer: the paper's leaves at 1.32 m (Fig. 8)."""
@@ -32,9 +32,12 @@ _STAGE_WAVE_MM = 12.0
 _LINE_TRAVEL_MM = 122.0
 
 
+Value = float | Array
+
+
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One leaf: where its blade begins, which way it points, how large it is.
+    """One leaf, or as arrays the leaf of each ray: where its blade is, its heading and shape.
 
     Attributes
     ----------
@@ -42,8 +45,8 @@ class Leaf:
         Range of its level before the layer's curvature is added.
     stage_mm, line_mm : float
         Middle of the blade.
-    angle_rad : float
-        Direction from stalk to tip, from the laser line towards the stage direction.
+    heading_stage, heading_line : float
+        Unit vector from stalk to tip.
     length_mm, half_width_mm : float
         Of the blade; the petiole adds a quarter to the length.
     fullness : float
@@ -53,39 +56,48 @@ class Leaf:
     albedo : float
     """
 
-    depth_mm: float
-    stage_mm: float
-    line_mm: float
-    angle_rad: float
-    length_mm: float
-    half_width_mm: float
-    fullness: float
-    lobes: float
-    lobe_depth: float
-    albedo: float
+    depth_mm: Value
+    stage_mm: Value
+    line_mm: Value
+    heading_stage: Value
+    heading_line: Value
+    length_mm: Value
+    half_width_mm: Value
+    fullness: Value
+    lobes: Value
+    lobe_depth: Value
+    albedo: Value
 
     @property
-    def half_extent_mm(self) -> tuple[float, float]:
+    def half_extent_mm(self) -> tuple[Array, Array]:
         """Half of the box around blade and petiole: along the stage and along the line."""
         along = self.length_mm * (0.5 + _PETIOLE_SHARE)
-        s, c = abs(math.sin(self.angle_rad)), abs(math.cos(self.angle_rad))
+        s, c = np.abs(self.heading_stage), np.abs(self.heading_line)
         return along * s + self.half_width_mm * c, along * c + self.half_width_mm * s
+
+    def take(self, index: NDArray[Any]) -> Leaf:
+        """Leaf of every entry of ``index`` (numbers or a mask), from leaves as arrays."""
+        return Leaf(*(np.asarray(getattr(self, name))[index] for name in self.__slots__))
 
     def place(self, y: Array, z: Array) -> tuple[Array, Array]:
         """Coordinates in the leaf, mm: from the blade's beginning to its tip, and across."""
-        s, c = math.sin(self.angle_rad), math.cos(self.angle_rad)
         dy, dz = y - self.stage_mm, z - self.line_mm
-        return dz * c + dy * s + 0.5 * self.length_mm, dy * c - dz * s
+        along = dz * self.heading_line + dy * self.heading_stage + 0.5 * self.length_mm
+        return along, dy * self.heading_line - dz * self.heading_stage
+
+    def near(self, along: Array, across: Array) -> NDArray[np.bool_]:
+        """Whether a point is within the box around blade and petiole, or 1 mm beside it."""
+        within = (along > -_PETIOLE_SHARE * self.length_mm - 1.0) & (along < self.length_mm + 1.0)
+        return np.asarray(within & (np.abs(across) < self.half_width_mm + 1.0))
 
     def covers(self, along: Array, across: Array) -> NDArray[np.bool_]:
         """Whether blade or petiole is there."""
         distance = np.abs(across)
         u = np.clip(along / self.length_mm, 0.0, 1.0)
-        half = self.half_width_mm * np.sin(np.pi * u**self.fullness)
-        if self.lobe_depth:
-            # Lobes lean towards the tip as the side veins do.
-            turns = self.lobes * (u - 0.5 * distance / self.length_mm)
-            half *= 1.0 - self.lobe_depth * (0.5 + 0.5 * np.cos(2.0 * np.pi * turns))
+        # Lobes lean towards the tip as the side veins do.
+        turns = self.lobes * (u - 0.5 * distance / self.length_mm)
+        cut = self.lobe_depth * (0.5 + 0.5 * np.cos(2.0 * np.pi * turns))
+        half = self.half_width_mm * np.sin(np.pi * u**self.fullness) * (1.0 - cut)
         petiole = (along > -_PETIOLE_SHARE * self.length_mm) & (along <= 0.25 * self.length_mm)
         return np.asarray((distance < half) | (petiole & (distance < _PETIOLE_HALF_MM)))
 
@@ -127,6 +139,8 @@ class Leaves:
     leaves_per_layer: int = 7
     seed: int = 8
     leaves: tuple[Leaf, ...] = field(init=False, repr=False)
+    _arrays: Leaf = field(init=False, repr=False, compare=False)
+    _recent: RecentRays = field(init=False, repr=False, compare=False, default_factory=RecentRays)
 
     def __post_init__(self) -> None:
         for name in ("centre_mm", "span_mm", "leaves_per_layer"):
@@ -142,6 +156,8 @@ class Leaves:
             for leaf in self._layer(depth, stage, rng)
         ]
         object.__setattr__(self, "leaves", tuple(leaves))
+        arrays = Leaf(*(np.array([getattr(x, name) for x in leaves]) for name in Leaf.__slots__))
+        object.__setattr__(self, "_arrays", arrays)
 
     def _layer(self, depth_mm: float, stage_mm: float, rng: np.random.Generator) -> list[Leaf]:
         """Leaves along a wavy row, each overlapping the one before, level after level."""
@@ -149,12 +165,14 @@ class Leaves:
         line = np.linspace(-_LINE_TRAVEL_MM, _LINE_TRAVEL_MM, count) + rng.uniform(-8, 8, count)
         wave = np.sin(rng.uniform(0.0, 2.0 * np.pi) + 2.4 * np.arange(count))
         stage = stage_mm + _STAGE_WAVE_MM * wave
+        angle = rng.uniform(-1.3, 1.3, count) + np.pi * rng.integers(0, 2, count)
         return [
             Leaf(
                 depth_mm=depth_mm + SEPARATION_MM * (k % LEVELS),
                 stage_mm=float(stage[k]),
                 line_mm=float(line[k]),
-                angle_rad=float(rng.uniform(-1.3, 1.3) + np.pi * rng.integers(2)),
+                heading_stage=float(np.sin(angle[k])),
+                heading_line=float(np.cos(angle[k])),
                 length_mm=float(rng.uniform(66.0, 90.0)),
                 half_width_mm=float(rng.uniform(18.0, 25.0)),
                 fullness=float(rng.uniform(0.7, 0.9)),
@@ -172,8 +190,7 @@ class Leaves:
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
         """Each leaf's own, 0 between the leaves."""
         leaf = self._hits(stage_mm, columns, model)[1]
-        albedo = np.array([item.albedo for item in self.leaves] + [0.0])
-        return albedo[leaf]
+        return np.append(self._arrays.albedo, 0.0)[leaf]
 
     def leaf_index(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
@@ -190,35 +207,41 @@ class Leaves:
     def _hits(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
     ) -> tuple[Array, NDArray[np.intp]]:
+        return self._recent.get(self._cast, stage_mm, columns, model)
+
+    def _cast(
+        self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Range and leaf of the first hit of every ray: NaN and -1 for none."""
         y, slope = sheet(stage_mm, columns, model)
-        near = np.full((y.size, slope.size), np.inf)
-        hit = np.full(near.shape, -1, dtype=np.intp)
-        for index, leaf in enumerate(self.leaves):
-            tall, wide = leaf.half_extent_mm
-            rows = np.flatnonzero(np.abs(y[:, 0] - leaf.stage_mm) < tall)
-            if rows.size == 0:
-                continue
-            # Generous by what curvature and slope can move the hit along the line.
-            line = slope[0] * (leaf.depth_mm + model.b_mm)
-            cols = np.flatnonzero(np.abs(line - leaf.line_mm) < wide + 5.0)
-            if cols.size == 0:
-                continue
-            part = np.ix_(rows, cols)
-            x, inside = self._meet(leaf, y[rows], slope[:, cols], model.b_mm)
-            nearer = inside & (x < near[part])
-            near[part] = np.where(nearer, x, near[part])
-            hit[part] = np.where(nearer, index, hit[part])
-        return np.where(hit < 0, np.nan, near), hit
+        every = self._arrays
+        tall, wide = every.half_extent_mm
+        rows = np.abs(y - every.stage_mm) < tall
+        line = slope.T * (every.depth_mm + model.b_mm)
+        # Curvature moves a hit along the line by less than 1 mm.
+        cols = np.abs(line - every.line_mm) < wide + 1.0
+        row, col, which = np.nonzero(rows[:, np.newaxis, :] & cols[np.newaxis, :, :])
+        leaf, at, z = every.take(which), y[row, 0], line[col, which]
+        close = leaf.near(*leaf.place(at, z))
+        row, col, which, at, z = row[close], col[close], which[close], at[close], z[close]
+        x, inside = self._meet(every.take(which), at, z, slope[0, col], model.b_mm)
+        place, x, which = (row * slope.size + col)[inside], x[inside], which[inside]
+        near = np.full(y.size * slope.size, np.inf)
+        np.minimum.at(near, place, x)
+        hit = np.full(near.size, -1, dtype=np.intp)
+        first = x == near[place]
+        hit[place[first]] = which[first]
+        shape = (y.size, slope.size)
+        return np.where(hit < 0, np.nan, near).reshape(shape), hit.reshape(shape)
 
     def _meet(
-        self, leaf: Leaf, y: Array, slope: Array, b_mm: float
+        self, leaf: Leaf, y: Array, z: Array, slope: Array, b_mm: float
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Where rays meet the leaf's surface, and whether the leaf reaches that far.
+        """Where each ray meets its leaf's surface, and whether the leaf reaches that far.
 
         The surface is nearly flat: a step of ``x = surface(y, slope (x + b))`` leaves less than a
         twentieth of the error, and two of them less than 2 um.
         """
-        z = slope * (leaf.depth_mm + b_mm)
         x = leaf.depth_mm + self.curvature_mm(y, z)
         for _ in range(_SOLVE_STEPS):
             z = slope * (x + b_mm)
