@@ -40,7 +40,7 @@ _STEPS_MAX = 4096
 def _shares(u, y, settled, tau_us, follower_us):
     """``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
     apart = 1.0 - follower_us / tau_us
-    # Equal time constants have no such form; a part in a million apart they have, to 1e-9.
+    # Equal time constants have no such form; a part in a million apart they have, to 1e-6.
     if abs(apart) < 1e-6:
         apart, follower_us = 1e-6, tau_us * (1.0 - 1e-6)
     a = (u - settled) / apart
@@ -53,14 +53,19 @@ def _advanced(u, y, settled, tau_us, follower_us, t_us):
     x, z = t_us / tau_us, t_us / follower_us
     if x > _SETTLED and z > _SETTLED:
         return settled, settled
-    a, b, follower_us = _shares(u, y, settled, tau_us, follower_us)
-    z = t_us / follower_us
-    if x < 0.01 and z < 0.01:
-        fade = math.expm1(-x)
-        return u + (u - settled) * fade, y + a * fade + b * math.expm1(-z)
+    way = u - settled
     fade = math.exp(-x) if x < _SETTLED else 0.0
-    u, y = settled + (u - settled) * fade, settled + a * fade
-    return u, y + b * math.exp(-z) if z < _SETTLED else y
+    lag = math.exp(-z) if z < _SETTLED else 0.0
+    apart = 1.0 - follower_us / tau_us
+    w = x * apart * (tau_us / follower_us)
+    if abs(w) > 0.1:
+        share = (fade - lag) / apart
+    else:
+        # expm1(w) / w: both exponentials fall nearly or wholly into one.
+        share = lag * (t_us / follower_us) * (math.expm1(w) / w if w != 0.0 else 1.0)
+    if x < 0.01 and z < 0.01:
+        return u + way * math.expm1(-x), y + (y - settled) * math.expm1(-z) + way * share
+    return settled + way * fade, settled + (y - settled) * lag + way * share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
