@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,9 @@ from eschorty_ros.core.raw_file import RawReader
 from eschorty_ros.core.reconstructor import Reconstructor
 from eschorty_ros.core.recording import Recording
 from eschorty_ros.core.settings import Settings
+
+_SPEED_SAMPLES = 256
+_MOVING_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +64,7 @@ def reconstruct_recording(
     ----------
     recording : Recording
     settings : Settings, optional
+        ``stage_speed_mm_s`` is taken from the recording instead.
     progress : callable, optional
         Called with bytes read so far and bytes in all.
 
@@ -74,6 +78,7 @@ def reconstruct_recording(
         When the event file is not EVT3.
     """
     began = time.perf_counter()
+    settings = replace(settings or Settings(), stage_speed_mm_s=stage_speed_mm_s(recording))
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings)
     total = recording.events_path.stat().st_size
     reader = RawReader(recording.events_path)
@@ -114,3 +119,18 @@ def reconstruct_recording(
         time.perf_counter() - began,
         tuple(warnings),
     )
+
+
+def stage_speed_mm_s(recording: Recording) -> float:
+    """Median speed of the recording's stage towards +y while it moves; 0 when it rests."""
+    first_us, last_us = recording.stage.first_us, recording.stage.last_us
+    if first_us is None or last_us is None or last_us == first_us:
+        return 0.0
+    t_us = np.linspace(first_us, last_us, _SPEED_SAMPLES).astype(np.int64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        speed = np.diff(recording.stage.position_mm(t_us)) / np.diff(t_us) * 1e6
+    speed = speed[np.isfinite(speed)]
+    moving = np.abs(speed) > _MOVING_SHARE * np.abs(speed).max(initial=0.0)
+    if not moving.any():
+        return 0.0
+    return float(np.median(speed[moving])) * recording.calibration.stage_direction[1]

@@ -62,7 +62,7 @@ class Reconstructor:
             else None
         )
         self._assembler = ProfileAssembler(settings, self.model)
-        self._finisher = Finisher(settings)
+        self._finisher = Finisher(settings, self.model)
         self._held = HeldEvents()
         self._counts: dict[str, int] = dict.fromkeys(
             ("events", "events_filtered", "events_outside_phase"), 0
@@ -83,6 +83,7 @@ class Reconstructor:
             )
         self._modulation = modulation
         self._schedule = EdgeSchedule(modulation, self.settings.periods_per_profile)
+        self._finisher.restart(modulation, self._assembler.take())
         self._assembler.restart(modulation)
         self.phase: PhaseEstimate | None = None
         self._phase_missing = False
@@ -118,6 +119,7 @@ class Reconstructor:
         counts.update(bins)
         counts["points"] = self._assembler.points
         counts["points_beyond_pole"] = self._assembler.points_beyond_pole
+        counts["columns_compensated"] = self._finisher.columns_compensated
         counts["events_held"] = len(self._held)
         counts["events_dropped"] = (
             counts["events_over_column_limit"]
@@ -157,7 +159,8 @@ class Reconstructor:
         ``phase_missing`` is set.
         """
         self._drain()
-        return self._finisher.push(self._assembler.take())
+        done = self._finisher.push(self._assembler.take())
+        return Profiles.concatenate([done, self._finisher.flush()])
 
     def note_gap(self) -> None:
         """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""

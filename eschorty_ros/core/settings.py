@@ -99,6 +99,17 @@ class Settings:
         "width (standard deviation of the rows) of a white target, to which reflectance refers; "
         "0 takes the median of each profile",
     )
+    reflectance_compensation: str = _choice(
+        "off", SWITCH, "take out the shift of points at reflectance steps"
+    )
+    stage_speed_mm_s: float = _number(
+        300.0,
+        -10_000.0,
+        10_000.0,
+        "mm/s",
+        "stage speed towards +y, by which the compensation knows a step's way through the "
+        "line, 0 for a resting one; recordings tell their own",
+    )
     sigma_factor: float = _number(
         SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"
     )

@@ -1,0 +1,86 @@
+"""Compiled correction of points whose footprint straddles a reflectance step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_REACH = 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shift(before, now, after):
+    """How far the footprint's centroid moved towards the rows the surface comes from, px.
+
+    Full widths of the lit rows on the surface before the step, across it and behind it. The
+    wider side shows ``low / 2 + half`` rows on one side of the centre, the other ``low / 2``.
+    As the step crosses, rows of the wider side come first beyond a gap, then replace dark rows,
+    then replace lit ones (no change of width), and at last the narrower side's rows go.
+    """
+    low = min(before, after)
+    high = max(before, after)
+    extra = min(max(now - low, 0.0), high - low)
+    if extra == 0.0:
+        size = 0.0
+    elif 2.0 * extra <= high - low:
+        size = extra * (high - extra) / (2.0 * now)
+    else:
+        size = 0.5 * (high - low - extra)
+    return size if after >= before else -size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _middle(events, column, lit_only, scratch):
+    """Median of the columns around ``column``; with ``lit_only`` of those that have a point."""
+    n = 0
+    for c in range(max(column - _REACH, 0), min(column + _REACH + 1, events.size)):
+        if events[c] > 0.0 or not lit_only:
+            scratch[n] = events[c]
+            n += 1
+    if n == 0:
+        return 0.0
+    part = np.sort(scratch[:n])
+    return 0.5 * (part[(n - 1) // 2] + part[n // 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step_shifts(
+    column,
+    back,
+    ahead,
+    events,
+    rows,
+    present,
+    newest,
+    place,
+    per_row,
+    width_gate,
+    row_gate,
+    scratch,
+    out,
+):
+    """Shift of each point of the profile ``place``, towards the rows the surface comes from.
+
+    ``events`` and ``rows`` hold one profile per line, ``place`` and ``newest`` count profiles
+    without end; ``back`` and ``ahead`` say how many before and after a point's footprint is all on
+    one side. Profiles that are not known leave a point as it is.
+    """
+    size = present.size
+    now_line = events[place % size]
+    for k in range(column.size):
+        out[k] = 0.0
+        c = np.int64(column[k])
+        first, last = place - back[k], place + ahead[k]
+        if first <= newest - size or last > newest:
+            continue
+        before_slot, after_slot = first % size, last % size
+        if not (present[before_slot] and present[after_slot]):
+            continue
+        before = _middle(events[before_slot], c, False, scratch) / per_row
+        after = _middle(events[after_slot], c, False, scratch) / per_row
+        if abs(after - before) < width_gate:
+            continue
+        if abs(rows[before_slot, c] - rows[after_slot, c]) > row_gate:
+            continue
+        now = _middle(now_line, c, True, scratch) / per_row
+        out[k] = _shift(before, now, after)

@@ -1,0 +1,158 @@
+"""Takes out the shift of the centroid where the line straddles a reflectance step.
+
+Rows on the brighter side of a step are lit further out than rows on the darker side, and the
+centroid moves towards the brighter side by up to half the difference: 2.9 px from black to white
+(the paper's Fig. 7). A single profile does not tell this from a change of range. Its neighbours
+do: before and after the step has crossed the beam the line is as wide as either side alone makes
+it, the width between says how far the step has come, and the motion says from where.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core._step_kernels import _step_shifts
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.reflectance import events_per_row
+from eschorty_ros.core.settings import Settings
+
+LAG_MAX = 256
+"""Most profiles held back; a beam that takes longer to cross is corrected in part."""
+
+_WIDTH_GATE_PX = 3.0
+"""Widths of the line that differ by less are taken as one reflectance."""
+
+_ROW_GATE_PX = 6.0
+"""Rows before and after that differ by more are two surfaces, not a step on one."""
+
+_AHEAD_SHARE = 0.8
+"""Part of the line's width to look ahead: what is left shifts little, and holding back costs."""
+
+_SIGMA_SHARE = 0.2
+"""Standard deviation of a correction as a share of it."""
+
+
+class StepCompensator:
+    """Corrects profiles as they stream by; holds back as many as cross the beam.
+
+    Parameters
+    ----------
+    settings : Settings
+        ``stage_speed_mm_s`` gives the speed and, by its sign, the direction of the surface.
+    model : RangeModel
+    modulation : Modulation
+    """
+
+    def __init__(self, settings: Settings, model: RangeModel, modulation: Modulation) -> None:
+        self._model = model
+        self._every = settings.periods_per_profile
+        # The stage carries the instrument towards +y, and +y appears at lower rows.
+        self._sign = -math.copysign(1.0, settings.stage_speed_mm_s)
+        step_mm = abs(settings.stage_speed_mm_s) * modulation.period_us * 1e-6 * self._every
+        self._crossing_mm_px = settings.line_width_px / max(step_mm, 1e-9)
+        back, ahead = self._lags(np.array([self._farthest_mm()]))
+        self.delay = int(ahead[0])
+        size = int(back[0] + ahead[0]) + 1
+        self._present = np.zeros(size, dtype=np.bool_)
+        self._events = np.zeros((size, model.columns))
+        self._rows = np.full((size, model.columns), np.nan)
+        self._per_row = np.full(size, np.nan)
+        self._held: list[tuple[int, Profiles]] = []
+        self._newest = -1
+        self._last_index: int | None = None
+        self._scratch = np.empty(5)
+        self.columns_compensated = 0
+
+    def push(self, profiles: Profiles) -> Profiles:
+        """Take whole profiles; returns the corrected ones whose neighbours are known by now."""
+        starts = np.flatnonzero(np.diff(profiles.period, prepend=-1 - profiles.period[:1]))
+        bounds = [*starts.tolist(), len(profiles)]
+        done = []
+        for begin, end in pairwise(bounds):
+            self._enter(profiles.select(np.arange(begin, end)))
+            done += self._release(self._newest - self.delay)
+        return Profiles.concatenate(done)
+
+    def flush(self) -> Profiles:
+        """Profiles still held back; a point whose later neighbours are missing stays as it is."""
+        return Profiles.concatenate(self._release(self._newest))
+
+    def _enter(self, profile: Profiles) -> None:
+        """Store one profile's widths and rows at its place in time."""
+        index = int(profile.period[0]) // self._every
+        passed = 1 if self._last_index is None else index - self._last_index
+        self._last_index = index
+        size = self._present.size
+        # A number that does not grow is a new grid: nothing before it is a neighbour.
+        passed = passed if 0 < passed < size else size
+        for skipped in range(passed):
+            slot = (self._newest + 1 + skipped) % size
+            self._present[slot] = False
+            self._per_row[slot] = np.nan
+        self._newest += passed
+        slot = self._newest % size
+        self._present[slot] = True
+        self._per_row[slot] = events_per_row(profile.width_px, profile.events)
+        self._events[slot] = 0.0
+        self._rows[slot] = np.nan
+        self._events[slot, profile.column] = profile.events
+        self._rows[slot, profile.column] = profile.row
+        self._held.append((self._newest, profile))
+
+    def _release(self, until: int) -> list[Profiles]:
+        done = []
+        while self._held and self._held[0][0] <= until:
+            done.append(self._corrected(*self._held.pop(0)))
+        return done
+
+    def _corrected(self, place: int, profile: Profiles) -> Profiles:
+        known = np.isfinite(self._per_row)
+        if not known.any():
+            return profile
+        shift = np.empty(len(profile))
+        _step_shifts(
+            profile.column,
+            *self._lags(profile.range_mm),
+            self._events,
+            self._rows,
+            self._present,
+            self._newest,
+            place,
+            float(np.median(self._per_row[known])),
+            _WIDTH_GATE_PX,
+            _ROW_GATE_PX,
+            self._scratch,
+            shift,
+        )
+        moved = shift != 0.0
+        if not moved.any():
+            return profile
+        self.columns_compensated += int(np.count_nonzero(moved))
+        row = profile.row - self._sign * shift
+        sigma_row = np.hypot(profile.sigma_row, _SIGMA_SHARE * shift)
+        return replace(
+            profile,
+            row=row,
+            sigma_row=sigma_row,
+            range_mm=np.where(moved, self._model.range_mm(row), profile.range_mm),
+            sigma_mm=np.where(moved, self._model.range_sigma_mm(row, sigma_row), profile.sigma_mm),
+        )
+
+    def _lags(self, range_mm: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Profiles back and ahead until a step at the middle of the line has left it."""
+        rows_per_mm = self._model.rows_per_mm_off_sheet(range_mm)
+        profiles = np.nan_to_num(self._crossing_mm_px / np.maximum(rows_per_mm, 1e-9), nan=1.0)
+        back = np.clip(np.ceil(profiles), 1, LAG_MAX).astype(np.int64)
+        ahead = np.clip(np.rint(_AHEAD_SHARE * profiles), 1, LAG_MAX).astype(np.int64)
+        return back, ahead
+
+    def _farthest_mm(self) -> float:
+        far_mm = self._model.range_limits_mm[1]
+        return far_mm if math.isfinite(far_mm) else 1e6

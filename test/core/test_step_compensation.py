@@ -1,0 +1,128 @@
+"""Reflectance steps that cross the line: shift with and without compensation."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core._step_kernels import _shift
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.report.experiments._crossing import SPEED_MM_S, Crossing, crossing
+from eschorty_ros.simulation.pixel import PixelParameters
+
+SEED = 20261121
+PARAMETERS = PixelParameters()
+# Profiles at either end of a stream whose neighbours are not in it.
+EDGE_ROWS = 20.0
+
+
+def errors(case: Crossing, **settings):
+    """Error of every point on the target whose neighbours are known, and the step's offset."""
+    found, counts = case.reconstruct(**settings)
+    offset = case.offset_rows[found.period, found.column]
+    inside = case.target[found.column] & (np.abs(offset) < EDGE_ROWS)
+    error = found.row - case.line_row[found.column]
+    return error[inside], offset[inside], counts
+
+
+def shift_over_offset(error, offset):
+    """Mean error in bins of two rows of the step's offset, the largest in size."""
+    place = np.floor(offset / 2.0).astype(int)
+    return max(abs(float(error[place == k].mean())) for k in np.unique(place))
+
+
+@pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
+@pytest.mark.parametrize(("before", "after"), [(0.08, 1.0), (1.0, 0.08), (0.04, 0.8)])
+def test_shift_at_a_step_is_more_than_halved(frequency_hz, before, after):
+    case = crossing(PARAMETERS, frequency_hz, before, after, columns=40, slanted=True, seed=SEED)
+    off = errors(case, reflectance_compensation="off")
+    on = errors(case, reflectance_compensation="on")
+    assert off[2]["columns_compensated"] == 0
+    assert on[2]["columns_compensated"] > 0
+    left = shift_over_offset(on[0], on[1]) / shift_over_offset(off[0], off[1])
+    assert left < 0.4, f"seed {SEED}: {left}"
+    assert np.sqrt(np.mean(on[0] ** 2)) < 0.4 * np.sqrt(np.mean(off[0] ** 2)), f"seed {SEED}"
+
+
+@pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
+@pytest.mark.parametrize("reflectance", [0.1, 0.4, 1.0])
+def test_uniform_targets_stay_as_they_are(frequency_hz, reflectance):
+    case = crossing(
+        PARAMETERS, frequency_hz, reflectance, reflectance, columns=40, background_hz=0.2, seed=SEED
+    )
+    off, _ = case.reconstruct(reflectance_compensation="off")
+    on, counts = case.reconstruct(reflectance_compensation="on")
+    change = np.abs(on.row - off.row)
+    assert np.sqrt(np.mean(change**2)) < 0.1, f"seed {SEED}"
+    assert counts["columns_compensated"] < 0.005 * len(on), f"seed {SEED}"
+
+
+def test_the_other_direction_needs_the_other_sign():
+    case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=16, seed=SEED)
+    right = errors(case, reflectance_compensation="on")[0]
+    wrong = errors(case, reflectance_compensation="on", stage_speed_mm_s=-SPEED_MM_S)[0]
+    none = errors(case, reflectance_compensation="off")[0]
+    rms = [float(np.sqrt(np.mean(e**2))) for e in (right, none, wrong)]
+    assert rms[0] < 0.5 * rms[1], f"seed {SEED}: {rms}"
+    assert rms[2] > 1.5 * rms[1], f"seed {SEED}: {rms}"
+
+
+def test_a_resting_stage_has_no_steps_to_compensate():
+    case = crossing(PARAMETERS, 70.0, 0.1, 1.0, columns=16, seed=SEED)
+    off, _ = case.reconstruct(reflectance_compensation="off")
+    on, counts = case.reconstruct(reflectance_compensation="on", stage_speed_mm_s=0.0)
+    np.testing.assert_array_equal(on.row, off.row)
+    assert counts["columns_compensated"] == 0
+
+
+def assert_same(a: Profiles, b: Profiles):
+    for item in fields(Profiles):
+        np.testing.assert_array_equal(getattr(a, item.name), getattr(b, item.name), item.name)
+
+
+def test_points_do_not_depend_on_how_the_bytes_are_split():
+    case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=16, seed=SEED)
+    whole, counts = case.reconstruct(reflectance_compensation="on")
+    settings = Settings(reflectance_compensation="on", stage_speed_mm_s=SPEED_MM_S)
+    for piece in (1000, 7777):
+        reconstructor = Reconstructor(case.calibration, case.modulation, settings)
+        parts = [
+            reconstructor.push(case.data[k : k + piece]) for k in range(0, len(case.data), piece)
+        ]
+        assert_same(Profiles.concatenate([*parts, reconstructor.flush()]), whole)
+        assert reconstructor.counters == counts
+
+
+def test_no_profile_is_lost_or_doubled_and_a_new_modulation_lets_all_out():
+    case = crossing(PARAMETERS, 1000.0, 0.5, 0.5, columns=8, seed=SEED)
+    off, _ = case.reconstruct(reflectance_compensation="off")
+    on, _ = case.reconstruct(reflectance_compensation="on")
+    np.testing.assert_array_equal(on.period, off.period)
+    np.testing.assert_array_equal(on.column, off.column)
+    settings = Settings(reflectance_compensation="on", stage_speed_mm_s=SPEED_MM_S)
+    reconstructor = Reconstructor(case.calibration, case.modulation, settings)
+    half = len(case.data) // 2
+    parts = [reconstructor.push(case.data[:half])]
+    reconstructor.set_modulation(Modulation(500.0, on_edge_us=0))
+    parts += [reconstructor.push(case.data[half:]), reconstructor.flush()]
+    assert reconstructor.counters["points"] == sum(len(part) for part in parts)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 20.0), (6.0, 20.0), (14.0, 20.0)])
+def test_shift_agrees_with_lit_rows_counted(low, high):
+    """Rows lit on either side of a step at every offset, against the centroid's closed form."""
+    half_low, half_high = low / 2, high / 2
+    y = np.arange(-15.0, 15.0, 0.01) + 0.005
+    for offset in np.arange(-12.0, 12.0, 0.5):
+        wide = y < offset
+        lit = np.where(wide, np.abs(y) < half_high, np.abs(y) < half_low)
+        if not lit.any():
+            continue
+        width, centre = lit.sum() * 0.01, y[lit].mean()
+        # The new surface, at low rows, is the wider one: the centroid moves down.
+        assert -_shift(low, width, high) == pytest.approx(centre, abs=0.02)
+        assert _shift(high, width, low) == pytest.approx(centre, abs=0.02)
