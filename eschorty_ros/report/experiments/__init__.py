@@ -7,7 +7,14 @@ from importlib import import_module
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.report.experiment import Experiment
 
-NAMES: tuple[str, ...] = ("tables", "range_curves", "scans", "estimators", "tradeoff")
+NAMES: tuple[str, ...] = (
+    "tables",
+    "range_curves",
+    "reflectance_step",
+    "scans",
+    "estimators",
+    "tradeoff",
+)
 """Module of each experiment, in the order of the page."""
 
 

@@ -19,6 +19,7 @@ SPEED_MM_S = 300.0
 BOARD = 0.8
 """Reflectance of the board around the step: a line that is dark as a whole gives no profile."""
 
+BOARD_COLUMNS = 16
 _SETTLING_PERIODS = 3
 _COLUMNS_MAX = 2048
 _FAR_ROWS = 200.0
@@ -88,7 +89,7 @@ def crossing(
     before, after : array_like, scalar or shape (columns,)
         Reflectance of the surface that is seen first and of the one that follows.
     columns : int
-        Columns that see the step; as many see the board.
+        Columns that see the step; ``BOARD_COLUMNS`` more see the board.
     margin_rows : float
         How far from the line's centre the step begins and ends.
     slanted : bool
@@ -100,14 +101,14 @@ def crossing(
     step = rows_per_profile(frequency_hz)
     reach = int(np.ceil(margin_rows / step))
     rng = np.random.default_rng(seed)
-    full = 2 * columns
+    full = columns + BOARD_COLUMNS
     calibration = load_calibration("config_3").model_copy(update={"columns": full})
     line_row = float(calibration.model().row(RANGE_MM)) + rng.random(full)
-    slant = np.arange(full) % columns / columns * step if slanted else np.zeros(full)
+    slant = np.arange(full) / columns * step if slanted else np.zeros(full)
     offsets = np.arange(-reach, reach + 1)[:, None] * step + slant
     target = np.arange(full) < columns
-    old = np.concatenate((np.broadcast_to(before, columns), np.full(columns, BOARD)))
-    new = np.concatenate((np.broadcast_to(after, columns), np.full(columns, BOARD)))
+    old = np.concatenate((np.broadcast_to(before, columns), np.full(BOARD_COLUMNS, BOARD)))
+    new = np.concatenate((np.broadcast_to(after, columns), np.full(BOARD_COLUMNS, BOARD)))
     modulation = Modulation(frequency_hz, on_edge_us=0)
     at_once = _COLUMNS_MAX // full
     parts = []
