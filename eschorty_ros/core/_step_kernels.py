@@ -44,26 +44,26 @@ def _middle(events, column, lit_only, scratch):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _between(row_before, row_after, back, ahead):
+    """Row on the line between two neighbours in time, or of the only one; NaN without any."""
+    if np.isnan(row_before):
+        return row_after
+    if np.isnan(row_after):
+        return row_before
+    return (row_before * ahead + row_after * back) / (back + ahead)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _step_shifts(
-    column,
-    back,
-    ahead,
-    events,
-    rows,
-    present,
-    newest,
-    place,
-    per_row,
-    width_gate,
-    row_gate,
-    scratch,
-    out,
-):
+    column, back, ahead, events, rows, present, newest, place, per_row, sign, width_gate, row_gate,
+    scratch, out,
+):  # fmt: skip
     """Shift of each point of the profile ``place``, towards the rows the surface comes from.
 
     ``events`` and ``rows`` hold one profile per line, ``place`` and ``newest`` count profiles
     without end; ``back`` and ``ahead`` say how many before and after a point's footprint is all on
-    one side. Profiles that are not known leave a point as it is.
+    one side. Profiles that are not known leave a point as it is, and so does a correction that
+    would not bring it nearer to its neighbours; ``sign`` is where the surface comes from.
     """
     size = present.size
     now_line = events[place % size]
@@ -80,7 +80,12 @@ def _step_shifts(
         after = _middle(events[after_slot], c, False, scratch) / per_row
         if abs(after - before) < width_gate:
             continue
-        if abs(rows[before_slot, c] - rows[after_slot, c]) > row_gate:
+        row_before, row_after = rows[before_slot, c], rows[after_slot, c]
+        if abs(row_before - row_after) > row_gate:
             continue
         now = _middle(now_line, c, True, scratch) / per_row
-        out[k] = _shift(before, now, after)
+        shift = _shift(before, now, after)
+        expected = _between(row_before, row_after, back[k], ahead[k])
+        off = rows[place % size, c] - expected
+        if not abs(off - sign * shift) > abs(off):
+            out[k] = shift

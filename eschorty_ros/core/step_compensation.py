@@ -126,6 +126,7 @@ class StepCompensator:
             self._newest,
             place,
             float(np.median(self._per_row[known])),
+            self._sign,
             _WIDTH_GATE_PX,
             _ROW_GATE_PX,
             self._scratch,

@@ -16,6 +16,7 @@ from eschorty_ros.core import (
     reflectance,
     settings,
     smoothing,
+    step_compensation,
 )
 from hostile.kinds import (
     HUGE,
@@ -53,9 +54,11 @@ def blank_settings() -> dict[str, Any]:
     return {name: getattr(settings.Settings(), name) for name in parameters(settings.Settings)}
 
 
-def settings_kind(value: Any) -> Kind:
+def settings_kind(name: str, value: Any) -> Kind:
     if isinstance(value, str):
         return text()
+    if name == "stage_speed_mm_s":
+        return number(-10_000.1, 10_000.1)
     return whole(-1) if isinstance(value, int) else number(-1e-9)
 
 
@@ -101,9 +104,27 @@ CALLS: dict[str, Call] = {
         },
         {"method": "centroid"},
     ),
-    "finishing.Finisher": Call(finishing.Finisher, {"settings": settings.Settings()}),
+    "finishing.Finisher": Call(
+        finishing.Finisher, {"settings": settings.Settings(), "model": MODEL}
+    ),
+    "finishing.Finisher.restart": Call(
+        finishing.Finisher(settings.Settings(), MODEL).restart,
+        {"modulation": LASER, "last": blank_profiles(3)},
+    ),
     "finishing.Finisher.push": Call(
-        finishing.Finisher(settings.Settings()).push, {"profiles": blank_profiles(3)}
+        finishing.Finisher(settings.Settings(), MODEL).push, {"profiles": blank_profiles(3)}
+    ),
+    "finishing.Finisher.flush": Call(finishing.Finisher(settings.Settings(), MODEL).flush, {}),
+    "step_compensation.StepCompensator.flush": Call(
+        step_compensation.StepCompensator(settings.Settings(), MODEL, LASER).flush, {}
+    ),
+    "step_compensation.StepCompensator": Call(
+        step_compensation.StepCompensator,
+        {"settings": settings.Settings(), "model": MODEL, "modulation": LASER},
+    ),
+    "step_compensation.StepCompensator.push": Call(
+        step_compensation.StepCompensator(settings.Settings(), MODEL, LASER).push,
+        {"profiles": blank_profiles(3)},
     ),
     "profile_assembler.ProfileAssembler": Call(
         profile_assembler.ProfileAssembler, {"settings": settings.Settings(), "model": MODEL}
@@ -200,7 +221,7 @@ CALLS: dict[str, Call] = {
     "settings.Settings": Call(
         settings.Settings,
         blank_settings(),
-        {name: settings_kind(value) for name, value in blank_settings().items()},
+        {name: settings_kind(name, value) for name, value in blank_settings().items()},
     ),
     "smoothing.smooth": Call(
         smoothing.smooth,

@@ -30,17 +30,18 @@ HANDED_OUT = {
 """Plain records that the package makes; nobody else has to."""
 TESTED_ELSEWHERE = {
     # All their arguments are objects of the package, or they take none.
-    "offline.reconstruct_recording", "warm_up.warm_up", "calibration.Calibration.model",
-    "calibration.config_folders", "calibration_diagnostics.chi_square_limit",
+    "offline.reconstruct_recording", "offline.stage_speed_mm_s", "warm_up.warm_up",
+    "calibration.Calibration.model", "calibration.config_folders",
+    "calibration_diagnostics.chi_square_limit",
     "calibration_diagnostics.k_profile", "calibration_diagnostics.leave_one_out_px",
     "calibration_diagnostics.prior_ratios", "calibration_diagnostics.verdicts",
     # Every key of the file has its own test in test/core/test_calibration_file.py.
     "calibration.Calibration",
 }  # fmt: skip
 PACKAGE_OBJECTS = {
-    "calibration", "date", "design", "drain", "error", "frame", "known", "model", "modulation",
-    "nominal", "parts", "plan", "posts", "profiles", "progress", "schema", "settings",
-    "targets",
+    "calibration", "date", "design", "drain", "error", "frame", "known", "last",
+    "model", "modulation", "nominal", "parts", "plan", "posts", "profiles", "progress", "schema",
+    "settings", "targets",
 }  # fmt: skip
 TAKES_EVENTS = {"noise.ActivityFilter.filter", "aggregate_frame.AggregateFrame.add"}
 """Their tables give the arrays of the events one by one."""
