@@ -4,7 +4,8 @@ A logarithmic sensor sees a Gaussian footprint as far out as its contrast reache
 the full width W of the lit rows obeys ``W^2 = 8 sigma^2 ln(A rho / (e^theta - 1))``: linear in
 ``ln rho`` with a slope that only the optical footprint's sigma decides. At high frequencies, where
 the photoreceptor's bandwidth limits the swing, the offset changes and the slope does not. Evenly
-lit rows have the variance ``W^2 / 12`` and a number of events in proportion to W; both are used.
+lit rows have the variance ``W^2 / 12`` and a number of events in proportion to W; the smaller W of
+the two counts. Above about 1 kHz rows give an event in some periods only and neither holds.
 """
 
 from __future__ import annotations
@@ -23,8 +24,11 @@ Array = NDArray[np.float64]
 ROOT_12 = math.sqrt(12.0)
 """Full width over standard deviation of evenly spread rows."""
 
-_WIDTH_FLOOR_PX = 0.55
-_WIDTH_FACTOR = 0.24
+# Standard deviation of ln(rho): what the pixels' thresholds leave however many the events,
+# comparator noise in each row's few events, and whole rows at the two ends of the line.
+_FIXED = 0.11
+_PER_EVENT = 0.18
+_ENDS_PX = 0.41
 
 
 def events_per_row(width_px: Array, events: NDArray[np.integer]) -> float:
@@ -56,7 +60,7 @@ def relative_reflectance(
     footprint_sigma_px : float
         Standard deviation of the laser line's intensity over the rows, px.
     white_width_px : float
-        Root mean square ``width_px`` of a white target's points; 0 for the profile's own median.
+        Median ``width_px`` of a white target's points; 0 for the profile's own median.
 
     Returns
     -------
@@ -80,30 +84,22 @@ def relative_reflectance(
     # Full width squared per e-fold of reflectance.
     slope = 8.0 * footprint_sigma_px * footprint_sigma_px
     width2 = np.empty(edge_us.size)
-    reference2 = np.empty(edge_us.size)
+    reference2 = np.full(edge_us.size, 12.0 * white_width_px * white_width_px)
+    variance = np.full(edge_us.size, _FIXED * _FIXED)
     starts = np.flatnonzero(np.diff(edge_us, prepend=~edge_us[:1]))
     for begin, end in pairwise([*starts.tolist(), edge_us.size]):
         part = slice(begin, end)
-        width2[part] = full_width2(width_px[part], counts[part])
-        reference2[part] = np.median(width2[part])
-    if white_width_px > 0.0:
-        reference2[:] = 12.0 * white_width_px * white_width_px
+        per_row = events_per_row(width_px[part], counts[part])
+        width2[part] = 12.0 * width_px[part] * width_px[part]
+        if not math.isnan(per_row):
+            # Background widens the spread most, a refractory time distorts the counts.
+            width2[part] = np.minimum(width2[part], np.square(counts[part] / per_row))
+            variance[part] += (_PER_EVENT / per_row) ** 2
+        if white_width_px == 0.0:
+            reference2[part] = np.median(width2[part])
     reflectance = np.exp((width2 - reference2) / slope)
-    width_sigma2 = _WIDTH_FLOOR_PX**2 + _WIDTH_FACTOR**2 * 0.2 * width2 / np.maximum(counts, 1)
-    return reflectance, reflectance * 2.0 * np.sqrt(width2 * width_sigma2) / slope
-
-
-def full_width2(width_px: Array, events: NDArray[np.integer]) -> Array:
-    """Square of the full width of the lit rows of one profile's points, px squared.
-
-    The mean of what spread and number of events say; where no point has a spread, 0.
-    """
-    width_px, counts = _checked(width_px, events)
-    from_spread = 12.0 * width_px * width_px
-    per_row = events_per_row(width_px, counts)
-    if math.isnan(per_row):
-        return from_spread
-    return 0.5 * (from_spread + np.square(counts / per_row))
+    variance += 4.0 * width2 * (_ENDS_PX / slope) ** 2
+    return reflectance, reflectance * np.sqrt(variance)
 
 
 def _checked(width_px: Array, events: NDArray[np.integer]) -> tuple[Array, NDArray[np.int64]]:

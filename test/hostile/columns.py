@@ -196,11 +196,6 @@ CALLS: dict[str, Call] = {
         {"width_px": np.ones(N), "events": np.ones(N, np.uint32)},
         {"width_px": vector(-1.0, size=N), "events": integers(-1, size=N)},
     ),
-    "reflectance.full_width2": Call(
-        reflectance.full_width2,
-        {"width_px": np.ones(N), "events": np.ones(N, np.uint32)},
-        {"width_px": vector(-1.0, size=N), "events": integers(-1, size=N)},
-    ),
     "reflectance.relative_reflectance": Call(
         reflectance.relative_reflectance,
         {

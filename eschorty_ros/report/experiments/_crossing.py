@@ -20,7 +20,7 @@ BOARD = 0.8
 """Reflectance of the board around the step: a line that is dark as a whole gives no profile."""
 
 BOARD_COLUMNS = 16
-_SETTLING_PERIODS = 3
+_SETTLING_PERIODS = 2
 _COLUMNS_MAX = 2048
 _FAR_ROWS = 200.0
 
@@ -72,7 +72,7 @@ def crossing(
     after: ArrayLike,
     *,
     columns: int,
-    margin_rows: float = 45.0,
+    margin_rows: float = 36.0,
     slanted: bool = False,
     background_hz: float = 0.0,
     seed: int = 0,
@@ -99,7 +99,7 @@ def crossing(
     seed : int
     """
     step = rows_per_profile(frequency_hz)
-    reach = int(np.ceil(margin_rows / step))
+    reach = int(np.ceil(margin_rows / step)) + 1
     rng = np.random.default_rng(seed)
     full = columns + BOARD_COLUMNS
     calibration = load_calibration("config_3").model_copy(update={"columns": full})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -53,15 +53,15 @@ def measure_reflectance(
     columns = effort.choose(1024, 320)
     rng = np.random.default_rng(effort.seed)
     truth = np.exp(rng.uniform(np.log(BINS[0]), 0.0, columns))
-    white = _points(parameters, frequency_hz, np.ones(columns), effort.seed, Settings())
-    width_px = float(np.sqrt(np.mean(white.width_px**2)))
-    found = _points(
-        parameters, frequency_hz, truth, effort.seed + 1,
-        Settings(
-            reflectance="on", white_width_px=width_px, phase_gate_us=GATE_US[frequency_hz],
-            smoothing_half_width=0, isolation_events=0,
-        ),
-    )  # fmt: skip
+    settings = Settings(
+        reflectance="on",
+        phase_gate_us=GATE_US[frequency_hz],
+        smoothing_half_width=0,
+        isolation_events=0,
+    )
+    white = _points(parameters, frequency_hz, np.ones(columns), effort.seed, settings)
+    settings = replace(settings, white_width_px=float(np.median(white.width_px)))
+    found = _points(parameters, frequency_hz, truth, effort.seed + 1, settings)
     assert found.reflectance is not None
     assert found.reflectance_sigma is not None
     return Measured(frequency_hz, truth[found.column], found.reflectance, found.reflectance_sigma)

@@ -73,7 +73,7 @@ def step_figure(curves: list[Curve], passages: list[Passage]) -> Figure:
         _contrast(place, curve)
     highest = max(float((c.raw + c.scatter).max()) for c in curves)
     for place in axes[:2]:
-        place.set_ylim(-0.7, 1.1 * highest)
+        place.set_ylim(-1.1, 1.1 * highest)
     for passage, colour in zip(passages, ("tab:blue", "tab:orange"), strict=True):
         label = f"{passage.frequency_hz:g} Hz"
         axes[2].plot(passage.offset_rows, passage.raw, "o-", ms=3, color=colour, label=label)
