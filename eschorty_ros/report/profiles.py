@@ -7,12 +7,16 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 
+# Returns of one period, in their mean times; a part of the period.
+RETURNS_APART = 0.2
+
 
 def period_s(points: NDArray[np.void]) -> float:
     """Modulation period of a cloud in seconds, NaN when no column has two points.
 
     A column's points lie whole periods apart and mostly one, so their distances in time give a
-    first guess; straight-line fits over doubling spans then sharpen it.
+    first guess; straight-line fits over doubling spans then sharpen it. Two returns of one period
+    lie a small part of it apart and are left out of the guess.
 
     Parameters
     ----------
@@ -29,6 +33,7 @@ def period_s(points: NDArray[np.void]) -> float:
     gaps = gaps[gaps > 0.0]
     if gaps.size == 0:
         return float("nan")
+    gaps = gaps[gaps > RETURNS_APART * np.quantile(gaps, 0.75)]
     guess = float(np.median(gaps))
     period = float(gaps.sum() / np.maximum(np.rint(gaps / guess), 1.0).sum())
     elapsed = np.sort(points["t"]) - points["t"].min()

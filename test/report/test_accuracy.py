@@ -132,6 +132,16 @@ def test_periods_are_recovered_from_the_points_alone():
     np.testing.assert_array_equal(index, np.rint(points["t"] / PERIOD_S))
 
 
+def test_two_returns_of_a_column_belong_to_one_period():
+    rng = np.random.default_rng(5)
+    points = np.concatenate([cloud(0.0, lines=40)] * 2)
+    truth = np.rint(points["t"] / PERIOD_S)
+    points["t"] += rng.normal(0.0, 0.004 * PERIOD_S, len(points))
+    period = profiles.period_s(points)
+    assert period == pytest.approx(PERIOD_S, rel=1e-4)
+    np.testing.assert_array_equal(profiles.profile_index(points, period), truth)
+
+
 def test_a_single_profile_has_no_period():
     assert np.isnan(profiles.period_s(cloud(0.0, lines=1)))
     with pytest.raises(ArgumentError, match="period"):
