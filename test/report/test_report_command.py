@@ -1,6 +1,8 @@
 """`eschorty report`: its page, its files, its exit codes; with small experiments made here."""
 
 import csv
+import re
+from pathlib import Path
 
 import html_check
 import numpy as np
@@ -139,6 +141,12 @@ def test_only_runs_what_is_named_in_the_order_of_the_page(report, monkeypatch):
     words = html_check.text(out / "index.html")
     assert words.index(f"The {names[0]} <one>") <= words.index(f"The {names[-1]} <one>")
     assert not any(f"The {name} <one>" in words for name in names if name not in chosen)
+
+
+def test_the_documentation_lists_every_experiment():
+    text = (Path(__file__).parents[2] / "docs" / "report.md").read_text()
+    documented = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
+    assert tuple(documented) == experiments.NAMES
 
 
 def test_an_unknown_name_is_wrong_usage_and_names_the_choices(tmp_path):

@@ -10,6 +10,7 @@ from eschorty_ros.report.experiment import Experiment
 NAMES: tuple[str, ...] = (
     "tables",
     "range_curves",
+    "modulation_sweep",
     "reflectance_step",
     "scans",
     "estimators",

@@ -53,9 +53,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         for frequency in frequencies:
             progress(done / (len(PRESETS) * len(frequencies)), f"{name} {frequency:g} Hz")
             periods = _periods(frequency, effort)
-            sweeps[name].append(
-                measure(parameters[name], frequency, columns, periods, effort.seed)
-            )
+            sweeps[name].append(measure(parameters[name], frequency, columns, periods, effort.seed))
             done += 1
     return Outcome(
         findings=[*_findings("paper", sweeps["paper"], 5.0),
@@ -123,7 +121,7 @@ def _remarks(sweeps: dict[str, list[Point]], parameters: dict[str, PixelParamete
     paper, narrow = sweeps["paper"], sweeps["narrow"]
     return [
         "Width: rows from the first to the last bin at half of the mean of the three highest, "
-        "both ends counted, in each column alone; the columns' lines lie anywhere between two rows.",
+        "both ends counted, in each column alone; the lines lie anywhere between two rows.",
         f"Counts peak at {_peak_hz(paper):g} Hz (paper) and {_peak_hz(narrow):g} Hz (narrow). The "
         "paper has them fall from about 1 kHz on; preset paper stays flat over some kHz and dips "
         "near 1 kHz, where pixels still in their refractory time skip every other edge.",
