@@ -13,6 +13,7 @@ COMMANDS = {
     "scan": "Scan a simulated scene through the ROS 2 nodes; cloud, picture and error.",
     "simulate": "Simulate a recording with its truth; needs no ROS.",
     "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
+    "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
     "view": "Draw a cloud, or open it in a window.",
     "info": "Say what a file or recording holds.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",

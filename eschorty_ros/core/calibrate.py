@@ -22,9 +22,11 @@ from eschorty_ros.core._calibration_model import WIDTH_BIAS, Observed
 from eschorty_ros.core._calibration_robust import TARGETS_MIN, inliers
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.calibration_diagnostics import (
+    LISTED,
     KProfile,
     k_profile,
     leave_one_out_px,
+    listed,
     prior_ratios,
     verdicts,
 )
@@ -185,8 +187,8 @@ def calibrate(
     found = fit(kept, design, names, prior_sigma=priors)
     said = verdicts(kept, design, found)
     if rejected:
-        said = (*said, f"{len(rejected)} of {len(targets)} targets rejected: "
-                f"{', '.join(entry.label for entry in rejected)}")  # fmt: skip
+        names_left_out = listed([entry.label for entry in rejected[:LISTED]], len(rejected))
+        said = (*said, f"{len(rejected)} of {len(targets)} targets rejected: {names_left_out}")
     residual, alone = _residuals(targets, used, design, found)
     return CalibrationReport(
         calibration=_calibration(nominal, found, kept, method, date),

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 PRIOR_SHARE = math.sqrt(0.5)
 """Above this ratio of standard deviations a prior tells more than the targets."""
 RESIDUAL_SIGMA = 3.0
+LISTED = 4
+"""Targets that a verdict names."""
 _MARGIN = 0.05
 _PROFILE_POINTS = 41
 _PROFILE_SIGMA = 4.0
@@ -185,9 +187,21 @@ def _residuals(targets: Targets, found: CalibrationFit) -> list[str]:
             "targets or state larger sigmas"
         )
     ratio = np.abs(found.residual_px) / found.sigma_px
-    for index in np.flatnonzero(ratio > RESIDUAL_SIGMA):
+    beyond = np.flatnonzero(ratio > RESIDUAL_SIGMA)
+    if beyond.size:
+        worst = beyond[np.argsort(-ratio[beyond], kind="stable")][:LISTED].tolist()
+        each = [
+            f"{targets.labels[i]} {found.residual_px[i]:+.2f} px = {ratio[i]:.1f} sigma"
+            for i in worst
+        ]
         lines.append(
-            f"target {targets.labels[index]}: residual {found.residual_px[index]:+.2f} px is "
-            f"{ratio[index]:.1f} sigma; measure it again"
+            f"{beyond.size} of {len(targets)} targets have residuals beyond {RESIDUAL_SIGMA:g} "
+            f"sigma: {listed(each, beyond.size)}; measure them again"
         )
     return lines
+
+
+def listed(first: list[str], count: int) -> str:
+    """``first`` in one line, and how many more there are."""
+    rest = count - len(first)
+    return ", ".join(first) + (f" and {rest} more" if rest else "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -51,16 +52,8 @@ def write_page(
 
 def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0) -> str:
     """Text of the page; parameters as in `write_page`."""
-    environment = Environment(
-        loader=PackageLoader("eschorty_ros.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"number": number, "band": band, "breakable": breakable}
-    return environment.get_template("page.html.jinja").render(
+    return render(
+        "page.html.jinja",
         title=TITLE,
         sections=sections,
         made_with=made_with,
@@ -70,6 +63,20 @@ def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending
         failed=[section for section in sections if section.failure],
         seconds=sum(section.seconds for section in sections),
     )
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill a template of this folder; text is escaped, a missing value an error."""
+    environment = Environment(
+        loader=PackageLoader("eschorty_ros.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"number": number, "band": band, "breakable": breakable}
+    return environment.get_template(template).render(**values)
 
 
 def number(value: float | int | str) -> str:

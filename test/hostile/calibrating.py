@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from eschorty_ros.core import calibrate, calibration, calibration_fit, targets
-from hostile.kinds import Call, Kind, reals, text, vector
+from pathlib import Path
+from typing import Any
+
+from eschorty_ros.core import calibrate, calibration, calibration_fit, targets, targets_file
+from hostile.kinds import Call, Kind, number, path, reals, text, vector
 from hostile.subjects import MODEL
 
 ROWS, RANGES_MM = [100.0, 300.0, 500.0], [860.0, 1064.0, 1395.0]
@@ -13,6 +16,18 @@ SOME_FREE = Kind([3, "k", ["k_mm", "k_mm"], [], [3], [[]]])
 FREE = Kind([None, *SOME_FREE.refused])
 PRIORS = Kind([{"k_mm": 1.0}, {"k_prime_px": 0.0}, {"k_prime_px": "a"}, 3, "k_mm"])
 
+
+def reading(read: Any, header: str) -> Any:
+    """Read a small file of its own, or the path given."""
+
+    def call(**arguments: Any) -> Any:
+        Path("t.csv").write_text(header)
+        return read(**arguments)
+
+    return call
+
+
+SIGMAS = {"sigma_row_px": number(0.0), "sigma_range_mm": number(-1.0)}
 CALLS: dict[str, Call] = {
     "calibrate.calibrate": Call(
         calibrate.calibrate,
@@ -61,5 +76,15 @@ CALLS: dict[str, Call] = {
             "sigma_range_mm": vector(-1.0, size=3),
             "prior_sigma": PRIORS,
         },
+    ),
+    "targets_file.read_targets": Call(
+        reading(targets_file.read_targets, "row,range_mm\n100,900\n"),
+        {"path": "t.csv", "sigma_row_px": 0.3, "sigma_range_mm": 1.0},
+        {"path": path(), **SIGMAS},
+    ),
+    "targets_file.read_distances": Call(
+        reading(targets_file.read_distances, "range_mm\n900\n"),
+        {"path": "t.csv", "sigma_range_mm": 1.0},
+        {"path": path(), "sigma_range_mm": number(-1.0)},
     ),
 }

@@ -32,9 +32,11 @@ TESTED_ELSEWHERE = {
     # All their arguments are objects of the package, or they take none.
     "offline.reconstruct_recording", "offline.stage_speed_mm_s", "warm_up.warm_up",
     "calibration.Calibration.model", "calibration.config_folders",
-    "calibration_diagnostics.chi_square_limit",
+    "calibration_diagnostics.chi_square_limit", "calibration_diagnostics.listed",
     "calibration_diagnostics.k_profile", "calibration_diagnostics.leave_one_out_px",
     "calibration_diagnostics.prior_ratios", "calibration_diagnostics.verdicts",
+    # Their arguments go to moving_target and match_posts.
+    "recorded_targets.recorded_moving_target", "recorded_targets.recorded_posts",
     # Every key of the file has its own test in test/core/test_calibration_file.py.
     "calibration.Calibration",
 }  # fmt: skip

@@ -1,0 +1,277 @@
+"""`eschorty calibrate`."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from eschorty_ros.cli.console import progress_bar, show, table
+from eschorty_ros.core.errors import FitError
+
+if TYPE_CHECKING:
+    from eschorty_ros.core.calibrate import CalibrationReport
+    from eschorty_ros.core.calibration import Calibration
+    from eschorty_ros.core.posts import KnownTarget
+    from eschorty_ros.core.targets import Targets
+
+
+@click.command("calibrate")
+@click.argument(
+    "sources",
+    metavar="SOURCE...",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, path_type=Path),
+)
+@click.option(
+    "--nominal",
+    default="config_3",
+    show_default=True,
+    help="The build as designed: nominal, config_1, config_2, config_3, or a calibration.yaml.",
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    default=Path("calibration.yaml"),
+    show_default=True,
+    help="Calibration to write; its page goes beside it as .html.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["joint", "paper"]),
+    default="joint",
+    show_default=True,
+    help="joint: k', b, b', with sizes also k, under priors. paper: k' and b' alone.",
+)
+@click.option(
+    "--distances",
+    metavar="FILE|MM,MM,...",
+    help="Ranges of the posts of a recording: a CSV file or a list in mm.",
+)
+@click.option(
+    "--moving",
+    type=float,
+    metavar="MM",
+    help="One target moved by the stage instead of posts: its range with the stage at 0.",
+)
+@click.option(
+    "--range-per-stage",
+    type=click.FloatRange(-1, 1),
+    default=1.0,
+    show_default=True,
+    help="With --moving: range gained per stage travel, negative towards the sensor.",
+)
+@click.option(
+    "--free",
+    multiple=True,
+    metavar="NAME",
+    help="Fit these parameters only: k_mm, k_prime_px, b_mm, b_prime_px, b_prime_1_px, "
+    "b_prime_2_px, width_bias_px. May be given several times.",
+)
+@click.option(
+    "--prior",
+    multiple=True,
+    metavar="NAME=SIGMA",
+    help="How far a parameter may lie from the design, one sigma; none for no prior.",
+)
+@click.option(
+    "--robust/--no-robust",
+    default=None,
+    help="Find targets that do not follow the curve and leave them out.  "
+    "[default: with joint, from 5 targets on]",
+)
+@click.option(
+    "--row-sigma", type=click.FloatRange(0, min_open=True), default=0.3, show_default=True,
+    help="Error of a row, px, where targets.csv gives none.",
+)  # fmt: skip
+@click.option(
+    "--range-sigma", type=click.FloatRange(0), default=1.0, show_default=True,
+    help="Error of a known range, mm, where the file gives none.",
+)  # fmt: skip
+def command(
+    sources: tuple[Path, ...],
+    nominal: str,
+    out: Path,
+    method: str,
+    distances: str | None,
+    moving: float | None,
+    range_per_stage: float,
+    free: tuple[str, ...],
+    prior: tuple[str, ...],
+    robust: bool | None,
+    row_sigma: float,
+    range_sigma: float,
+) -> None:
+    """Calibrate a build on targets at known ranges.
+
+    SOURCE is a CSV file of targets or a recording folder; several count together. Writes a
+    calibration.yaml for --calibration of the other commands, and a page that shows how far to
+    trust it. When the targets do not determine the build nothing is written, and an existing
+    file stays.
+
+    \b
+    targets.csv   row,range_mm[,row_sigma][,range_sigma_mm][,column]
+                  [,width_px,size_mm][,spacing_px,spacing_mm][,label]
+      row         where the target appears, px; row_sigma its error
+      range_mm    range along the laser sheet from the mechanical datum
+      width_px    columns a target of size_mm covers; two sizes or more, because light blooms
+      spacing_px  columns between the centres of two marks spacing_mm apart
+
+    \b
+    A recording   --distances: posts at these ranges, at least two, sizes helpful; a CSV file
+                  has range_mm[,range_sigma_mm][,size_mm][,column][,row][,label]
+                  --moving: a flat target that the stage moves along the range; give sweeps
+                forth and back, because a moving line is seen late
+
+    \b
+    Verdicts
+      identifiable        the targets determine every fitted parameter
+      prior dominates X   X comes from the design: more targets, or another spread, tell it
+      extrapolates ...    ranges outside of what the targets cover are not backed by them
+
+    \b
+    Examples:
+      eschorty calibrate targets.csv --nominal config_3 --out calibration.yaml
+      eschorty calibrate targets.csv --method paper
+      eschorty calibrate rec --distances 820,974,1128,1281,1435,1589,1742,1896,2050
+      eschorty calibrate rec --distances posts.csv --prior b_mm=1
+      eschorty calibrate forth back --moving 780
+
+    \b
+    Exit codes:
+      0  written; read the verdicts
+      1  the targets do not determine the build, or a file is at fault
+      2  wrong usage
+    """  # noqa: D301
+    _check_usage(sources, out, distances, moving)
+    priors = _priors(prior)
+    from eschorty_ros.core.calibrate import calibrate
+    from eschorty_ros.core.calibration import load_calibration, save_calibration
+    from eschorty_ros.core.files import atomic_write
+    from eschorty_ros.core.targets import Targets
+    from eschorty_ros.core.targets_file import read_targets
+    from eschorty_ros.report.calibration_page import calibration_html
+
+    design = load_calibration(nominal)
+    made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
+    targets = Targets.concatenate(
+        [
+            _recorded(source, design, distances, moving, range_per_stage, range_sigma)
+            if source.is_dir()
+            else read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
+            for source in sources
+        ]
+    )
+    report = calibrate(
+        targets,
+        design,
+        "paper" if method == "paper" else "joint",
+        free=free or None,
+        prior_sigma=priors,
+        robust=robust,
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+    )
+    page = calibration_html(report, made_with)
+    save_calibration(report.calibration, out)
+    with atomic_write(out.with_suffix(".html")) as stream:
+        stream.write(page.encode())
+    _show(report)
+    click.echo(str(out))
+    click.echo(str(out.with_suffix(".html")))
+
+
+def _check_usage(
+    sources: tuple[Path, ...], out: Path, distances: str | None, moving: float | None
+) -> None:
+    if out.suffix not in (".yaml", ".yml"):
+        raise click.UsageError(f"--out is {out}; give a path ending in .yaml")
+    folders = [source for source in sources if source.is_dir()]
+    if not folders and (distances is not None or moving is not None):
+        raise click.UsageError("--distances and --moving belong to a recording folder")
+    if folders and (distances is None) == (moving is None):
+        raise click.UsageError(f"{folders[0]} is a recording; give --distances or --moving")
+
+
+def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
+    """NAME=SIGMA as a mapping; ``none`` becomes infinity."""
+    priors = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        try:
+            priors[name] = math.inf if value == "none" else float(value)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise click.UsageError(f"--prior is {text!r}; write NAME=SIGMA, such as b_mm=3")
+    return priors or None
+
+
+def _recorded(
+    source: Path,
+    design: Calibration,
+    distances: str | None,
+    moving: float | None,
+    range_per_stage: float,
+    range_sigma: float,
+) -> Targets:
+    from eschorty_ros.core.recorded_targets import recorded_moving_target, recorded_posts
+    from eschorty_ros.core.recording import load_recording
+
+    recording = load_recording(source)
+    with progress_bar("reading") as report:
+
+        def progress(done: int, total: int) -> None:
+            report(done / max(total, 1), "")
+
+        if moving is not None:
+            return recorded_moving_target(
+                recording, design, moving, range_per_stage=range_per_stage, progress=progress
+            )
+        known = _known(distances or "", range_sigma)
+        match = recorded_posts(recording, known, design, progress)
+    for line in match.rejected:
+        click.echo(f"left out: {line}")
+    if match.targets is None:
+        raise FitError(
+            f"--distances is {distances}; no post lies where they say, check the ranges and "
+            "--nominal"
+        )
+    return match.targets
+
+
+def _known(distances: str, range_sigma: float) -> list[KnownTarget]:
+    from eschorty_ros.core.posts import KnownTarget
+    from eschorty_ros.core.targets_file import read_distances
+
+    try:
+        ranges = [float(part) for part in distances.split(",")]
+    except ValueError:
+        return read_distances(distances, sigma_range_mm=range_sigma)
+    return [KnownTarget(range_mm, range_sigma) for range_mm in ranges]
+
+
+def _show(report: CalibrationReport) -> None:
+    """Print the parameters, how well the targets fit, and the verdicts."""
+    from eschorty_ros.report.calibration_page import parameters
+    from eschorty_ros.report.page import number
+
+    used = int(report.used.sum())
+    made = table(
+        f"{report.calibration.id}: {used} of {len(report.targets)} targets, residual "
+        f"{number(report.calibration.residual_rms_px or 0.0)} px, reduced chi-square "
+        f"{number(report.fit.reduced_chi_square)}",
+        *("", "value", "sigma", "design", "prior sigma"),
+    )
+    for entry in parameters(report):
+        sigma = "fixed" if math.isnan(entry.sigma) else number(entry.sigma)
+        prior = "" if math.isnan(entry.prior) else number(entry.prior)
+        made.add_row(entry.name, number(entry.value), sigma, number(entry.nominal), prior)
+    show(made)
+    for left_out in report.rejected:
+        click.echo(f"rejected: {left_out.label}: {left_out.reason}")
+    for line in report.verdicts:
+        click.echo(f"verdict: {line}")
