@@ -211,7 +211,9 @@ def _uncut_row(row, sigma2, variance, window, half, rows, factor, floor):
     share = 1.0 if centre == 0.0 else 0.25
     scatter2 = factor**2 + max(1.0 - factor**2, 0.0) * (1.0 - ratio)
     wider2 = scatter2 * sigma**2 / (ratio * count) + floor**2 + share * shift**2
-    return row - shift if from_low < from_high else row + shift, max(sigma2, wider2), True
+    row = row - shift if from_low < from_high else row + shift
+    # Another estimate than the mean may start closer to the edge than the correction is long.
+    return min(max(row, -0.5), rows - 0.5), max(sigma2, wider2), True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
