@@ -23,7 +23,7 @@ from numba import njit
 # An exponential this far gone is below half a unit in the last place of what it is added to.
 _SETTLED = 38.0
 
-GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 5.0, 64.0
+GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 4.5, 64.0
 """Span of the noise table in standard deviations, and its entries per standard deviation."""
 
 ON, OFF, NOTHING, UNKNOWN = 1, 0, -1, -2
@@ -190,7 +190,7 @@ def _gap(value, per_level, noise, per_noise, sign):
     return x * (1.0 + x * (x * (1 / 3) - sign * 0.5)) * per_noise
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _noisy(
     u, y, settled, tau_us, follower_us, on_level, off_level, middle, noise, table, from_us,
     until_us, budget,
