@@ -120,3 +120,9 @@ class PixelParameters:
         lowest = min(self.threshold_on, self.threshold_off) * (1.0 - 4.0 * self.threshold_mismatch)
         swing = lowest - max(3.0 * self.noise, 0.4 * lowest)
         return self.background_intensity * math.expm1(max(swing, self.threshold_min))
+
+    @property
+    def half_width_rows(self) -> float:
+        """Rows from the line's centre to the last that is drawn, on a surface of reflectance 1."""
+        ratio = self.amplitude / self.least_contrast
+        return self.sigma_rows * math.sqrt(2.0 * math.log(ratio)) if ratio > 1.0 else 0.0

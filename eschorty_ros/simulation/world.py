@@ -13,6 +13,7 @@ from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan
 from eschorty_ros.core.recording import TRUTH_DTYPE
+from eschorty_ros.simulation.footprint import footprint
 from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
 from eschorty_ros.simulation.scene import Scene
 from eschorty_ros.simulation.timeline import LaserTimeline, StageTimeline
@@ -26,6 +27,7 @@ STEP_MM = 0.25
 _STEP_MAX_US = 5_000
 _STEP_MIN_US = 50
 _ROW_STEP = 0.02
+_REFLECTANCE_STEP = 0.01
 _PIECE_US = 16_384
 _TIME_HIGH_US = 4_096
 _PHASES_KEPT = 1_000_000
@@ -61,9 +63,9 @@ class World:
         self.columns = self.model.columns
         self.rows = self.model.rows
         self.events = 0
-        self._pixels = PixelArray(
-            self.columns, self.rows, parameters or PixelParameters(), seed, background_hz
-        )
+        pixels = parameters or PixelParameters()
+        self._half_rows = pixels.half_width_rows
+        self._pixels = PixelArray(self.columns, self.rows, pixels, seed, background_hz)
         self._encoder = Encoder(self.columns, self.rows)
         self._laser = LaserTimeline()
         self._stage = StageTimeline()
@@ -74,6 +76,8 @@ class World:
         self._step_us: int | None = None
         self._drawn_mm = np.nan
         self._drawn_row = np.full(self.columns, np.nan)
+        self._drawn_reflectance = np.full(self.columns, np.nan)
+        self._was_split = np.zeros(self.columns, dtype=bool)
         self._phases: deque[tuple[int, float]] = deque(maxlen=_PHASES_KEPT)
 
     @property
@@ -190,21 +194,38 @@ class World:
         if self._lit_since_us is None:
             self._lit_since_us = t_us
             self._drawn_row[:] = np.nan
+            self._was_split[:] = False
             self._drawn_mm = np.nan
         if position_mm != self._drawn_mm:
-            stage = np.array([position_mm])
-            range_mm = self.scene.range_mm(stage, self._every_column, self.model)[0]
-            row = self.model.row(range_mm, self._every_column)
-            moved = ~(np.abs(row - self._drawn_row) <= _ROW_STEP)
-            moved &= ~(np.isnan(row) & np.isnan(self._drawn_row))
-            if moved.any():
-                albedo = self.scene.reflectance(stage, self._every_column, self.model)[0]
-                columns = self._every_column[moved]
-                self._pixels.relight(t_us, columns, row[moved], albedo[moved])
-                self._drawn_row[moved] = row[moved]
+            self._draw_at(t_us, position_mm)
             self._drawn_mm = position_mm
         pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
         self._step_us = t_us + int(min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US))
+
+    def _draw_at(self, t_us: int, position_mm: float) -> None:
+        seen = footprint(self.scene, self.model, position_mm, self._half_rows)
+        moved = ~(np.abs(seen.row - self._drawn_row) <= _ROW_STEP)
+        moved &= ~(np.isnan(seen.row) & np.isnan(self._drawn_row))
+        with np.errstate(invalid="ignore"):
+            moved |= np.abs(seen.reflectance - self._drawn_reflectance) > _REFLECTANCE_STEP
+        moved |= self._was_split
+        moved[seen.split] = False
+        if moved.any():
+            columns = self._every_column[moved]
+            self._pixels.relight(t_us, columns, seen.row[moved], seen.reflectance[moved])
+            self._drawn_row[moved] = seen.row[moved]
+            self._drawn_reflectance[moved] = seen.reflectance[moved]
+        self._was_split[:] = False
+        if seen.split.size:
+            self._was_split[seen.split] = True
+            self._pixels.relight(
+                t_us,
+                seen.split,
+                seen.patch_row,
+                seen.patch_reflectance,
+                seen.low_row,
+                seen.high_row,
+            )
 
     def _darken(self, t_us: int) -> None:
         """Take the line away and note the phase that ends here."""
