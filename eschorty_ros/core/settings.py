@@ -121,6 +121,11 @@ class Settings:
         for item in fields(self):
             _check(item.name, getattr(self, item.name), item.default, item.metadata)
         check_method(self.centroid, self.returns)
+        if self.returns == "all" and self.reflectance_compensation == "on":
+            raise ArgumentError(
+                "returns is 'all' and reflectance_compensation 'on', which follows one surface per "
+                "column; choose strongest, first or last"
+            )
 
 
 def _check(name: str, value: Any, default: Any, metadata: Any) -> None:

@@ -136,6 +136,7 @@ def test_clouds_hold_both_returns():
 def test_whole_column_methods_cannot_tell_returns_apart(method):
     for refused in (
         lambda: Settings(centroid=method, returns="all"),
+        lambda: Settings(returns="all", reflectance_compensation="on"),
         lambda: estimate([1], [0, 1], method, returns="first"),
     ):
         with pytest.raises(ArgumentError, match="returns is") as caught:

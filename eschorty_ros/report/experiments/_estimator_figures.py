@@ -25,11 +25,13 @@ class Case(NamedTuple):
 
 
 class Second(NamedTuple):
-    """What ``returns="all"`` makes of a second line."""
+    """What a method makes of a column with a second line: the strongest return, then all."""
 
     method: str
     strength: float
     apart_fwhm: float
+    over_bound: float
+    gross: float
     reported: float
     near_over_bound: float
     far_over_bound: float
