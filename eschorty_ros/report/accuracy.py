@@ -65,7 +65,7 @@ class Accuracy:
     points : int
         All points of the cloud.
     expected_points, found_points : int
-        Lit columns summed over those periods, and points there.
+        Columns lit in the middle of those periods, summed, and those of them with a point.
     completeness : float
         ``found_points / expected_points``.
     error_median_mm, error_p95_mm : float
@@ -152,16 +152,16 @@ def true_range_mm(
 
 def lit_columns(
     scene: KnownScene, model: RangeModel, positions_mm: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Columns that see the scene within the sensor's rows, counted at each stage position."""
+) -> NDArray[np.bool_]:
+    """Whether each column sees the scene within the sensor's rows, shape (positions, columns)."""
     columns = np.arange(model.columns, dtype=np.int64)
     near_mm, far_mm = model.range_limits_mm
-    counts = np.zeros(len(positions_mm), np.int64)
+    lit = np.zeros((len(positions_mm), model.columns), dtype=np.bool_)
     for index, position in enumerate(positions_mm):
         truth = scene.range_mm(np.array([position]), columns, model)[0]
         with np.errstate(invalid="ignore"):
-            counts[index] = np.count_nonzero((truth >= near_mm) & (truth <= far_mm))
-    return counts
+            lit[index] = (truth >= near_mm) & (truth <= far_mm)
+    return lit
 
 
 def range_error_mm(
@@ -179,7 +179,7 @@ def whole_periods(
     points: NDArray[np.void],
     sweep: Sweep,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Find the modulation periods that lie within the sweep from one end to the other.
 
     The points place one period on the stage; the others follow one pitch apart, whether they
@@ -195,15 +195,15 @@ def whole_periods(
     -------
     positions_mm : ndarray of float64
         Stage position at the middle of the events of each period.
-    member : ndarray of bool, shape (n,)
-        Whether a point belongs to one of them.
+    number : ndarray of int64, shape (n,)
+        Which of them a point belongs to, -1 for none.
     """
     pitch = sweep.pitch_mm
     low, high = sorted((sweep.start_mm, sweep.stop_mm))
     if len(points) == 0:
         count = int((high - low) / abs(pitch))
         positions = np.asarray(sweep.start_mm + pitch * (np.arange(count) + 0.5))
-        return positions, np.zeros(0, dtype=np.bool_)
+        return positions, np.zeros(0, dtype=np.int64)
     stage_mm, _ = stage_and_range_mm(points, stage_direction)
     index = profile_index(points, 1.0 / sweep.frequency_hz)
     offset = float(np.median(stage_mm - pitch * index))
@@ -211,7 +211,7 @@ def whole_periods(
     ends = sorted(((low + half - offset) / pitch, (high - half - offset) / pitch))
     first, last = int(np.ceil(ends[0])), int(np.floor(ends[1]))
     positions = np.asarray(offset + pitch * np.arange(first, last + 1))
-    return positions, (index >= first) & (index <= last)
+    return positions, np.where((index >= first) & (index <= last), index - first, -1)
 
 
 def measure(
@@ -240,10 +240,12 @@ def measure(
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
-    positions, member = whole_periods(points, sweep, stage_direction)
-    expected = int(lit_columns(scene, model, positions).sum())
+    positions, number = whole_periods(points, sweep, stage_direction)
+    lit = lit_columns(scene, model, positions)
+    with_point = np.zeros_like(lit)
+    with_point[number[number >= 0], points["column"][number >= 0]] = True
+    expected, found = int(lit.sum()), int(np.count_nonzero(lit & with_point))
     known = np.isfinite(error_mm)
-    found = int(np.count_nonzero(known & member))
     error = error_mm[known]
     size = np.abs(error)
     ratio = size / (points["sigma"][known].astype(np.float64) * 1e3)
