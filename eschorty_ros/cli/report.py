@@ -88,7 +88,7 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
 
 def _summarise(sections: list[Section]) -> None:
     """Print findings and time of every experiment, then each finding outside its band."""
-    from eschorty_ros.report.page import band, number
+    from eschorty_ros.report.page import band, reading
 
     made = table("", "experiment", "findings that hold", "s")
     for section in sections:
@@ -99,6 +99,6 @@ def _summarise(sections: list[Section]) -> None:
     for section in sections:
         for finding in section.missed:
             click.echo(
-                f"missed: {section.name}: {finding.name} is {number(finding.value)} "
-                f"{finding.unit}, band {band(finding)}"
+                f"missed: {section.name}: {finding.name} is {reading(finding)}, "
+                f"band {band(finding)}"
             )

@@ -75,7 +75,12 @@ def render(template: str, **values: Any) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": number, "band": band, "breakable": breakable}
+    environment.filters |= {
+        "number": number,
+        "band": band,
+        "reading": reading,
+        "breakable": breakable,
+    }
     return environment.get_template(template).render(**values)
 
 
@@ -105,6 +110,11 @@ def number(value: float | int | str) -> str:
 def breakable(name: str) -> Markup:
     """Name that may wrap after each underscore."""
     return Markup("_<wbr>").join(name.split("_"))
+
+
+def reading(finding: Finding) -> str:
+    """Value of a finding with its unit."""
+    return f"{number(finding.value)} {finding.unit}".rstrip()
 
 
 def band(finding: Finding) -> str:

@@ -106,7 +106,7 @@ def test_the_csv_has_every_digit(report):
 def test_a_missed_finding_is_a_result_and_is_listed(report):
     result, _ = report(("good",))
     assert result.exit_code == 0
-    assert "missed: good: share is 0.4 , band ≤ 0.3" in result.stdout
+    assert "missed: good: share is 0.4, band ≤ 0.3" in result.stdout
     assert "slope" not in result.stdout
 
 

@@ -56,9 +56,9 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             sweeps[name].append(measure(parameters[name], frequency, columns, periods, effort.seed))
             done += 1
     return Outcome(
-        findings=[*_findings("paper", sweeps["paper"], 5.0),
+        findings=[*_findings("paper", sweeps["paper"], (1.0, 5.0)),
                   _closed_form_finding(sweeps["paper"], parameters["paper"]),
-                  *_findings("narrow", sweeps["narrow"], 2.0)],
+                  *_findings("narrow", sweeps["narrow"], (1.5, 2.5))],
         tables={"sweep": _table(sweeps, parameters)},
         figures={
             "events": _events_figure(sweeps),
@@ -88,7 +88,7 @@ def _at(points: list[Point], frequency_hz: float) -> Point:
     return next(point for point in points if point.frequency_hz == frequency_hz)
 
 
-def _findings(name: str, points: list[Point], narrowest_px: float) -> list[Finding]:
+def _findings(name: str, points: list[Point], narrowest_px: tuple[float, float]) -> list[Finding]:
     first = points[0]
     linear = [
         abs(point.rate_hz / (first.rate_hz * point.frequency_hz / first.frequency_hz) - 1.0)
@@ -103,7 +103,7 @@ def _findings(name: str, points: list[Point], narrowest_px: float) -> list[Findi
         Finding(f"{name}: events at 1 kHz over those at 500 Hz, saturation", one / half, high=1.5),
         Finding(f"{name}: events at 20 kHz over those at 1 kHz, breakdown", last / one, high=0.25),
         Finding(f"{name}: width at 50 Hz", first.width_px, 18.0, 22.0, "px"),
-        Finding(f"{name}: width at 20 kHz", points[-1].width_px, 1.0, narrowest_px, "px"),
+        Finding(f"{name}: width at 20 kHz", points[-1].width_px, *narrowest_px, "px"),
         Finding(f"{name}: largest widening from 1 kHz on, from one frequency to the next",
                 float(np.max(np.diff(falling))), high=1.0, unit="px"),
     ]  # fmt: skip
