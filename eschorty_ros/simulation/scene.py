@@ -114,12 +114,14 @@ class Steps(UniformReflectance):
 
     A tile lies at ``base_mm + column_levels_mm[i] + stage_levels_mm[j]``; the first and last
     stage band go on for ever. Walls between column bands run along the rays, so that no tile
-    hides another. The default spans 207 mm around 1.32 m with steps from 2 to 102 mm.
+    hides another. The default spans 207 mm around 1.32 m with steps from 2 to 102 mm. Between
+    10 and 110 mm the stage crosses one large step: the laser line is 7 mm thick there and lies
+    on both levels for as long.
     """
 
     base_mm: float = 1320.0
     column_levels_mm: tuple[float, ...] = (0.0, 2.0, 5.0, 25.0, 60.0, 20.0, -40.0, -45.0)
-    stage_levels_mm: tuple[float, ...] = (0.0, 3.0, 40.0, 35.0, -5.0, -40.0, 62.0, 60.0, 0.0)
+    stage_levels_mm: tuple[float, ...] = (0.0, 2.0, 40.0, 38.0, 36.0, -40.0, 62.0, 60.0, 0.0)
     stage_band_mm: float = 25.0
 
     def __post_init__(self) -> None:
