@@ -73,7 +73,7 @@ def test_streams_are_clean_ordered_and_full_of_vectors() -> None:
     assert np.all(np.diff(t) >= 0)
     assert t[-1] < 300_000
     assert set(p.tolist()) == {0, 1}
-    assert len(np.unique(np.stack((t, x, y)), axis=1).T) == t.size
+    assert len(np.unique(np.stack((t, x, y, p)), axis=1).T) == t.size
 
 
 def test_line_lies_where_the_range_equation_puts_it() -> None:
