@@ -40,6 +40,7 @@ PARAMETERS = (
 Positive = Annotated[float, Field(gt=0.0)]
 # A strict tuple refuses the list that YAML makes of it; its items stay strict.
 Vector = Annotated[tuple[float, float, float], Field(strict=False)]
+Window = Annotated[tuple[int, int, int, int], Field(strict=False)]
 
 
 class Calibration(Schema):
@@ -48,7 +49,9 @@ class Calibration(Schema):
     The keys are those of ``calibration.yaml``, with the unit in the name. Signs as in
     :class:`~eschorty_ros.core.optics.RangeModel`; the sign of ``theta_prime_deg`` tells the side
     to which the sensor is tilted. ``k_mm`` left out means ``focal_length_mm / sin(theta_deg)``,
-    unrounded. ``stage_direction`` is the unit vector of stage travel in ``eschorty_link``.
+    unrounded. ``roi_px`` is the window that the camera reads out, ``[first column, first row,
+    columns, rows]``; left out it is the whole sensor. ``stage_direction`` is the unit vector of
+    stage travel in ``eschorty_link``.
     The keys from ``id`` on describe a fit: ``covariance`` belongs to ``parameters_fitted`` in
     that order and in their units, ``range_mm`` is the span the fit has seen.
     """
@@ -67,6 +70,7 @@ class Calibration(Schema):
     b_prime_2_px: float = 0.0
     columns: Annotated[int, Field(gt=0, le=2048)] = COLUMNS
     rows: Annotated[int, Field(gt=0, le=2048)] = ROWS
+    roi_px: Window | None = None
     principal_column: float = PRINCIPAL_COLUMN
     stage_direction: Vector = (0.0, 1.0, 0.0)
     id: str | None = None
@@ -94,6 +98,19 @@ class Calibration(Schema):
         if value == 0.0:
             raise ValueError("choose a tilted sensor, such as -7.62")
         return value
+
+    @model_validator(mode="after")
+    def _window_on_the_sensor(self) -> Calibration:
+        if self.roi_px is None:
+            return self
+        column, row, columns, rows = self.roi_px
+        fits = 0 <= column < column + columns <= self.columns
+        if not (fits and 0 <= row < row + rows <= self.rows):
+            raise ValueError(
+                f"roi_px {list(self.roi_px)} leaves the sensor of {self.columns} x {self.rows}; "
+                "write first column, first row, columns, rows"
+            )
+        return self
 
     @field_validator("stage_direction")
     @classmethod

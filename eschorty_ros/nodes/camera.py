@@ -34,6 +34,7 @@ TABLE = (
     drivers.DRIVER,
     Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
     Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
+    Param("as_built", "", "fake camera: build as it really is; empty: as calibration says"),
     Param(
         "pixels",
         "paper",

@@ -31,7 +31,8 @@ def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSourc
     from eschorty_ros.simulation.warm_up import warm_up
     from eschorty_ros.simulation.world import World
 
-    calibration = load_calibration(parameters["calibration"])
+    # The world is as it is, whatever the instrument is believed to be.
+    calibration = load_calibration(parameters["as_built"] or parameters["calibration"])
     warm_up(calibration)
     world = World(
         named(parameters["scene"]),

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
+
+from eschorty_ros.core.errors import EschortyError
+
+_POLL_S = 0.1
 
 Job = Callable[[], None]
 
@@ -40,6 +45,34 @@ class Mailbox:
     def post_bulk(self, job: Job) -> bool:
         """Queue a bulk job; ``False`` and counted when the queue is full."""
         return self._append(job, True)
+
+    def run(self, job: Job, timeout_s: float, alive: Callable[[], bool]) -> tuple[bool, str]:
+        """Queue a small job and wait for its end, at most while ``alive()``.
+
+        Returns
+        -------
+        bool, str
+            Whether it succeeded, and why not: an ``EschortyError``'s text, or that nobody did it.
+        """
+        answered = threading.Event()
+        refusal: list[str] = []
+
+        def guarded() -> None:
+            try:
+                job()
+            except EschortyError as error:
+                refusal.append(str(error))
+            finally:
+                answered.set()
+
+        self.post(guarded)
+        end_s = time.monotonic() + timeout_s
+        while not answered.wait(min(_POLL_S, timeout_s)):
+            if not alive():
+                return False, "the node was shut down"
+            if time.monotonic() > end_s:
+                return False, f"the reconstruction did not answer within {timeout_s:g} s"
+        return not refusal, "".join(refusal)
 
     def take(self, timeout_s: float) -> Job | None:
         """Return the oldest job, ``None`` when none comes within ``timeout_s``."""

@@ -1,59 +1,45 @@
-"""All nodes in one process on simulated hardware, and one scan through the same action."""
+"""One scan or one calibration through the same actions, all nodes in one process."""
 
 from __future__ import annotations
 
 import contextlib
-import os
-import tempfile
-import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
-import yaml
 from numpy.typing import NDArray
 from rclpy.action import ActionClient
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
-from eschorty_ros.action import Scan
+from eschorty_ros.action import Calibrate, Scan
+from eschorty_ros.core.calibration import Calibration, load_calibration
 from eschorty_ros.core.cloud import POINT_DTYPE
 from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.core.posts import KnownTarget
 from eschorty_ros.nodes import qos
-from eschorty_ros.nodes.camera import CameraNode
+from eschorty_ros.nodes.calibration_messages import target_message
 from eschorty_ros.nodes.cloud_messages import points_from_message
-from eschorty_ros.nodes.domain import free_domain
-from eschorty_ros.nodes.laser import LaserNode
-from eschorty_ros.nodes.reconstruction import ReconstructionNode
-from eschorty_ros.nodes.scanner import ScannerNode
-from eschorty_ros.nodes.spin import make_safe, turn, undisturbed
-from eschorty_ros.nodes.stage import StageNode
+from eschorty_ros.nodes.composition import (
+    START_S,
+    Composition,
+    Tables,
+    composition,
+    lossless_events,
+    wait,
+)
 
-NAMESPACE = "/eschorty"
-NODES = {
-    "camera": CameraNode,
-    "laser": LaserNode,
-    "stage": StageNode,
-    "reconstruction": ReconstructionNode,
-    "scanner": ScannerNode,
-}
-THREADS = 12
-START_S = 60.0
 SLACK_S = 60.0
-_POLL_S = 0.02
 
 Feedback = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class OneScan:
-    """What to scan and how; mm and mm/s."""
+    """What to scan and how; mm and mm/s.
+
+    ``as_built`` is the build the simulated world has, where it is not as ``calibration`` says.
+    """
 
     scene: str
     calibration: str
@@ -63,6 +49,7 @@ class OneScan:
     frequency_hz: float
     seed: int = 0
     pixels: str = "paper"
+    as_built: str = ""
 
     @property
     def sweep_s(self) -> float:
@@ -83,33 +70,30 @@ class Outcome:
     events_dropped: int
 
 
-def parameters(scan: OneScan) -> dict[str, dict[str, Any]]:
+def parameters(scan: OneScan) -> Tables:
     """Parameters of every node for a scan on simulated hardware."""
-    topic = f"{NAMESPACE}/camera/events"
-    return {
-        "camera": {
-            "scene": scan.scene,
-            "calibration": scan.calibration,
-            "seed": scan.seed,
-            "pixels": scan.pixels,
-            "qos_overrides": {topic: {"publisher": {"reliability": "reliable"}}},
-        },
-        "reconstruction": {
-            "calibration": scan.calibration,
-            "qos_overrides": {topic: {"subscription": {"reliability": "reliable"}}},
-        },
-    }
+    tables = lossless_events()
+    tables["camera"] |= _world(scan)
+    tables["reconstruction"]["calibration"] = scan.calibration
+    return tables
+
+
+def _world(job: OneScan | OneCalibration) -> dict[str, Any]:
+    """Camera's parameters that tell what it looks at."""
+    names = ("scene", "calibration", "as_built", "seed", "pixels")
+    return {name: getattr(job, name) for name in names}
 
 
 class Instrument:
-    """The nodes, spinning in a thread of this process, and a client of their scan action."""
+    """A client of the scan action of running nodes."""
 
-    def __init__(self, client: Node, nodes: list[Node]) -> None:
-        self._client = client
-        self._nodes = nodes
+    def __init__(self, running: Composition) -> None:
+        self._running = running
         self._clouds: list[PointCloud2] = []
-        self._action: ActionClient[Any, Any, Any] = ActionClient(client, Scan, "scan")
-        client.create_subscription(PointCloud2, "scan/points", self._clouds.append, qos.latched())
+        self._action: ActionClient[Any, Any, Any] = ActionClient(running.client, Scan, "scan")
+        running.client.create_subscription(
+            PointCloud2, "scan/points", self._clouds.append, qos.latched()
+        )
 
     def scan(self, scan: OneScan, feedback: Feedback) -> Outcome:
         """Send one scan and wait for its end.
@@ -120,7 +104,7 @@ class Instrument:
             When the scanner does not answer, refuses the goal or takes far too long.
         """
         feedback(0.0, "starting")
-        _wait(self._ready, START_S, "the nodes are not active")
+        self._running.wait_until_active(self._action)
         goal = Scan.Goal(
             start=scan.start_mm * 1e-3,
             stop=scan.stop_mm * 1e-3,
@@ -132,20 +116,9 @@ class Instrument:
             state = message.feedback
             feedback(float(state.progress), f"{state.phase} {state.points:,} points")
 
-        sent = self._action.send_goal_async(goal, feedback_callback=on_feedback)
-        _wait(sent.done, START_S, "the scanner does not answer")
-        handle = sent.result()
-        if handle is None or not handle.accepted:
-            raise DeviceError("the scanner refused the scan; see its message above")
-        finished = handle.get_result_async()
-        try:
-            _wait(finished.done, 5.0 * scan.sweep_s + SLACK_S, "the scan does not end")
-        except BaseException:
-            handle.cancel_goal_async()
-            raise
-        result = finished.result().result
+        result = _result(self._action, goal, on_feedback, 5.0 * scan.sweep_s)
         if result.points:
-            _wait(lambda: bool(self._clouds), START_S, "no cloud came on scan/points")
+            wait(lambda: bool(self._clouds), START_S, "no cloud came on scan/points")
         return Outcome(
             bool(result.success),
             str(result.message),
@@ -156,91 +129,153 @@ class Instrument:
             int(result.events_dropped),
         )
 
-    def _ready(self) -> bool:
-        failed = [
-            f"{node.get_name()}: {reason.splitlines()[-1]}"
-            for node in self._nodes
-            if (reason := getattr(node, "failure", ""))
-        ]
-        if failed:
-            raise DeviceError("; ".join(failed))
-        active = all(getattr(node, "active", True) for node in self._nodes)
-        return active and self._action.server_is_ready()
-
 
 @contextlib.contextmanager
 def instrument(scan: OneScan) -> Iterator[Instrument]:
-    """All nodes for one scan; on leaving, whatever happened, the laser is off.
+    """All nodes for one scan; on leaving, whatever happened, the laser is off."""
+    with composition(parameters(scan)) as running:
+        yield Instrument(running)
 
-    Unless ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own, so that they meet no
-    other instrument.
+
+@dataclass(frozen=True, slots=True)
+class OneCalibration:
+    """What to calibrate with.
+
+    Attributes
+    ----------
+    targets : tuple of KnownTarget
+        What the scene holds, as far as the calibration is told.
+    scene : str
+    calibration : str
+        The build as designed.
+    as_built : str
+        The build the simulated world has.
+    method : {"joint", "paper"}
+    capture_s, frequency_hz : float
+    seed : int
+    pixels : str
+        Preset of the pixels.
+    folder : str
+        Where the calibration is written.
     """
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    nodes: list[Node] = []
-    with tempfile.TemporaryDirectory(prefix="eschorty_") as folder:
-        file = Path(folder) / "parameters.yaml"
-        file.write_text(_parameter_file(parameters(scan)))
-        rclpy.init(
-            args=[
-                "--ros-args",
-                *("-r", f"__ns:={NAMESPACE}"),
-                *("--params-file", str(file)),
-                *("--log-level", "warn"),
-            ],
-            domain_id=None if os.environ.get("ROS_DOMAIN_ID") else free_domain(),
-            signal_handler_options=SignalHandlerOptions.NO,
+
+    targets: tuple[KnownTarget, ...]
+    folder: str
+    scene: str = "posts"
+    calibration: str = "config_3"
+    as_built: str = "config_3_as_built"
+    method: str = "joint"
+    capture_s: float = 1.0
+    frequency_hz: float = 70.0
+    seed: int = 0
+    pixels: str = "paper"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationOutcome:
+    """The action's result.
+
+    Attributes
+    ----------
+    success : bool
+    message : str
+        Why not, empty when it succeeded.
+    calibration : Calibration or None
+        As read back from ``file``.
+    file : str
+    verdicts, rejected : tuple of str
+    range_mm, row, residual_px : ndarray of float64
+        Of the targets used.
+    frame : ndarray of uint8, shape (rows, columns)
+        All events of the capture.
+    """
+
+    success: bool
+    message: str
+    calibration: Calibration | None
+    file: str
+    verdicts: tuple[str, ...]
+    rejected: tuple[str, ...]
+    range_mm: NDArray[np.float64]
+    row: NDArray[np.float64]
+    residual_px: NDArray[np.float64]
+    frame: NDArray[np.uint8]
+
+
+def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcome:
+    """Run all nodes on simulated hardware, calibrate once through the action, end them.
+
+    Parameters
+    ----------
+    job : OneCalibration
+    feedback : callable
+        Called with the share done and a line of text.
+
+    Raises
+    ------
+    DeviceError
+        When the nodes do not answer, refuse the goal or take far too long.
+    """
+    tables = lossless_events()
+    tables["camera"] |= _world(job)
+    tables["reconstruction"] |= {
+        "calibration": job.calibration,
+        "calibration_folder": job.folder,
+    }
+    with composition(tables) as running:
+        feedback(0.0, "starting")
+        action: ActionClient[Any, Any, Any] = ActionClient(running.client, Calibrate, "calibrate")
+        running.wait_until_active(action)
+        goal = Calibrate.Goal(
+            targets=[target_message(target) for target in job.targets],
+            method=job.method,
+            capture_time=job.capture_s,
+            frequency=job.frequency_hz,
         )
-        executor = MultiThreadedExecutor(THREADS)
-        ending = threading.Event()
-        thread = threading.Thread(target=_spin, args=(executor, ending), name="nodes")
-        try:
-            for factory in NODES.values():
-                nodes.append(factory())
-            nodes.append(client := Node("eschorty_scan"))
-            made = Instrument(client, nodes)
-            for node in nodes:
-                executor.add_node(node)
-            thread.start()
-            yield made
-        finally:
-            with undisturbed():
-                make_safe(nodes)
-                ending.set()
-                # An ended context also ends callbacks that wait, such as homing.
-                rclpy.try_shutdown()
-                if thread.is_alive():
-                    thread.join(5.0)
-                executor.shutdown(timeout_sec=2.0)
-                for node in nodes:
-                    node.destroy_node()
 
+        def on_feedback(message: Any) -> None:
+            state = message.feedback
+            feedback(
+                float(state.progress),
+                f"{state.phase} {state.matched} of {state.posts} posts known",
+            )
 
-def _parameter_file(values: dict[str, dict[str, Any]]) -> str:
-    return yaml.safe_dump(
-        {f"{NAMESPACE}/{node}": {"ros__parameters": table} for node, table in values.items()}
+        result = _result(action, goal, on_feedback, 5.0 * job.capture_s)
+    return CalibrationOutcome(
+        success=bool(result.success),
+        message=str(result.message),
+        calibration=load_calibration(result.file) if result.success else None,
+        file=str(result.file),
+        verdicts=tuple(result.verdicts),
+        rejected=tuple(result.rejected),
+        range_mm=np.array(result.ranges) * 1e3,
+        row=np.array(result.rows),
+        residual_px=np.array(result.residuals),
+        frame=np.frombuffer(result.frame.data, np.uint8).reshape(
+            result.frame.height, result.frame.width
+        ),
     )
 
 
-def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
-    # Shutting an executor down while it spins raises in this thread, so it is asked to end.
+def _result(
+    action: ActionClient[Any, Any, Any],
+    goal: Any,
+    on_feedback: Callable[[Any], None],
+    expected_s: float,
+) -> Any:
+    """Send a goal and wait for its result; whatever interrupts the waiting cancels it."""
+    sent = action.send_goal_async(goal, feedback_callback=on_feedback)
+    wait(sent.done, START_S, "the action does not answer")
+    handle = sent.result()
+    if handle is None or not handle.accepted:
+        raise DeviceError("the goal was refused; see the message above")
+    finished = handle.get_result_async()
     try:
-        while not ending.is_set():
-            turn(executor)
-    except ExternalShutdownException:
-        pass
-    except Exception:
-        # A callback that publishes while the context ends fails; that is no news.
-        if not ending.is_set():
-            raise
-
-
-def _wait(condition: Callable[[], Any], limit_s: float, fault: str) -> None:
-    # Polled from the main thread, so that Ctrl-C arrives at once.
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        if time.monotonic() > end_s:
-            raise DeviceError(f"{fault} after {limit_s:.0f} s; look at the log above")
-        time.sleep(_POLL_S)
+        wait(finished.done, expected_s + SLACK_S, "the action does not end")
+    except BaseException:
+        handle.cancel_goal_async()
+        raise
+    return finished.result().result
 
 
 def _cloud_points(clouds: list[PointCloud2]) -> NDArray[np.void]:

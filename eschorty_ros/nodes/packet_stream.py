@@ -151,10 +151,12 @@ class PacketStream:
         if settings == self._settings:
             return
         self._settings = settings
-        until_ns = self.processed_until_ns
-        if self._reconstructor is not None:
-            self._retire()
-            self._last_stamp_ns = until_ns or self._last_stamp_ns
+        self._renew()
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Use ``calibration`` for packets processed later; the open period is closed first."""
+        self.calibration = calibration
+        self._renew()
 
     def add(self, packet: Packet, now_s: float) -> None:
         """Queue one packet that arrived at steady time ``now_s``."""
@@ -246,6 +248,13 @@ class PacketStream:
         if epoch_ns is None or not self._announced or self._clock is None:
             return modulation
         return replace(modulation, on_edge_us=self._clock.to_us(epoch_ns) - self._wraps * WRAP_US)
+
+    def _renew(self) -> None:
+        """End the reconstructor; the next one goes on where it stopped."""
+        until_ns = self.processed_until_ns
+        if self._reconstructor is not None:
+            self._retire()
+            self._last_stamp_ns = until_ns or self._last_stamp_ns
 
     def _retire(self) -> None:
         """Close the open period and keep the counters of the reconstructor that ends here."""

@@ -9,6 +9,7 @@ import numpy as np
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.reconstruction import Settings, place
+from eschorty_ros.nodes.calibration_capture import Capture
 from eschorty_ros.nodes.packet_stream import Packet, PacketStream
 from eschorty_ros.nodes.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
 from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
@@ -37,6 +38,11 @@ class Pipeline:
     settings : Settings
     clock_timeout_s, stage_gap_s, stage_timeout_s : float
         See ``PacketStream`` and ``StagePlacer``.
+
+    Attributes
+    ----------
+    capture : Capture or None
+        Gets a calibration's events and placed profiles while it is set.
     """
 
     def __init__(
@@ -53,6 +59,7 @@ class Pipeline:
         self.placer = StagePlacer(stage_gap_s, stage_timeout_s)
         self.profiles = 0
         self.points = 0
+        self.capture: Capture | None = None
         self._fresh: list[TimedProfiles] = []
         self._buffer: ScanBuffer | None = None
         self._at_begin: tuple[int, int, int, int] = (0, 0, 0, 0)
@@ -71,17 +78,40 @@ class Pipeline:
         """Queue a packet and reconstruct what is possible."""
         self.stream.add(packet, now_s)
         self._receive(self.stream.process(now_s), now_s)
+        if self.capture is not None:
+            self.capture.packet(packet.data)
 
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
         """Advance whatever waited: profiles completed and points placed since the last call."""
         self._receive(self.stream.process(now_s), now_s)
-        placed = [self._place(timed, mm) for timed, mm in self.placer.ready(now_s)]
+        ready = self.placer.ready(now_s)
+        if self.capture is not None:
+            for timed, stage_mm in ready:
+                self.capture.profiles(timed, stage_mm)
+        placed = [self._place(timed, mm) for timed, mm in ready]
         for part in placed:
             self.points += len(part)
             if self._buffer is not None:
                 self._buffer.add(part)
         fresh, self._fresh = self._fresh, []
         return fresh, placed
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Use ``calibration`` for packets processed later.
+
+        Raises
+        ------
+        ArgumentError
+            While a scan is being collected: one scan has one calibration.
+        """
+        if self._buffer is not None:
+            raise ArgumentError(
+                f"scan {self._buffer.scan_id!r} is being collected; end it before changing the "
+                "calibration"
+            )
+        self.stream.set_calibration(calibration)
+        self.calibration = calibration
+        self.model = calibration.model()
 
     def begin_scan(self, scan_id: str, start_mm: float, stop_mm: float) -> None:
         """Start collecting; a request repeated because its answer got lost changes nothing.
@@ -98,8 +128,24 @@ class Pipeline:
                 f"scan {self._buffer.scan_id!r} is being collected; end it before beginning "
                 f"{scan_id!r}"
             )
+        if self.capture is not None:
+            raise ArgumentError("a calibration is running; wait for its end or cancel it")
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
         self._at_begin = self._losses()
+
+    def set_capture(self, capture: Capture | None) -> None:
+        """Begin or, with ``None``, end feeding a calibration's capture.
+
+        Raises
+        ------
+        ArgumentError
+            While a scan is being collected.
+        """
+        if capture is not None and self._buffer is not None:
+            raise ArgumentError(
+                f"scan {self._buffer.scan_id!r} is being collected; calibrate after its end"
+            )
+        self.capture = capture
 
     def close_period(self, scan_id: str, now_s: float) -> None:
         """First half of ending a scan: complete the open period, as the light is off by now.

@@ -19,12 +19,14 @@ from rclpy.node import Node
 from sensor_msgs.msg import TimeReference
 from tf2_msgs.msg import TFMessage
 
-from eschorty_ros.core.calibration import load_calibration
-from eschorty_ros.core.errors import ArgumentError, EschortyError
+from eschorty_ros.core.calibration import Calibration, load_calibration
+from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.warm_up import warm_up
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, qos, transforms
+from eschorty_ros.nodes.active_calibration import ActiveCalibration
+from eschorty_ros.nodes.calibrator import Calibrator
 from eschorty_ros.nodes.conversions import (
     mm_from_m,
     modulation_from_laser_state,
@@ -73,8 +75,23 @@ class ReconstructionNode(Node):
         self._mailbox = Mailbox(self.parameters["packets_max"])
         self._ending: tuple[Callable[[ScanReport], None], ...] = ()
         self._reports = Reports(self, self._pipeline, self._mailbox)
+        self._calibrator = self._made_calibrator()
         self._make_interfaces()
         self._worker.start()
+
+    def _made_calibrator(self) -> Calibrator:
+        values = self.parameters
+        folder = values["calibration_folder"]
+        return Calibrator(
+            self,
+            ActiveCalibration(
+                self, self.calibration, values["calibration"], folder, self._use_calibration
+            ),
+            self._in_worker,
+            self._pipeline.set_capture,
+            lambda: float(values["line_width_px"]),
+            (values["node_timeout"], values["service_timeout"], values["events_timeout"]),
+        )
 
     def _make_interfaces(self) -> None:
         override = {"qos_overriding_options": qos.overridable()}
@@ -104,6 +121,10 @@ class ReconstructionNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.1, self._reports.publish_state, clock=steady)
         self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
+
+    def safe_state(self) -> None:
+        """End a calibration under way: its way out switches the laser off."""
+        self._calibrator.safe_state()
 
     def destroy_node(self) -> None:
         """Stop the worker, then the node."""
@@ -194,21 +215,20 @@ class ReconstructionNode(Node):
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
         """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
-        answered = threading.Event()
-        refusal: list[str] = []
+        # After a signal nobody works any more, and an exit must not wait for it.
+        return self._mailbox.run(
+            job, timeout_s, lambda: not self._closing.is_set() and self.context.ok()
+        )
 
-        def guarded() -> None:
-            try:
-                job()
-            except EschortyError as error:
-                refusal.append(str(error))
-            finally:
-                answered.set()
+    def _use_calibration(self, calibration: Calibration) -> None:
+        def use() -> None:
+            self._pipeline.set_calibration(calibration)
+            self._outputs.set_calibration(calibration)
+            self.calibration = calibration
 
-        self._mailbox.post(guarded)
-        if not answered.wait(timeout_s):
-            return False, f"the reconstruction did not answer within {timeout_s:g} s"
-        return not refusal, "".join(refusal)
+        done, reason = self._in_worker(use)
+        if not done:
+            raise ArgumentError(f"calibration not exchanged: {reason}")
 
     # The worker.
 
@@ -257,7 +277,7 @@ class ReconstructionNode(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(ReconstructionNode, threads=4)
+    return run(ReconstructionNode, threads=6)
 
 
 if __name__ == "__main__":

@@ -55,6 +55,10 @@ class Outputs:
         self._frame: EventFrame | None = None
         self._frame_at_s = 0.0
 
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Use another calibration of the same sensor."""
+        self._model = calibration.model()
+
     def packet(self, data: Any) -> None:
         """Let the picture see a packet, while somebody looks at it."""
         if self._image.get_subscription_count() == 0:

@@ -23,6 +23,12 @@ TABLE = (
     Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
     Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
+    Param("calibration_folder", "", "where calibrations are written; empty: eschorty in ROS's "
+          "home"),
+    Param("node_timeout", 60.0, "calibration: longest wait for the other nodes", "s", 0.1, 600.0),
+    Param("service_timeout", 5.0, "calibration: longest wait for an answer", "s", 0.1, 60.0),
+    Param("events_timeout", 3.0, "calibration: longest pause of the events while the laser is on",
+          "s", 0.1, 60.0),
     Param("publish_tf", True, "publish /tf and /tf_static"),
 )  # fmt: skip
 

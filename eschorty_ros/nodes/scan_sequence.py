@@ -132,15 +132,19 @@ def check_request(request: ScanRequest, limits: ScanLimits) -> None:
             f"speed is {request.speed_mm_s * 1e-3:g} m/s; choose more than 0 and at most "
             f"{limits.speed_max_mm_s * 1e-3:g} m/s"
         )
-    frequency = request.frequency_hz
-    if frequency != 0.0 and not FREQUENCY_MIN_HZ <= frequency <= FREQUENCY_MAX_HZ:
+    check_laser(request.frequency_hz, request.duty)
+
+
+def check_laser(frequency_hz: float, duty: float) -> None:
+    """Raise ``ArgumentError`` when the laser cannot be set so; 0 keeps its setting."""
+    if frequency_hz != 0.0 and not FREQUENCY_MIN_HZ <= frequency_hz <= FREQUENCY_MAX_HZ:
         raise ArgumentError(
-            f"frequency is {frequency:g} Hz; choose {FREQUENCY_MIN_HZ:g} to "
+            f"frequency is {frequency_hz:g} Hz; choose {FREQUENCY_MIN_HZ:g} to "
             f"{FREQUENCY_MAX_HZ:g} Hz, or 0 to keep the laser's"
         )
-    if not 0.0 <= request.duty < 1.0:
+    if not 0.0 <= duty < 1.0:
         raise ArgumentError(
-            f"duty is {request.duty:g}; choose a value between 0 and 1, or 0 to keep the laser's"
+            f"duty is {duty:g}; choose a value between 0 and 1, or 0 to keep the laser's"
         )
 
 

@@ -14,7 +14,8 @@ from eschorty_ros.simulation.scene import UniformReflectance, sheet
 
 Array = NDArray[np.float64]
 
-NEAR_MM, FAR_MM, COUNT = 820.0, 2050.0, 9
+RANGES_MM = (820.0, 960.0, 1110.0, 1270.0, 1440.0, 1610.0, 1770.0, 1910.0, 2050.0)
+"""A third of them in the far third of what the third build sees."""
 SLIM_MM, WIDE_MM = 12.7, 25.4
 _SLIM_WITHIN_MM = 1000.0
 _FAN_SLOPE = 0.0287
@@ -82,8 +83,8 @@ class Post:
         return left, right
 
 
-def bench(count: int = COUNT, near_mm: float = NEAR_MM, far_mm: float = FAR_MM) -> tuple[Post, ...]:
-    """Flat posts at evenly spaced ranges, each in the middle of its share of the fan.
+def bench(ranges_mm: Sequence[float] = RANGES_MM) -> tuple[Post, ...]:
+    """Flat posts at these ranges, each in the middle of its share of the fan.
 
     Slim and wide ones by turns, so that a blooming of the image does not pass for a size; the
     nearest are slim, because a wide one would fill its share.
@@ -91,17 +92,16 @@ def bench(count: int = COUNT, near_mm: float = NEAR_MM, far_mm: float = FAR_MM) 
     Raises
     ------
     ArgumentError
-        For a count that does not fit side by side, or ranges that are not in order.
+        For more posts than fit side by side.
     """
-    if not 2 <= count <= COUNT or not 0.0 < near_mm < far_mm:
+    if len(ranges_mm) > len(RANGES_MM):
         raise ArgumentError(
-            f"{count!r} posts from {near_mm!r} to {far_mm!r} mm; choose 2 to {COUNT} posts and the "
-            "nearest range first"
+            f"{len(ranges_mm)} posts do not fit side by side; choose {len(RANGES_MM)} at most"
         )
     posts = []
-    for index, range_mm in enumerate(np.linspace(near_mm, far_mm, count).tolist()):
+    for index, range_mm in enumerate(ranges_mm):
         slim = index % 2 == 1 or range_mm < _SLIM_WITHIN_MM
-        line_mm = (index - 0.5 * (count - 1)) * _FAN_SLOPE * range_mm
+        line_mm = (index - 0.5 * (len(ranges_mm) - 1)) * _FAN_SLOPE * range_mm
         posts.append(Post(range_mm, line_mm, SLIM_MM if slim else WIDE_MM))
     return tuple(posts)
 

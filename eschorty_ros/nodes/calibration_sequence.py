@@ -1,0 +1,180 @@
+"""The order of a capture for a calibration, without ROS: whatever happens, laser off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from eschorty_ros.core.calibrate import METHODS
+from eschorty_ros.core.errors import ArgumentError, EschortyError
+from eschorty_ros.core.posts import KnownTarget
+from eschorty_ros.nodes.scan_sequence import End, ScanCanceled, check_laser
+
+CAPTURE_MAX_S = 120.0
+_DRAIN_S = 10.0
+_SETTLE_MM_S = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """The stage moves the one target from ``start_mm`` to ``stop_mm`` and back."""
+
+    start_mm: float
+    stop_mm: float
+    speed_mm_s: float
+    range_per_stage: float
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureRequest:
+    """What is lit and for how long; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+
+    targets: tuple[KnownTarget, ...]
+    method: str = "joint"
+    capture_s: float = 1.0
+    frequency_hz: float = 0.0
+    duty: float = 0.0
+    sweep: Sweep | None = None
+
+
+@dataclass(slots=True)
+class CaptureOutcome:
+    """How a capture ended."""
+
+    end: End = End.ABORTED
+    message: str = ""
+
+
+class CaptureRig(Protocol):
+    """What the sequence asks of the nodes; the same hands as a scan's (see ``Rig``)."""
+
+    def check_nodes(self) -> None:
+        """Raise ``ScanFailure`` naming the node that does not answer."""
+
+    def configure_laser(self, frequency_hz: float, duty: float) -> None:
+        """Set what is not 0."""
+
+    def move(self, position_mm: float, speed_mm_s: float) -> None:
+        """Move and wait until the stage is there."""
+
+    def stop_stage(self) -> None:
+        """End a move under way and wait for the stage to rest."""
+
+    def laser_on(self) -> None:
+        """Heartbeat, arm, enable."""
+
+    def laser_off(self) -> None:
+        """Disable; the heartbeat ends in any case."""
+
+    def watch(self, enabled: bool) -> None:
+        """Whether waiting raises ``ScanFailure`` when light or events stop."""
+
+    def shield(self) -> None:
+        """From here on waiting no longer raises ``ScanCanceled``."""
+
+    def hold(self, duration_s: float) -> None:
+        """Wait until so much sensor time has passed."""
+
+    def drain(self, no_progress_s: float) -> None:
+        """Wait until the reconstruction has passed the present time."""
+
+    def report(self, phase: str) -> None:
+        """Name the phase in the feedback."""
+
+
+def check_request(request: CaptureRequest) -> None:
+    """Raise ``ArgumentError`` with name, value and remedy when a capture cannot be done."""
+    if request.method not in METHODS:
+        raise ArgumentError(f"method is {request.method!r}; choose one of {', '.join(METHODS)}")
+    check_laser(request.frequency_hz, request.duty)
+    sweep = request.sweep
+    if sweep is None:
+        if len(request.targets) < 2:
+            raise ArgumentError(
+                f"targets holds {len(request.targets)}; give two or more, or sweep_speed for one "
+                "that the stage moves"
+            )
+        if not 0.0 < request.capture_s <= CAPTURE_MAX_S:
+            raise ArgumentError(
+                f"capture_time is {request.capture_s:g} s; choose more than 0 and at most "
+                f"{CAPTURE_MAX_S:g} s"
+            )
+        return
+    if len(request.targets) != 1:
+        raise ArgumentError(
+            f"targets holds {len(request.targets)}; with sweep_speed give the one that moves"
+        )
+    if not (sweep.speed_mm_s > 0.0 and math.isfinite(sweep.speed_mm_s)):
+        raise ArgumentError(f"sweep_speed is {sweep.speed_mm_s * 1e-3:g} m/s; choose more than 0")
+    if not abs(sweep.stop_mm - sweep.start_mm) > 0.0:
+        raise ArgumentError(
+            f"sweep_start and sweep_stop are both {sweep.start_mm * 1e-3:g} m; choose different "
+            "ones"
+        )
+    if not 0.0 < abs(sweep.range_per_stage) <= 1.0:
+        raise ArgumentError(
+            f"range_per_stage is {sweep.range_per_stage:g}; choose -1 to 1 and not 0"
+        )
+
+
+def run_capture(
+    rig: CaptureRig,
+    request: CaptureRequest,
+    begin: Callable[[], None],
+    finish: Callable[[], None],
+) -> CaptureOutcome:
+    """Do one capture; never raises an ``EschortyError``, and leaves laser off and stage at rest.
+
+    ``begin`` and ``finish`` have the reconstruction collect events and cease to; ``finish`` is
+    called whenever ``begin`` was.
+    """
+    outcome = CaptureOutcome()
+    collecting = False
+    sweep = request.sweep
+    try:
+        rig.report("preparing")
+        # Before anything is waited for or touched: it is refused while a scan is under way.
+        begin()
+        collecting = True
+        rig.check_nodes()
+        rig.configure_laser(request.frequency_hz, request.duty)
+        if sweep is not None:
+            rig.move(sweep.start_mm, _SETTLE_MM_S)
+        rig.laser_on()
+        rig.watch(True)
+        rig.report("capturing")
+        if sweep is None:
+            rig.hold(request.capture_s)
+        else:
+            rig.move(sweep.stop_mm, sweep.speed_mm_s)
+            rig.move(sweep.start_mm, sweep.speed_mm_s)
+        outcome.end = End.SUCCEEDED
+    except ScanCanceled:
+        outcome.end, outcome.message = End.CANCELED, "canceled"
+    except EschortyError as error:
+        outcome.message = str(error)
+    finally:
+        _finish(rig, outcome, finish if collecting else None)
+    return outcome
+
+
+def _finish(rig: CaptureRig, outcome: CaptureOutcome, finish: Callable[[], None] | None) -> None:
+    """Leave every capture the same way: light off first."""
+    rig.shield()
+    rig.watch(False)
+    steps: list[Callable[[], None]] = [rig.laser_off]
+    if outcome.end is not End.SUCCEEDED:
+        steps.append(rig.stop_stage)
+    elif finish is not None:
+        rig.report("finishing")
+        steps.append(lambda: rig.drain(_DRAIN_S))
+    if finish is not None:
+        steps.append(finish)
+    for step in steps:
+        try:
+            step()
+        except EschortyError as error:
+            if outcome.end is not End.ABORTED:
+                outcome.end, outcome.message = End.ABORTED, str(error)

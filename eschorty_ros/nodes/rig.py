@@ -1,0 +1,293 @@
+"""Hands on laser and stage for whoever sequences them: clients, heartbeat, waiting."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+
+from eschorty_ros.action import MoveStage
+from eschorty_ros.msg import LaserState
+from eschorty_ros.nodes.conversions import m_from_mm, stamp_from_ns
+from eschorty_ros.nodes.scan_monitor import ScanMonitor
+from eschorty_ros.nodes.scan_sequence import ScanCanceled, ScanFailure
+
+_TICK_S = 0.02
+_HEARTBEAT_S = 0.1
+_RESEND_S = 2.0
+
+
+class LaserStageRig:
+    """Laser and stage over the other nodes' topics, services and action.
+
+    Its methods block, so they run in a thread of their own beside the executor's.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    node_timeout_s, service_timeout_s, events_timeout_s : float
+        Longest wait for the nodes to appear, for an answer, and for the events to go on.
+    services : mapping of str to service type
+        What else is needed, by name.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        node_timeout_s: float,
+        service_timeout_s: float,
+        events_timeout_s: float,
+        services: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._node = node
+        self._node_timeout_s = node_timeout_s
+        self._service_timeout_s = service_timeout_s
+        self._events_timeout_s = events_timeout_s
+        group = ReentrantCallbackGroup()
+        # In a group of its own, one message at a time, so that samples stay in order.
+        self.monitor = ScanMonitor(node, MutuallyExclusiveCallbackGroup())
+        self._heartbeat = node.create_publisher(Header, "laser/heartbeat", 10)
+        self._clients = {
+            name: node.create_client(kind, name, callback_group=group)
+            for name, kind in (
+                ("laser/set_parameters", SetParameters),
+                ("laser/arm", Trigger),
+                ("laser/enable", SetBool),
+                *(services or {}).items(),
+            )
+        }
+        self._stage = ActionClient(node, MoveStage, "stage/move", callback_group=group)
+        self._sent: Any = None
+        self._ended = threading.Event()
+        self._beating = False
+        self._beat_s = 0.0
+        self._watching = False
+        self._shielded = False
+        self._canceled: Callable[[], bool] = lambda: False
+        self._feedback: Callable[[str], None] = lambda phase: None
+        self._phase = ""
+
+    def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
+        """Reset for a new sequence; both callables are used at every ``pause``."""
+        self._canceled, self._feedback = canceled, feedback
+        self._watching = self._shielded = False
+        self._phase = "preparing"
+        self.monitor.samples.clear()
+
+    def end(self) -> None:
+        """Make every wait fail from now on."""
+        self._ended.set()
+
+    # Rig
+
+    def check_nodes(self) -> None:
+        """See ``Rig``."""
+        begun_ns = self.monitor.until_ns
+        for what, there in (
+            *((name, client.service_is_ready) for name, client in self._clients.items()),
+            ("stage/move", self._stage.server_is_ready),
+        ):
+            self._wait(there, self._node_timeout_s, f"{what.split('/')[0]}: no {what}")
+        for there, failure in (
+            (lambda: self.monitor.stage_heard, lambda: "stage: no odometry"),
+            (lambda: self.monitor.at_rest, lambda: "stage: another move does not end"),
+            (lambda: self.monitor.laser is not None, lambda: "laser: no state"),
+            (lambda: self.monitor.until_ns > begun_ns, self.monitor.why_no_progress),
+        ):
+            self._wait(there, self._node_timeout_s, failure)
+
+    def configure_laser(self, frequency_hz: float, duty: float) -> None:
+        """See ``Rig``."""
+        values = {"frequency": float(frequency_hz), "duty": float(duty)}
+        wanted = {name: value for name, value in values.items() if value}
+        if not wanted:
+            return
+        messages = [Parameter(name, value=value).to_parameter_msg()
+                    for name, value in wanted.items()]  # fmt: skip
+        answer = self._call("laser/set_parameters", SetParameters.Request(parameters=messages))
+        for result in answer.results:
+            if not result.successful:
+                raise ScanFailure(f"laser: {result.reason}")
+
+        def applied() -> bool:
+            state = self.monitor.laser
+            return state is not None and all(
+                abs(getattr(state, name) - value) <= 1e-3 * value for name, value in wanted.items()
+            )
+
+        self._wait(applied, self._service_timeout_s,
+                   f"laser: its state does not show {wanted}")  # fmt: skip
+
+    def move(self, position_mm: float, speed_mm_s: float) -> None:
+        """See ``Rig``."""
+        self.monitor.samples.clear()
+        goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
+        # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
+        self._sent = self._stage.send_goal_async(goal)
+        handle = self._answer(self._sent, "stage/move")
+        if not handle.accepted:
+            self._sent = None
+            raise ScanFailure(
+                f"stage: refused to move to {position_mm * 1e-3:g} m at {speed_mm_s * 1e-3:g} m/s"
+            )
+        future = handle.get_result_async()
+        while not future.done():
+            self._pause()
+            self.monitor.check_stage()
+        self._sent = None
+        answer = future.result()
+        if answer.status != GoalStatus.STATUS_SUCCEEDED or not answer.result.success:
+            raise ScanFailure(f"stage: {answer.result.message or 'the move did not succeed'}")
+
+    def stop_stage(self) -> None:
+        """See ``Rig``."""
+        sent, self._sent = self._sent, None
+        if sent is None:
+            return
+        handle = self._answer(sent, "stage/move")
+        if not handle.accepted:
+            return
+        with self._living_context():
+            ended = handle.cancel_goal_async(), handle.get_result_async()
+        for future in ended:
+            self._answer(future, "stage/move")
+
+    def laser_on(self) -> None:
+        """See ``Rig``."""
+        self._beating = True
+        self._pause()
+        for name, request in (
+            ("laser/arm", Trigger.Request()),
+            ("laser/enable", SetBool.Request(data=True)),
+        ):
+            answer = self._call(name, request)
+            if not answer.success:
+                raise ScanFailure(f"laser: {answer.message}")
+        self._wait(lambda: self.monitor.output == LaserState.OUTPUT_ON, self._service_timeout_s,
+                   "laser: its output does not read back on")  # fmt: skip
+
+    def laser_off(self) -> None:
+        """See ``Rig``."""
+        try:
+            if self._beating:
+                answer = self._call("laser/enable", SetBool.Request(data=False))
+                if not answer.success:
+                    raise ScanFailure(f"laser: {answer.message}")
+                self._wait(lambda: self.monitor.output == LaserState.OUTPUT_OFF,
+                           self._service_timeout_s,
+                           "laser: its output does not read back off")  # fmt: skip
+        finally:
+            # Without it the laser switches itself off, should the call have failed.
+            self._beating = False
+
+    def watch(self, enabled: bool) -> None:
+        """See ``Rig``."""
+        self.monitor.restart_patience()
+        self._watching = enabled
+
+    def shield(self) -> None:
+        """See ``Rig``."""
+        self._shielded = True
+
+    def drain(self, no_progress_s: float) -> None:
+        """See ``Rig``."""
+        target_ns = self._node.get_clock().now().nanoseconds
+        self.monitor.restart_patience()
+        while self.monitor.until_ns < target_ns:
+            self._pause()
+            self.monitor.check_progress(no_progress_s)
+
+    def hold(self, duration_s: float) -> None:
+        """Wait until the reconstruction has passed so much sensor time from now on."""
+        target_ns = self._node.get_clock().now().nanoseconds + round(duration_s * 1e9)
+        self.monitor.restart_patience()
+        while self.monitor.until_ns < target_ns:
+            self._pause()
+
+    def report(self, phase: str) -> None:
+        """See ``Rig``."""
+        self._phase = phase
+        # On the way out after a signal there is nobody left to tell.
+        with contextlib.suppress(ScanFailure), self._living_context():
+            self._feedback(phase)
+
+    # Waiting
+
+    def _pause(self) -> None:
+        """One tick: heartbeat, feedback, and the reasons to end."""
+        if self._ended.is_set() or not self._node.context.ok():
+            raise ScanFailure(f"{self._node.get_name()}: the node was shut down")
+        now_s = time.monotonic()
+        with self._living_context():
+            if self._beating and now_s - self._beat_s >= _HEARTBEAT_S:
+                self._beat_s = now_s
+                stamp = stamp_from_ns(self._node.get_clock().now().nanoseconds)
+                self._heartbeat.publish(Header(stamp=stamp))
+            self._feedback(self._phase)
+        if self._watching:
+            self.monitor.check_laser()
+            self.monitor.check_progress(self._events_timeout_s)
+        if not self._shielded and self._canceled():
+            raise ScanCanceled
+        time.sleep(_TICK_S)
+
+    def _wait(
+        self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
+    ) -> None:
+        end_s = time.monotonic() + timeout_s
+        while not condition():
+            self._pause()
+            if time.monotonic() > end_s:
+                text = failure if isinstance(failure, str) else failure()
+                raise ScanFailure(f"{text} within {timeout_s:g} s; check that the node runs")
+
+    def _answer(self, future: Any, name: str) -> Any:
+        self._wait(
+            future.done, self._service_timeout_s, f"{name.split('/')[0]}: no answer of {name}"
+        )
+        return future.result()
+
+    def _call(self, name: str, request: Any, patience_s: float | None = None) -> Any:
+        """Answer of a service; asked again meanwhile unless ``patience_s`` is given.
+
+        A server that has just discovered this node may not know yet where to send its answer.
+        All requests but the one that takes patience may be carried out twice.
+        """
+        futures: list[Any] = []
+        sent_s = -math.inf
+
+        def answered() -> bool:
+            nonlocal sent_s
+            repeat = patience_s is None or not futures
+            if repeat and time.monotonic() - sent_s > _RESEND_S:
+                sent_s = time.monotonic()
+                with self._living_context():
+                    futures.append(self._clients[name].call_async(request))
+            return any(future.done() for future in futures)
+
+        timeout_s = patience_s or self._service_timeout_s
+        self._wait(answered, timeout_s, f"{name.split('/')[0]}: no answer of {name}")
+        return next(future.result() for future in futures if future.done())
+
+    @contextlib.contextmanager
+    def _living_context(self) -> Iterator[None]:
+        """Turn the errors of a context that a signal has ended into a ``ScanFailure``."""
+        try:
+            yield
+        except (_rclpy.RCLError, _rclpy.InvalidHandle) as error:
+            raise ScanFailure(
+                f"{self._node.get_name()}: the node was shut down: {error}"
+            ) from error

@@ -1,0 +1,86 @@
+"""Calibrations over real DDS, each node a process of its own."""
+
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+import calibration_scenarios as scenarios
+from ros_process import NodeProcess, processes
+
+from eschorty_ros.nodes.domain import free_domain
+
+CAMERA = "eschorty_ros.nodes.camera"
+
+
+class Instrument:
+    """The bench, the running nodes, and a camera that can be pointed elsewhere."""
+
+    def __init__(self, bench, running):
+        self.bench = bench
+        self.running = running
+
+    def point_camera_at(self, scene):
+        self.running["camera"].interrupt()
+        self.running["camera"].kill()
+        self.running["camera"] = NodeProcess(
+            CAMERA, scenarios.camera_parameters(scene), domain=self.bench.domain
+        )
+        self.bench.observer.wait_for_state("camera", "active")
+
+
+@pytest.fixture(scope="module")
+def instrument(tmp_path_factory):
+    """Five node processes and a bench; the deaths come last."""
+    log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
+    folder = Path(tmp_path_factory.mktemp("calibrations")) / "made"
+    domain = free_domain()
+    nodes = scenarios.node_parameters(log, folder, scenarios.KNOWN_SCENE)
+    with (
+        processes(nodes, domain) as running,
+        scenarios.bench(domain, log, folder) as bench,
+    ):
+        yield Instrument(bench, running)
+        for name, process in running.items():
+            print(f"--- {name}\n{process.output[-3000:]}")
+
+
+def test_calibration_takes_a_known_target_from_tens_of_mm_to_one(instrument):
+    scenarios.uncalibrated_scan_is_off(instrument.bench)
+    instrument.point_camera_at("posts")
+    scenarios.nine_posts(instrument.bench, "paper")
+    scenarios.nine_posts(instrument.bench, "joint")
+    instrument.point_camera_at(scenarios.KNOWN_SCENE)
+    scenarios.calibrated_scan_is_right(instrument.bench)
+
+
+def test_only_calibrations_of_this_instrument_are_loaded(instrument, tmp_path):
+    scenarios.load_and_save(instrument.bench, tmp_path)
+
+
+def test_bad_goals_are_refused(instrument):
+    scenarios.bad_goals(instrument.bench)
+
+
+def test_useless_captures_change_nothing(instrument):
+    instrument.point_camera_at("posts")
+    scenarios.useless_captures(instrument.bench)
+
+
+def test_one_thing_at_a_time(instrument):
+    scenarios.one_thing_at_a_time(instrument.bench)
+
+
+def test_killed_camera_ends_the_calibration(instrument):
+    camera = instrument.running["camera"]
+    scenarios.camera_killed(instrument.bench, lambda: camera.send(signal.SIGKILL))
+
+
+def test_interrupted_reconstruction_leaves_the_laser_off(instrument):
+    instrument.point_camera_at("posts")
+    process = instrument.running["reconstruction"]
+    scenarios.reconstruction_interrupted(instrument.bench, lambda: process.send(signal.SIGINT))
+    assert process.wait(10.0) == 0, process.output
+    assert "Traceback" not in process.output, process.output
