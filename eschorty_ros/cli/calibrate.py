@@ -137,7 +137,7 @@ def command(
     Examples:
       eschorty calibrate targets.csv --nominal config_3 --out calibration.yaml
       eschorty calibrate targets.csv --method paper
-      eschorty calibrate rec --distances 820,974,1128,1281,1435,1589,1742,1896,2050
+      eschorty calibrate rec --distances 820,960,1110,1270,1440,1610,1770,1910,2050
       eschorty calibrate rec --distances posts.csv --prior b_mm=1
       eschorty calibrate forth back --moving 780
 
