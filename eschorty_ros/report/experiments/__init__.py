@@ -14,6 +14,7 @@ NAMES: tuple[str, ...] = (
     "reflectance_step",
     "scans",
     "estimators",
+    "calibration",
     "tradeoff",
 )
 """Module of each experiment, in the order of the page."""
