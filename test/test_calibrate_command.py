@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import html_check
 import numpy as np
 import pytest
@@ -9,7 +12,9 @@ from calibration_posts import NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, range_error
 from click.testing import CliRunner
 
 from eschorty_ros.cli import main
+from eschorty_ros.core.calibrate import PRIOR_SIGMA
 from eschorty_ros.core.calibration import load_calibration, save_calibration
+from eschorty_ros.core.targets_file import DISTANCE_COLUMNS, TARGET_COLUMNS
 from eschorty_ros.simulation.recorder import simulate_recording
 from eschorty_ros.simulation.scene import Plane
 from eschorty_ros.simulation.scene_posts import Posts, bench
@@ -164,3 +169,17 @@ def test_wrong_usage_is_exit_code_2(targets_csv, tmp_path):
         done = run(*arguments)
         assert done.exit_code == 2, done.output
         assert message in done.output
+
+
+def test_the_python_example_of_the_documentation_runs(targets_csv, monkeypatch, capsys):
+    page = (Path(__file__).parents[1] / "docs" / "calibration.md").read_text()
+    monkeypatch.chdir(targets_csv.parent)
+    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1), {})
+    assert "1 of 9 targets rejected: line 5" in capsys.readouterr().out
+    assert load_calibration("calibration.yaml").parameters_fitted[0] == "k_mm"
+
+
+def test_the_documentation_names_every_column_verdict_and_prior():
+    page = (Path(__file__).parents[1] / "docs" / "calibration.md").read_text()
+    for name in (*TARGET_COLUMNS, *DISTANCE_COLUMNS, *PRIOR_SIGMA):
+        assert name in page, name
