@@ -8,7 +8,7 @@ from fractions import Fraction
 from eschorty_ros.core._checks import TIME_LIMIT, number, whole
 from eschorty_ros.core.errors import ArgumentError
 
-WAVEFORMS = ("square", "sine")
+WAVEFORMS = ("square", "sine", "pulse")
 FREQUENCY_MIN_HZ = 16.0
 FREQUENCY_MAX_HZ = 20_000.0
 
@@ -23,7 +23,10 @@ class Modulation:
         Modulation frequency, 16 Hz to 20 kHz.
     duty : float
         Share of the period with the laser on, strictly between 0 and 1.
-    waveform : {"square", "sine"}
+    waveform : {"square", "sine", "pulse"}
+        ``square`` and ``pulse`` are both full light for ``duty`` of the period; generators name
+        them apart. ``sine`` rises as half a cosine wave for ``duty`` of the period and falls as
+        another for the rest; its rising edge is where the light is least.
     on_edge_us : int, optional
         Sensor time of one rising edge, int64 microseconds; ``None`` when unknown.
 

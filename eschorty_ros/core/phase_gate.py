@@ -25,7 +25,7 @@ def gate_parameters(modulation: Modulation, gate_us: int) -> NDArray[np.float64]
     Parameters
     ----------
     modulation : Modulation
-        Square; other waveforms have no edges and are not gated.
+        A sine has no edges and is not gated.
     gate_us : int
         How long after each edge events are kept, 0 to 100 000 us; 0 is no gate.
 
@@ -44,7 +44,7 @@ def gate_parameters(modulation: Modulation, gate_us: int) -> NDArray[np.float64]
     gate = np.zeros(kernels.G_SIZE)
     period_us = modulation.period_us
     length_us = LEAD_US + gate_us
-    if gate_us and modulation.waveform == "square" and length_us < period_us:
+    if gate_us and modulation.waveform != "sine" and length_us < period_us:
         gate[kernels.G_PERIOD] = period_us
         gate[kernels.G_INVERSE] = 1.0 / period_us
         gate[kernels.G_ON] = LEAD_US

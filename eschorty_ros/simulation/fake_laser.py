@@ -49,14 +49,10 @@ class FakeLaser:
         Raises
         ------
         DeviceError
-            When closed or for a waveform other than square.
+            When closed.
         """
         with self._lock:
             self._refuse_closed()
-            if modulation.waveform != "square":
-                raise DeviceError(
-                    f"waveform is {modulation.waveform!r}; the simulated laser does 'square' only"
-                )
             self._modulation = modulation
             self._epoch_ns = self._clock_ns()
             if self._output is LaserOutput.ON:

@@ -109,7 +109,7 @@ def simulate_line(
     every = np.arange(columns)
     t_us: int | None = 0
     while t_us is not None and t_us < duration_us:
-        pixels.relight(t_us, every, line, bright * float(laser.lit(t_us)), low, high)
+        pixels.relight(t_us, every, line, bright * laser.level(t_us), low, high)
         t_us = laser.next_us(t_us)
     pixels.run_until(duration_us)
     t, x, y, p = unpack(pixels.take(duration_us))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -10,20 +11,24 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan
 
+SINE_STEPS = 12
+"""Steps of constant light in which a sine rises, and in which it falls."""
+
 
 @dataclass(frozen=True)
 class Gate:
-    """A square wave as exact integer edges.
+    """A wave as exact integer edges with constant light between them.
 
     Parameters
     ----------
     modulation : Modulation
-        ``on_edge_us`` must be known; edges agree with :meth:`Modulation.edge_us`.
+        ``on_edge_us`` must be known; edges agree with :meth:`Modulation.edge_us`. A sine is
+        rendered in ``SINE_STEPS`` steps per flank, fewer where they would be below 1 us.
 
     Raises
     ------
     ArgumentError
-        For an unknown edge or a waveform other than square.
+        For an unknown edge.
     """
 
     modulation: Modulation
@@ -34,10 +39,6 @@ class Gate:
     def __post_init__(self) -> None:
         if self.modulation.on_edge_us is None:
             raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")
-        if self.modulation.waveform != "square":
-            raise ArgumentError(
-                f"waveform is {self.modulation.waveform!r}; the simulation renders 'square' only"
-            )
         # Integers throughout: edges are asked for in the inner loop, Fraction objects are slow.
         period = 1_000_000 / Fraction(self.modulation.frequency_hz)
         object.__setattr__(self, "_period", period.as_integer_ratio())
@@ -68,15 +69,33 @@ class Gate:
             index += 1
         return index
 
-    def lit(self, t_us: int) -> bool:
-        """Whether the wave is high at ``t_us``."""
-        return t_us < self.fall_us(self.index(t_us))
+    def level(self, t_us: int) -> float:
+        """Light at ``t_us``, 0 to 1."""
+        begin_us, end_us, rising = self._flank(t_us)
+        if self.modulation.waveform != "sine":
+            return float(rising)
+        steps = min(SINE_STEPS, end_us - begin_us)
+        step = (t_us - begin_us) * steps // (end_us - begin_us)
+        share = 0.5 - 0.5 * math.cos(math.pi * (step + 0.5) / steps)
+        return share if rising else 1.0 - share
 
     def next_us(self, t_us: int) -> int:
-        """First edge after ``t_us``."""
+        """First time after ``t_us`` at which the light changes."""
+        begin_us, end_us, _ = self._flank(t_us)
+        if self.modulation.waveform != "sine":
+            return end_us
+        length_us = end_us - begin_us
+        steps = min(SINE_STEPS, length_us)
+        step = (t_us - begin_us) * steps // length_us
+        return begin_us - (-(step + 1) * length_us) // steps
+
+    def _flank(self, t_us: int) -> tuple[int, int, bool]:
+        """Begin and end of the part of the period that holds ``t_us``; whether it is the first."""
         index = self.index(t_us)
         fall = self.fall_us(index)
-        return fall if t_us < fall else self.rise_us(index + 1)
+        if t_us < fall:
+            return self.rise_us(index), fall, True
+        return fall, self.rise_us(index + 1), False
 
 
 def _round_ratio(numerator: int, denominator: int) -> int:
@@ -99,7 +118,7 @@ class LaserTimeline:
         Raises
         ------
         ArgumentError
-            When ``on`` without a modulation that :class:`Gate` accepts.
+            When ``on`` without a modulation, or without its edge.
         """
         if on and modulation is None:
             raise ArgumentError("the laser is on without a modulation; give one")
@@ -108,10 +127,15 @@ class LaserTimeline:
         self._times[keep:] = [t_us]
         self._gates[keep:] = [gate]
 
-    def lit(self, t_us: int) -> bool:
-        """Whether the laser is lit at ``t_us``."""
+    def level(self, t_us: int) -> float:
+        """Light of the laser at ``t_us``, 0 to 1."""
         gate = self._gate(t_us)
-        return gate is not None and gate.lit(t_us)
+        return 0.0 if gate is None else gate.level(t_us)
+
+    def rises(self, t_us: int) -> bool:
+        """Whether ``t_us`` is a rising edge."""
+        gate = self._gate(t_us)
+        return gate is not None and gate.rise_us(gate.index(t_us)) == t_us
 
     def next_us(self, t_us: int) -> int | None:
         """First time after ``t_us`` at which the laser may change, ``None`` for never."""

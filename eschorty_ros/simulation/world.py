@@ -75,6 +75,7 @@ class World:
         self._lit_since_us: int | None = None
         self._step_us: int | None = None
         self._drawn_mm = np.nan
+        self._drawn_level = 0.0
         self._drawn_row = np.full(self.columns, np.nan)
         self._drawn_reflectance = np.full(self.columns, np.nan)
         self._was_split = np.zeros(self.columns, dtype=bool)
@@ -93,7 +94,7 @@ class World:
         Raises
         ------
         ArgumentError
-            When ``t_us`` has been simulated already, or the modulation cannot be rendered.
+            When ``t_us`` has been simulated already, or the modulation's edge is unknown.
         """
         self._refuse_past("t_us", t_us)
         self._laser.set(t_us, on, modulation)
@@ -182,20 +183,24 @@ class World:
             if t_us >= end_us:
                 return
             self._handled_us = t_us
-            lit = self._laser.lit(t_us)
-            if lit:
-                self._draw(t_us)
+            level = self._laser.level(t_us)
+            if self._lit_since_us is not None and self._laser.rises(t_us):
+                # Light that never goes out: the next period begins.
+                self._close_phase(t_us)
+            if level > 0.0:
+                self._draw(t_us, level)
             elif self._lit_since_us is not None:
                 self._darken(t_us)
 
-    def _draw(self, t_us: int) -> None:
-        """Put the line where the scene has it now, in the columns where it moved."""
+    def _draw(self, t_us: int, level: float) -> None:
+        """Put the line where the scene has it now, in the columns where it changed."""
         position_mm, velocity_mm_s = self._stage.state(t_us)
         if self._lit_since_us is None:
             self._lit_since_us = t_us
+        if level != self._drawn_level:
             self._drawn_row[:] = np.nan
-            self._was_split[:] = False
             self._drawn_mm = np.nan
+            self._drawn_level = level
         if position_mm != self._drawn_mm:
             self._draw_at(t_us, position_mm)
             self._drawn_mm = position_mm
@@ -212,7 +217,9 @@ class World:
         moved[seen.split] = False
         if moved.any():
             columns = self._every_column[moved]
-            self._pixels.relight(t_us, columns, seen.row[moved], seen.reflectance[moved])
+            self._pixels.relight(
+                t_us, columns, seen.row[moved], seen.reflectance[moved] * self._drawn_level
+            )
             self._drawn_row[moved] = seen.row[moved]
             self._drawn_reflectance[moved] = seen.reflectance[moved]
         self._was_split[:] = False
@@ -222,7 +229,7 @@ class World:
                 t_us,
                 seen.split,
                 seen.patch_row,
-                seen.patch_reflectance,
+                seen.patch_reflectance * self._drawn_level,
                 seen.low_row,
                 seen.high_row,
             )
@@ -231,7 +238,13 @@ class World:
         """Take the line away and note the phase that ends here."""
         dark = np.zeros(self.columns)
         self._pixels.relight(t_us, self._every_column, self._drawn_row, dark)
-        middle_us = ((self._lit_since_us or 0) + t_us) // 2
-        self._phases.append((middle_us, self._stage.state(middle_us)[0]))
+        self._close_phase(t_us)
         self._lit_since_us = None
         self._step_us = None
+        self._drawn_level = 0.0
+
+    def _close_phase(self, t_us: int) -> None:
+        """Note the lit phase that ends here; light goes on into the next unless it is dark."""
+        middle_us = ((self._lit_since_us or 0) + t_us) // 2
+        self._phases.append((middle_us, self._stage.state(middle_us)[0]))
+        self._lit_since_us = t_us

@@ -12,7 +12,9 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan, plan_move
+from eschorty_ros.core.offline import reconstruct_recording
 from eschorty_ros.core.recording import load_recording
+from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.simulation.pixel import PixelParameters
 from eschorty_ros.simulation.recorder import simulate_recording
 from eschorty_ros.simulation.scene import Plane, Sphere, Steps
@@ -210,8 +212,6 @@ def test_changes_of_the_past_and_unknown_waves_are_refused() -> None:
         world.advance(9_999)
     with pytest.raises(ArgumentError, match="on_edge_us"):
         world.set_laser(20_000, True, Modulation(70.0))
-    with pytest.raises(ArgumentError, match="sine"):
-        world.set_laser(20_000, True, Modulation(70.0, waveform="sine", on_edge_us=0))
     with pytest.raises(ArgumentError, match="without a modulation"):
         world.set_laser(20_000, True)
 
@@ -224,11 +224,55 @@ def test_gate_edges_agree_with_the_modulation(frequency_hz: float) -> None:
     for t_us in rng.integers(-(10**9), 10**9, 200).tolist():
         k = gate.index(t_us)
         assert wave.edge_us(k) <= t_us < wave.edge_us(k + 1)
-        assert gate.lit(t_us) == (t_us - wave.edge_us(k) < gate.fall_us(k) - wave.edge_us(k))
+        assert (gate.level(t_us) == 1.0) == (
+            t_us - wave.edge_us(k) < gate.fall_us(k) - wave.edge_us(k)
+        )
         assert abs(gate.fall_us(k) - wave.edge_us(k) - 0.3 * wave.period_us) <= 1.0
         nearest = gate.next_us(t_us)
-        assert gate.lit(nearest) != gate.lit(t_us)
-        assert gate.lit(nearest - 1) == gate.lit(t_us)
+        assert gate.level(nearest) != gate.level(t_us)
+        assert gate.level(nearest - 1) == gate.level(t_us)
+
+
+@pytest.mark.parametrize(("frequency_hz", "duty"), [(70.0, 0.5), (300.0, 0.3), (19_999.9, 0.5)])
+def test_a_sine_rises_and_falls_in_steps(frequency_hz: float, duty: float) -> None:
+    wave = Modulation(frequency_hz, duty, "sine", 500)
+    gate = Gate(wave)
+    t_us, light, steps = gate.rise_us(3), [], []
+    while t_us < gate.rise_us(4):
+        end_us = gate.next_us(t_us)
+        light.append(gate.level(t_us))
+        steps.append(end_us - t_us)
+        assert gate.level(end_us - 1) == light[-1]
+        t_us = end_us
+    assert t_us == gate.rise_us(4)
+    assert sum(steps) == gate.rise_us(4) - gate.rise_us(3)
+    top = int(np.argmax(light))
+    assert np.all(np.diff(light[: top + 1]) > 0)
+    assert np.all(np.diff(light[top + 1 :]) < 0)
+    assert max(light) > 0.98
+    assert min(light) < 0.02
+    assert sum(steps[: len(steps) // 2]) == pytest.approx(duty * wave.period_us, abs=2.0)
+    assert np.average(light, weights=steps) == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize(("waveform", "duty"), [("sine", 0.5), ("pulse", 0.1)])
+def test_other_waveforms_are_reconstructed_too(waveform: str, duty: float, tmp_path) -> None:
+    print(f"seed {SEED}")
+    recording = simulate_recording(
+        tmp_path / "rec", Plane(1320.0, 0.3), SMALL, Modulation(70.0, duty, waveform),
+        10.0, 30.0, 50.0, SEED,
+    )  # fmt: skip
+    assert recording.modulation == Modulation(70.0, duty, waveform, 50_000)
+    result = reconstruct_recording(recording)
+    truth = recording.truth
+    assert truth is not None
+    periods = np.unique(truth["t_us"])
+    assert np.median(np.diff(periods)) == pytest.approx(1e6 / 70, abs=1.0)
+    assert len(result.points) == pytest.approx(96 * periods.size, rel=0.05)
+    stage_mm, range_mm = stage_and_range_mm(result.points)
+    error = range_mm - (1320.0 + 0.3 * stage_mm)
+    assert np.median(np.abs(error)) < 0.7
+    assert abs(np.median(error)) < 0.3
 
 
 def test_timelines_replace_the_future_and_forget_the_past() -> None:
@@ -236,7 +280,13 @@ def test_timelines_replace_the_future_and_forget_the_past() -> None:
     laser.set(100, True, Modulation(100.0, 0.5, "square", 0))
     laser.set(900, False, None)
     laser.set(500, False, None)
-    assert [laser.lit(t) for t in (99, 100, 499, 500, 950)] == [False, True, True, False, False]
+    assert [laser.level(t) > 0.0 for t in (99, 100, 499, 500, 950)] == [
+        False,
+        True,
+        True,
+        False,
+        False,
+    ]
     assert laser.next_us(99) == 100
     assert laser.next_us(100) == 500
     assert laser.next_us(500) is None
@@ -245,7 +295,7 @@ def test_timelines_replace_the_future_and_forget_the_past() -> None:
     assert [stage.state(t)[0] for t in (-1, 0, 999, 1000)] == [0.0, 3.0, 3.0, 5.0]
     laser.forget_before(600)
     stage.forget_before(2000)
-    assert not laser.lit(600)
+    assert not laser.level(600)
     assert stage.state(2000)[0] == 5.0
 
 
