@@ -7,10 +7,10 @@ ros2 launch eschorty_ros scan.launch.py --show-args
 from launch.actions import EmitEvent, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import IfElseSubstitution, LaunchConfiguration
+from launch.substitutions import LaunchConfiguration
 from launch_ros.parameter_descriptions import ParameterValue
 
-from eschorty_ros.nodes.launching import EVENTS, declare, node, number, rviz, text
+from eschorty_ros.nodes.launching import declare, driver, node, number, reliable, rviz, text
 from launch import LaunchDescription
 
 ARGUMENTS = (
@@ -40,17 +40,6 @@ ARGUMENTS = (
     ("auto_scan", "true", "true: scan once when every node is ready", ["true", "false"]),
     ("rviz", "false", "true: show cloud, live profile and frames in RViz", ["true", "false"]),
 )
-
-
-def driver(real):
-    """Choose the simulated device, or the real one's driver."""
-    return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
-
-
-def reliable(end):
-    """Lossless events at one end; a simulated camera can wait, so nothing has to be lost."""
-    if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
-    return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
 
 
 def nodes():

@@ -155,6 +155,10 @@ class Calibrator:
         result.success = end is End.SUCCEEDED
         if result.success:
             goal.succeed()
+            self._node.get_logger().info(
+                f"calibrated on {len(result.ranges)} targets, residual {result.residual_rms:.2f} "
+                f"px; {'; '.join(result.verdicts)}"
+            )
         elif end is End.CANCELED and goal.is_cancel_requested:
             goal.canceled()
         else:

@@ -7,7 +7,11 @@ from typing import Any
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import EqualsSubstitution, LaunchConfiguration
+from launch.substitutions import (
+    EqualsSubstitution,
+    IfElseSubstitution,
+    LaunchConfiguration,
+)
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -36,6 +40,17 @@ def number(name: str) -> Any:
 def text(name: str) -> Any:
     """Value of an argument as a string, also when it looks like a number."""
     return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+def driver(real: str) -> Any:
+    """Choose the simulated device, or the real one's driver."""
+    return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
+
+
+def reliable(end: str) -> dict[str, Any]:
+    """Lossless events at one end; a simulated camera can wait, so nothing has to be lost."""
+    if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
+    return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
 
 
 def node(executable: str, parameters: dict[str, Any]) -> Any:

@@ -26,6 +26,7 @@ from eschorty_ros.core.warm_up import warm_up
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, qos, transforms
 from eschorty_ros.nodes.active_calibration import ActiveCalibration
+from eschorty_ros.nodes.auto_calibration import AutoCalibration
 from eschorty_ros.nodes.calibrator import Calibrator
 from eschorty_ros.nodes.conversions import (
     mm_from_m,
@@ -77,6 +78,9 @@ class ReconstructionNode(Node):
         self._reports = Reports(self, self._pipeline, self._mailbox)
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
+        if self.parameters["auto_calibrate"]:
+            names = ("distances", "method", "capture_time")
+            self._auto = AutoCalibration(self, *(self.parameters[name] for name in names))
         self._worker.start()
 
     def _made_calibrator(self) -> Calibrator:

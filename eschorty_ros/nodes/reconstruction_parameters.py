@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from eschorty_ros.core.calibrate import METHODS
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
+from eschorty_ros.nodes.calibration_sequence import CAPTURE_MAX_S
 from eschorty_ros.nodes.parameters import Param
 
 TABLE = (
@@ -25,6 +27,10 @@ TABLE = (
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
     Param("calibration_folder", "", "where calibrations are written; empty: eschorty in ROS's "
           "home"),
+    Param("auto_calibrate", False, "calibrate once as soon as the other nodes are there"),
+    Param("distances", "posts", "its targets: a file's name in config/ or a path"),
+    Param("method", "joint", "its method", choices=METHODS),
+    Param("capture_time", 1.0, "its capture", "s", 1e-3, CAPTURE_MAX_S),
     Param("node_timeout", 60.0, "calibration: longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "calibration: longest wait for an answer", "s", 0.1, 60.0),
     Param("events_timeout", 3.0, "calibration: longest pause of the events while the laser is on",

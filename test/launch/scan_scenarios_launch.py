@@ -5,15 +5,13 @@ For ``launch_test``; ``test_scan_launch.py`` runs it from pytest.
 
 import os
 import signal
-import sys
 import tempfile
 import unittest
 from pathlib import Path
 
 import launch_testing.actions
 import scan_scenarios as scenarios
-from launch.actions import ExecuteProcess
-from ros_process import NAMESPACE, domain_environment
+from launch_processes import node_process
 
 import launch
 from eschorty_ros.nodes.domain import free_domain
@@ -22,23 +20,10 @@ LASER_LOG = Path(tempfile.mkdtemp(prefix="laser_")) / "output.log"
 DOMAIN = free_domain()
 
 
-def node_process(module, parameters):
-    """One node as launch starts it."""
-    command = [sys.executable, "-m", module, "--ros-args", "-r", f"__ns:={NAMESPACE}"]
-    for name, value in parameters.items():
-        command += ["-p", f"{name}:={value}"]
-    return ExecuteProcess(
-        cmd=command,
-        name=module.rsplit(".", 1)[-1],
-        additional_env=domain_environment(DOMAIN),
-        output="screen",
-    )
-
-
 def generate_test_description():
     """Five nodes; the tests find the camera's process by name."""
     nodes = {
-        module.rsplit(".", 1)[-1]: node_process(module, parameters)
+        module.rsplit(".", 1)[-1]: node_process(module, parameters, DOMAIN)
         for module, parameters in scenarios.node_parameters(LASER_LOG).items()
     }
     ready = launch_testing.actions.ReadyToTest()

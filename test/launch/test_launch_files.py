@@ -19,6 +19,11 @@ CLOUDS = {
     "/eschorty/points": "Volatile",
     "/eschorty/profile": "Volatile",
 }
+STARTED = {
+    "scan.launch.py": NODES - {"replay"},
+    "calibrate.launch.py": NODES - {"replay", "scanner"},
+    "replay.launch.py": {"reconstruction", "replay"},
+}
 EXPECTED = {
     "scan.launch.py": {
         "fake",
@@ -31,6 +36,19 @@ EXPECTED = {
         "stop",
         "rviz",
         "auto_scan",
+    },
+    "calibrate.launch.py": {
+        "fake",
+        "scene",
+        "pixels",
+        "calibration",
+        "as_built",
+        "frequency",
+        "distances",
+        "method",
+        "capture_time",
+        "calibration_folder",
+        "auto_calibrate",
     },
     "replay.launch.py": {"recording", "rate", "rviz"},
 }
@@ -52,6 +70,8 @@ def configurations(tree):
             continue
         if node.func.id == "rviz":
             used.add("rviz")
+        elif node.func.id in ("driver", "reliable"):
+            used.add("fake")
         elif (
             node.func.id in ("LaunchConfiguration", "number", "text")
             and node.args
@@ -107,8 +127,7 @@ def test_launch_loads_the_description(name):
         if isinstance(entity, Node)
         and (entity.condition is None or entity.condition.evaluate(context))
     ]
-    expected = NODES - {"replay"} if name.startswith("scan") else {"reconstruction", "replay"}
-    assert set(started) == expected
+    assert set(started) == STARTED[name]
 
 
 def test_rviz_shows_our_topics_with_our_quality_of_service():

@@ -17,14 +17,15 @@ pytest.importorskip("launch_testing", reason="launch_testing is not installed")
 TESTS = Path(__file__).resolve().parents[1]
 
 
-def test_scan_scenarios_under_launch():
+@pytest.mark.parametrize("name", ["scan", "calibration"])
+def test_scenarios_under_launch(name):
     search = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [
             sys.executable,
             "-m",
             "launch_testing.launch_test",
-            str(TESTS / "launch" / "scan_scenarios_launch.py"),
+            str(TESTS / "launch" / f"{name}_scenarios_launch.py"),
         ],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(search)},
         capture_output=True,

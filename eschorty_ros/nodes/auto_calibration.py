@@ -1,0 +1,60 @@
+"""One calibration without being asked: what the launch file runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+from eschorty_ros.action import Calibrate
+from eschorty_ros.core.calibration import config_folders
+from eschorty_ros.core.targets_file import read_distances
+from eschorty_ros.nodes.calibration_messages import target_message
+
+
+class AutoCalibration:
+    """Sends one goal to the ``calibrate`` action as soon as it is there.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    distances : str
+        File of what is known of the targets: a name in ``config/`` or a path.
+    method : str
+    capture_s : float
+
+    Raises
+    ------
+    FormatError
+        When the file cannot be read.
+    """
+
+    def __init__(self, node: Node, distances: str, method: str, capture_s: float) -> None:
+        targets = [target_message(target) for target in read_distances(_find(distances))]
+        self._goal = Calibrate.Goal(targets=targets, method=method, capture_time=capture_s)
+        group = ReentrantCallbackGroup()
+        self._client: ActionClient[Any, Any, Any] = ActionClient(
+            node, Calibrate, "calibrate", callback_group=group
+        )
+        self._timer = node.create_timer(
+            0.1, self._send, group, Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    def _send(self) -> None:
+        if self._client.server_is_ready():
+            self._timer.cancel()
+            self._client.send_goal_async(self._goal)
+
+
+def _find(name_or_path: str) -> Path:
+    if os.sep not in name_or_path and not name_or_path.endswith(".csv"):
+        for folder in config_folders():
+            if (folder / f"{name_or_path}.csv").is_file():
+                return folder / f"{name_or_path}.csv"
+    return Path(name_or_path)
