@@ -44,6 +44,8 @@ CASES = {
     "ours, all returns": Settings(returns="all"),
     "ours + activity filter": Settings(noise_filter="activity"),
     "ours + phase gate": Settings(phase_gate_us=1000),
+    "ours + reflectance": Settings(reflectance="on"),
+    "ours + compensation": Settings(reflectance_compensation="on"),
 }
 
 

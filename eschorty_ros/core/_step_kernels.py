@@ -30,17 +30,29 @@ def _shift(before, now, after):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _middle(events, column, lit_only, scratch):
+def _middle(widths, column, lit_only, scratch):
     """Median of the columns around ``column``; with ``lit_only`` of those that have a point."""
     n = 0
-    for c in range(max(column - _REACH, 0), min(column + _REACH + 1, events.size)):
-        if events[c] > 0.0 or not lit_only:
-            scratch[n] = events[c]
-            n += 1
+    for c in range(max(column - _REACH, 0), min(column + _REACH + 1, widths.size)):
+        value = widths[c]
+        if value == 0.0 and lit_only:
+            continue
+        k = n
+        while k > 0 and scratch[k - 1] > value:
+            scratch[k] = scratch[k - 1]
+            k -= 1
+        scratch[k] = value
+        n += 1
     if n == 0:
         return 0.0
-    part = np.sort(scratch[:n])
-    return 0.5 * (part[(n - 1) // 2] + part[n // 2])
+    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _middles(widths, scratch, out):
+    """Median of the columns around each column, those without a point counting as 0."""
+    for c in range(widths.size):
+        out[c] = _middle(widths, c, False, scratch)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -55,18 +67,19 @@ def _between(row_before, row_after, back, ahead):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _step_shifts(
-    column, back, ahead, events, rows, present, newest, place, per_row, sign, width_gate, row_gate,
+    column, back, ahead, widths, middles, rows, present, newest, place, sign, width_gate, row_gate,
     scratch, out,
 ):  # fmt: skip
     """Shift of each point of the profile ``place``, towards the rows the surface comes from.
 
-    ``events`` and ``rows`` hold one profile per line, ``place`` and ``newest`` count profiles
-    without end; ``back`` and ``ahead`` say how many before and after a point's footprint is all on
-    one side. Profiles that are not known leave a point as it is, and so does a correction that
-    would not bring it nearer to its neighbours; ``sign`` is where the surface comes from.
+    ``widths``, their ``middles`` and ``rows`` hold one profile per line, ``place`` and ``newest``
+    count profiles without end; ``back`` and ``ahead`` say how many before and after a point's
+    footprint is all on one side. Profiles that are not known leave a point as it is, and so does a
+    correction that would not bring it nearer to its neighbours; ``sign`` is where the surface
+    comes from.
     """
     size = present.size
-    now_line = events[place % size]
+    now_line = widths[place % size]
     for k in range(column.size):
         out[k] = 0.0
         c = np.int64(column[k])
@@ -76,14 +89,14 @@ def _step_shifts(
         before_slot, after_slot = first % size, last % size
         if not (present[before_slot] and present[after_slot]):
             continue
-        before = _middle(events[before_slot], c, False, scratch) / per_row
-        after = _middle(events[after_slot], c, False, scratch) / per_row
+        before = middles[before_slot, c]
+        after = middles[after_slot, c]
         if abs(after - before) < width_gate:
             continue
         row_before, row_after = rows[before_slot, c], rows[after_slot, c]
         if abs(row_before - row_after) > row_gate:
             continue
-        now = _middle(now_line, c, True, scratch) / per_row
+        now = _middle(now_line, c, True, scratch)
         shift = _shift(before, now, after)
         expected = _between(row_before, row_after, back[k], ahead[k])
         off = rows[place % size, c] - expected

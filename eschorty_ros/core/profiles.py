@@ -93,7 +93,7 @@ class Profiles:
             **{name: np.concatenate([getattr(part, name) for part in kept]) for name in names}
         )
 
-    def select(self, mask: ArrayLike) -> Profiles:
+    def select(self, mask: ArrayLike | slice) -> Profiles:
         """Pick points by a boolean mask, a slice or an index array."""
         picked = mask if isinstance(mask, slice) else selection("mask", mask, len(self))
         chosen: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(self)}

@@ -283,16 +283,8 @@ class Reconstructor:
         edge: int,
         drain: bool,
     ) -> int:
-        return self._assembler.merge(
-            source.t[part],
-            source.x[part],
-            source.y[part],
-            source.p[part],
-            edges,
-            indices,
-            edge,
-            drain,
-        )
+        t, x, y, p = source.t[part], source.x[part], source.y[part], source.p[part]
+        return self._assembler.merge(t, x, y, p, edges, indices, edge, drain)
 
     def _drain(self) -> None:
         if self._schedule.anchored or self._find_phase(_FLUSH_US, last=True):

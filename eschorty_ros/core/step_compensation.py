@@ -16,11 +16,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core._step_kernels import _step_shifts
+from eschorty_ros.core._step_kernels import _middles, _step_shifts
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.profiles import Profiles
-from eschorty_ros.core.reflectance import events_per_row
+from eschorty_ros.core.reflectance import ROOT_12, events_per_row
 from eschorty_ros.core.settings import Settings
 
 LAG_MAX = 256
@@ -61,7 +61,8 @@ class StepCompensator:
         self.delay = int(ahead[0])
         size = int(back[0] + ahead[0]) + 1
         self._present = np.zeros(size, dtype=np.bool_)
-        self._events = np.zeros((size, model.columns))
+        self._widths = np.zeros((size, model.columns))
+        self._middles = np.zeros((size, model.columns))
         self._rows = np.full((size, model.columns), np.nan)
         self._per_row = np.full(size, np.nan)
         self._held: list[tuple[int, Profiles]] = []
@@ -76,7 +77,7 @@ class StepCompensator:
         bounds = [*starts.tolist(), len(profiles)]
         done = []
         for begin, end in pairwise(bounds):
-            self._enter(profiles.select(np.arange(begin, end)))
+            self._enter(profiles.select(slice(begin, end)))
             done += self._release(self._newest - self.delay)
         return Profiles.concatenate(done)
 
@@ -100,11 +101,25 @@ class StepCompensator:
         slot = self._newest % size
         self._present[slot] = True
         self._per_row[slot] = events_per_row(profile.width_px, profile.events)
-        self._events[slot] = 0.0
-        self._rows[slot] = np.nan
-        self._events[slot, profile.column] = profile.events
-        self._rows[slot, profile.column] = profile.row
+        widths, line = self._widths[slot], self._rows[slot]
+        widths[:], line[:] = 0.0, np.nan
+        widths[profile.column] = self._full_width(profile)
+        line[profile.column] = profile.row
+        _middles(widths, self._scratch, self._middles[slot])
         self._held.append((self._newest, profile))
+
+    def _full_width(self, profile: Profiles) -> NDArray[np.float64]:
+        """Full widths of the lit rows: the smaller of what spread and counts say, 1 px at least.
+
+        A gap between two lit parts widens the spread, and so does background; a refractory time
+        distorts the counts.
+        """
+        width = ROOT_12 * profile.width_px
+        known = self._per_row[np.isfinite(self._per_row)]
+        if known.size:
+            # Over many profiles: in a single one every column may straddle a step.
+            width = np.minimum(width, profile.events / np.median(known))
+        return np.maximum(width, 1.0)
 
     def _release(self, until: int) -> list[Profiles]:
         done = []
@@ -113,19 +128,16 @@ class StepCompensator:
         return done
 
     def _corrected(self, place: int, profile: Profiles) -> Profiles:
-        known = np.isfinite(self._per_row)
-        if not known.any():
-            return profile
         shift = np.empty(len(profile))
         _step_shifts(
             profile.column,
             *self._lags(profile.range_mm),
-            self._events,
+            self._widths,
+            self._middles,
             self._rows,
             self._present,
             self._newest,
             place,
-            float(np.median(self._per_row[known])),
             self._sign,
             _WIDTH_GATE_PX,
             _ROW_GATE_PX,
