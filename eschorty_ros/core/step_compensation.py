@@ -36,7 +36,8 @@ _AHEAD_SHARE = 0.8
 """Part of the line's width to look ahead: what is left shifts little, and holding back costs."""
 
 _SIGMA_SHARE = 0.2
-"""Standard deviation of a correction as a share of it."""
+_SIGMA_PX = 0.3
+"""Standard deviation of a correction: a share of it, and what half the error of a width gives."""
 
 
 class StepCompensator:
@@ -149,7 +150,8 @@ class StepCompensator:
             return profile
         self.columns_compensated += int(np.count_nonzero(moved))
         row = profile.row - self._sign * shift
-        sigma_row = np.hypot(profile.sigma_row, _SIGMA_SHARE * shift)
+        added = np.where(moved, np.hypot(_SIGMA_PX, _SIGMA_SHARE * shift), 0.0)
+        sigma_row = np.hypot(profile.sigma_row, added)
         return replace(
             profile,
             row=row,

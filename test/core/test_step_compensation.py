@@ -126,3 +126,15 @@ def test_shift_agrees_with_lit_rows_counted(low, high):
         # The new surface, at low rows, is the wider one: the centroid moves down.
         assert -_shift(low, width, high) == pytest.approx(centre, abs=0.02)
         assert _shift(high, width, low) == pytest.approx(centre, abs=0.02)
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.04, 1.0), (1.0, 0.1), (0.2, 0.8)])
+def test_sigma_of_corrected_points_is_honest(before, after):
+    case = crossing(PARAMETERS, 1000.0, before, after, columns=60, slanted=True, seed=SEED)
+    off, _ = case.reconstruct(reflectance_compensation="off", smoothing_half_width=0)
+    on, _ = case.reconstruct(reflectance_compensation="on", smoothing_half_width=0)
+    moved = (on.row != off.row) & (np.abs(case.offset_rows[on.period, on.column]) < EDGE_ROWS)
+    pull = np.abs((on.row - case.line_row[on.column]) / on.sigma_row)[moved]
+    within = [float(np.mean(pull < k)) for k in (1.0, 2.0)]
+    assert 0.55 < within[0] < 0.85, f"seed {SEED}: {within}"
+    assert within[1] > 0.85, f"seed {SEED}: {within}"
