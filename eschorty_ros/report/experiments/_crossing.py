@@ -12,7 +12,7 @@ from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.simulation.line_bench import simulate_line
-from eschorty_ros.simulation.pixel import PixelParameters
+from eschorty_ros.simulation.pixel_parameters import PixelParameters
 
 RANGE_MM = 1320.0
 SPEED_MM_S = 300.0

@@ -14,7 +14,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.report.experiment import Effort
 from eschorty_ros.simulation.line_bench import simulate_line
-from eschorty_ros.simulation.pixel import PixelParameters
+from eschorty_ros.simulation.pixel_parameters import PixelParameters
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,8 @@ from eschorty_ros.report.experiments._step_figures import (
     reflectance_figure,
     step_figure,
 )
-from eschorty_ros.simulation.pixel import PixelParameters
+from eschorty_ros.simulation.pixel_parameters import PixelParameters
+from eschorty_ros.simulation.presets import preset
 
 BLACK = 0.04
 """Reflectance of the black side; the paper's maximum corresponds to about this."""
@@ -49,7 +50,7 @@ _SHOWN_ROWS = 14.0
 
 def run(effort: Effort, progress: Progress) -> Outcome:
     """Simulate steps and uniform targets at 70 Hz and 1 kHz, with and without compensation."""
-    parameters = PixelParameters()
+    parameters = preset("paper")
     curves, passages, uniform = [], [], []
     for k, frequency_hz in enumerate(STEP_HZ):
         progress(0.35 * k, f"steps at {frequency_hz:g} Hz")
