@@ -17,7 +17,7 @@ from eschorty_ros.core.recording import Recording
 from eschorty_ros.core.settings import Settings
 
 _SPEED_SAMPLES = 256
-_MOVING_SHARE = 0.5
+_MOVING_SHARE = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +122,7 @@ def reconstruct_recording(
 
 
 def stage_speed_mm_s(recording: Recording) -> float:
-    """Median speed of the recording's stage towards +y while it moves; 0 when it rests."""
+    """Median speed of the recording's stage towards +y while it cruises; 0 when it rests."""
     first_us, last_us = recording.stage.first_us, recording.stage.last_us
     if first_us is None or last_us is None or last_us == first_us:
         return 0.0
