@@ -11,6 +11,8 @@ from eschorty_ros.core._checks import whole
 from eschorty_ros.core._evt3_encode_kernels import NONE, T_US, _encode, _first_fall, _put_time
 from eschorty_ros.core.errors import ArgumentError
 
+_DROP = np.uint16(0xEEDA)
+"""OTHERS word of a sensor that has dropped events."""
 _IDLE_MAX_US = 3_600_000_000
 """Longest silence filled with TIME_HIGH words: one hour, 1.8 MB."""
 
@@ -58,8 +60,9 @@ class Encoder:
         p: ArrayLike,
         trigger_t: ArrayLike | None = None,
         trigger_edge: ArrayLike | None = None,
+        drop_t: ArrayLike | None = None,
     ) -> bytes:
-        """Bytes of the next events and triggers.
+        """Bytes of the next events, triggers and notes of dropped events.
 
         Parameters
         ----------
@@ -70,6 +73,8 @@ class Encoder:
         trigger_t, trigger_edge : array_like of int, shape (m,), optional
             Trigger times (not falling) and edges (1 = rising), channel 0; at equal times a
             trigger comes before the events.
+        drop_t : array_like of int, shape (k,), optional
+            Times (not falling) at which the stream says that the sensor dropped events.
 
         Raises
         ------
@@ -93,15 +98,22 @@ class Encoder:
                 f"trigger_t has {trigger_times.size} entries and trigger_edge {edges.size}; "
                 "give one edge per trigger"
             )
-        for name, series in (("t", times), ("trigger_t", trigger_times)):
+        drop_times = _checked("drop_t", _or_none(drop_t), np.int64, 1 << 62)
+        for name, series in (("t", times), ("trigger_t", trigger_times), ("drop_t", drop_times)):
             self._refuse_fall(name, series)
-        ends = [int(series[-1]) for series in (times, trigger_times) if series.size]
+        mark_times = np.concatenate((trigger_times, drop_times))
+        marks = np.concatenate((0xA000 | edges.astype(np.uint16), np.full(drop_times.size, _DROP)))
+        marks = marks.astype(np.uint16)
+        if drop_times.size:
+            order = np.argsort(mark_times, kind="stable")
+            mark_times, marks = mark_times[order], marks[order]
+        ends = [int(series[-1]) for series in (times, mark_times) if series.size]
         if not ends:
             return b""
-        starts = [int(series[0]) for series in (times, trigger_times) if series.size]
+        starts = [int(series[0]) for series in (times, mark_times) if series.size]
         steps = self._high_words(min(starts), max(ends))
-        # At most TIME_LOW, ADDR_Y and ADDR_X for each event, TIME_LOW and the trigger for each.
-        bound = 3 * times.size + 2 * edges.size + steps
+        # At most TIME_LOW, ADDR_Y and ADDR_X for each event, TIME_LOW and the word for each mark.
+        bound = 3 * times.size + 2 * marks.size + steps
         if self._words.size < bound:
             self._words = np.empty(bound, dtype="<u2")
         n = _encode(
@@ -109,8 +121,8 @@ class Encoder:
             columns,
             rows,
             polarities,
-            trigger_times,
-            edges,
+            mark_times,
+            marks,
             self.width,
             self._state,
             self._words,

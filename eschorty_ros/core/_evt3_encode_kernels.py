@@ -102,18 +102,18 @@ def _put_row(k, end, x, y, p, width, s, words, n):
     return n
 
 
-@njit(uint64(_I8, _U2, _U2, _U1, _I8, _U1, int64, int64[::1], uint16[::1]), cache=True, nogil=True)
-def _encode(t, x, y, p, trigger_t, trigger_edge, width, s, words):
-    """Merge events and triggers by time (triggers first); returns the number of words."""
+@njit(uint64(_I8, _U2, _U2, _U1, _I8, _U2, int64, int64[::1], uint16[::1]), cache=True, nogil=True)
+def _encode(t, x, y, p, mark_t, marks, width, s, words):
+    """Merge events and ready-made words by time (these first); returns the number of words."""
     n = np.uint64(0)
     k = np.uint64(0)
     j = np.uint64(0)
     end = np.uint64(t.size)
-    triggers = np.uint64(trigger_t.size)
-    while k < end or j < triggers:
-        if j < triggers and (k >= end or trigger_t[j] <= t[k]):
-            n = _put_time(trigger_t[j], False, s, words, n)
-            words[n] = np.uint16(0xA000 | np.int64(trigger_edge[j]))
+    count = np.uint64(mark_t.size)
+    while k < end or j < count:
+        if j < count and (k >= end or mark_t[j] <= t[k]):
+            n = _put_time(mark_t[j], False, s, words, n)
+            words[n] = marks[j]
             n += np.uint64(1)
             j += np.uint64(1)
             continue

@@ -53,16 +53,9 @@ def _mix(value):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _readout_key(t_us, column, row, polarity, slots):
-    """Event as one sortable integer: time of the row's next readout slot, row, polarity, column.
-
-    ``slots`` holds per row the phase of its slots (rows take turns), and last the slot's length
-    and one over it.
-    """
-    slot_us, per_us = slots[np.uintp(slots.size - 2)], slots[np.uintp(slots.size - 1)]
-    phase = slots[np.uintp(row)]
-    t = np.int64(np.ceil((t_us - phase) * per_us) * slot_us + phase)
-    return (t << 22) | (row << 12) | (polarity << 11) | column
+def _key(t_us, column, row, polarity):
+    """Event as one sortable integer: whole microsecond from ``t_us`` on, row, polarity, column."""
+    return (np.int64(np.ceil(t_us)) << 22) | (row << 12) | (polarity << 11) | column
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -95,7 +88,7 @@ def _exponential(bits):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _live(pixels, column, lo, hi, until_us, light, model, table, seed, slots, out, n):
+def _live(pixels, column, lo, hi, until_us, light, model, table, seed, out, n):
     """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
     An empty ``light`` leaves theirs as it is. ``model`` = omega0 (per us), follower (us), noise,
@@ -155,7 +148,7 @@ def _live(pixels, column, lo, hi, until_us, light, model, table, seed, slots, ou
                     break
                 bits = _bits(t_next, column, row, seed, 3)
                 late_us = max(1.0, model[5] + model[6] * _gaussian(bits))
-                out[np.uintp(n)] = _readout_key(t_next + late_us, column, row, state, slots)
+                out[np.uintp(n)] = _key(t_next + late_us, column, row, state)
                 n += 1
                 state = HELD
                 held_us = model[3]
@@ -218,7 +211,7 @@ def _add_patch(light, lo, hi, patch, sigma):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _relight(
-    pixels, spans, due, columns, begin, patches, light, optics, model, table, t_us, seed, slots,
+    pixels, spans, due, columns, begin, patches, light, optics, model, table, t_us, seed,
     out, n,
 ):  # fmt: skip
     """Put the footprint ``patches`` (columns, patches, 4) in ``columns[begin:]`` from ``t_us`` on.
@@ -250,10 +243,10 @@ def _relight(
         apart = hi < old_lo or lo > old_hi
         n, earliest = _live(
             pixels, column, old_lo if apart else first, old_hi if apart else last, t_us, light,
-            model, table, seed, slots, out, n,
+            model, table, seed, out, n,
         )  # fmt: skip
         if apart and earliest != _FULL:
-            n, other = _live(pixels, column, lo, hi, t_us, light, model, table, seed, slots, out, n)
+            n, other = _live(pixels, column, lo, hi, t_us, light, model, table, seed, out, n)
             earliest = min(earliest, other)
         if earliest == _FULL:
             return k, n
@@ -268,7 +261,7 @@ def _relight(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, slots, out, n):
+def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, out, n):
     """Everything that is due up to ``until_us`` in the columns from ``begin`` on.
 
     Stops where the output does not suffice; returns the next column and the number of events.
@@ -279,7 +272,7 @@ def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, slots,
             continue
         n, earliest = _live(
             pixels, column, spans[column, 2], spans[column, 3], until_us, unchanged, model, table,
-            seed, slots, out, n,
+            seed, out, n,
         )  # fmt: skip
         if earliest == _FULL:
             return column, n
@@ -288,7 +281,7 @@ def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, slots,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _background(process, per_us, shares, hot, until_us, columns, rows, seed, slots, out, n):
+def _background(process, per_us, shares, hot, until_us, columns, rows, seed, out, n):
     """Poisson events over the whole sensor; ``process`` = time of the next one, count so far.
 
     ``shares`` = those that are OFF, those of the pixels ``hot``. Stops at a full output; returns
@@ -302,9 +295,7 @@ def _background(process, per_us, shares, hot, until_us, columns, rows, seed, slo
         draw = _mix(np.uint64(seed) ^ (np.uint64(2) * count + np.uint64(1)))
         if hot.size and _uniform(_mix(draw)) < shares[1]:
             place = hot[place % hot.size]
-        out[np.uintp(n)] = _readout_key(
-            process[0], place % columns, place // columns, polarity, slots
-        )
+        out[np.uintp(n)] = _key(process[0], place % columns, place // columns, polarity)
         n += 1
         process[0] -= math.log(_uniform(draw)) / per_us
         process[1] += 1.0

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
+from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.timeline import LaserTimeline
 
 
@@ -52,6 +53,7 @@ def simulate_line(
     background_hz: float = 0.0,
     seed: int = 0,
     rows: int = 720,
+    readout: ReadoutParameters | None = None,
 ) -> LineEvents:
     """Events of a resting line; no two columns share noise or thresholds.
 
@@ -80,6 +82,8 @@ def simulate_line(
         Same seed, same events.
     rows : int
         Height of the sensor, at most 1024.
+    readout : ReadoutParameters, optional
+        Left out, every event leaves the sensor as soon as its pixel asks.
 
     Raises
     ------
@@ -112,7 +116,10 @@ def simulate_line(
         pixels.relight(t_us, every, line, bright * laser.level(t_us), low, high)
         t_us = laser.next_us(t_us)
     pixels.run_until(duration_us)
-    t, x, y, p = unpack(pixels.take(duration_us))
+    keys = pixels.take(duration_us)
+    if readout is not None:
+        keys, _ = Readout(rows, readout).read_out(keys, duration_us)
+    t, x, y, p = unpack(keys)
     return LineEvents(t, x, y, p, centre)
 
 

@@ -3,7 +3,7 @@
 Per pixel: relative photocurrent ``I = I_bg + A rho g(y) w(t)`` with a Gaussian ``g`` over the
 rows, a photoreceptor whose bandwidth grows with ``I``, a source follower, comparator noise, an
 ON/OFF comparator with fixed mismatch, a refractory time during which the reference follows the
-signal, leak and background activity, a latency with jitter, and a row-wise readout. Times of
+signal, leak and background activity, a latency with jitter. Times of
 threshold crossings are solved, never stepped through.
 """
 
@@ -84,8 +84,6 @@ class PixelArray:
             ]
         )
         self._noise_table = noise_table(max(p.follower_us, DECISION_US))
-        phases = np.arange(rows) * 7 % p.row_slot_us
-        self._slots = np.concatenate((phases, [p.row_slot_us, 1.0 / p.row_slot_us]))
         # Leaks of dark pixels come at random times too: each has its own phase and rate.
         self._hot = np.flatnonzero(
             np.random.default_rng(hot_seed).random(columns * rows) < p.hot_fraction
@@ -156,7 +154,6 @@ class PixelArray:
                 self._noise_table,
                 float(t_us),
                 self._seeds[0],
-                self._slots,
                 self._keys,
                 self._count,
             )
@@ -177,7 +174,6 @@ class PixelArray:
                 self._model,
                 self._noise_table,
                 self._seeds[0],
-                self._slots,
                 self._keys,
                 self._count,
             )
@@ -194,7 +190,6 @@ class PixelArray:
                 self.columns,
                 self.rows,
                 self._seeds[1],
-                self._slots,
                 self._keys,
                 self._count,
             )
@@ -203,7 +198,7 @@ class PixelArray:
             self._grow()
 
     def take(self, before_us: int) -> NDArray[np.int64]:
-        """Keys of the events read out before ``before_us``, sorted, each pixel once per time.
+        """Keys of the events requested before ``before_us``, sorted, each pixel once per time.
 
         ``key >> T_SHIFT`` is the time, then follow row, polarity and column (:func:`unpack`).
         Call :meth:`run_until` with the same time first.

@@ -57,9 +57,6 @@ class PixelParameters:
         ... each so many times a second.
     latency_us, latency_jitter_us : float
         Mean and standard deviation from crossing to readout request; never below 1 us.
-    row_slot_us : int
-        Requests of one row that fall into one slot are read out together and share a timestamp:
-        a simple stand-in for the row arbiter that yields vectors as the sensor sends them.
 
     Raises
     ------
@@ -84,7 +81,6 @@ class PixelParameters:
     hot_hz: float = 100.0
     latency_us: float = 100.0
     latency_jitter_us: float = 30.0
-    row_slot_us: int = 10
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -97,8 +93,6 @@ class PixelParameters:
             raise ArgumentError(f"hot_fraction is {self.hot_fraction!r}; choose 0 to 1")
         if self.refractory_us < 1.0:
             raise ArgumentError(f"refractory_us is {self.refractory_us!r}; choose 1 us or more")
-        if not (isinstance(self.row_slot_us, int) and self.row_slot_us >= 1):
-            raise ArgumentError(f"row_slot_us is {self.row_slot_us!r}; choose whole microseconds")
 
     @property
     def omega_per_us(self) -> float:

@@ -15,6 +15,7 @@ from eschorty_ros.core.motion import MotionPlan
 from eschorty_ros.core.recording import TRUTH_DTYPE
 from eschorty_ros.simulation.footprint import footprint
 from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
+from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.scene import Scene
 from eschorty_ros.simulation.timeline import LaserTimeline, StageTimeline
 
@@ -48,6 +49,7 @@ class World:
         Fixes thresholds, jitter and background.
     background_hz : float
         Background events per pixel and second.
+    readout : ReadoutParameters, optional
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class World:
         parameters: PixelParameters | None = None,
         seed: int = 0,
         background_hz: float = BACKGROUND_HZ,
+        readout: ReadoutParameters | None = None,
     ) -> None:
         self.scene = scene
         self.model = calibration.model()
@@ -66,6 +69,7 @@ class World:
         pixels = parameters or PixelParameters()
         self._half_rows = pixels.half_width_rows
         self._pixels = PixelArray(self.columns, self.rows, pixels, seed, background_hz)
+        self._readout = Readout(self.rows, readout)
         self._encoder = Encoder(self.columns, self.rows)
         self._laser = LaserTimeline()
         self._stage = StageTimeline()
@@ -85,6 +89,11 @@ class World:
     def now_us(self) -> int:
         """Sensor time simulated so far."""
         return self._now_us
+
+    @property
+    def dropped(self) -> int:
+        """Events lost in the readout so far; the stream says when, not how many."""
+        return self._readout.dropped
 
     def set_laser(self, t_us: int, on: bool, modulation: Modulation | None = None) -> None:
         """Switch the laser from ``t_us`` on; ``modulation.on_edge_us`` places the wave.
@@ -132,11 +141,11 @@ class World:
             end_us = min(until_us, self._now_us + _PIECE_US)
             self._follow(end_us)
             self._pixels.run_until(end_us)
-            keys = self._pixels.take(end_us)
+            keys, drops_us = self._readout.read_out(self._pixels.take(end_us), end_us)
             if self._encoder.time_us is None:
                 parts.append(self._encoder.advance(0))
             self.events += keys.size
-            parts.append(self._encoder.encode(*unpack(keys)))
+            parts.append(self._encoder.encode(*unpack(keys), drop_t=drops_us))
             # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
             step_us = end_us - end_us % _TIME_HIGH_US
             if step_us > (self._encoder.time_us or 0):

@@ -21,7 +21,6 @@ CLEAN = {
     "noise": 0.0,
     "latency_us": 0.0,
     "latency_jitter_us": 0.0,
-    "row_slot_us": 1,
 }
 """Nothing but photoreceptor, comparator and refractory time."""
 
@@ -175,7 +174,7 @@ def test_rows_fire_where_the_closed_form_swing_exceeds_the_threshold(frequency_h
 
 
 def test_no_pixel_fires_within_its_refractory_time() -> None:
-    prompt = PixelParameters(latency_us=0.0, latency_jitter_us=0.0, row_slot_us=1)
+    prompt = PixelParameters(latency_us=0.0, latency_jitter_us=0.0)
     t, x, y, _ = flash(PixelArray(16, ROWS, prompt, SEED), 900.0, 0.1)
     pixel = x.astype(np.int64) * ROWS + y
     order = np.lexsort((t, pixel))
@@ -193,13 +192,6 @@ def test_latency_has_the_promised_mean_and_jitter() -> None:
     late = late - t_prompt[0][t_prompt[2] == 40].mean() + 1.0
     assert late.mean() == pytest.approx(100.0, abs=3.0)
     assert late.std() == pytest.approx(30.0, abs=2.0)
-
-
-def test_rows_are_read_out_in_slots() -> None:
-    t, _, y, _ = flash(PixelArray(256, ROWS, PixelParameters(), SEED), 70.0, 0.05)
-    for row in (38, 39, 40):
-        assert np.unique(t[y == row] % 10).size == 1
-    assert np.unique(t[y == 39] % 10) != np.unique(t[y == 40] % 10)
 
 
 def test_row_position_is_found_between_rows() -> None:
@@ -258,7 +250,6 @@ def test_output_grows_when_it_must() -> None:
         ("threshold_on", -0.1),
         ("amplitude", math.nan),
         ("refractory_us", 0.5),
-        ("row_slot_us", 2.5),
         ("latency_us", -1.0),
         ("noise", -0.1),
         ("follower_hz", math.nan),

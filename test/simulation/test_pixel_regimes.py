@@ -65,9 +65,7 @@ def test_counts_and_widths_agree_with_fine_time_steps(frequency_hz: float, secon
 
 
 def test_first_event_times_agree_with_fine_time_steps() -> None:
-    prompt = PixelParameters(
-        threshold_mismatch=0.0, latency_us=0.0, latency_jitter_us=0.0, row_slot_us=1
-    )
+    prompt = PixelParameters(threshold_mismatch=0.0, latency_us=0.0, latency_jitter_us=0.0)
     events = bench(70.0, 1 / 70, columns=64, parameters=prompt)
     reference = stepped(prompt, 70.0, 1 / 70, np.tile([0.0, 5.0, 8.0], 200), SEED, 0.5)
     half_us = 5e5 / 70
