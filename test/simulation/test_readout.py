@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -68,7 +70,7 @@ def test_cutting_the_calls_changes_nothing() -> None:
     assert whole.dropped > 100
     parts, drops, readout = [], [], Readout(720, tight)
     times = np.unique(np.append(rng.integers(1000, 6000, 60), [0, 20_000]))
-    for begin, end in zip(times[:-1], times[1:], strict=True):
+    for begin, end in itertools.pairwise(times):
         now = requests[(requests >> 22 >= begin) & (requests >> 22 < end)]
         out, lost = readout.read_out(now, int(end))
         assert np.all(out >> 22 < end)
