@@ -23,7 +23,8 @@ ARGUMENTS = (
     (
         "scene",
         "steps",
-        "what a simulated camera sees: steps, plane, tilted, sphere, leaves, face, posts or a mesh",
+        "what a simulated camera sees: steps, plane, tilted, sphere, leaves, face, posts, receding "
+        "or a mesh",
         None,
     ),
     ("calibration", "config_3", "optical build: a name in config/ or the path of a file", None),

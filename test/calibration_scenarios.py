@@ -20,7 +20,7 @@ from std_msgs.msg import Bool
 from eschorty_ros.core.calibration import load_calibration, save_calibration
 from eschorty_ros.nodes import qos
 from eschorty_ros.report.accuracy import range_error_mm
-from eschorty_ros.simulation.scene import named
+from eschorty_ros.simulation.scene import RECEDING_MM, named
 from eschorty_ros.simulation.scene_posts import bench as bench_of_posts
 
 CALIBRATION, AS_BUILT = "config_3", "config_3_as_built"
@@ -195,6 +195,28 @@ def nine_posts(bench: CalibrationBench, method: str) -> None:
     table = dict(zip(bench.newest.parameters, bench.newest.values, strict=True))
     assert table["b_prime_px"] == made.b_prime_px
     assert any(f.matched == len(POSTS) and len(f.residuals) == len(POSTS) for f in bench.seen)
+    bench.assert_dark_and_at_rest()
+
+
+def moving_target(bench: CalibrationBench) -> None:
+    """One target that the stage moves forth and back gives range within 1 mm RMS where it was."""
+    status, result = bench.calibrate(
+        targets=[CalibrationTarget(range=RECEDING_MM * 1e-3)],
+        sweep_speed=0.1,
+        sweep_start=0.01,
+        sweep_stop=0.11,
+        range_per_stage=1.0,
+    )
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert len(result.ranges) > 100
+    true = load_calibration(AS_BUILT).model()
+    for near_mm, far_mm, bound_mm in ((910.0, 1010.0, 0.2), (800.0, 1150.0, 1.0)):
+        true_mm = np.linspace(near_mm, far_mm, 101)
+        error = load_calibration(result.file).model().range_mm(true.row(true_mm)) - true_mm
+        rms_mm = float(np.sqrt(np.mean(error**2)))
+        print(f"moved by the stage: range RMS {rms_mm:.3f} mm from {near_mm:g} to {far_mm:g} mm")
+        assert rms_mm < bound_mm
+    assert bench.newest.id == result.calibration_id
     bench.assert_dark_and_at_rest()
 
 

@@ -14,8 +14,8 @@ _SWEEP = (
         "--scene",
         default="steps",
         show_default=True,
-        help="steps, plane, tilted, sphere, leaves, face, posts, or a mesh in metres "
-        "(needs open3d).",
+        help="steps, plane, tilted, sphere, leaves, face, posts, receding, or a mesh in "
+        "metres (needs open3d).",
     ),
     click.option(
         "--frequency",

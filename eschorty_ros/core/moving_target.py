@@ -19,6 +19,8 @@ SIGMA_STAGE_MM = 0.01
 """How well an encoder tells where the target is."""
 _SEEN_SHARE = 0.5
 _OUTLIER_PX = 4.0
+_LATE_PX = 0.23
+"""A moving line is seen late by this much; the other way round on the way back."""
 
 
 def moving_target(
@@ -146,7 +148,7 @@ def _measured(
     return Targets(
         row=centre[enough],
         range_mm=range_mm,
-        sigma_row_px=np.hypot(scatter, GRID_SIGMA_PX)[enough],
+        sigma_row_px=np.hypot(scatter, math.hypot(GRID_SIGMA_PX, _LATE_PX))[enough],
         sigma_range_mm=sigma_stage_mm * math.fabs(range_per_stage),
         column=mean(column)[enough],
         labels=[f"stage {mm:.3f} mm" for mm in at_mm.tolist()],

@@ -21,6 +21,10 @@ from eschorty_ros.core.optics import RangeModel
 Array = NDArray[np.float64]
 
 
+RECEDING_MM = 900.0
+"""Range of the scene ``receding`` with the stage at 0."""
+
+
 class Scene(Protocol):
     """A surface the laser sheet can hit."""
 
@@ -202,6 +206,8 @@ _BUILDERS: dict[str, Callable[[], Scene]] = {
     "leaves": _leaves,
     "face": _face,
     "posts": _posts,
+    # A flat target on the stage: 1 mm farther away per mm of travel.
+    "receding": lambda: Plane(RECEDING_MM, slope_stage=1.0),
 }
 NAMES = tuple(_BUILDERS)
 

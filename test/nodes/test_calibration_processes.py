@@ -56,6 +56,11 @@ def test_calibration_takes_a_known_target_from_tens_of_mm_to_one(instrument):
     scenarios.calibrated_scan_is_right(instrument.bench)
 
 
+def test_a_target_moved_by_the_stage_calibrates_too(instrument):
+    instrument.point_camera_at("receding")
+    scenarios.moving_target(instrument.bench)
+
+
 def test_only_calibrations_of_this_instrument_are_loaded(instrument, tmp_path):
     scenarios.load_and_save(instrument.bench, tmp_path)
 
