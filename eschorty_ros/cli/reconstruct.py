@@ -63,7 +63,8 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     """Turn the folder RECORDING into a point cloud.
 
     The cloud is in eschorty_base, in metres: x y z, intensity (events used), sigma (one sigma of
-    the range), t (seconds since the first event), column.
+    the range), t (seconds since the first event), column; with --reflectance on also reflectance
+    and reflectance_sigma.
 
     \b
     --json prints events, dropped_events, profiles, points, seconds, events_per_second and
