@@ -139,6 +139,8 @@ class Reconstructor:
     def push(self, data: bytes | bytearray | memoryview) -> Profiles:
         """Take the next bytes of the stream and return the profiles they complete.
 
+        With ``reflectance_compensation`` the newest wait for those behind them.
+
         Parameters
         ----------
         data : bytes-like
@@ -159,8 +161,8 @@ class Reconstructor:
         ``phase_missing`` is set.
         """
         self._drain()
-        done = self._finisher.push(self._assembler.take())
-        return Profiles.concatenate([done, self._finisher.flush()])
+        last = self._assembler.take()
+        return Profiles.concatenate([self._finisher.push(last), self._finisher.flush()])
 
     def note_gap(self) -> None:
         """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""

@@ -46,6 +46,9 @@ class Settings:
     biases. 1000 us at 70 Hz and 600 us at 300 Hz keep what the simulated sensor sends. Windows
     that cover the period, above about 1 kHz, remove nothing.
 
+    So is the compensation of reflectance steps: it must know the stage's speed, and it holds back
+    as many profiles as a step takes to cross the line.
+
     ``periods_per_profile`` is for frequencies at which a column gives fewer than ``events_min``
     events per period (above about 5 kHz).
 

@@ -11,6 +11,7 @@ from eschorty_ros.msg import LaserState
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from eschorty_ros.core.cloud import REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.nodes import transforms
 from eschorty_ros.nodes.cloud_messages import (
@@ -62,6 +63,17 @@ def test_live_cloud_counts_ns_from_its_stamp():
     assert seen["t"].tolist() == [0, 1, 3_999_999_999, 7]
     np.testing.assert_array_equal(seen["x"], points["x"])
     assert [(f.name, f.offset) for f in message.fields[:3]] == [("x", 0), ("y", 4), ("z", 8)]
+
+
+def test_reflectance_goes_along_when_the_points_have_it():
+    points = np.zeros(3, REFLECTANCE_DTYPE)
+    points["reflectance"] = [0.25, 0.5, 1.0]
+    live = live_points(points, 10**18 + np.arange(3), 10**18)
+    for cloud in (points, live):
+        seen = points_from_message(cloud_message(cloud, 10**18, "eschorty_link"))
+        assert seen.dtype.names[-2:] == ("reflectance", "reflectance_sigma")
+        np.testing.assert_array_equal(seen["reflectance"], points["reflectance"])
+    assert live["t"].dtype == np.uint32
 
 
 def test_image_is_row_major():

@@ -5,6 +5,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from eschorty_ros.core.cloud import REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
@@ -14,8 +15,8 @@ from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
 T0_NS = 1_700_000_000_000_000_123
 
 
-def placed(stage_mm, edge_ns, columns):
-    points = np.zeros(len(columns), SCAN_DTYPE)
+def placed(stage_mm, edge_ns, columns, dtype=SCAN_DTYPE):
+    points = np.zeros(len(columns), dtype)
     points["column"] = columns
     points["sigma"] = 1e-3
     edges = np.asarray(edge_ns, dtype=np.int64)
@@ -27,6 +28,16 @@ def timed(t_ns):
     empty = {name: getattr(Profiles.empty(), name) for name in Profiles.__slots__}
     fields = {k: np.zeros(len(t_ns), v.dtype) for k, v in empty.items() if v is not None}
     return TimedProfiles(Profiles(**fields), t_ns, t_ns)
+
+
+def test_reflectance_asked_for_in_the_middle_of_a_scan_is_nan_before():
+    buffer = ScanBuffer("a", 0.0, 20.0)
+    buffer.add(placed([10.0], [T0_NS], [7]))
+    buffer.add(placed([15.0], [T0_NS + 1000], [9], REFLECTANCE_DTYPE))
+    points = buffer.assemble().points
+    assert points.dtype == REFLECTANCE_DTYPE
+    assert np.isnan(points["reflectance"]).tolist() == [True, False]
+    assert points["column"].tolist() == [7, 9]
 
 
 def test_scan_is_sorted_by_period_then_column_and_limits_are_included():
