@@ -71,11 +71,25 @@ def _read_out(
     """
     n = 0
     state[S_NOTES] = 0
+    served_us = -1
     for request in requests:
         t_us = request >> 22
-        n = _serve(
-            t_us, row_ns, window_us, window_events, state, queue, heads, links, keys, out, drops, n
-        )
+        if t_us != served_us:
+            served_us = t_us
+            n = _serve(
+                t_us,
+                row_ns,
+                window_us,
+                window_events,
+                state,
+                queue,
+                heads,
+                links,
+                keys,
+                out,
+                drops,
+                n,
+            )
         place = heads[heads.size - 1]
         if place < 0:
             _drop(t_us, window_us, state, drops)
