@@ -15,6 +15,7 @@ NAMES: tuple[str, ...] = (
     "scans",
     "estimators",
     "calibration",
+    "calibrated_scan",
     "tradeoff",
 )
 """Module of each experiment, in the order of the page."""
