@@ -213,14 +213,14 @@ def _figure(scan: Scan, report: CalibrationReport, design: RangeModel, truth: Ra
         axes.plot(LEVELS_MM, medians, "o", color="black", ms=5, label="median of a level")
         axes.plot(CHECK_MM, model.range_mm(row) - CHECK_MM, color="tab:orange",
                   label="error of the curve alone")  # fmt: skip
-        axes.set_ylabel(f"range error {name}, mm")
+        axes.set_ylabel(f"range error {name} (mm)")
         axes.grid(alpha=0.3)
     sigma = report.fit.range_sigma_mm(CHECK_MM)
     below.fill_between(CHECK_MM, -sigma, sigma, color="tab:orange", alpha=0.2,
                        label="stated standard deviation")  # fmt: skip
     limit = float(np.quantile(np.abs(scan.after_mm), 0.999))
     below.set_ylim(-limit, limit)
-    below.set_xlabel("true range, mm")
+    below.set_xlabel("true range (mm)")
     for axes in (above, below):
         axes.legend(loc="lower left", fontsize=9)
     return figure
