@@ -18,6 +18,9 @@ from eschorty_ros.report.accuracy import KnownScene, true_range_mm
 GROSS_PX = 10.0
 """Half the line's full width at half maximum: a row this far off is not on the line."""
 
+RIM_MM = 3.0
+"""Half the line's thickness along the stage at 1.3 m, and the stage's way within a lit phase."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanErrors:
@@ -30,12 +33,16 @@ class ScanErrors:
         scene holds nothing.
     gross : ndarray of bool, shape (points,)
         More than ``GROSS_PX`` rows off, or where the scene holds nothing.
+    inside : ndarray of bool, shape (points,)
+        ``RIM_MM`` ahead and behind along the stage the scene goes on: the line's thickness lies on
+        one surface.
     completeness : float
         Share of the truth's periods and columns that have a point.
     """
 
     error_mm: NDArray[np.float64]
     gross: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
     completeness: float
 
     @property
@@ -60,6 +67,11 @@ class ScanErrors:
         """Gross errors among all points; NaN without points."""
         return float(np.mean(self.gross)) if self.gross.size else float("nan")
 
+    def away_from_rims(self) -> ScanErrors:
+        """Pick the points whose line lies on one surface."""
+        at = self.inside
+        return ScanErrors(self.error_mm[at], self.gross[at], at[at], self.completeness)
+
     def quantile_mm(self, share: float) -> float:
         """Quantile of the absolute error; NaN without points."""
         size = np.abs(self.error_mm[np.isfinite(self.error_mm)])
@@ -71,6 +83,7 @@ def pooled(parts: Sequence[ScanErrors]) -> ScanErrors:
     return ScanErrors(
         np.concatenate([part.error_mm for part in parts]),
         np.concatenate([part.gross for part in parts]),
+        np.concatenate([part.inside for part in parts]),
         float(np.mean([part.completeness for part in parts])),
     )
 
@@ -98,13 +111,20 @@ def scan_errors(
     profiles = profiles.select(profiles.column % every == 0)
     stage_mm = np.asarray(recording.stage.position_mm(profiles.t_us))
     truth_mm = true_range_mm(scene, model, stage_mm, profiles.column)
-    off_px = np.abs(profiles.row - model.row(truth_mm))
+    beside_px = [
+        model.row(true_range_mm(scene, model, stage_mm + off_mm, profiles.column))
+        for off_mm in (-RIM_MM, RIM_MM)
+    ]
+    rows = model.row(truth_mm)
+    inside = np.all([np.abs(beside - rows) <= GROSS_PX for beside in beside_px], axis=0)
+    off_px = np.abs(profiles.row - rows)
     truth = recording.truth
     assert truth is not None, "a simulated recording has its truth"
     truth = truth[truth["column"] % every == 0]
     return ScanErrors(
         profiles.range_mm - truth_mm,
         ~(off_px <= GROSS_PX),
+        inside,
         _completeness(profiles, truth, recording.modulation, model),
     )
 
