@@ -216,10 +216,10 @@ def _relight(
 ):  # fmt: skip
     """Put the footprint ``patches`` (columns, patches, 4) in ``columns[begin:]`` from ``t_us`` on.
 
-    ``spans`` holds per column the lit rows [0, 1) and the rows with something pending [2, 3);
-    ``due`` the earliest pending time. ``optics`` = sigma (rows), least contrast drawn, background
-    intensity. ``light`` is room for one column. Stops where the output does not suffice; returns
-    the next column to do and the number of events.
+    ``spans`` holds per column the lit rows [0, 1) and the rows with something pending [2, 3),
+    ``due`` the earliest pending time. ``optics`` = sigma (rows), least contrast drawn, background.
+    ``light`` is room for one column. Stops where the output does not suffice; returns the next
+    column to do and the number of events.
     """
     sigma, background = optics[0], optics[2]
     rows = pixels.shape[1]
