@@ -23,6 +23,10 @@ def refuse_unknowable(targets: Targets, names: tuple[str, ...]) -> None:
             f"range_mm holds {distinct} different ranges (condition number inf); give targets at "
             "2 different ranges or more"
         )
+    if set(names) == {WIDTH_BIAS}:
+        raise ArgumentError(
+            f"free is {WIDTH_BIAS} alone, which is no part of a build; add parameters"
+        )
     if {"k_mm", "k_prime_px"} <= set(names) and not targets.lateral:
         raise FitError(
             "k_mm and k_prime_px are both free without sizes (condition number inf): ranges show "

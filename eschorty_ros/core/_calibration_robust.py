@@ -72,7 +72,9 @@ def _cut(
     distance = every.distance(values)
     kept = np.zeros(len(observed), dtype=bool)
     for _ in range(_ITERATIONS):
-        scale = _scale(distance, observed.known)
+        # Once the wrong ones are out they no longer widen the cut.
+        better = observed.known & kept[:, None] if kept.any() else observed.known
+        scale = _scale(distance, better)
         before, kept = kept, np.abs(distance).max(axis=1) <= CUT_SIGMA * scale
         _refuse_chaos(kept, scale, observed)
         if np.array_equal(kept, before):

@@ -111,7 +111,8 @@ class Problem:
     def size(self) -> float:
         """Length of the vector of fitted values, against which steps count as small."""
         seen = np.where(self.observed.known, self.observed.seen / self.sigma_px, 0.0)
-        return float(np.linalg.norm(seen)) + math.sqrt(len(self.observed))
+        held = np.linalg.norm(self._centre / self._spread)
+        return float(np.linalg.norm(seen) + held) + math.sqrt(len(self.observed))
 
 
 def solve(
@@ -129,6 +130,8 @@ def solve(
     # A range error weighs with the slope of the curve, which the fit has yet to find.
     for _ in range(1 + _REWEIGHTINGS * bool(observed.sigma_range_mm.any())):
         problem = Problem(observed, design, names, priors, values)
+        if not names:
+            return problem, values
         refuse_singular(problem, values)
         if closed:
             values = straight_line(observed, problem.sigma_px[:, 0], design)

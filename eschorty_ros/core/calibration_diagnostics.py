@@ -23,6 +23,9 @@ RESIDUAL_SIGMA = 3.0
 LISTED = 4
 """Targets that a verdict names."""
 _MARGIN = 0.05
+_FAR_SHARE = 0.25
+# Of Gaussian errors.
+_SHARE_BEYOND = 0.0027
 _PROFILE_POINTS = 41
 _PROFILE_SIGMA = 4.0
 _CHI_SQUARE_95 = 3.841
@@ -48,7 +51,10 @@ class KProfile:
 
 
 def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KProfile | None:
-    """Profile likelihood of k within four standard deviations; ``None`` where k was fixed."""
+    """Profile likelihood of k within four standard deviations.
+
+    ``None`` where k was fixed, or no k lets the other parameters be found.
+    """
     if "k_mm" not in found.free:
         return None
     at = found.free.index("k_mm")
@@ -67,6 +73,8 @@ def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KP
             continue
         white = problem.residual(problem.free(values))
         chi_square[index] = np.nan if white is None else white @ white
+    if np.isnan(chi_square).all():
+        return None
     delta = chi_square - np.nanmin(chi_square)
     return KProfile(k_mm, delta, _interval(k_mm, delta))
 
@@ -170,7 +178,7 @@ def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:
     near, far = model.range_limits_mm
     third = near + (far - near) * 2.0 / 3.0
     beyond = int((targets.range_mm >= third).sum())
-    if math.isfinite(third) and 3 * beyond < len(targets):
+    if math.isfinite(third) and beyond < _FAR_SHARE * len(targets):
         lines.append(
             f"{beyond} of {len(targets)} targets lie in the far third, beyond {third:.0f} mm; put "
             "at least a third of them there"
@@ -188,7 +196,8 @@ def _residuals(targets: Targets, found: CalibrationFit) -> list[str]:
         )
     ratio = np.abs(found.residual_px) / found.sigma_px
     beyond = np.flatnonzero(ratio > RESIDUAL_SIGMA)
-    if beyond.size:
+    by_chance = _SHARE_BEYOND * len(targets)
+    if beyond.size > by_chance + RESIDUAL_SIGMA * math.sqrt(by_chance):
         worst = beyond[np.argsort(-ratio[beyond], kind="stable")][:LISTED].tolist()
         each = [
             f"{targets.labels[i]} {found.residual_px[i]:+.2f} px = {ratio[i]:.1f} sigma"

@@ -195,3 +195,79 @@ def test_choices_that_make_no_sense_are_refused():
     refused(ArgumentError, targets.select(range(4)), robust=True, match="robust is True with 4")
     assert calibrate(targets.select(range(4)), NOMINAL).used.all()
     assert set(calibrate(targets, NOMINAL).fit.prior_sigma) <= set(PRIOR_SIGMA)
+
+
+def test_a_prior_far_tighter_than_the_targets_holds_its_parameter():
+    """Rounding of the prior's own pull must not keep the search from ending."""
+    targets = posts(size_mm=TWO_SIZES_MM)
+    report = calibrate(
+        targets, NOMINAL, free=("k_prime_px", "b_prime_px"), prior_sigma={"k_prime_px": 1e-3}
+    )
+    assert report.fit.model.k_prime_px == pytest.approx(DESIGN.k_prime_px, abs=5e-3)
+    assert report.prior_ratio["k_prime_px"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_k_alone_has_a_profile_and_a_width_bias_alone_is_no_calibration():
+    targets = posts(size_mm=TWO_SIZES_MM)
+    report = calibrate(targets, NOMINAL, free=("k_mm",), robust=False)
+    assert report.calibration.parameters_fitted == ("k_mm",)
+    assert report.profile.delta_chi_square.size == report.profile.k_mm.size
+    refused(ArgumentError, targets, free=(WIDTH_BIAS,), match="width_bias_px alone")
+
+
+@pytest.mark.filterwarnings("error")
+def test_any_choice_gives_a_report_or_one_line():
+    names = ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "b_prime_1_px", "b_prime_2_px", WIDTH_BIAS)
+    reports, lines = 0, []
+    for seed in range(150):
+        rng = np.random.default_rng([SEED, seed])
+        count = int(rng.integers(1, 14))
+        targets = posts_at_random(rng, count)
+        free = tuple(rng.permutation(names)[: rng.integers(1, 7)].tolist())
+        options = {"free": free} if rng.random() < 0.7 else {}
+        if options and rng.random() < 0.5:
+            options["prior_sigma"] = {
+                name: float(rng.choice([math.inf, 1e-3, 1.0, 1e3])) for name in free
+            }
+        try:
+            report = calibrate(targets, NOMINAL, **options)
+        except (ArgumentError, FitError) as error:
+            lines.append(str(error))
+            continue
+        reports += 1
+        assert np.isfinite(report.fit.covariance).all()
+        assert np.linalg.eigvalsh(report.fit.covariance).min() > 0.0
+        assert np.isfinite(report.range_sigma_mm(300.0, 0.3))
+    print(f"seed {SEED}: {reports} reports of 150")
+    assert reports > 50
+    assert not any("\n" in line for line in lines)
+
+
+def posts_at_random(rng, count):
+    """Posts anywhere, some with sizes and columns, some of them wrong, sigmas good or bad."""
+    ranges = rng.uniform(850.0, 2050.0, count)
+    size = np.where(rng.random(count) < 0.3, np.nan, rng.choice([10.0, 25.4, 50.8], count))
+    seen = see(rng, ranges, size_mm=size, bloom_px=rng.uniform(0.0, 4.0))
+    row = seen.row + np.where(rng.random(count) < 0.1, rng.uniform(-30.0, 30.0), 0.0)
+    return Targets(
+        np.clip(row, 0.0, 719.0), ranges, 10.0 ** rng.uniform(-3.0, 1.0),
+        rng.choice([0.0, 1.0, 30.0]), rng.choice([np.nan, 1.0]) * rng.uniform(0, 1279, count),
+        width_px=seen.width_px, size_mm=size,
+    )  # fmt: skip
+
+
+def test_a_third_of_hundreds_of_targets_may_be_wrong():
+    rng = np.random.default_rng(SEED)
+    ranges = np.linspace(800.0, 2090.0, 900)
+    row = TRUTH.row(ranges) + rng.normal(0.0, 0.3, 900)
+    wrong = rng.random(900) < 0.33
+    row[wrong] += rng.choice([-1.0, 1.0], wrong.sum()) * rng.uniform(3.0, 30.0, wrong.sum())
+    inside = (row > 0.0) & (row < 719.0)
+    report = calibrate(Targets(row, ranges, 0.3, 0.01).select(inside), NOMINAL)
+    left_out = {entry.index for entry in report.rejected}
+    assert left_out == set(np.flatnonzero(wrong[inside]).tolist())
+    assert (
+        np.abs(report.fit.model.range_mm(TRUTH.row([800.0, 2100.0])) - [800.0, 2100.0]).max() < 0.3
+    )
+    assert report.verdicts[0] == "identifiable"
+    assert not any("beyond 3 sigma" in line for line in report.verdicts)
