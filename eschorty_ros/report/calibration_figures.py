@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 SIGMA_ROW_PX = 0.3
 """Centroid error of a measurement that the range sigma is drawn for."""
+MANY, FEW = 60, 6
+"""More targets than `MANY` are drawn small; a number goes to `FEW` rejected ones at most."""
 SYMBOLS = {
     "k_mm": "k (mm)",
     "k_prime_px": "k' (px)",
@@ -52,10 +54,11 @@ def curve_figure(report: CalibrationReport) -> Figure:
     curve.plot(rows, nominal.range_mm(rows), "--", color="0.5", label="nominal")
     curve.plot(rows, model.range_mm(rows), color="C0", label="fitted")
     targets, used = report.targets, report.used
-    curve.plot(targets.row[used], targets.range_mm[used], "o", color="C1", ms=5, label="used")
+    size = _marker(report)
+    curve.plot(targets.row[used], targets.range_mm[used], "o", color="C1", ms=size, label="used")
     if not used.all():
         curve.plot(
-            targets.row[~used], targets.range_mm[~used], "x", color="C3", ms=7, label="rejected"
+            targets.row[~used], targets.range_mm[~used], "x", color="C3", ms=size, label="rejected"
         )
     curve.set(xlabel="row (px)", ylabel="range (mm)", title="Fitted curve and targets")
     sigma.plot(rows, report.range_sigma_mm(rows), color="C0", label="calibration alone")
@@ -87,10 +90,12 @@ def residual_figure(report: CalibrationReport) -> Figure:
     order = np.argsort(at[used])
     band = 3.0 * fit.sigma_px[order]
     in_rows.fill_between(at[used][order], -band, band, color="0.9", label="± 3 sigma")
-    in_rows.plot(at[used], residual[used], "o", color="C1", ms=5, label="used")
-    in_rows.plot(at[used], alone[used], "o", mfc="none", color="C0", ms=8, label="leave one out")
+    size = _marker(report)
+    in_rows.plot(at[used], residual[used], "o", color="C1", ms=size, label="used")
+    if len(targets) <= MANY:
+        in_rows.plot(at[used], alone[used], "o", mfc="none", color="C0", ms=8, label="left out")
     limit = 1.3 * float(np.nanmax(np.abs([*band, *residual[used], *alone[used]])))
-    _rejected(in_rows, at[~used], residual[~used], limit)
+    _rejected(in_rows, at[~used], residual[~used], limit, size)
     in_rows.set(
         xlabel="range (mm)", ylabel="row residual (px)", title="In rows", ylim=(-limit, limit)
     )
@@ -101,9 +106,9 @@ def residual_figure(report: CalibrationReport) -> Figure:
         in_mm.plot(ranges, sign * focus, ":", color="C4", label=name)
         name = "± one row (Eq. 4)" if sign > 0.0 else None
         in_mm.plot(ranges, sign * step, "--", color="C2", label=name)
-    in_mm.plot(at[used], report.residual_mm[used], "o", color="C1", ms=5, label="used")
+    in_mm.plot(at[used], report.residual_mm[used], "o", color="C1", ms=size, label="used")
     if not used.all():
-        in_mm.plot(at[~used], report.residual_mm[~used], "x", color="C3", ms=7, label="rejected")
+        in_mm.plot(at[~used], report.residual_mm[~used], "x", color="C3", ms=size, label="rejected")
     in_mm.set_yscale("symlog", linthresh=5.0)
     in_mm.set(xlabel="range (mm)", ylabel="range residual (mm)", title="Against one row and focus")
     ticks = [-100, -10, -5, 0, 5, 10, 100]
@@ -150,7 +155,7 @@ def magnification_figure(report: CalibrationReport) -> Figure:
             scale = pixel_mm / true_mm[known]
             axes.errorbar(
                 targets.row[known], seen[known] * scale, 3.0 * sigma[known] * scale, fmt=marker,
-                color=colour, ms=5, lw=1, capsize=2, label=f"{name} ± 3 sigma",
+                color=colour, ms=_marker(report), lw=1, capsize=2, label=f"{name} ± 3 sigma",
             )  # fmt: skip
     axes.axvspan(model.rows - 0.5, 1.05 * -model.b_prime_px, color="0.93", label="off the sensor")
     axes.set(
@@ -244,12 +249,19 @@ def _interval(axes: Axes, report: CalibrationReport, name: str) -> None:
     axes.grid(alpha=0.3)
 
 
-def _rejected(axes: Axes, at: Array, residual: Array, limit: float) -> None:
-    """Crosses, at the rim with their number where they lie beyond it."""
+def _marker(report: CalibrationReport) -> float:
+    """Size of a point, smaller where they would hide each other."""
+    return 6.0 if len(report.targets) <= MANY else 2.0
+
+
+def _rejected(axes: Axes, at: Array, residual: Array, limit: float, size: float) -> None:
+    """Crosses, at the rim where they lie beyond it, with their number if they are few."""
     if not at.size:
         return
-    axes.plot(at, np.clip(residual, -0.93 * limit, 0.93 * limit), "x", color="C3", ms=7,
+    axes.plot(at, np.clip(residual, -0.93 * limit, 0.93 * limit), "x", color="C3", ms=size,
               label="rejected")  # fmt: skip
+    if at.size > FEW:
+        return
     for x, y in zip(at, residual, strict=True):
         if abs(y) > limit:
             axes.annotate(

@@ -32,9 +32,9 @@ _FIGURES: tuple[tuple[Callable[[CalibrationReport], Figure], str], ...] = (
     (
         drawn.residual_figure,
         "Left: residuals in rows, where the errors are, with three standard deviations; open "
-        "circles are residuals against the fit without that target. Right: the same as ranges, "
-        "against the step of one row (Eq. 4) and the depth of field (Eq. 3). The depth of field "
-        "is no criterion: it is more than ten times too wide.",
+        "circles (of up to 60 targets) are residuals against the fit without that target. Right: "
+        "the same as ranges, against the step of one row (Eq. 4) and the depth of field (Eq. 3). "
+        "The depth of field is no criterion: it is more than ten times too wide.",
     ),
     (
         drawn.magnification_figure,
