@@ -164,7 +164,7 @@ def test_wrong_usage_is_exit_code_2(targets_csv, tmp_path):
         ((targets_csv, "--method", "best"), "'best' is not one of"),
         ((tmp_path / "rec",), "give --distances or --moving"),
         ((tmp_path / "rec", "--distances", "1", "--moving", 5), "give --distances or --moving"),
-        ((), "Missing argument"),
+        ((), "no SOURCE"),
     ):
         done = run(*arguments)
         assert done.exit_code == 2, done.output

@@ -9,22 +9,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import progress_bar, show, table
-from eschorty_ros.core.errors import FitError
+from eschorty_ros.cli.calibrate_simulated import calibrate_simulated
+from eschorty_ros.cli.calibration_sources import known, recorded
+from eschorty_ros.cli.console import show, table
 
 if TYPE_CHECKING:
     from eschorty_ros.core.calibrate import CalibrationReport
-    from eschorty_ros.core.calibration import Calibration
-    from eschorty_ros.core.posts import KnownTarget
-    from eschorty_ros.core.targets import Targets
 
 
 @click.command("calibrate")
 @click.argument(
     "sources",
-    metavar="SOURCE...",
+    metavar="[SOURCE]...",
     nargs=-1,
-    required=True,
     type=click.Path(exists=True, path_type=Path),
 )
 @click.option(
@@ -92,6 +89,17 @@ if TYPE_CHECKING:
     "--range-sigma", type=click.FloatRange(0), default=1.0, show_default=True,
     help="Error of a known range, mm, where the file gives none.",
 )  # fmt: skip
+@click.option(
+    "--fake",
+    is_flag=True,
+    help="No SOURCE: run all nodes on simulated hardware and calibrate on nine posts.",
+)
+@click.option(
+    "--as-built",
+    default="config_3_as_built",
+    show_default=True,
+    help="With --fake: the build that the simulated world really has.",
+)
 def command(
     sources: tuple[Path, ...],
     nominal: str,
@@ -105,6 +113,8 @@ def command(
     robust: bool | None,
     row_sigma: float,
     range_sigma: float,
+    fake: bool,
+    as_built: str,
 ) -> None:
     """Calibrate a build on targets at known ranges.
 
@@ -140,6 +150,7 @@ def command(
       eschorty calibrate rec --distances 820,960,1110,1270,1440,1610,1770,1910,2050
       eschorty calibrate rec --distances posts.csv --prior b_mm=1
       eschorty calibrate forth back --moving 780
+      eschorty calibrate --fake
 
     \b
     Exit codes:
@@ -147,6 +158,12 @@ def command(
       1  the targets do not determine the build, or a file is at fault
       2  wrong usage
     """  # noqa: D301
+    if fake:
+        if sources or moving is not None or free or prior or robust is not None:
+            raise click.UsageError("--fake takes no SOURCE, --moving, --free, --prior or --robust")
+        _check_out(out)
+        calibrate_simulated(known(distances, range_sigma), nominal, as_built, method, out)
+        return
     _check_usage(sources, out, distances, moving)
     priors = _priors(prior)
     from eschorty_ros.core.calibrate import calibrate
@@ -160,7 +177,7 @@ def command(
     made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
     targets = Targets.concatenate(
         [
-            _recorded(source, design, distances, moving, range_per_stage, range_sigma)
+            recorded(source, design, distances, moving, range_per_stage, range_sigma)
             if source.is_dir()
             else read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
             for source in sources
@@ -187,13 +204,19 @@ def command(
 def _check_usage(
     sources: tuple[Path, ...], out: Path, distances: str | None, moving: float | None
 ) -> None:
-    if out.suffix not in (".yaml", ".yml"):
-        raise click.UsageError(f"--out is {out}; give a path ending in .yaml")
+    _check_out(out)
+    if not sources:
+        raise click.UsageError("no SOURCE; give targets.csv, a recording, or --fake")
     folders = [source for source in sources if source.is_dir()]
     if not folders and (distances is not None or moving is not None):
         raise click.UsageError("--distances and --moving belong to a recording folder")
     if folders and (distances is None) == (moving is None):
         raise click.UsageError(f"{folders[0]} is a recording; give --distances or --moving")
+
+
+def _check_out(out: Path) -> None:
+    if out.suffix not in (".yaml", ".yml"):
+        raise click.UsageError(f"--out is {out}; give a path ending in .yaml")
 
 
 def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
@@ -208,50 +231,6 @@ def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
         if not equals:
             raise click.UsageError(f"--prior is {text!r}; write NAME=SIGMA, such as b_mm=3")
     return priors or None
-
-
-def _recorded(
-    source: Path,
-    design: Calibration,
-    distances: str | None,
-    moving: float | None,
-    range_per_stage: float,
-    range_sigma: float,
-) -> Targets:
-    from eschorty_ros.core.recorded_targets import recorded_moving_target, recorded_posts
-    from eschorty_ros.core.recording import load_recording
-
-    recording = load_recording(source)
-    with progress_bar("reading") as report:
-
-        def progress(done: int, total: int) -> None:
-            report(done / max(total, 1), "")
-
-        if moving is not None:
-            return recorded_moving_target(
-                recording, design, moving, range_per_stage=range_per_stage, progress=progress
-            )
-        known = _known(distances or "", range_sigma)
-        match = recorded_posts(recording, known, design, progress)
-    for line in match.rejected:
-        click.echo(f"left out: {line}")
-    if match.targets is None:
-        raise FitError(
-            f"--distances is {distances}; no post lies where they say, check the ranges and "
-            "--nominal"
-        )
-    return match.targets
-
-
-def _known(distances: str, range_sigma: float) -> list[KnownTarget]:
-    from eschorty_ros.core.posts import KnownTarget
-    from eschorty_ros.core.targets_file import read_distances
-
-    try:
-        ranges = [float(part) for part in distances.split(",")]
-    except ValueError:
-        return read_distances(distances, sigma_range_mm=range_sigma)
-    return [KnownTarget(range_mm, range_sigma) for range_mm in ranges]
 
 
 def _show(report: CalibrationReport) -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.instrument import ended_by_signals, one_process
 from eschorty_ros.cli.options import check_sweep, sweep_options
-from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.errors import DeviceError
 
 if TYPE_CHECKING:
     from eschorty_ros.nodes.one_process import OneScan, Outcome
@@ -53,19 +51,16 @@ def command(
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
     """  # noqa: D301
     check_sweep(start, stop)
-    one_process = _nodes()
+    nodes = one_process("scan")
     _check(scene, calibration)
-    request = one_process.OneScan(scene, calibration, start, stop, speed, frequency, seed, pixels)
+    request = nodes.OneScan(scene, calibration, start, stop, speed, frequency, seed, pixels)
     out.mkdir(parents=True, exist_ok=True)
-    # A shell's background job starts with SIGINT ignored; a laser must go off all the same.
-    handlers = {signal.SIGTERM: _terminated, signal.SIGINT: signal.default_int_handler}
-    previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
-        with progress_bar("scanning") as report, one_process.instrument(request) as made:
-            outcome = made.scan(request, report)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    with (
+        ended_by_signals(),
+        progress_bar("scanning") as report,
+        nodes.instrument(request) as made,
+    ):
+        outcome = made.scan(request, report)
     finish(request, outcome, out)
 
 
@@ -123,19 +118,3 @@ def _print(outcome: Outcome, measured: Accuracy, seconds: float, out: Path) -> N
             "seconds of sweep": f"{seconds:.2f}",
         },
     )
-
-
-def _nodes() -> ModuleType:
-    """Import the composition of nodes; a missing ROS 2 is a stated failure."""
-    try:
-        from eschorty_ros.nodes import one_process
-    except ImportError as error:
-        raise EschortyError(
-            f"ROS 2 is not ready ({error}); run `make scan`, or source a ROS 2 installation in "
-            "which this package is built; `eschorty simulate` needs no ROS"
-        ) from error
-    return one_process
-
-
-def _terminated(*_: object) -> NoReturn:
-    sys.exit(128 + signal.SIGTERM)

@@ -235,6 +235,20 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
     )
 
 
+def config_file(name: str) -> Path:
+    """Path of a file that lies in ``config/``.
+
+    Raises
+    ------
+    CalibrationError
+        When there is none of that name.
+    """
+    for folder in config_folders():
+        if (folder / name).is_file():
+            return folder / name
+    raise CalibrationError(f"there is no {name} in config/; give the path of a file")
+
+
 def config_folders() -> list[Path]:
     """List where builds may lie: source tree, inside a pip-installed package, colcon's share."""
     here = Path(__file__).absolute()

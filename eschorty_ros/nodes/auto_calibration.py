@@ -13,7 +13,7 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from eschorty_ros.action import Calibrate
-from eschorty_ros.core.calibration import config_folders
+from eschorty_ros.core.calibration import config_file
 from eschorty_ros.core.targets_file import read_distances
 from eschorty_ros.nodes.calibration_messages import target_message
 
@@ -31,8 +31,8 @@ class AutoCalibration:
 
     Raises
     ------
-    FormatError
-        When the file cannot be read.
+    FormatError, CalibrationError
+        When the file cannot be read, or there is none of that name.
     """
 
     def __init__(self, node: Node, distances: str, method: str, capture_s: float) -> None:
@@ -53,8 +53,5 @@ class AutoCalibration:
 
 
 def _find(name_or_path: str) -> Path:
-    if os.sep not in name_or_path and not name_or_path.endswith(".csv"):
-        for folder in config_folders():
-            if (folder / f"{name_or_path}.csv").is_file():
-                return folder / f"{name_or_path}.csv"
-    return Path(name_or_path)
+    bare = os.sep not in name_or_path and "." not in name_or_path
+    return config_file(f"{name_or_path}.csv") if bare else Path(name_or_path)

@@ -202,6 +202,17 @@ class CalibrationOutcome:
     frame: NDArray[np.uint8]
 
 
+def calibration_parameters(job: OneCalibration) -> Tables:
+    """Parameters of every node for a calibration on simulated hardware."""
+    tables = lossless_events()
+    tables["camera"] |= _world(job)
+    tables["reconstruction"] |= {
+        "calibration": job.calibration,
+        "calibration_folder": job.folder,
+    }
+    return tables
+
+
 def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcome:
     """Run all nodes on simulated hardware, calibrate once through the action, end them.
 
@@ -216,13 +227,7 @@ def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcom
     DeviceError
         When the nodes do not answer, refuse the goal or take far too long.
     """
-    tables = lossless_events()
-    tables["camera"] |= _world(job)
-    tables["reconstruction"] |= {
-        "calibration": job.calibration,
-        "calibration_folder": job.folder,
-    }
-    with composition(tables) as running:
+    with composition(calibration_parameters(job)) as running:
         feedback(0.0, "starting")
         action: ActionClient[Any, Any, Any] = ActionClient(running.client, Calibrate, "calibrate")
         running.wait_until_active(action)

@@ -1,0 +1,46 @@
+"""What the commands share that run all nodes in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from types import ModuleType
+from typing import NoReturn
+
+from eschorty_ros.core.errors import EschortyError
+
+
+def one_process(make: str) -> ModuleType:
+    """Import the composition of nodes; a missing ROS 2 is a stated failure.
+
+    ``make`` is the Makefile's target that does the same with all set-up.
+    """
+    try:
+        from eschorty_ros.nodes import one_process
+    except ImportError as error:
+        raise EschortyError(
+            f"ROS 2 is not ready ({error}); run `make {make}`, or source a ROS 2 installation in "
+            "which this package is built; `eschorty simulate` needs no ROS"
+        ) from error
+    return one_process
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Within it SIGTERM and SIGINT end the process the orderly way.
+
+    A shell's background job starts with SIGINT ignored; a laser must go off all the same.
+    """
+    handlers = {signal.SIGTERM: _terminated, signal.SIGINT: signal.default_int_handler}
+    previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _terminated(*_: object) -> NoReturn:
+    sys.exit(128 + signal.SIGTERM)
