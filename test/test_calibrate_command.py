@@ -133,6 +133,25 @@ def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
     assert made.columns == 48
 
 
+def test_roll_and_smile_show_in_a_target_moved_by_the_stage(tmp_path):
+    small = {"columns": 192, "principal_column": 95.5}
+    bent = {"b_prime_1_px": -9.0, "b_prime_2_px": 5.0}
+    save_calibration(NOMINAL.model_copy(update=small), tmp_path / "nominal.yaml")
+    simulate_recording(
+        tmp_path / "rec", Plane(1500.0, slope_stage=1.0), AS_BUILT.model_copy(update=small | bent),
+        start_mm=10.0, stop_mm=160.0, speed_mm_s=300.0, seed=SEED,
+    )  # fmt: skip
+    out = tmp_path / "made.yaml"
+    free = [f"--free={name}" for name in ("k_prime_px", "b_prime_px", *bent)]
+    done = run(tmp_path / "rec", "--moving", 1500.0, "--nominal", tmp_path / "nominal.yaml",
+               *free, "--out", out)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    made = load_calibration(out)
+    print(f"seed {SEED}: b'1 {made.b_prime_1_px:.2f} px, b'2 {made.b_prime_2_px:.2f} px")
+    assert made.b_prime_1_px == pytest.approx(-9.0, abs=0.2)
+    assert made.b_prime_2_px == pytest.approx(5.0, abs=0.5)
+
+
 def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
     out = tmp_path / "made.yaml"
     out.write_text("old")

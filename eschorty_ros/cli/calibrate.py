@@ -16,6 +16,9 @@ from eschorty_ros.cli.console import show, table
 if TYPE_CHECKING:
     from eschorty_ros.core.calibrate import CalibrationReport
 
+BLOCKS = 8
+"""Targets side by side that a moving target gives when the fit asks for roll or smile."""
+
 
 @click.command("calibrate")
 @click.argument(
@@ -150,6 +153,8 @@ def command(
       eschorty calibrate rec --distances 820,960,1110,1270,1440,1610,1770,1910,2050
       eschorty calibrate rec --distances posts.csv --prior b_mm=1
       eschorty calibrate forth back --moving 780
+      eschorty calibrate forth back --moving 780 --free k_prime_px --free b_prime_px \\
+                         --free b_prime_1_px --free b_prime_2_px
       eschorty calibrate --fake
 
     \b
@@ -168,6 +173,7 @@ def command(
     priors = _priors(prior)
     from eschorty_ros.core.calibrate import calibrate
     from eschorty_ros.core.calibration import load_calibration, save_calibration
+    from eschorty_ros.core.calibration_fit import COLUMN_TERMS
     from eschorty_ros.core.files import atomic_write
     from eschorty_ros.core.targets import Targets
     from eschorty_ros.core.targets_file import read_targets
@@ -175,9 +181,11 @@ def command(
 
     design = load_calibration(nominal)
     made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
+    # What varies across the columns shows in several targets side by side.
+    blocks = BLOCKS if set(COLUMN_TERMS) & set(free) else 1
     targets = Targets.concatenate(
         [
-            recorded(source, design, distances, moving, range_per_stage, range_sigma)
+            recorded(source, design, distances, moving, range_per_stage, range_sigma, blocks)
             if source.is_dir()
             else read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
             for source in sources

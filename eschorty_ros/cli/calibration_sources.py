@@ -23,8 +23,11 @@ def recorded(
     moving: float | None,
     range_per_stage: float,
     range_sigma: float,
+    blocks: int = 1,
 ) -> Targets:
     """Find the targets of a recording: posts, or one target moved by the stage.
+
+    ``blocks`` is how many targets stand side by side in every profile of a moving one.
 
     Raises
     ------
@@ -42,8 +45,9 @@ def recorded(
 
         if moving is not None:
             return recorded_moving_target(
-                recording, design, moving, range_per_stage=range_per_stage, progress=progress
-            )
+                recording, design, moving, range_per_stage=range_per_stage, blocks=blocks,
+                progress=progress,
+            )  # fmt: skip
         match = recorded_posts(recording, known(distances, range_sigma), design, progress)
     for line in match.rejected:
         click.echo(f"left out: {line}")

@@ -68,7 +68,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     stages = stage_mm + _LOOKS * half_mm
     range_mm = scene.range_mm(stages, columns, model)
     reflectance = scene.reflectance(stages, columns, model)
-    row = np.where(np.isfinite(range_mm), model.row(range_mm), np.nan)
+    row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
     step = _jumps(row, reflectance)
     # The edge next to the middle, of the looks' four stretches.
     order = np.array([1, 2, 0, 3])
@@ -87,7 +87,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     here_row, here_reflectance = row[_CENTRE, split], reflectance[_CENTRE, split]
     patch_row = np.column_stack((here_row, there_row))
     with np.errstate(invalid="ignore"):
-        per_mm = model.rows_per_mm_off_sheet(model.range_mm(patch_row))
+        per_mm = model.rows_per_mm_off_sheet(model.range_mm(patch_row, split[:, np.newaxis]))
     border = patch_row - edge_mm[:, np.newaxis] * per_mm
     ahead = (edge_mm > 0.0)[:, np.newaxis]
     middle = np.array([True, False])
@@ -124,7 +124,7 @@ def _edges(
     """
     stages = np.linspace(stretch[0], stretch[1], _FINE + 1)
     range_mm = scene.range_mm(stages, columns, model)
-    row = np.where(np.isfinite(range_mm), model.row(range_mm), np.nan)
+    row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
     reflectance = scene.reflectance(stages, columns, model)
     each = np.arange(columns.size)
     lit = np.isfinite(row)
