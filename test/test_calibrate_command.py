@@ -12,8 +12,8 @@ from calibration_posts import NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, range_error
 from click.testing import CliRunner
 
 from eschorty_ros.cli import main
-from eschorty_ros.core.calibrate import PRIOR_SIGMA
 from eschorty_ros.core.calibration import load_calibration, save_calibration
+from eschorty_ros.core.calibration_fit import PRIOR_SIGMA
 from eschorty_ros.core.targets_file import DISTANCE_COLUMNS, TARGET_COLUMNS
 from eschorty_ros.simulation.recorder import simulate_recording
 from eschorty_ros.simulation.scene import Plane

@@ -30,7 +30,13 @@ from eschorty_ros.core.calibration_diagnostics import (
     prior_ratios,
     verdicts,
 )
-from eschorty_ros.core.calibration_fit import PAPER_FREE, CalibrationFit, fit
+from eschorty_ros.core.calibration_fit import (
+    K_PRIOR_SHARE,
+    PAPER_FREE,
+    PRIOR_SIGMA,
+    CalibrationFit,
+    fit,
+)
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.targets import Targets
@@ -39,16 +45,6 @@ Array = NDArray[np.float64]
 Method = Literal["paper", "joint"]
 
 METHODS: tuple[Method, ...] = ("paper", "joint")
-PRIOR_SIGMA = {
-    "k_prime_px": 3000.0,
-    "b_mm": 3.0,
-    "b_prime_px": 60.0,
-    "b_prime_1_px": 15.0,
-    "b_prime_2_px": 5.0,
-    WIDTH_BIAS: 3.0,
-}
-"""How far a build is expected from its design; k lies within `K_PRIOR_SHARE` of its own."""
-K_PRIOR_SHARE = 0.01
 _CHANNELS = ("row", "width", "spacing")
 
 
@@ -211,8 +207,7 @@ def _free(method: Method, free: Sequence[str] | None, targets: Targets) -> Seque
         raise ArgumentError(f"method is {method!r}; choose {' or '.join(METHODS)}")
     if method == "paper":
         if free is not None:
-            raise ArgumentError("method paper fits k_prime_px and b_prime_px; choose joint or "
-                                "leave free out")  # fmt: skip
+            raise ArgumentError("method paper fits k_prime_px and b_prime_px; leave free out")
         return PAPER_FREE
     if free is not None:
         return free

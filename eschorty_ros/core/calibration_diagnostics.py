@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core._calibration_model import COLUMN_TERMS, WIDTH_BIAS, Observed
 from eschorty_ros.core._calibration_solvers import Problem, solve
-from eschorty_ros.core.calibration_fit import CONDITION_WARNING, CalibrationFit
+from eschorty_ros.core.calibration_fit import (
+    CONDITION_WARNING,
+    PRIOR_SIGMA,
+    CalibrationFit,
+    fit,
+)
 from eschorty_ros.core.errors import FitError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.targets import Targets
@@ -146,6 +151,7 @@ def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tup
                 f"{name} lies {abs(pull):.1f} prior sigmas from the design; check the nominal "
                 "build or widen its prior"
             )
+    lines += _sizes(targets, design, found)
     return (*lines, *_coverage(targets, found), *_residuals(targets, found))
 
 
@@ -159,6 +165,28 @@ def _remedy(name: str) -> str:
 
 def _centre(design: RangeModel, name: str) -> float:
     return 0.0 if name == WIDTH_BIAS else float(getattr(design, name))
+
+
+def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[str]:
+    """Say when known sizes contradict a k that stayed as designed."""
+    if "k_mm" in found.free or not targets.lateral:
+        return []
+    names, priors = ["k_mm", *found.free], dict(found.prior_sigma)
+    if targets.has_width.any() and WIDTH_BIAS not in names:
+        names.append(WIDTH_BIAS)
+        priors[WIDTH_BIAS] = PRIOR_SIGMA[WIDTH_BIAS]
+    try:
+        freed = fit(targets, design, names, prior_sigma=priors)
+    except FitError:
+        return []
+    k_mm, sigma = freed.model.k_mm, math.sqrt(freed.covariance[0, 0])
+    away = abs(k_mm - design.k_mm) / sigma
+    if away <= RESIDUAL_SIGMA:
+        return []
+    return [
+        f"sizes contradict k_mm: they say {k_mm:.3f} with a sigma of {sigma:.3f}, {away:.1f} sigma "
+        f"from the {design.k_mm:.3f} it was held at; method joint fits it"
+    ]
 
 
 def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:

@@ -36,8 +36,10 @@ from eschorty_ros.core.targets import Targets
 __all__ = [
     "COLUMN_TERMS",
     "CONDITION_WARNING",
+    "K_PRIOR_SHARE",
     "PAPER_FREE",
     "PARAMETERS",
+    "PRIOR_SIGMA",
     "WIDTH_BIAS",
     "CalibrationFit",
     "fit",
@@ -47,6 +49,16 @@ __all__ = [
 Array = NDArray[np.float64]
 
 CONDITION_WARNING = 1e3
+PRIOR_SIGMA = {
+    "k_prime_px": 3000.0,
+    "b_mm": 3.0,
+    "b_prime_px": 60.0,
+    "b_prime_1_px": 15.0,
+    "b_prime_2_px": 5.0,
+    WIDTH_BIAS: 3.0,
+}
+"""How far a build is expected from its design; k lies within `K_PRIOR_SHARE` of it."""
+K_PRIOR_SHARE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)

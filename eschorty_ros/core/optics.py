@@ -185,19 +185,10 @@ class RangeModel:
             return np.asarray(self.b_prime_px + u * (self.b_prime_1_px + u * self.b_prime_2_px))
 
     def range_mm(self, row: ArrayLike, column: ArrayLike | None = None) -> Array:
-        """Range along the sheet from the mechanical datum (Eq. 2 inverted).
+        """Range along the sheet from the mechanical datum, mm (Eq. 2 inverted).
 
-        Parameters
-        ----------
-        row : array_like, any shape
-            Row coordinate, px; may lie off the sensor.
-        column : array_like, optional
-            Where the row was seen; broadcasts with ``row``. The principal column by default.
-
-        Returns
-        -------
-        ndarray of float64, shape of ``row`` and ``column``
-            mm; NaN within 1 px of the pole and behind it (``row + b' > -1``).
+        ``row`` may lie off the sensor; ``column`` is where it was seen, by default the principal
+        one. They broadcast. NaN within 1 px of the pole and behind it (``row + b' > -1``).
         """
         return np.asarray(self.product_mm_px / self._image_px(row, column) - self.b_mm)
 

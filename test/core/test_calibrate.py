@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from calibration_posts import DESIGN, NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, see
 
-from eschorty_ros.core.calibrate import PRIOR_SIGMA, calibrate
+from eschorty_ros.core.calibrate import calibrate
 from eschorty_ros.core.calibration import load_calibration, save_calibration
-from eschorty_ros.core.calibration_fit import WIDTH_BIAS, fit
+from eschorty_ros.core.calibration_fit import PRIOR_SIGMA, WIDTH_BIAS, fit
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.targets import Targets
 
@@ -271,3 +271,16 @@ def test_a_third_of_hundreds_of_targets_may_be_wrong():
     )
     assert report.verdicts[0] == "identifiable"
     assert not any("beyond 3 sigma" in line for line in report.verdicts)
+
+
+def test_sizes_that_contradict_the_k_of_the_papers_method_are_said():
+    other = replace(TRUTH, k_mm=25.0)
+    targets = see(np.random.default_rng(SEED), truth=other, size_mm=TWO_SIZES_MM, bloom_px=4.0)
+    line = next(v for v in calibrate(targets, NOMINAL, "paper").verdicts if "sizes" in v)
+    stated = float(line.split("they say ")[1].split()[0])
+    assert stated == pytest.approx(25.0, rel=0.006)
+    assert "method joint fits it" in line
+    good = see(np.random.default_rng(SEED), truth=DESIGN, size_mm=TWO_SIZES_MM, bloom_px=4.0)
+    for method in ("paper", "joint"):
+        assert not any("sizes" in v for v in calibrate(good, NOMINAL, method).verdicts)
+    assert not any("sizes" in v for v in calibrate(targets, NOMINAL).verdicts)

@@ -18,9 +18,15 @@ from calibration_posts import (
     see,
 )
 
-from eschorty_ros.core.calibrate import K_PRIOR_SHARE, PRIOR_SIGMA, calibrate
+from eschorty_ros.core.calibrate import calibrate
 from eschorty_ros.core.calibration import BUILDS, load_calibration
-from eschorty_ros.core.calibration_fit import PARAMETERS, WIDTH_BIAS, fit
+from eschorty_ros.core.calibration_fit import (
+    K_PRIOR_SHARE,
+    PARAMETERS,
+    PRIOR_SIGMA,
+    WIDTH_BIAS,
+    fit,
+)
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.targets import Targets
 

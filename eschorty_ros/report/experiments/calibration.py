@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.calibrate import K_PRIOR_SHARE, PRIOR_SIGMA, calibrate
+from eschorty_ros.core.calibrate import calibrate
 from eschorty_ros.core.calibration import Calibration, load_calibration
-from eschorty_ros.core.calibration_fit import PARAMETERS, WIDTH_BIAS, CalibrationFit, fit
+from eschorty_ros.core.calibration_fit import (
+    K_PRIOR_SHARE,
+    PARAMETERS,
+    PRIOR_SIGMA,
+    WIDTH_BIAS,
+    CalibrationFit,
+    fit,
+)
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.targets import Targets
 from eschorty_ros.report.experiment import (
