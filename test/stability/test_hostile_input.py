@@ -35,6 +35,7 @@ TESTED_ELSEWHERE = {
     "calibration_diagnostics.chi_square_limit", "calibration_diagnostics.listed",
     "calibration_diagnostics.k_profile", "calibration_diagnostics.leave_one_out_px",
     "calibration_diagnostics.prior_ratios", "calibration_diagnostics.verdicts",
+    "calibration_identity.refuse_other_instrument",
     # Their arguments go to moving_target and match_posts.
     "recorded_targets.recorded_moving_target", "recorded_targets.recorded_posts",
     # Every key of the file has its own test in test/core/test_calibration_file.py.
