@@ -243,10 +243,11 @@ def config_file(name: str) -> Path:
     CalibrationError
         When there is none of that name.
     """
+    wanted = file_path("name", name)
     for folder in config_folders():
-        if (folder / name).is_file():
-            return folder / name
-    raise CalibrationError(f"there is no {name} in config/; give the path of a file")
+        if (folder / wanted).is_file():
+            return folder / wanted
+    raise CalibrationError(f"name is {name!r}, and config/ has no such file; give its path instead")
 
 
 def config_folders() -> list[Path]:

@@ -39,6 +39,9 @@ def write_atomically(path: Any) -> None:
 
 
 CALLS: dict[str, Call] = {
+    "calibration.config_file": Call(
+        calibration.config_file, {"name": "config_3.yaml"}, {"name": path()}
+    ),
     "calibration.load_calibration": Call(
         calibration.load_calibration,
         {"name_or_path": "config_3"},
