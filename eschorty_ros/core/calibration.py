@@ -50,7 +50,8 @@ class Calibration(Schema):
     :class:`~eschorty_ros.core.optics.RangeModel`; the sign of ``theta_prime_deg`` tells the side
     to which the sensor is tilted. ``k_mm`` left out means ``focal_length_mm / sin(theta_deg)``,
     unrounded. ``roi_px`` is the window that the camera reads out, ``[first column, first row,
-    columns, rows]``; left out it is the whole sensor. ``stage_direction`` is the unit vector of
+    columns, rows]``; left out it is the whole sensor. ``b_prime_1_px`` and ``b_prime_2_px`` are
+    roll and smile of the laser line, 0 unless fitted. ``stage_direction`` is the unit vector of
     stage travel in ``eschorty_link``.
     The keys from ``id`` on describe a fit: ``covariance`` belongs to ``parameters_fitted`` in
     that order and in their units, ``range_mm`` is the span the fit has seen.

@@ -165,10 +165,7 @@ class RangeModel:
 
     @property
     def range_limits_mm(self) -> tuple[float, float]:
-        """Range at row 0 and at the last row in the principal column, mm.
-
-        Infinite where the pole is on the sensor.
-        """
+        """Range at both ends of the principal column, mm; infinite where the pole is on it."""
         near, far = self.range_mm([0.0, self.rows - 1.0])
         return float(near), math.inf if math.isnan(far) else float(far)
 
