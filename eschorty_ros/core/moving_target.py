@@ -19,6 +19,7 @@ SIGMA_STAGE_MM = 0.01
 """How well an encoder tells where the target is."""
 _SEEN_SHARE = 0.5
 _OUTLIER_PX = 4.0
+_PAIRED_MAX = 300
 _LATE_PX = 0.23
 """A moving line is seen late by this much; the other way round on the way back."""
 
@@ -62,7 +63,8 @@ def moving_target(
     Returns
     -------
     Targets
-        By time, then column; ``label`` is the stage position in mm.
+        By time, then column; ``label`` is the stage position in mm. Profiles that are more than
+        4 px off what the others say, or show the target in few columns, are left out.
 
     Raises
     ------
@@ -145,7 +147,7 @@ def _measured(
             f"range_at_zero_mm is {range_at_zero_mm!r}: at a stage position of "
             f"{at_mm[np.argmin(range_mm)]:g} mm the target would lie behind the datum"
         )
-    return Targets(
+    targets = Targets(
         row=centre[enough],
         range_mm=range_mm,
         sigma_row_px=np.hypot(scatter, math.hypot(GRID_SIGMA_PX, _LATE_PX))[enough],
@@ -153,3 +155,17 @@ def _measured(
         column=mean(column)[enough],
         labels=[f"stage {mm:.3f} mm" for mm in at_mm.tolist()],
     )
+    return targets.select(_following(targets.row, 1.0 / targets.range_mm))
+
+
+def _following(row: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mark the rows near the straight line in ``1 / R`` through the median of all pairs."""
+    few = np.unique(np.linspace(0, row.size - 1, min(row.size, _PAIRED_MAX)).round().astype(int))
+    one, other = np.triu_indices(few.size, 1)
+    run = inverse[few][other] - inverse[few][one]
+    apart = run != 0.0
+    if not apart.any():
+        return np.ones(row.size, bool)
+    slope = np.median((row[few][other] - row[few][one])[apart] / run[apart])
+    away = row - slope * inverse
+    return np.abs(away - np.median(away)) <= _OUTLIER_PX

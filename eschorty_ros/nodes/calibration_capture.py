@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from eschorty_ros.core.posts import AggregateFrame, find_posts, match_posts, mov
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.targets import Targets
 from eschorty_ros.nodes.calibration_sequence import CaptureRequest, Sweep
+from eschorty_ros.nodes.packet_stream import Packet
 from eschorty_ros.nodes.stage_placer import TimedProfiles
 
 _TARGETS_LEAST = 3
@@ -48,8 +49,9 @@ class Capture(Protocol):
     """Fed by the reconstruction's worker; looked at when the light is off, or in a copy."""
 
     frame: AggregateFrame
+    packets_lost: int
 
-    def packet(self, data: Any) -> None:
+    def packet(self, packet: Packet) -> None:
         """Take the next bytes of the EVT3 stream."""
 
     def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
@@ -65,11 +67,18 @@ class _Frame:
     def __init__(self, nominal: Calibration) -> None:
         self._nominal = nominal
         self._decoder = Decoder(nominal.columns, nominal.rows)
+        self._next_seq: int | None = None
         self.frame = AggregateFrame(nominal.columns, nominal.rows)
+        self.packets_lost = 0
 
-    def packet(self, data: Any) -> None:
+    def packet(self, packet: Packet) -> None:
         """See ``Capture``."""
-        self.frame.add(self._decoder.decode(data))
+        missing = 0 if self._next_seq is None else packet.seq - self._next_seq
+        if missing:
+            self.packets_lost += max(missing, 0)
+            self._decoder.note_gap()
+        self._next_seq = packet.seq + 1
+        self.frame.add(self._decoder.decode(packet.data))
 
 
 class PostsCapture(_Frame):
@@ -126,13 +135,16 @@ class SweepCapture(_Frame):
         parts = list(self._parts)
         if not parts:
             return Findings(rejected=(f"target {self._target.label}: no profile shows it",))
+        profiles = Profiles.concatenate([part for part, _ in parts])
         targets = moving_target(
-            Profiles.concatenate([profiles for profiles, _ in parts]),
+            profiles,
             np.concatenate([stage_mm for _, stage_mm in parts]),
             self._target.range_mm,
             range_per_stage=self._sweep.range_per_stage,
         )
-        return Findings(targets, 1, (), _residuals(targets, self._nominal))
+        lost = profiles.profile_count - len(targets)
+        rejected = (f"{lost} profiles show no whole target, or one off the others",) * (lost > 0)
+        return Findings(targets, 1, rejected, _residuals(targets, self._nominal))
 
 
 def enough_targets(findings: Findings, wanted: int) -> Targets:

@@ -127,9 +127,7 @@ class Calibrator:
         feedback = _Feedback(goal, request, capture, self._in_worker)
         rig = self._made_rig()
         rig.prepare(lambda: bool(goal.is_cancel_requested), feedback.send)
-        outcome = run_capture(
-            rig, request, lambda: self._hand(capture, feedback), lambda: self._hand(None)
-        )
+        outcome = run_capture(rig, request, lambda: self._hand(capture), lambda: self._hand(None))
         result = Calibrate.Result(message=outcome.message)
         if not self._node.context.ok():
             return result
@@ -138,7 +136,14 @@ class Calibrator:
         if outcome.end is End.SUCCEEDED:
             try:
                 feedback.send("fitting")
-                self._fit(capture.find(capture.frame), request, result)
+                findings = capture.find(capture.frame)
+                feedback.show(findings, capture.frame.events)
+                self._fit(findings, request, result)
+                if capture.packets_lost:
+                    result.verdicts = [
+                        *result.verdicts,
+                        f"{capture.packets_lost} packets of events were lost",
+                    ]
             except EschortyError as error:
                 outcome.end, result.message = End.ABORTED, str(error)
         return self._closed(goal, outcome.end, result)
@@ -171,12 +176,10 @@ class Calibrator:
         goal.abort()
         return Calibrate.Result(success=False, message=reason)
 
-    def _hand(self, capture: Capture | None, feedback: _Feedback | None = None) -> None:
+    def _hand(self, capture: Capture | None) -> None:
         done, reason = self._in_worker(lambda: self._tap(capture), _HAND_TIMEOUT_S)
         if not done:
             raise DeviceError(f"reconstruction: {reason}")
-        if feedback is not None:
-            feedback.begin()
 
     def _made_rig(self) -> LaserStageRig:
         # Made for the first goal: until then its subscriptions would cost for nothing.
@@ -200,17 +203,15 @@ class _Feedback:
         self._begun_s = self._sent_s = self._looked_s = time.monotonic()
         self._message = Calibrate.Feedback()
 
-    def begin(self) -> None:
-        """Count the capture's progress from now."""
-        self._begun_s = time.monotonic()
-
     def send(self, phase: str) -> None:
         """Publish the state when it is due, after a new look when that is due."""
         now_s = time.monotonic()
         if phase == self._message.phase and now_s - self._sent_s < _FEEDBACK_S:
             return
-        self._sent_s = now_s
         message = self._message
+        if phase == "capturing" != message.phase:
+            self._begun_s = self._looked_s = now_s
+        self._sent_s = now_s
         message.phase = phase
         if phase == "capturing":
             share = (now_s - self._begun_s) / self._expected_s()
@@ -227,12 +228,20 @@ class _Feedback:
         self._in_worker(lambda: copies.append(copy.deepcopy(self._capture.frame)), _LOOK_TIMEOUT_S)
         if not copies:
             return
-        self._message.events = copies[0].events
         try:
             findings = self._capture.find(copies[0])
         except EschortyError:
             # A picture that is not complete yet may be ambiguous.
-            return
+            findings = Findings()
+        self._note(findings, copies[0].events)
+
+    def show(self, findings: Findings, events: int) -> None:
+        """Publish what the whole capture shows."""
+        self._note(findings, events)
+        self._goal.publish_feedback(self._message)
+
+    def _note(self, findings: Findings, events: int) -> None:
+        self._message.events = events
         self._message.posts = findings.posts
         self._message.matched = len(findings.targets) if findings.targets is not None else 0
         self._message.residuals = findings.residual_px.tolist()

@@ -79,7 +79,7 @@ class Pipeline:
         self.stream.add(packet, now_s)
         self._receive(self.stream.process(now_s), now_s)
         if self.capture is not None:
-            self.capture.packet(packet.data)
+            self.capture.packet(packet)
 
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
         """Advance whatever waited: profiles completed and points placed since the last call."""

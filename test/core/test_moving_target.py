@@ -80,6 +80,16 @@ def test_the_other_direction_and_part_of_the_columns(sweeps):
     assert 15.0 < forth.column.min() <= forth.column.max() < 35.0
 
 
+def test_profiles_off_the_others_are_left_out(sweeps):
+    zero, profiles, stage = sweeps[0]
+    good = moving_target(profiles, stage, zero)
+    edges = np.unique(profiles.edge_us)[[3, 40, 41, 90]]
+    wrong = np.where(np.isin(profiles.edge_us, edges), stage + 12.0, stage)
+    kept = moving_target(profiles, wrong, zero)
+    assert len(kept) == len(good) - len(edges)
+    assert set(kept.row.tolist()) <= set(good.row.tolist())
+
+
 def test_points_without_a_stage_position_are_left_out(sweeps):
     zero, profiles, stage = sweeps[0]
     half = np.where(stage < 100.0, np.nan, stage)

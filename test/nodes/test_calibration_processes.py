@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import calibration_scenarios as scenarios
-from ros_process import NodeProcess, processes
+from ros_process import NAMESPACE, NodeProcess, processes, wait_until
 
 from eschorty_ros.nodes.domain import free_domain
 
@@ -28,7 +28,12 @@ class Instrument:
         self.running["camera"] = NodeProcess(
             CAMERA, scenarios.camera_parameters(scene), domain=self.bench.domain
         )
-        self.bench.observer.wait_for_state("camera", "active")
+        observer = self.bench.observer
+        observer.wait_for_state("camera", "active")
+        wait_until(
+            lambda: observer.node.count_subscribers(f"{NAMESPACE}/stage/motion"),
+            "a camera that listens to the stage",
+        )
 
 
 @pytest.fixture(scope="module")
