@@ -37,8 +37,8 @@ from eschorty_ros.nodes.transforms import OPTICAL
 
 _FEEDBACK_S = 0.2
 _LOOK_S = 0.5
-# A look that waits longer would keep the laser's heartbeat waiting, too.
-_LOOK_TIMEOUT_S = 0.2
+_LOOK_TIMEOUT_S = 2.0
+_LOOK_JOIN_S = 5.0
 _HAND_TIMEOUT_S = 30.0
 
 InWorker = Callable[[Callable[[], None], float], tuple[bool, str]]
@@ -202,6 +202,8 @@ class _Feedback:
         self._in_worker = in_worker
         self._begun_s = self._sent_s = self._looked_s = time.monotonic()
         self._message = Calibrate.Feedback()
+        # Beside the sequence, whose thread keeps the laser's heartbeat.
+        self._looking = threading.Thread(target=self._look, daemon=True)
 
     def send(self, phase: str) -> None:
         """Publish the state when it is due, after a new look when that is due."""
@@ -216,9 +218,10 @@ class _Feedback:
         if phase == "capturing":
             share = (now_s - self._begun_s) / self._expected_s()
             message.progress = min(max(share, 0.0), 1.0)
-            if now_s - self._looked_s >= _LOOK_S:
+            if now_s - self._looked_s >= _LOOK_S and not self._looking.is_alive():
                 self._looked_s = now_s
-                self._look()
+                self._looking = threading.Thread(target=self._look, daemon=True)
+                self._looking.start()
         elif phase in ("finishing", "fitting"):
             message.progress = 1.0
         self._goal.publish_feedback(message)
@@ -237,6 +240,8 @@ class _Feedback:
 
     def show(self, findings: Findings, events: int) -> None:
         """Publish what the whole capture shows."""
+        if self._looking.is_alive():
+            self._looking.join(_LOOK_JOIN_S)
         self._note(findings, events)
         self._goal.publish_feedback(self._message)
 
