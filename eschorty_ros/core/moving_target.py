@@ -17,6 +17,7 @@ from eschorty_ros.core.targets import Targets
 
 SIGMA_STAGE_MM = 0.01
 """How well an encoder tells where the target is."""
+_NEAREST_MM = 1.0
 _SEEN_SHARE = 0.5
 _OUTLIER_PX = 4.0
 _PAIRED_MAX = 300
@@ -142,10 +143,10 @@ def _measured(
     scatter = np.sqrt(np.maximum(variance, SIGMA_FLOOR_PX**2) / np.maximum(count, 1))
     at_mm = mean(position)[enough]
     range_mm = range_at_zero_mm + range_per_stage * at_mm
-    if not (range_mm > 0.0).all():
+    if not (range_mm >= _NEAREST_MM).all():
         raise ArgumentError(
             f"range_at_zero_mm is {range_at_zero_mm!r}: at a stage position of "
-            f"{at_mm[np.argmin(range_mm)]:g} mm the target would lie behind the datum"
+            f"{at_mm[np.argmin(range_mm)]:g} mm the target would lie at or behind the datum"
         )
     targets = Targets(
         row=centre[enough],

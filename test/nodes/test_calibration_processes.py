@@ -38,7 +38,7 @@ class Instrument:
 
 @pytest.fixture(scope="module")
 def instrument(tmp_path_factory):
-    """Five node processes and a bench; the deaths come last."""
+    """Five node processes and a bench; the reconstruction's end comes last."""
     log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
     folder = Path(tmp_path_factory.mktemp("calibrations")) / "made"
     domain = free_domain()
@@ -61,17 +61,17 @@ def test_calibration_takes_a_known_target_from_tens_of_mm_to_one(instrument):
     scenarios.calibrated_scan_is_right(instrument.bench)
 
 
-def test_a_target_moved_by_the_stage_calibrates_too(instrument):
-    instrument.point_camera_at("receding")
-    scenarios.moving_target(instrument.bench)
-
-
 def test_only_calibrations_of_this_instrument_are_loaded(instrument, tmp_path):
     scenarios.load_and_save(instrument.bench, tmp_path)
 
 
 def test_bad_goals_are_refused(instrument):
     scenarios.bad_goals(instrument.bench)
+
+
+def test_killed_camera_ends_the_calibration(instrument):
+    camera = instrument.running["camera"]
+    scenarios.camera_killed(instrument.bench, lambda: camera.send(signal.SIGKILL))
 
 
 def test_useless_captures_change_nothing(instrument):
@@ -83,13 +83,12 @@ def test_one_thing_at_a_time(instrument):
     scenarios.one_thing_at_a_time(instrument.bench)
 
 
-def test_killed_camera_ends_the_calibration(instrument):
-    camera = instrument.running["camera"]
-    scenarios.camera_killed(instrument.bench, lambda: camera.send(signal.SIGKILL))
+def test_a_target_moved_by_the_stage_calibrates_too(instrument):
+    instrument.point_camera_at("receding")
+    scenarios.moving_target(instrument.bench)
 
 
 def test_interrupted_reconstruction_leaves_the_laser_off(instrument):
-    instrument.point_camera_at("posts")
     process = instrument.running["reconstruction"]
     scenarios.reconstruction_interrupted(instrument.bench, lambda: process.send(signal.SIGINT))
     assert process.wait(10.0) == 0, process.output
