@@ -135,11 +135,15 @@ def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: 
     """The project's bounds on errors, and at least ``completeness`` of the lit columns."""
     model, scene = load_calibration(CALIBRATION).model(), named(SCENE)
     error_mm = range_error_mm(points, scene, model)
-    error_mm = np.abs(error_mm[np.isfinite(error_mm)])
+    signed_mm, where_mm = error_mm[np.isfinite(error_mm)], 1e3 * points["y"][np.isfinite(error_mm)]
+    error_mm = np.abs(signed_mm)
     share = len(error_mm) / int(lit_columns(scene, model, positions_mm).sum())
     median_mm, p95_mm = np.median(error_mm), np.percentile(error_mm, 95.0)
     found = f"{share:.4f} of the lit points, error median {median_mm:.3f}, p95 {p95_mm:.3f} mm"
     print(found)
+    for begin in range(int(where_mm.min()), int(where_mm.max()) + 1, 5):
+        part = signed_mm[(where_mm >= begin) & (where_mm < begin + 5)]
+        print(f"  from {begin} mm: {len(part)} points, off by {np.median(part):+.3f} mm")
     assert share >= completeness, found
     assert median_mm <= 0.7, found
     assert p95_mm <= 2.5, found

@@ -20,6 +20,7 @@ from eschorty_ros.core._centroid_kernels import (
 from eschorty_ros.core._mode_kernels import AMBIGUOUS, FOUND
 from eschorty_ros.core._phase_gate_kernels import G_LENGTH, _outside
 from eschorty_ros.core._row_kernels import HALF_PER_SIGMA, _fill_likelihood
+from eschorty_ros.core._sigma_kernels import _clipped2, _common2
 from eschorty_ros.core._smoothing_kernels import _reject_isolated, _smooth
 from eschorty_ros.core._window_kernels import (
     BLOCK,
@@ -55,14 +56,16 @@ COUNTERS = (
 # whole-number settings
 P_METHOD, P_RETURNS, P_EVENTS_MIN, P_HALF_MAX, P_ROWS, P_SMOOTH, P_WEAK, P_SIZE = range(8)
 # fractional settings
-F_FACTOR, F_FLOOR, F_GATE, F_ISOLATION, F_SIZE = range(5)
+F_GATE, F_ISOLATION, F_OWN, F_SIZE = range(4)
 # a column's numbers, one plane per return
-(W_ROW, W_SIGMA2, W_SMOOTH_ROW, W_SMOOTH_SIGMA2, W_VARIANCE, W_SIZE) = range(6)
+(W_ROW, W_SIGMA2, W_COMMON2, W_SMOOTH_ROW, W_SMOOTH_SIGMA2, W_VARIANCE, W_SIZE) = range(7)
 N_EVENTS, N_MEAN_DT, N_REJECTED, N_SIZE = range(4)
 
 ISOLATION_REACH = 2
 _HALF_MIN = 3 * FRACTION
 _WIDTH_MIN_DOF = 64
+# A whole column wider than this many times the line's variance holds stray events.
+_STRAYED = 1.5
 _NO_WINDOW = (np.int64(0),) * 7
 
 
@@ -105,10 +108,11 @@ def _append(t, x, y, p, first, stop, limit, lists, counts, rows, edge, gate, cou
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _estimate_period(
-    lists, counts, seeds, whole, fractional, half, work, work_int, scratch, table, counters
+    lists, counts, seeds, whole, fractional, noise, half, work, work_int, scratch, table, counters
 ):
     """Every column's rows; returns the pooled sum of squares and degrees of freedom."""
-    row, sigma2, variances = work[W_ROW], work[W_SIGMA2], work[W_VARIANCE]
+    row, sigma2, common2 = work[W_ROW], work[W_SIGMA2], work[W_COMMON2]
+    variances = work[W_VARIANCE]
     events, mean_dt = work_int[N_EVENTS], work_int[N_MEAN_DT]
     row[:] = np.nan
     rows = float(whole[P_ROWS])
@@ -117,8 +121,8 @@ def _estimate_period(
     neighbour = np.int64(-1)
     stride = lists.size // counts.size
     method, returns, events_min = whole[P_METHOD], whole[P_RETURNS], whole[P_EVENTS_MIN]
-    factor, floor = fractional[F_FACTOR], fractional[F_FLOOR]
     windowed = method != MEAN and method != MEDIAN
+    own = min((half / HALF_PER_SIGMA) ** 2, fractional[F_OWN])
     size = _fill_likelihood(table, half) if method == GAUSS_ML else np.int64(0)
     for c in range(counts.size):
         n = np.int64(counts[c])
@@ -144,6 +148,7 @@ def _estimate_period(
         if status != FOUND:
             counters[C_AMBIGUOUS if status == AMBIGUOUS else C_FEW] += 1
             continue
+        last = seeds[c]
         seeds[c] = neighbour = a[6]
         counters[C_TWO] += found - 1
         found, window, other = _chosen(returns, found, a, b)
@@ -152,13 +157,19 @@ def _estimate_period(
             if method > MEAN:
                 r = _row(lists, start, n, window, other, method, half, rows, scratch, table, size)
             row[k, c], sigma2[k, c], cut = _judge(
-                r, variance, window, method, half, rows, factor, floor
+                r, variance, own, window, method, half, rows, noise
             )
+            if not windowed:
+                seeds[c] = np.int64(np.rint(FRACTION * r))
+            common2[k, c] = _common2(seeds[c], last, noise)
+            # Until a profile has shown the line's width, nothing can be said to be missing.
+            if not cut and half < whole[P_HALF_MAX]:
+                common2[k, c] += _clipped2(variance, own, noise)
             used = window[0]
             variances[k, c] = variance
             events[k, c] = used
             mean_dt[k, c] = np.int64(np.rint(window[5] / used))
-            if not cut:
+            if not cut and (windowed or variance <= _STRAYED * fractional[F_OWN]):
                 squares += variance * (used - 1)
                 freedom += used - 1
             window, other = other, window
@@ -204,22 +215,22 @@ def _emit(work, work_int, state, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close(
-    lists, counts, seeds, state, whole, fractional, work, work_int, scratch, table, counters, out
-):
+    lists, counts, seeds, state, whole, fractional, noise, work, work_int, scratch, table, counters,
+    out,
+):  # fmt: skip
     """Turn the open period into points."""
     counters[C_CLOSED] += 1
     squares, freedom = _estimate_period(
-        lists, counts, seeds, whole, fractional, state[S_HALF], work, work_int, scratch, table,
-        counters,
+        lists, counts, seeds, whole, fractional, noise, state[S_HALF], work, work_int, scratch,
+        table, counters,
     )  # fmt: skip
-    if whole[P_METHOD] != MEAN and whole[P_METHOD] != MEDIAN:
-        state[S_HALF] = _adapted_half(state[S_HALF], squares, freedom, whole[P_HALF_MAX])
+    state[S_HALF] = _adapted_half(state[S_HALF], squares, freedom, whole[P_HALF_MAX])
     counters[C_ISOLATED] += _reject_isolated(
         work[W_ROW], work_int[N_EVENTS], ISOLATION_REACH, fractional[F_ISOLATION], whole[P_WEAK],
         work_int[N_REJECTED],
     )  # fmt: skip
     counters[C_SMOOTHED] += _smooth(
-        work[W_ROW], work[W_SIGMA2], fractional[F_FLOOR] ** 2, whole[P_SMOOTH],
+        work[W_ROW], work[W_SIGMA2], work[W_COMMON2], whole[P_SMOOTH],
         fractional[F_GATE], work[W_SMOOTH_ROW], work[W_SMOOTH_SIGMA2],
     )  # fmt: skip
     _emit(work, work_int, state, out)
@@ -228,7 +239,7 @@ def _close(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bin(
     t, x, y, p, first, stop, edges, indices, edge, edge_count, drain, gate, lists, counts, seeds,
-    state, whole, fractional, work, work_int, scratch, table, counters, out,
+    state, whole, fractional, noise, work, work_int, scratch, table, counters, out,
 ):  # fmt: skip
     """Merge events ``first..stop`` with edges ``edge..edge_count``.
 
@@ -259,8 +270,8 @@ def _bin(
             if state[S_POINTS] > room:
                 return i, edge
             _close(
-                lists, counts, seeds, state, whole, fractional, work, work_int, scratch, table,
-                counters, out,
+                lists, counts, seeds, state, whole, fractional, noise, work, work_int, scratch,
+                table, counters, out,
             )  # fmt: skip
         elif state[S_OPEN] == 1:
             counters[C_EMPTY] += 1

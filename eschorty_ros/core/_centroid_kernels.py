@@ -19,11 +19,11 @@ from eschorty_ros.core._row_kernels import (
     _fill_likelihood,
     _gauss_ml,
     _median_row,
-    _sigma2,
     _uncut_row,
     _variance,
     _whole_sigma2,
 )
+from eschorty_ros.core._sigma_kernels import _common2, _sigma2
 from eschorty_ros.core._window_kernels import ROW_BITS, ROW_LAST, _pad, _whole_column
 
 # The methods up to MEAN are a window's mean.
@@ -82,14 +82,14 @@ def _row(packed, start, n, window, other, method, half, rows, counts, table, siz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _judge(row, variance, window, method, half, rows, factor, floor):
-    """Row, its variance and whether the edge of the sensor cuts its window."""
+def _judge(row, variance, own, window, method, half, rows, noise):
+    """Row, its own variance and whether the edge of the sensor cuts its window."""
     if method == MEAN or method == MEDIAN:
-        sigma2, cut = _whole_sigma2(row, variance, window[0], rows, factor, floor)
+        sigma2, cut = _whole_sigma2(row, variance, own, window[0], rows, noise)
         return row, sigma2, cut
-    sigma2 = _sigma2(variance, window[0], factor, floor)
+    sigma2 = _sigma2(variance, own, window[0], row, rows, noise)
     if window[1] == 0 or window[2] >= rows - 1.0:
-        return _uncut_row(row, sigma2, variance, window, half, rows, factor, floor)
+        return _uncut_row(row, sigma2, variance, window, half, rows, noise)
     return row, sigma2, False
 
 
@@ -108,7 +108,7 @@ def _chosen(returns, count, a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _estimate_lists(
-    packed, offsets, method, returns, half, rows, events_min, factor, floor, scratch, table,
+    packed, offsets, method, returns, half, own, rows, events_min, noise, scratch, table,
     out_row, out_sigma, out_variance, out_events, out_cut, out_status,
 ):  # fmt: skip
     """Every column of a CSR layout on its own, without seeds."""
@@ -140,9 +140,9 @@ def _estimate_lists(
             row, variance = _window_mean(window)
             if method > MEAN:
                 row = _row(scratch, 0, n, window, other, method, half, rows, counts, table, size)
-            row, sigma2, cut = _judge(row, variance, window, method, half, rows, factor, floor)
+            row, sigma2, cut = _judge(row, variance, own, window, method, half, rows, noise)
             out_row[column, k] = row
-            out_sigma[column, k] = np.sqrt(sigma2)
+            out_sigma[column, k] = np.sqrt(sigma2 + _common2(window[6], -1, noise))
             out_variance[column, k] = variance
             out_events[column, k] = window[0]
             out_cut[column, k] = cut

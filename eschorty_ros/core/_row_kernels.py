@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
+from eschorty_ros.core._sigma_kernels import N_FLOOR, _sigma2
 from eschorty_ros.core._window_kernels import (
     FRACTION,
     ROW_LAST,
@@ -24,6 +25,8 @@ _EDGE_PART = 8
 _CUT_ITERATIONS = 30
 # Below this part of the variance to expect, a cut line is taken to be narrower than the window's.
 _NARROWER = 0.4
+# Square of the factor on s/sqrt(N) for a line that is not cut, from counts that vary little.
+_CUT_FACTOR2 = 0.24**2
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
 _CUT_BIAS2 = 1.7519
 
@@ -149,18 +152,6 @@ def _variance(count, sum_d, sum_d2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sigma2(variance, count, factor, floor):
-    """Variance of the estimated row, px squared.
-
-    Rows quantise to a twelfth when there is no spread to judge by.
-    """
-    sigma2 = factor * factor * variance / count + floor * floor
-    if count < 2 or variance == 0.0:
-        sigma2 = max(sigma2, 1.0 / 12.0 + floor * floor)
-    return sigma2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _uncut(mean, variance, sigma_max):
     """Centre and sigma of a Gaussian whose part beyond 0 has this mean and variance.
 
@@ -191,7 +182,7 @@ def _uncut(mean, variance, sigma_max):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _uncut_row(row, sigma2, variance, window, half, rows, factor, floor):
+def _uncut_row(row, sigma2, variance, window, half, rows, noise):
     """Row, its variance ``sigma2``, and whether the edge of the sensor cuts the window.
 
     The line is taken to be centred on the sensor. What the correction adds counts half as an
@@ -209,17 +200,18 @@ def _uncut_row(row, sigma2, variance, window, half, rows, factor, floor):
     centre, sigma, ratio = _uncut(beyond, variance, reach * FRACTION / HALF_PER_SIGMA)
     shift = beyond - centre
     share = 1.0 if centre == 0.0 else 0.25
-    scatter2 = factor**2 + max(1.0 - factor**2, 0.0) * (1.0 - ratio)
-    wider2 = scatter2 * sigma**2 / (ratio * count) + floor**2 + share * shift**2
+    factor2 = _CUT_FACTOR2
+    scatter2 = factor2 + max(1.0 - factor2, 0.0) * (1.0 - ratio)
+    wider2 = scatter2 * sigma**2 / (ratio * count) + noise[N_FLOOR] ** 2 + share * shift**2
     row = row - shift if from_low < from_high else row + shift
     # Another estimate than the mean may start closer to the edge than the correction is long.
     return min(max(row, -0.5), rows - 0.5), max(sigma2, wider2), True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _whole_sigma2(row, variance, count, rows, factor, floor):
+def _whole_sigma2(row, variance, own, count, rows, noise):
     """Variance of a row estimated from a whole column, and whether the sensor's edge cuts it."""
-    sigma2 = _sigma2(variance, count, factor, floor)
-    reach = 3.0 * np.sqrt(variance)
+    sigma2 = _sigma2(variance, own, count, row, rows, noise)
+    reach = 2.0 * np.sqrt(variance)
     cut = row < reach or rows - 1.0 - row < reach
     return sigma2 + _CUT_BIAS2 * variance if cut else sigma2, cut

@@ -32,6 +32,7 @@ def _partner(row, k, c, other):
 def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
     """Mean over symmetric pairs of columns; returns how many points were averaged.
 
+    ``sigma2`` is the columns' own variance, which the mean lessens, ``common2`` what they share.
     Arrays have one plane per return and one entry per column. The pairs grow outwards and end at
     the first one that is incomplete or beyond the gate.
     """
@@ -40,12 +41,12 @@ def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
     for k in range(planes):
         for c in range(columns):
             out_row[k, c] = row[k, c]
-            out_sigma2[k, c] = sigma2[k, c]
+            out_sigma2[k, c] = sigma2[k, c] + common2[k, c]
             centre = row[k, c]
             if np.isnan(centre):
                 continue
             total = 0.0
-            variance = sigma2[k, c] - common2
+            variance = sigma2[k, c]
             used = 1
             for j in range(1, half_width + 1):
                 if c < j or c + j >= columns:
@@ -59,11 +60,11 @@ def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
                 if not (abs(left) <= gate and abs(right) <= gate):
                     break
                 total += left + right
-                variance += sigma2[before, c - j] + sigma2[after, c + j] - 2.0 * common2
+                variance += sigma2[before, c - j] + sigma2[after, c + j]
                 used += 2
             if used > 1:
                 out_row[k, c] = centre + total / used
-                out_sigma2[k, c] = common2 + variance / (used * used)
+                out_sigma2[k, c] = common2[k, c] + variance / (used * used)
                 smoothed += 1
     return smoothed
 

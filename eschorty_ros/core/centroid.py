@@ -13,6 +13,13 @@ from eschorty_ros.core._mode_kernels import AMBIGUOUS
 from eschorty_ros.core._row_kernels import likelihood_size
 from eschorty_ros.core._window_kernels import BLOCK, FRACTION, ROW_LAST
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.row_sigma import (
+    OWN_PER_WIDTH2,
+    SIGMA_COMMON_PX,
+    SIGMA_FACTOR,
+    SIGMA_FLOOR_PX,
+    noise_of,
+)
 
 METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
 METHOD_CODES = {
@@ -32,21 +39,6 @@ RETURN_CODES = {
 }
 HALF_WIDTH_PER_FWHM = 1.3
 FWHM_PER_SIGMA = 2.3548200450309493
-SIGMA_FACTOR = 0.24
-SIGMA_FLOOR_PX = 0.20
-SIGMA_LIMIT = 1e6
-METHOD_SIGMA = {
-    "mode_mean": (1.0, 1.0),
-    "mean": (1.0, 1.0),
-    "median": (1.2533, 1.0),
-    "gauss_ml": (1.0, 1.0),
-    "edge_mid": (1.2147, 1.0),
-}
-"""Each method's multiples of ``sigma_factor`` and ``sigma_floor_px``.
-
-The factors are the scatter of independent Gaussian samples against that of their mean: sqrt(pi/2)
-for the median, 1.2147 for the middle of the quantiles 1/8 and 7/8.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,17 +77,6 @@ def half_width_fixed(fwhm_px: float) -> int:
     return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), 3 * FRACTION)
 
 
-def method_sigma(
-    method: str, sigma_factor: float = SIGMA_FACTOR, sigma_floor_px: float = SIGMA_FLOOR_PX
-) -> tuple[float, float]:
-    """Factor on s/sqrt(N) and floor in px of ``method``."""
-    check_method(method)
-    number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT)
-    number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT)
-    factor, floor = METHOD_SIGMA[method]
-    return factor * sigma_factor, floor * sigma_floor_px
-
-
 def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
     """Codes of a method and of the returns it reports, for the kernels.
 
@@ -128,6 +109,7 @@ def estimate(
     events_min: int = 1,
     sigma_factor: float = SIGMA_FACTOR,
     sigma_floor_px: float = SIGMA_FLOOR_PX,
+    sigma_common_px: float = SIGMA_COMMON_PX,
 ) -> Centroids:
     """Row of the line in each column of a CSR layout, every column on its own.
 
@@ -153,10 +135,8 @@ def estimate(
         Rows of the sensor, at most 1023.
     events_min : int
         Columns with fewer events in the window give NaN.
-    sigma_factor, sigma_floor_px : float
-        ``sigma_row^2 = sigma_factor^2 s^2 / N + sigma_floor_px^2`` with s the sample standard
-        deviation of the rows used: counts per pixel and laser edge vary less than Poisson counts,
-        and the mismatch of the pixels' thresholds does not average out over one column.
+    sigma_factor, sigma_floor_px, sigma_common_px : float
+        Error model of ``sigma_row``, see `row_sigma`.
 
     Returns
     -------
@@ -183,7 +163,7 @@ def estimate(
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
     whole("events_min", events_min, 1, 1 << 31)
-    number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT)
+    noise = noise_of(method, sigma_factor, sigma_floor_px, sigma_common_px)
     columns = offset_array.size - 1
     longest = int(np.diff(offset_array).max(initial=0))
     half = half_width_fixed(line_width_px)
@@ -193,8 +173,8 @@ def estimate(
     cut = np.empty(shape, dtype=np.bool_)
     status = np.empty(columns, dtype=np.uint8)
     kernels._estimate_lists(
-        row_array, offset_array, code, policy, half, float(height), events_min,
-        *method_sigma(method, sigma_factor, sigma_floor_px),
+        row_array, offset_array, code, policy, half, OWN_PER_WIDTH2 * line_width_px**2,
+        float(height), events_min, noise,
         np.empty(longest + BLOCK, dtype=np.uint32), np.empty(likelihood_size(half)),
         row, sigma, variance, events, cut, status,
     )  # fmt: skip

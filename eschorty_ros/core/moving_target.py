@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core._checks import number, positive, reals, whole, whole_vector
-from eschorty_ros.core.centroid import SIGMA_FLOOR_PX
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import PIXELS_MAX
 from eschorty_ros.core.post_finder import COLUMNS_MIN, GRID_SIGMA_PX
 from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.row_sigma import SIGMA_FLOOR_PX
 from eschorty_ros.core.targets import Targets
 
 SIGMA_STAGE_MM = 0.01

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core._checks import number, whole
 from eschorty_ros.core.aggregate_frame import AggregateFrame
-from eschorty_ros.core.centroid import HALF_WIDTH_PER_FWHM, SIGMA_FLOOR_PX
+from eschorty_ros.core.centroid import HALF_WIDTH_PER_FWHM
+from eschorty_ros.core.row_sigma import SIGMA_FLOOR_PX
 
 Array = NDArray[np.float64]
 

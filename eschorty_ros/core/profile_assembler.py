@@ -9,12 +9,13 @@ from eschorty_ros.core import _binning as binning
 from eschorty_ros.core import _window_kernels as windows
 from eschorty_ros.core._checks import exact, whole
 from eschorty_ros.core._row_kernels import likelihood_size
-from eschorty_ros.core.centroid import check_method, half_width_fixed, method_sigma
+from eschorty_ros.core.centroid import check_method, half_width_fixed
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.phase_gate import gate_parameters
 from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.row_sigma import OWN_PER_WIDTH2, noise_of
 from eschorty_ros.core.settings import Settings
 
 _OUTPUT_PROFILES = 64
@@ -59,6 +60,10 @@ class ProfileAssembler:
         self._scratch = np.zeros(1 << windows.ROW_BITS, dtype=np.int64)
         self._likelihood = np.empty(likelihood_size(self._half_max))
         self._whole, self._fractional = _parameters(settings, model.rows)
+        self._noise = noise_of(
+            settings.centroid, settings.sigma_factor, settings.sigma_floor_px,
+            settings.sigma_common_px,
+        )  # fmt: skip
         size = _OUTPUT_PROFILES * planes * columns
         self._whole_out = np.empty((3, size), dtype=np.int64)
         self._column_out = np.empty(size, dtype=np.uint16)
@@ -119,8 +124,8 @@ class ProfileAssembler:
             first, edge = binning._bin(
                 t, x, y, p, first, stop, edges, indices, edge, len(edges), drain, self._gate,
                 self._lists, self._column_counts, self._seeds, self._state, self._whole,
-                self._fractional, self._work, self._work_int, self._scratch, self._likelihood,
-                self._counts, out,
+                self._fractional, self._noise, self._work, self._work_int, self._scratch,
+                self._likelihood, self._counts, out,
             )  # fmt: skip
             if first == stop and (edge == len(edges) or not drain):
                 return int(edge)
@@ -181,9 +186,7 @@ def _parameters(settings: Settings, rows: int) -> tuple[NDArray[np.int64], NDArr
     whole[binning.P_SMOOTH] = settings.smoothing_half_width
     whole[binning.P_WEAK] = settings.isolation_events
     fractional = np.zeros(binning.F_SIZE)
-    fractional[binning.F_FACTOR], fractional[binning.F_FLOOR] = method_sigma(
-        settings.centroid, settings.sigma_factor, settings.sigma_floor_px
-    )
+    fractional[binning.F_OWN] = OWN_PER_WIDTH2 * settings.line_width_px**2
     fractional[binning.F_GATE] = settings.smoothing_gate_px
     fractional[binning.F_ISOLATION] = settings.isolation_gate_px
     return whole, fractional

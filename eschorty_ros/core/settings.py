@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from eschorty_ros.core._checks import short
-from eschorty_ros.core.centroid import METHODS, RETURNS, SIGMA_FACTOR, SIGMA_FLOOR_PX, check_method
+from eschorty_ros.core.centroid import METHODS, RETURNS, check_method
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.phase_gate import GATE_MAX_US
+from eschorty_ros.core.row_sigma import SIGMA_COMMON_PX, SIGMA_FACTOR, SIGMA_FLOOR_PX
 
 NOISE_FILTERS = ("none", "activity")
 SWITCH = ("off", "on")
@@ -117,8 +118,13 @@ class Settings:
         SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"
     )
     sigma_floor_px: float = _number(
-        SIGMA_FLOOR_PX, 0.0, 10.0, "px", "part of the standard deviation that does not average out"
-    )
+        SIGMA_FLOOR_PX, 0.0, 10.0, "px",
+        "part of a column's standard deviation that more events do not lessen",
+    )  # fmt: skip
+    sigma_common_px: float = _number(
+        SIGMA_COMMON_PX, 0.0, 10.0, "px",
+        "part of it that neighbouring columns share and smoothing does not lessen",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         for item in fields(self):

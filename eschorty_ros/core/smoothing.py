@@ -59,8 +59,7 @@ def smooth(
     number("gate_px", gate_px, 0.0)
     number("common_px", common_px, 0.0)
     out_row, out_sigma2 = np.empty((2, 1, rows.size))
-    _smooth(
-        rows[None], (sigma * sigma)[None], common_px * common_px, half_width, gate_px, out_row,
-        out_sigma2,
-    )  # fmt: skip
+    own2 = np.maximum(sigma * sigma - common_px * common_px, 0.0)
+    common2 = sigma * sigma - own2
+    _smooth(rows[None], own2[None], common2[None], half_width, gate_px, out_row, out_sigma2)
     return out_row[0], np.sqrt(out_sigma2[0])

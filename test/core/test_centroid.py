@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 from eschorty_ros.core.centroid import METHODS, WHOLE_COLUMN_METHODS, estimate
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.row_sigma import METHOD_NOISE, SIGMA_COMMON_PX, SIGMA_FACTOR, SIGMA_FLOOR_PX
 
 SEED = 20260
 WINDOWED = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]
@@ -134,12 +135,20 @@ def test_two_equal_separate_groups_are_left_undecided():
     assert found.ambiguous[0]
 
 
-def test_sigma_follows_the_error_model():
-    rng = np.random.default_rng(SEED)
-    rows = np.rint(rng.normal(300, 5, 50)).astype(int)
-    found = estimate(rows, [0, 50], "mean")
-    expected = np.sqrt(0.24**2 * rows.var(ddof=1) / 50 + 0.2**2)
-    assert found.sigma_row[0] == pytest.approx(expected, rel=1e-12)
+def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
+    line = np.arange(290, 311).repeat(2)
+    sigma = {}
+    for strays in (0, 1, 3):
+        rows = np.concatenate([line, np.linspace(20, 700, strays).astype(int)])
+        found = estimate(rows, [0, rows.size], "mean")
+        error = found.row[0] - 300.0
+        assert abs(error) <= 2.0 * found.sigma_row[0], strays
+        sigma[strays] = found.sigma_row[0]
+    own = METHOD_NOISE["mean"]
+    floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2 + SIGMA_COMMON_PX**2
+    spread2 = (own.factor * SIGMA_FACTOR) ** 2 * line.var(ddof=1) / line.size
+    assert sigma[0] == pytest.approx(np.sqrt(floor2 + spread2), rel=1e-12)
+    assert sigma[0] < sigma[1] < sigma[3]
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from eschorty_ros.core.reconstruction import (
     place,
     place_link,
 )
+from eschorty_ros.core.row_sigma import METHOD_NOISE, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
 
 SEED = 77
 CALIBRATION = load_calibration("config_3")
@@ -173,7 +174,9 @@ def test_one_event_and_constant_columns():
     found, _ = run(encoded(events), settings=Settings(events_min=1, isolation_events=0))
     assert found.column.tolist() == [5, 9]
     assert found.row.tolist() == [300.0, 400.0]
-    np.testing.assert_allclose(found.sigma_row, np.sqrt(1 / 12 + 0.04))
+    floor_px = METHOD_NOISE["mode_mean"].floor * SIGMA_FLOOR_PX
+    expected = np.sqrt(1 / 12 + floor_px**2 + SIGMA_COMMON_PX**2)
+    np.testing.assert_allclose(found.sigma_row, expected)
     assert found.t_us.tolist() == [2000, 3010]
 
 

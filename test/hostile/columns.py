@@ -14,6 +14,7 @@ from eschorty_ros.core import (
     profiles,
     reference,
     reflectance,
+    row_sigma,
     settings,
     smoothing,
     step_compensation,
@@ -66,11 +67,18 @@ CALLS: dict[str, Call] = {
     "centroid.half_width_fixed": Call(
         centroid.half_width_fixed, {"fwhm_px": 5.0}, {"fwhm_px": number(0.0)}
     ),
-    "centroid.method_sigma": Call(
-        centroid.method_sigma,
-        {"method": "mean", "sigma_factor": 0.2, "sigma_floor_px": 0.2},
-        {"method": text(), "sigma_factor": number(-1.0), "sigma_floor_px": number(-1.0)},
-        {"method": "centroid"},
+    "row_sigma.noise_of": Call(
+        row_sigma.noise_of,
+        {"method": "mean", "sigma_factor": 0.2, "sigma_floor_px": 0.2, "sigma_common_px": 0.1},
+        {
+            "method": text(),
+            "sigma_factor": number(-1.0),
+            "sigma_floor_px": number(-1.0),
+            "sigma_common_px": number(-1.0),
+        },
+    ),
+    "row_sigma.MethodNoise": Call(
+        row_sigma.MethodNoise, {"factor": 1.0, "floor": 1.0, "background": 1.0, "motion": 0.0}
     ),
     "centroid.check_method": Call(
         centroid.check_method,
@@ -90,6 +98,7 @@ CALLS: dict[str, Call] = {
             "events_min": 1,
             "sigma_factor": 0.24,
             "sigma_floor_px": 0.2,
+            "sigma_common_px": 0.1,
         },
         {
             "rows": integers(-1, 720, 65535, 2**40, size=N),
@@ -101,6 +110,7 @@ CALLS: dict[str, Call] = {
             "events_min": whole(0),
             "sigma_factor": number(-1.0),
             "sigma_floor_px": number(-1.0),
+            "sigma_common_px": number(-1.0),
         },
         {"method": "centroid"},
     ),

@@ -13,13 +13,20 @@ from line_events import encoded
 
 from eschorty_ros.core._row_kernels import _uncut
 from eschorty_ros.core.calibration import load_calibration
-from eschorty_ros.core.centroid import METHODS, SIGMA_FLOOR_PX, estimate
+from eschorty_ros.core.centroid import METHODS, estimate
 from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.core.row_sigma import METHOD_NOISE, SIGMA_FLOOR_PX
 
 SEED = 20
-LONE_SIGMA_PX = np.sqrt(1.0 / 12.0 + SIGMA_FLOOR_PX**2)
+
+
+def lone_sigma_px(method):
+    """Least sigma of a row without spread."""
+    return np.sqrt(1.0 / 12.0 + (METHOD_NOISE[method].floor * SIGMA_FLOOR_PX) ** 2)
+
+
 AVERAGES = ("mean", "mode_mean")
 every_method = pytest.mark.parametrize("method", METHODS)
 
@@ -53,7 +60,7 @@ def test_case_04_variance_of_a_narrow_line_far_from_row_0(method, sigma_px, row,
 def test_case_05_one_event_or_one_row_has_a_floor_in_sigma(method, row, events, measured):
     found = one_column([row] * events, method)
     assert found.row[0] == pytest.approx(row, abs=1e-9)
-    shortfall = LONE_SIGMA_PX - float(found.sigma_row[0])
+    shortfall = lone_sigma_px(method) - float(found.sigma_row[0])
     measured("sigma below sqrt(1/12 + floor^2), px", shortfall, 1e-15)
 
 

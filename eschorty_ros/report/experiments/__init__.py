@@ -17,6 +17,7 @@ NAMES: tuple[str, ...] = (
     "calibration",
     "calibrated_scan",
     "tradeoff",
+    "sigma",
 )
 """Module of each experiment, in the order of the page."""
 
