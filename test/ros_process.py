@@ -119,8 +119,16 @@ class NodeProcess:
         fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-    def kill(self) -> None:
-        """SIGKILL if it still runs; always leaves nothing behind."""
+    def kill(self, patience_s: float = 3.0) -> None:
+        """SIGTERM, then SIGKILL if it still runs; always leaves nothing behind.
+
+        A killed process would leave its shared memory.
+        """
+        if self.running():
+            self._process.send_signal(signal.SIGCONT)
+            self._process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(patience_s)
         if self.running():
             self._process.kill()
         self._process.wait()
@@ -252,5 +260,8 @@ def processes(
     try:
         yield running
     finally:
+        for process in running.values():
+            if process.running():
+                process.send(signal.SIGTERM)
         for process in running.values():
             process.kill()
