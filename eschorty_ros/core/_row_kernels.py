@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from eschorty_ros.core._sigma_kernels import N_FLOOR, _sigma2
+from eschorty_ros.core._sigma_kernels import N_FACTOR, N_FLOOR, _sigma2
 from eschorty_ros.core._window_kernels import (
     FRACTION,
     ROW_LAST,
@@ -25,7 +25,7 @@ _EDGE_PART = 8
 _CUT_ITERATIONS = 30
 # Below this part of the variance to expect, a cut line is taken to be narrower than the window's.
 _NARROWER = 0.4
-# Square of the factor on s/sqrt(N) for a line that is not cut, from counts that vary little.
+# Square of the least factor on s/sqrt(N): a fit to part of a line amplifies what counts vary.
 _CUT_FACTOR2 = 0.24**2
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
 _CUT_BIAS2 = 1.7519
@@ -200,7 +200,7 @@ def _uncut_row(row, sigma2, variance, window, half, rows, noise):
     centre, sigma, ratio = _uncut(beyond, variance, reach * FRACTION / HALF_PER_SIGMA)
     shift = beyond - centre
     share = 1.0 if centre == 0.0 else 0.25
-    factor2 = _CUT_FACTOR2
+    factor2 = max(noise[N_FACTOR] ** 2, _CUT_FACTOR2)
     scatter2 = factor2 + max(1.0 - factor2, 0.0) * (1.0 - ratio)
     wider2 = scatter2 * sigma**2 / (ratio * count) + noise[N_FLOOR] ** 2 + share * shift**2
     row = row - shift if from_low < from_high else row + shift
@@ -212,6 +212,6 @@ def _uncut_row(row, sigma2, variance, window, half, rows, noise):
 def _whole_sigma2(row, variance, own, count, rows, noise):
     """Variance of a row estimated from a whole column, and whether the sensor's edge cuts it."""
     sigma2 = _sigma2(variance, own, count, row, rows, noise)
-    reach = 2.0 * np.sqrt(variance)
+    reach = 3.0 * np.sqrt(variance)
     cut = row < reach or rows - 1.0 - row < reach
     return sigma2 + _CUT_BIAS2 * variance if cut else sigma2, cut

@@ -62,7 +62,7 @@ class ProfileAssembler:
         self._whole, self._fractional = _parameters(settings, model.rows)
         self._noise = noise_of(
             settings.centroid, settings.sigma_factor, settings.sigma_floor_px,
-            settings.sigma_common_px,
+            settings.sigma_common_px, compensated=settings.reflectance_compensation == "on",
         )  # fmt: skip
         size = _OUTPUT_PROFILES * planes * columns
         self._whole_out = np.empty((3, size), dtype=np.int64)

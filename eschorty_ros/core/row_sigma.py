@@ -41,7 +41,7 @@ CLIPPED = 0.6
 
 
 @dataclass(frozen=True, slots=True)
-class MethodNoise:
+class _MethodNoise:
     """An estimator's multiples of factor and floor, its ``b``, and its share of the motion."""
 
     factor: float
@@ -51,11 +51,11 @@ class MethodNoise:
 
 
 METHOD_NOISE = {
-    "mode_mean": MethodNoise(0.2, 0.87, 0.4, 0.36),
-    "mean": MethodNoise(0.4, 0.725, 1.0, 0.22),
-    "median": MethodNoise(1.0, 0.81, 1.5, 0.28),
-    "gauss_ml": MethodNoise(0.2, 0.89, 0.4, 0.36),
-    "edge_mid": MethodNoise(0.2, 0.87, 0.4, 0.32),
+    "mode_mean": _MethodNoise(0.2, 0.87, 0.4, 0.36),
+    "mean": _MethodNoise(0.4, 0.725, 1.0, 0.22),
+    "median": _MethodNoise(1.0, 0.81, 1.5, 0.28),
+    "gauss_ml": _MethodNoise(0.2, 0.89, 0.4, 0.36),
+    "edge_mid": _MethodNoise(0.2, 0.87, 0.4, 0.32),
 }
 
 
@@ -64,6 +64,8 @@ def noise_of(
     sigma_factor: float = SIGMA_FACTOR,
     sigma_floor_px: float = SIGMA_FLOOR_PX,
     sigma_common_px: float = SIGMA_COMMON_PX,
+    *,
+    compensated: bool = False,
 ) -> NDArray[np.float64]:
     """Error model of an estimator for the kernels.
 
@@ -77,6 +79,9 @@ def noise_of(
         Part of a column's standard deviation that more events do not lessen.
     sigma_common_px : float
         Part that neighbouring columns share and smoothing does not lessen.
+
+    compensated : bool
+        Whether steps of reflectance are compensated, which leaves half of what they do.
 
     Raises
     ------
@@ -92,6 +97,6 @@ def noise_of(
     noise[kernels.N_COMMON] = number("sigma_common_px", sigma_common_px, 0.0, SIGMA_LIMIT)
     noise[kernels.N_BACKGROUND] = own.background
     noise[kernels.N_MOTION] = own.motion
-    noise[kernels.N_CLIPPED] = CLIPPED
+    noise[kernels.N_CLIPPED] = 0.5 * CLIPPED if compensated else CLIPPED
     noise[kernels.N_MEDIAN] = method == "median"
     return noise

@@ -111,9 +111,9 @@ def test_line_cut_by_the_sensor_is_not_biased(method, row):
     sigma, events, columns = 8.493, 100, 1500
     rows = np.rint(rng.normal(row, sigma, (columns, 4 * events)))
     rows = np.stack([line[(line >= 0) & (line <= 719)][:events] for line in rows]).astype(int)
-    found = estimate(
-        rows.ravel(), np.arange(columns + 1) * events, method, line_width_px=20.0, sigma_factor=1.0
-    )
+    independent = 1.0 / METHOD_NOISE[method].factor
+    offsets = np.arange(columns + 1) * events
+    found = estimate(rows.ravel(), offsets, method, line_width_px=20.0, sigma_factor=independent)
     error = found.row - row
     assert found.edge.all()
     assert abs(error.mean()) < 0.12 * sigma, f"seed {SEED}: {error.mean():.2f} px"

@@ -77,9 +77,6 @@ CALLS: dict[str, Call] = {
             "sigma_common_px": number(-1.0),
         },
     ),
-    "row_sigma.MethodNoise": Call(
-        row_sigma.MethodNoise, {"factor": 1.0, "floor": 1.0, "background": 1.0, "motion": 0.0}
-    ),
     "centroid.check_method": Call(
         centroid.check_method,
         {"method": "mode_mean", "returns": "all"},
