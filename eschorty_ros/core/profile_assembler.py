@@ -15,7 +15,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.phase_gate import gate_parameters
 from eschorty_ros.core.profiles import Profiles
-from eschorty_ros.core.row_sigma import OWN_PER_WIDTH2, noise_of
+from eschorty_ros.core.row_sigma import CLIPPED, OWN_PER_WIDTH2, noise_of
 from eschorty_ros.core.settings import Settings
 
 _OUTPUT_PROFILES = 64
@@ -62,7 +62,9 @@ class ProfileAssembler:
         self._whole, self._fractional = _parameters(settings, model.rows)
         self._noise = noise_of(
             settings.centroid, settings.sigma_factor, settings.sigma_floor_px,
-            settings.sigma_common_px, compensated=settings.reflectance_compensation == "on",
+            settings.sigma_common_px,
+            # What an edge of reflectance does is compensated, what one of range does is not.
+            0.5 * CLIPPED if settings.reflectance_compensation == "on" else CLIPPED,
         )  # fmt: skip
         size = _OUTPUT_PROFILES * planes * columns
         self._whole_out = np.empty((3, size), dtype=np.int64)

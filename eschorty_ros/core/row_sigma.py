@@ -64,8 +64,7 @@ def noise_of(
     sigma_factor: float = SIGMA_FACTOR,
     sigma_floor_px: float = SIGMA_FLOOR_PX,
     sigma_common_px: float = SIGMA_COMMON_PX,
-    *,
-    compensated: bool = False,
+    clipped: float = CLIPPED,
 ) -> NDArray[np.float64]:
     """Error model of an estimator for the kernels.
 
@@ -80,8 +79,8 @@ def noise_of(
     sigma_common_px : float
         Part that neighbouring columns share and smoothing does not lessen.
 
-    compensated : bool
-        Whether steps of reflectance are compensated, which leaves half of what they do.
+    clipped : float
+        Standard deviation over the rows missing to the line's full width.
 
     Raises
     ------
@@ -97,6 +96,6 @@ def noise_of(
     noise[kernels.N_COMMON] = number("sigma_common_px", sigma_common_px, 0.0, SIGMA_LIMIT)
     noise[kernels.N_BACKGROUND] = own.background
     noise[kernels.N_MOTION] = own.motion
-    noise[kernels.N_CLIPPED] = 0.5 * CLIPPED if compensated else CLIPPED
+    noise[kernels.N_CLIPPED] = number("clipped", clipped, 0.0, SIGMA_LIMIT)
     noise[kernels.N_MEDIAN] = method == "median"
     return noise

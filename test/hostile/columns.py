@@ -69,12 +69,19 @@ CALLS: dict[str, Call] = {
     ),
     "row_sigma.noise_of": Call(
         row_sigma.noise_of,
-        {"method": "mean", "sigma_factor": 0.2, "sigma_floor_px": 0.2, "sigma_common_px": 0.1},
+        {
+            "method": "mean",
+            "sigma_factor": 0.2,
+            "sigma_floor_px": 0.2,
+            "sigma_common_px": 0.1,
+            "clipped": 0.6,
+        },
         {
             "method": text(),
             "sigma_factor": number(-1.0),
             "sigma_floor_px": number(-1.0),
             "sigma_common_px": number(-1.0),
+            "clipped": number(-1.0),
         },
     ),
     "centroid.check_method": Call(

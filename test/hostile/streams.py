@@ -61,7 +61,7 @@ CALLS: dict[str, Call] = {
     "evt3.Encoder": Call(evt3.Encoder, {"width": 64, "height": 64}, SIZE),
     "evt3.Encoder.encode": Call(
         method(evt3.Encoder, "encode"),
-        dict(EVENTS, trigger_t=[1], trigger_edge=[1]),
+        dict(EVENTS, trigger_t=[1], trigger_edge=[1], drop_t=[1]),
         {
             "t": integers(-1, T_MAX, size=N),
             "x": integers(-1, 1280, 65535, size=N),
@@ -69,6 +69,7 @@ CALLS: dict[str, Call] = {
             "p": POLARITY,
             "trigger_t": integers(-1, T_MAX, size=1),
             "trigger_edge": integers(-1, 2, size=1),
+            "drop_t": Kind([bad for bad in integers(-1, T_MAX).refused if bad is not None]),
         },
     ),
     "evt3.Encoder.advance": Call(
