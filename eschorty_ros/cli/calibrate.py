@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.calibrate_simulated import calibrate_simulated
 from eschorty_ros.cli.calibration_sources import known, recorded
 from eschorty_ros.cli.console import show, table
 
@@ -167,6 +166,8 @@ def command(
         if sources or moving is not None or free or prior or robust is not None:
             raise click.UsageError("--fake takes no SOURCE, --moving, --free, --prior or --robust")
         _check_out(out)
+        from eschorty_ros.cli.calibrate_simulated import calibrate_simulated
+
         calibrate_simulated(known(distances, range_sigma), nominal, as_built, method, out)
         return
     _check_usage(sources, out, distances, moving)
