@@ -97,7 +97,7 @@ def test_posts_that_are_not_there_are_one_line_and_leave_an_old_file(command, tm
     out = tmp_path / "calibration.yaml"
     out.write_text("old")
     process = command(0.3, "--distances", "5000,6000,7000", "--out", out)
-    stdout, stderr = process.communicate(timeout=60)
+    stdout, stderr = process.communicate(timeout=100)
     assert process.returncode == 1, stderr
     assert stdout == ""
     said = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
@@ -114,6 +114,6 @@ def test_what_belongs_to_files_is_wrong_usage(command, tmp_path, arguments):
     (tmp_path / "targets.csv").write_text("row,range_mm\n")
     given = [tmp_path / name if name.endswith(".csv") else name for name in arguments]
     process = command(0.3, *given)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=100)
     assert process.returncode == 2, stderr
     assert "--fake takes no" in stderr
