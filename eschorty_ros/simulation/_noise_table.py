@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.simulation._response_kernels import GAP_MAX, GAP_MIN, GAP_STEPS
+from eschorty_ros.simulation._passage_kernels import GAP_MAX, GAP_MIN, GAP_STEPS
 
 DECISION_US = 1.0
 """The comparator decides once in so long: it does not see what noise does in between."""

@@ -12,15 +12,14 @@ import math
 import numpy as np
 from numba import njit
 
+from eschorty_ros.simulation._passage_kernels import GAP_MAX, _noisy
 from eschorty_ros.simulation._response_kernels import (
-    GAP_MAX,
     NOTHING,
     UNKNOWN,
     _advanced,
     _earliest_us,
     _fade,
     _noiseless,
-    _noisy,
 )
 
 PIXEL_DTYPE = np.dtype(
