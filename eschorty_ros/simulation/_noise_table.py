@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.simulation._passage_kernels import GAP_MAX, GAP_MIN, GAP_STEPS
+from eschorty_ros.simulation._prompt_kernels import (
+    DRAW_STEPS,
+    LAG_MAX,
+    LAG_STEPS,
+    PACE_STEPS,
+    WAY_MAX,
+    WAY_STEPS,
+)
 
 DECISION_US = 1.0
 """The comparator decides once in so long: it does not see what noise does in between."""
 
 
+@cache
 def noise_table(correlation_us: float) -> NDArray[np.float64]:
     """Risk of a passage against the gap between signal and level.
 
@@ -54,3 +64,55 @@ def noise_table(correlation_us: float) -> NDArray[np.float64]:
     rate /= correlation_us
     above = np.concatenate((np.cumsum((0.5 * (rate[1:] + rate[:-1]))[::-1])[::-1], [0.0]))
     return np.ascontiguousarray(np.column_stack((rate, above / GAP_STEPS, share)))
+
+
+def passage_gaps(table: NDArray[np.float64], correlation_us: float) -> NDArray[np.float32]:
+    """Gap at which a pixel passes whose signal comes near at a steady pace.
+
+    Parameters
+    ----------
+    table : ndarray of float64, shape (n, 3)
+        What :func:`noise_table` gave for the same correlation time.
+    correlation_us : float
+
+    Returns
+    -------
+    ndarray of float32, shape (PACE_STEPS + 1, DRAW_STEPS + 1)
+        Standard deviations. Rows: ``pace / (pace + correlation_us)`` from 0 to 1, the pace in us
+        per standard deviation. Columns: the probability not to have passed before, 0 to 1.
+    """
+    share = np.arange(PACE_STEPS + 1) / PACE_STEPS
+    paces_us = correlation_us * share / np.maximum(1.0 - share, 1e-6)
+    gap = GAP_MIN + np.arange(len(table)) / GAP_STEPS
+    frozen = np.maximum(-np.diff(table[:, 2]), 0.0)
+    passed = -np.diff(table[:, 1])
+    draws = np.linspace(0.0, 1.0, DRAW_STEPS + 1)
+    gaps = np.empty((PACE_STEPS + 1, DRAW_STEPS + 1), dtype=np.float32)
+    for row, pace_us in zip(gaps, paces_us, strict=True):
+        moved = passed * pace_us
+        cost = np.maximum(moved, frozen) + 0.6 * np.minimum(moved, frozen)
+        risk = np.append(np.cumsum(cost[::-1])[::-1], 0.0)
+        row[:] = np.interp(draws, np.exp(-risk), gap)
+    return gaps
+
+
+@cache
+def way_times() -> NDArray[np.float32]:
+    """Time after which a signal that set out from rest has gone a part of its way.
+
+    Returns
+    -------
+    ndarray of float32, shape (LAG_STEPS + 2, WAY_STEPS + 2)
+        In time constants of the photoreceptor. Rows: ``sqrt(tau_f / tau_p)`` from 0 to
+        ``LAG_MAX``; columns: square root of the part, 0 to ``WAY_MAX``.
+    """
+    times = np.concatenate(([0.0], np.geomspace(1e-5, 6.0, 4000)))
+    wanted = (np.arange(WAY_STEPS + 2) * (WAY_MAX / WAY_STEPS)) ** 2
+    ways = np.empty((LAG_STEPS + 2, WAY_STEPS + 2), dtype=np.float32)
+    for k, row in enumerate(ways):
+        rho = max((k * LAG_MAX / LAG_STEPS) ** 2, 1e-12)
+        # 1 - phi without cancellation for short times.
+        gone = (rho * np.expm1(-times / rho) - np.expm1(-times)) / (1.0 - rho)
+        row[:] = np.sqrt(np.interp(wanted, gone, times**2))
+    ways.setflags(write=False)
+    return ways

@@ -24,8 +24,6 @@ GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 4.5, 64.0
 _RATE, _SUM, _SHARE = 0, 1, 2
 _BEND = 0.15
 """Largest bend of the gap's path within a step of the summation, standard deviations."""
-_BEND_FAST, _FAST_US = 0.4, 12.0
-"""The same for signals so fast that the steps are short: an error of some 0.2 us."""
 _STEPS_MAX = 4096
 
 _DECAY_STEPS, _DECAY_MAX = 32.0, 40.0
@@ -92,17 +90,13 @@ def _start(u, y, settled, tau_us, follower_us, noise, from_us):
     # A step h bends the path of the gap by h^2/8 times its second derivative.
     bend = abs(a) * bend_a + abs(b) * bend_b
     scale = (settled + a + b) * noise
-    # One that is about to turn round may come closest to a level within a step.
-    turns = (a * rate_a + b * rate_b) * (a + b) < 0.0
-    fast = 8.0 * _BEND_FAST * scale < bend * _FAST_US * _FAST_US
-    bend_max = _BEND_FAST if fast and not turns else _BEND
-    room = 8.0 * bend_max * scale
+    room = 8.0 * _BEND * scale
     step_us = from_us
     # As long again as the signal took to come near is mostly right and costs no exponentials.
     if not 0.0 < bend * from_us * from_us < room:
         step_us = min(math.sqrt(room / (bend + 1e-300)), 0.5 * tau_us)
         fade_a, fade_b = _decay(step_us * rate_a), _decay(step_us * rate_b)
-    return a, b, step_us, fade_a, fade_b, bend_a, bend_b, bend_max
+    return a, b, step_us, fade_a, fade_b, bend_a, bend_b
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -117,7 +111,7 @@ def _noisy(
     side of ``middle``. Returns UNKNOWN when nothing happened up to ``until_us`` and the signal
     still moves: ask again later. The steps do not depend on ``until_us``.
     """
-    a, b, step_us, fade_a, fade_b, bend_a, bend_b, bend_max = _start(
+    a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(
         u, y, settled, tau_us, follower_us, noise, from_us
     )
     per_noise, per_on, per_off = 1.0 / noise, 1.0 / on_level, 1.0 / off_level
@@ -149,7 +143,7 @@ def _noisy(
             return t + (budget - spent) / rate, ON if sign > 0.0 else OFF
         if t > until_us:
             return np.inf, UNKNOWN
-        longer = (abs(a) * bend_a + abs(b) * bend_b) * step_us * step_us < 2.0 * bend_max * scale
+        longer = (abs(a) * bend_a + abs(b) * bend_b) * step_us * step_us < 2.0 * _BEND * scale
         step_us = 2.0 * step_us if longer else step_us
         fade_a = fade_a * fade_a if longer else fade_a
         fade_b = fade_b * fade_b if longer else fade_b

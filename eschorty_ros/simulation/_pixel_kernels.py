@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from eschorty_ros.simulation._passage_kernels import GAP_MAX, _noisy
+from eschorty_ros.simulation._prompt_kernels import _prompt
 from eschorty_ros.simulation._response_kernels import (
     NOTHING,
     UNKNOWN,
@@ -40,6 +41,8 @@ PIXEL_DTYPE = np.dtype(
 # States: OFF and ON = an event at t_next; WAITS = nothing before t_next; HELD = until t_next.
 WAITS, HELD = 2, 3
 _FULL = -1.0
+_AT_REST = 0.1
+"""Lag of y behind u that counts as none, standard deviations of the noise."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -81,13 +84,7 @@ def _uniform(bits):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _exponential(bits):
-    """Number drawn from an exponential distribution of mean 1."""
-    return -math.log(_uniform(bits))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _live(pixels, column, lo, hi, until_us, light, model, table, seed, out, n):
+def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
     """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
     An empty ``light`` leaves theirs as it is. ``model`` = omega0 (per us), follower (us), noise,
@@ -96,6 +93,7 @@ def _live(pixels, column, lo, hi, until_us, light, model, table, seed, out, n):
     output did not suffice: call again with more room.
     """
     omega, follower_us, noise = model[0], model[1], model[2]
+    table, ways, gaps = tables
     reach = math.exp(GAP_MAX * noise)
     earliest = np.inf
     relit = light.size > 0
@@ -115,11 +113,18 @@ def _live(pixels, column, lo, hi, until_us, light, model, table, seed, out, n):
         while t_next <= until_us:
             if state == WAITS:
                 if noise > 0.0:
-                    budget = _exponential(_bits(t, column, row, seed, 1))
-                    after_us, what = _noisy(
-                        u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
-                        table, t_next - t, until_us - t, budget,
-                    )  # fmt: skip
+                    draw = _uniform(_bits(t, column, row, seed, 1))
+                    what = UNKNOWN
+                    if t_next > t and abs(u - y) < _AT_REST * noise * u:
+                        after_us, what = _prompt(
+                            u, settled, tau_us, follower_us, on_level, off_level, noise, ways,
+                            gaps, draw,
+                        )  # fmt: skip
+                    if what == UNKNOWN:
+                        after_us, what = _noisy(
+                            u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
+                            table, t_next - t, until_us - t, -math.log(draw),
+                        )  # fmt: skip
                 else:
                     after_us, what = _noiseless(
                         u, y, settled, tau_us, follower_us, on_level, off_level
@@ -210,7 +215,7 @@ def _add_patch(light, lo, hi, patch, sigma):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _relight(
-    pixels, spans, due, columns, begin, patches, light, optics, model, table, t_us, seed,
+    pixels, spans, due, columns, begin, patches, light, optics, model, tables, t_us, seed,
     out, n,
 ):  # fmt: skip
     """Put the footprint ``patches`` (columns, patches, 4) in ``columns[begin:]`` from ``t_us`` on.
@@ -242,10 +247,10 @@ def _relight(
         apart = hi < old_lo or lo > old_hi
         n, earliest = _live(
             pixels, column, old_lo if apart else first, old_hi if apart else last, t_us, light,
-            model, table, seed, out, n,
+            model, tables, seed, out, n,
         )  # fmt: skip
         if apart and earliest != _FULL:
-            n, other = _live(pixels, column, lo, hi, t_us, light, model, table, seed, out, n)
+            n, other = _live(pixels, column, lo, hi, t_us, light, model, tables, seed, out, n)
             earliest = min(earliest, other)
         if earliest == _FULL:
             return k, n
@@ -260,7 +265,7 @@ def _relight(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, out, n):
+def _run_columns(pixels, spans, due, begin, until_us, model, tables, seed, out, n):
     """Everything that is due up to ``until_us`` in the columns from ``begin`` on.
 
     Stops where the output does not suffice; returns the next column and the number of events.
@@ -270,7 +275,7 @@ def _run_columns(pixels, spans, due, begin, until_us, model, table, seed, out, n
         if due[column] > until_us:
             continue
         n, earliest = _live(
-            pixels, column, spans[column, 2], spans[column, 3], until_us, unchanged, model, table,
+            pixels, column, spans[column, 2], spans[column, 3], until_us, unchanged, model, tables,
             seed, out, n,
         )  # fmt: skip
         if earliest == _FULL:

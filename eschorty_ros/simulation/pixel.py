@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.simulation._noise_table import DECISION_US, noise_table
+from eschorty_ros.simulation._noise_table import DECISION_US, noise_table, passage_gaps, way_times
 from eschorty_ros.simulation._pixel_kernels import (
     PIXEL_DTYPE,
     WAITS,
@@ -83,7 +83,9 @@ class PixelArray:
                 p.latency_jitter_us,
             ]
         )
-        self._noise_table = noise_table(max(p.follower_us, DECISION_US))
+        correlation_us = max(p.follower_us, DECISION_US)
+        risks = noise_table(correlation_us)
+        self._tables = (risks, way_times(), passage_gaps(risks, correlation_us))
         # Leaks of dark pixels come at random times too: each has its own phase and rate.
         self._hot = np.flatnonzero(
             np.random.default_rng(hot_seed).random(columns * rows) < p.hot_fraction
@@ -151,7 +153,7 @@ class PixelArray:
                 self._light,
                 self._optics,
                 self._model,
-                self._noise_table,
+                self._tables,
                 float(t_us),
                 self._seeds[0],
                 self._keys,
@@ -172,7 +174,7 @@ class PixelArray:
                 begin,
                 float(t_us),
                 self._model,
-                self._noise_table,
+                self._tables,
                 self._seeds[0],
                 self._keys,
                 self._count,
