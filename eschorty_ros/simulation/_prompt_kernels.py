@@ -39,13 +39,19 @@ def _between(table, row, column):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _inside(index, end):
+    """``index`` where it lies from 0 to below ``end``, else 0."""
+    return index if 0.0 <= index < end else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gone(u, per_way, level, x):
     """Square root of the part of the way to where y is ``exp(x)`` times ``level``."""
     value = level * (1.0 + x * (1.0 + x * (0.5 + x * (1 / 6 + x * (1 / 24)))))
     return math.sqrt((u - value) * per_way)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _prompt(u, settled, tau_us, follower_us, on_level, off_level, noise, ways, gaps, draw):
     """Time from now and polarity of the first passage of a signal at rest that moves away.
 
@@ -60,13 +66,15 @@ def _prompt(u, settled, tau_us, follower_us, on_level, off_level, noise, ways, g
     scale = WAY_STEPS / WAY_MAX
     late = _gone(u, per_way, level, _LATE * per_gap) * scale
     early = _gone(u, per_way, level, _EARLY * per_gap) * scale
-    if not (early >= 0.0 and late < WAY_STEPS and lag < LAG_STEPS):
-        return np.inf, UNKNOWN
-    pace = (_between(ways, lag, late) - _between(ways, lag, early)) * tau_us / (_LATE - _EARLY)
-    pace = abs(pace)
-    at_pace = pace / (pace + follower_us) * PACE_STEPS
-    gap = _between(gaps, at_pace, draw * DRAW_STEPS)
+    known = early >= 0.0 and late < WAY_STEPS and lag < LAG_STEPS
+    lag, late, early = _inside(lag, LAG_STEPS), _inside(late, WAY_STEPS), _inside(early, WAY_STEPS)
+    # No branch up to the last look at a table: with one, numba counts references to them.
+    way_us = (_between(ways, lag, late) - _between(ways, lag, early)) * tau_us
+    pace = abs(way_us) / (_EARLY - _LATE)
+    share = _inside(pace / (pace + follower_us), 1.0)
+    gap = _between(gaps, share * PACE_STEPS, draw * DRAW_STEPS)
     gone = _gone(u, per_way, level, gap * per_gap) * scale
-    if not gone < WAY_STEPS:
+    after_us = _between(ways, lag, _inside(gone, WAY_STEPS)) * tau_us
+    if not (known and gone < WAY_STEPS):
         return np.inf, UNKNOWN
-    return _between(ways, lag, gone) * tau_us, ON if falls else OFF
+    return after_us, ON if falls else OFF
