@@ -34,9 +34,9 @@ def _shares(u, y, settled, tau_us, follower_us):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _advanced(u, y, settled, tau_us, follower_us, t_us):
     """Photoreceptor and follower after ``t_us`` of constant light."""
-    x, z = t_us / tau_us, t_us / follower_us
-    if x > _SETTLED and z > _SETTLED:
+    if t_us > _SETTLED * tau_us and t_us > _SETTLED * follower_us:
         return settled, settled
+    x, z = t_us / tau_us, t_us / follower_us
     way = u - settled
     fade = math.exp(-x) if x < _SETTLED else 0.0
     lag = math.exp(-z) if z < _SETTLED else 0.0
