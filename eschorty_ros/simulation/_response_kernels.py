@@ -127,14 +127,13 @@ def _earliest_us(u, y, settled, t_us, tau_us, follower_us, on_level, off_level, 
     on_near, off_near = on_level * reach, off_level / reach
     if min(u, y) <= on_near or max(u, y) >= off_near:
         return t_us
+    # Where y is ahead of u, what it is ahead by only fades: it may set out from y as well.
     if settled < on_near:
-        near = on_near
+        way = min(u, y) - on_near
     elif settled > off_near:
-        near = off_near
+        way = max(u, y) - off_near
     else:
         return np.inf
-    # The response to a ramp as steep as u is now: u itself moves less and y lags behind it. With
-    # y ahead of u only the former holds.
-    ramp_us = tau_us * (u - near) / (u - settled)
-    lags = (y - u) * (u - settled) >= -1e-6 * u * abs(u - settled)
-    return t_us + (max(ramp_us, math.sqrt(2.0 * follower_us * ramp_us)) if lags else 0.0)
+    # The response to a ramp as steep as u is now: u itself moves less and y lags behind it.
+    ramp_us = tau_us * way / (u - settled)
+    return t_us + max(ramp_us, math.sqrt(2.0 * follower_us * ramp_us))
