@@ -28,13 +28,12 @@ _EARLY, _LATE = 2.5, 0.5
 @njit(cache=True, nogil=True, error_model="numpy")
 def _between(table, row, column):
     """Value of a table at fractional indices, linear between its entries."""
-    i, j = np.int64(row), np.int64(column)
-    up, right = row - i, column - j
-    i, j = np.uintp(i), np.uintp(j)
-    below, above = i, i + np.uintp(1)
-    next_j = j + np.uintp(1)
-    low = table[below, j] + right * (table[below, next_j] - table[below, j])
-    high = table[above, j] + right * (table[above, next_j] - table[above, j])
+    whole_row, whole_column = np.int64(row), np.int64(column)
+    up, right = row - whole_row, column - whole_column
+    i, j = np.uintp(whole_row), np.uintp(whole_column)
+    one = np.uintp(1)
+    low = table[i, j] + right * (table[i, j + one] - table[i, j])
+    high = table[i + one, j] + right * (table[i + one, j + one] - table[i + one, j])
     return low + up * (high - low)
 
 
