@@ -63,7 +63,9 @@ def noise_table(correlation_us: float) -> NDArray[np.float64]:
     share[-1] = 0.0
     rate /= correlation_us
     above = np.concatenate((np.cumsum((0.5 * (rate[1:] + rate[:-1]))[::-1])[::-1], [0.0]))
-    return np.ascontiguousarray(np.column_stack((rate, above / GAP_STEPS, share)))
+    table = np.ascontiguousarray(np.column_stack((rate, above / GAP_STEPS, share)))
+    table.setflags(write=False)
+    return table
 
 
 def passage_gaps(table: NDArray[np.float64], correlation_us: float) -> NDArray[np.float32]:
