@@ -93,7 +93,7 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
     output did not suffice: call again with more room.
     """
     omega, follower_us, noise = model[0], model[1], model[2]
-    table, ways, gaps = tables
+    table = tables[0]
     reach = math.exp(GAP_MAX * noise)
     earliest = np.inf
     relit = light.size > 0
@@ -113,18 +113,11 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
         while t_next <= until_us:
             if state == WAITS:
                 if noise > 0.0:
-                    draw = _uniform(_bits(t, column, row, seed, 1))
-                    what = UNKNOWN
-                    if t_next > t and abs(u - y) < _AT_REST * noise * u:
-                        after_us, what = _prompt(
-                            u, settled, tau_us, follower_us, on_level, off_level, noise, ways,
-                            gaps, draw,
-                        )  # fmt: skip
-                    if what == UNKNOWN:
-                        after_us, what = _noisy(
-                            u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
-                            table, t_next - t, until_us - t, -math.log(draw),
-                        )  # fmt: skip
+                    budget = -math.log(_uniform(_bits(t, column, row, seed, 1)))
+                    after_us, what = _noisy(
+                        u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
+                        table, t_next - t, until_us - t, budget,
+                    )  # fmt: skip
                 else:
                     after_us, what = _noiseless(
                         u, y, settled, tau_us, follower_us, on_level, off_level
@@ -180,6 +173,31 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
             return n, _FULL
         earliest = min(earliest, t_next)
     return n, earliest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _foresee(pixels, column, lo, hi, model, tables, seed):
+    """Look up the next event of the rows [lo, hi) just lit that set out from rest.
+
+    A pass of its own, since without branches on what a pixel does the processor works at
+    several pixels at once. Other rows are left to :func:`_live`.
+    """
+    omega, follower_us, noise = model[0], model[1], model[2]
+    ways, gaps = tables[1], tables[2]
+    for row in range(lo, hi):
+        pixel = pixels[np.uintp(column), np.uintp(row)]
+        u, t, settled, y_ref = pixel.u, pixel.t, pixel.u_settled, pixel.y_ref
+        waits = pixel.state == WAITS and t < pixel.t_next < np.inf
+        if not (waits and abs(u - pixel.y) < _AT_REST * noise * u):
+            continue
+        after_us, what = _prompt(
+            u, settled, settled / omega, follower_us, y_ref * np.float64(pixel.on_factor),
+            y_ref * np.float64(pixel.off_factor), noise, ways, gaps,
+            _uniform(_bits(t, column, row, seed, 1)),
+        )  # fmt: skip
+        if what != UNKNOWN:
+            pixel.state = what
+            pixel.t_next = t + after_us
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -254,6 +272,10 @@ def _relight(
             earliest = min(earliest, other)
         if earliest == _FULL:
             return k, n
+        if model[2] > 0.0:
+            _foresee(pixels, column, lo, hi, model, tables, seed)
+            if apart or old_lo < lo or old_hi > hi:
+                _foresee(pixels, column, old_lo, old_hi, model, tables, seed)
         if due[column] == np.inf:
             spans[column, 2], spans[column, 3] = first, last
         else:

@@ -16,9 +16,7 @@ TAU_DARK_US, THRESHOLD = 159.15, 0.25
 DRAWS = (np.arange(400) + 0.5) / 400
 
 
-def summed(
-    u: float, settled: float, follower_us: float, noise: float, dt_us: float
-) -> np.ndarray:
+def summed(u: float, settled: float, follower_us: float, noise: float, dt_us: float) -> np.ndarray:
     """Time of the passage per draw, us: the risk of the noise table in steps of ``dt_us``."""
     tau_us = TAU_DARK_US * settled
     t = np.arange(0.0, 12.0 * tau_us, dt_us)
