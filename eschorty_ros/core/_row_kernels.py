@@ -25,6 +25,8 @@ _EDGE_PART = 8
 _CUT_ITERATIONS = 30
 # Below this part of the variance to expect, a cut line is taken to be narrower than the window's.
 _NARROWER = 0.4
+# A column with more than this many times the line's variance holds stray events.
+_STRAY_FREE = 2.0
 # Square of the least factor on s/sqrt(N): a fit to part of a line amplifies what counts vary.
 _CUT_FACTOR2 = 0.24**2
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
@@ -212,6 +214,8 @@ def _uncut_row(row, sigma2, variance, window, half, rows, noise):
 def _whole_sigma2(row, variance, own, count, rows, noise):
     """Variance of a row estimated from a whole column, and whether the sensor's edge cuts it."""
     sigma2 = _sigma2(variance, own, count, row, rows, noise)
-    reach = 3.0 * np.sqrt(variance)
+    # Stray events make a column wide; they do not bring its line to the edge.
+    line = min(variance, _STRAY_FREE * own)
+    reach = 3.0 * np.sqrt(line)
     cut = row < reach or rows - 1.0 - row < reach
-    return sigma2 + _CUT_BIAS2 * variance if cut else sigma2, cut
+    return sigma2 + _CUT_BIAS2 * line if cut else sigma2, cut

@@ -13,6 +13,8 @@ from eschorty_ros.core._window_kernels import FRACTION
 N_FACTOR, N_FLOOR, N_COMMON, N_MOTION, N_BACKGROUND, N_CLIPPED, N_MEDIAN, NOISE_SIZE = range(8)
 # A line that jumps further lies on another surface: its last place says nothing any more.
 _MOTION_MAX_PX = 8.0
+# Standard deviation over the way of a line that jumps.
+_JUMP = 0.2
 # Scatter of the full width of an unclipped footprint, rows.
 _WIDTH_SCATTER_PX = 0.7
 
@@ -64,7 +66,7 @@ def _common2(centre, last, noise):
     moved = 0.0
     if last >= 0:
         moved = min(abs(centre - last) / FRACTION, _MOTION_MAX_PX)
-    return noise[N_COMMON] ** 2 + (noise[N_MOTION] * moved) ** 2
+    return noise[N_COMMON] ** 2 + noise[N_MOTION] ** 2 * moved + (_JUMP * moved) ** 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

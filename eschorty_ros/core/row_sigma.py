@@ -10,7 +10,7 @@ from the mismatch of the pixels' thresholds, which more events of the same pixel
 the last is for events beyond the line's own, which scatter independently. And the part that
 neighbouring columns share::
 
-    common^2 + (motion * way of the line since the last profile)^2
+    common^2 + motion^2 * way of the line since the last profile + (jump * that way)^2
              + (clipped * rows missing to the line's full width)^2
 
 The last is for footprints that an edge of the scene clips; a dark surface looks narrow, too, and
@@ -51,11 +51,11 @@ class _MethodNoise:
 
 
 METHOD_NOISE = {
-    "mode_mean": _MethodNoise(0.2, 0.87, 0.4, 0.36),
-    "mean": _MethodNoise(0.4, 0.725, 1.0, 0.22),
-    "median": _MethodNoise(1.0, 0.81, 1.5, 0.28),
-    "gauss_ml": _MethodNoise(0.2, 0.89, 0.4, 0.36),
-    "edge_mid": _MethodNoise(0.2, 0.87, 0.4, 0.32),
+    "mode_mean": _MethodNoise(0.2, 0.89, 0.4, 0.20),
+    "mean": _MethodNoise(0.4, 0.70, 1.0, 0.19),
+    "median": _MethodNoise(0.2, 0.865, 1.75, 0.11),
+    "gauss_ml": _MethodNoise(0.2, 0.91, 0.4, 0.20),
+    "edge_mid": _MethodNoise(0.243, 0.875, 0.4, 0.18),
 }
 
 

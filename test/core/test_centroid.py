@@ -111,7 +111,7 @@ def test_line_cut_by_the_sensor_is_not_biased(method, row):
     sigma, events, columns = 8.493, 100, 1500
     rows = np.rint(rng.normal(row, sigma, (columns, 4 * events)))
     rows = np.stack([line[(line >= 0) & (line <= 719)][:events] for line in rows]).astype(int)
-    independent = 1.0 / METHOD_NOISE[method].factor
+    independent = 1.0 / METHOD_NOISE["mode_mean"].factor
     offsets = np.arange(columns + 1) * events
     found = estimate(rows.ravel(), offsets, method, line_width_px=20.0, sigma_factor=independent)
     error = found.row - row

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from eschorty_ros.core.centroid import FWHM_PER_SIGMA, METHODS, estimate
+from eschorty_ros.core.row_sigma import METHOD_NOISE
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
@@ -181,8 +182,13 @@ def _cut(rng: np.random.Generator, columns: int) -> list[tuple[str, float, float
         offsets = np.arange(columns + 1) * CUT_EVENTS
         for method in METHODS:
             # Independent events: their mean scatters by s/sqrt(N), hence a factor of 1.
+            independent = 1.0 / METHOD_NOISE["mode_mean"].factor
             found = estimate(
-                drawn.rows.ravel(), offsets, method, line_width_px=CUT_FWHM_PX, sigma_factor=1.0
+                drawn.rows.ravel(),
+                offsets,
+                method,
+                line_width_px=CUT_FWHM_PX,
+                sigma_factor=independent,
             )
             error = found.row - row
             within = float(np.mean(np.abs(error) < 2.0 * found.sigma_row))

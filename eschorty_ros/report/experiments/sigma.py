@@ -111,7 +111,7 @@ def _ratios(
     scene_name: str, frequency_hz: float, speed_mm_s: float, travel_mm: float, effort: Effort
 ) -> list[Ratios]:
     scene = SCENES[scene_name]
-    columns = effort.choose(1280, 256)
+    columns = effort.choose(640, 160)
     calibration = load_calibration("config_3").model_copy(
         update={"columns": columns, "principal_column": (columns - 1) / 2}
     )
@@ -230,9 +230,9 @@ _REMARKS = (
     "many of them. The tables give their share and their coverage, and that of all points.",
     "On a single scene the share differs: much of the error repeats from period to period, so a "
     "flat target shows the error of a few rows only.",
-    "mean takes every background event of a column for the line's and is shown with a phase gate "
-    "of 1 ms. Without it most of its error is that of one to three stray events per column, which "
-    "sigma knows; the share within two sigma is then above 98 %.",
+    "mean takes every event of a column for the line's and is shown with a phase gate of 1 ms. "
+    "Without it most of its error is that of one to three stray events per column, which sigma "
+    "knows: the share within two sigma is then above 98 %.",
 )
 
 EXPERIMENT = Experiment("sigma", "Is the reported sigma honest?", run)
