@@ -134,6 +134,10 @@ def _earliest_us(u, y, settled, t_us, tau_us, follower_us, on_level, off_level, 
         way = max(u, y) - off_near
     else:
         return np.inf
+    # Far ahead it is about to turn round; the risk of that is summed up from the start.
+    ahead_max = u * max(0.02 * (reach - 1.0), 1e-6)
+    if (y - u) * (u - settled) < -ahead_max * abs(u - settled):
+        return t_us
     # The response to a ramp as steep as u is now: u itself moves less and y lags behind it.
     ramp_us = tau_us * way / (u - settled)
     return t_us + max(ramp_us, math.sqrt(2.0 * follower_us * ramp_us))
