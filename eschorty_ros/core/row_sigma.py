@@ -52,10 +52,10 @@ class _MethodNoise:
 
 METHOD_NOISE = {
     "mode_mean": _MethodNoise(0.2, 0.89, 0.4, 0.20),
-    "mean": _MethodNoise(0.4, 0.70, 1.0, 0.19),
-    "median": _MethodNoise(0.2, 0.865, 1.75, 0.11),
+    "mean": _MethodNoise(0.4, 0.672, 1.0, 0.18),
+    "median": _MethodNoise(0.2, 0.935, 1.48, 0.11),
     "gauss_ml": _MethodNoise(0.2, 0.91, 0.4, 0.20),
-    "edge_mid": _MethodNoise(0.243, 0.875, 0.4, 0.18),
+    "edge_mid": _MethodNoise(0.243, 0.885, 0.42, 0.18),
 }
 
 
