@@ -15,9 +15,8 @@ _OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 def use_profile() -> None:
     """Make Fast DDS read ``config/fastdds.xml`` unless the user has chosen a profile.
 
-    With its defaults bursts of event packets do not fit into shared memory, and a message that got
-    lost comes again only after up to 3 s, even on a reliable topic. Must run before the first
-    ``rclpy.init`` of the process.
+    With its defaults a message that got lost on a loaded host comes again only after up to 3 s,
+    even on a reliable topic. Must run before the first ``rclpy.init`` of the process.
     """
     chosen = any(name in os.environ for name in VARIABLES)
     if chosen or os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS:
