@@ -33,7 +33,13 @@ setup(
         )
     ],
     install_requires=REQUIREMENTS,
-    extras_require={"mesh": ["open3d>=0.19", "libusb-package"]},
+    extras_require={
+        "mesh": ["open3d>=0.19", "libusb-package"],
+        # LGPL: several transfers in flight; without it the camera is read one transfer at a time.
+        "usb-async": ["libusb1>=3.1"],
+        "usb-library": ["libusb-package"],
+        "neuromorphic": ["neuromorphic-drivers>=0.18"],
+    },
     entry_points={
         "console_scripts": [
             "eschorty = eschorty_ros.cli:main",

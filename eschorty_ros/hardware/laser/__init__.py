@@ -1,0 +1,1 @@
+"""Laser generator driver and its guard."""

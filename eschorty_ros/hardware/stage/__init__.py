@@ -1,0 +1,1 @@
+"""Linear stage driver."""
