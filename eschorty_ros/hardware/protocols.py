@@ -102,10 +102,26 @@ class StageState:
     flags: tuple[str, ...] = field(default=())
 
 
+@dataclass(frozen=True, slots=True)
+class PulseTrain:
+    """Pulses the stage gives: the i-th begins at ``first_mm + i * interval_mm``, i < count."""
+
+    first_mm: float
+    interval_mm: float
+    count: int
+
+
 class LinearStage(Protocol):
-    """A linear stage with absolute moves that end by themselves."""
+    """A linear stage with absolute moves that end by themselves.
+
+    Attributes
+    ----------
+    trigger : PulseTrain or None
+        Pulses for the camera's trigger input, in either direction; ``None`` when there are none.
+    """
 
     identity: DeviceIdentity
+    trigger: PulseTrain | None
     travel_mm: tuple[float, float]
     speed_max_mm_s: float
     acceleration_mm_s2: float

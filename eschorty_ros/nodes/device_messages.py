@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from eschorty_ros.core.motion import MotionPlan
-from eschorty_ros.hardware.protocols import LaserOutput, LaserReadback
-from eschorty_ros.msg import LaserState, StageMotion
+from eschorty_ros.hardware.protocols import LaserOutput, LaserReadback, PulseTrain
+from eschorty_ros.msg import LaserState, PositionTrigger, StageMotion
 from eschorty_ros.nodes.conversions import (
     m_from_mm,
     mm_from_m,
@@ -47,3 +47,14 @@ def plan_from_motion(message: StageMotion) -> MotionPlan:
         tuple(message.durations),
         tuple(mm_from_m(a) for a in message.accelerations),
     )
+
+
+def trigger_message(train: PulseTrain | None, stamp_ns: int) -> PositionTrigger:
+    """``stage/trigger`` of the pulses the stage gives from ``stamp_ns`` on."""
+    message = PositionTrigger()
+    if train is not None:
+        message.first = m_from_mm(train.first_mm)
+        message.interval = m_from_mm(train.interval_mm)
+        message.count = train.count
+    message.header.stamp = stamp_from_ns(stamp_ns)
+    return message

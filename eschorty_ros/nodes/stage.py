@@ -15,10 +15,10 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from eschorty_ros.action import MoveStage
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.hardware.protocols import LinearStage, StageState
-from eschorty_ros.msg import StageMotion
+from eschorty_ros.msg import PositionTrigger, StageMotion
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
-from eschorty_ros.nodes.device_messages import motion_message
+from eschorty_ros.nodes.device_messages import motion_message, trigger_message
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
@@ -41,7 +41,7 @@ TABLE = (
 
 
 class StageNode(DeviceNode):
-    """Action ``stage/move``; topics ``stage/odom`` and ``stage/motion``.
+    """Action ``stage/move``; topics ``stage/odom``, ``stage/motion`` and ``stage/trigger``.
 
     Activate homes when needed. A goal that cannot be carried out (outside travel, too fast, not
     active, another motion under way) is accepted and aborted at once, because a rejection carries
@@ -57,6 +57,7 @@ class StageNode(DeviceNode):
         self.moves = 0
         self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(ODOM_DEPTH))
         self._motion = self.create_publisher(StageMotion, "stage/motion", qos.stream())
+        self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
         self._move = ActionServer(
             self,
             MoveStage,
@@ -78,7 +79,10 @@ class StageNode(DeviceNode):
         """Open the stage."""
         with self._lock:
             self._stage = drivers.make(drivers.STAGES, self.parameters, self.now_ns)
-            identity = self._stage.identity
+            identity, trigger = self._stage.identity, self._stage.trigger
+        message = trigger_message(trigger, self.now_ns())
+        message.header.frame_id = self.parameters["base_frame"]
+        self._trigger.publish(message)
         self.get_logger().info(f"{identity.model} {identity.serial}")
 
     def start_device(self) -> None:

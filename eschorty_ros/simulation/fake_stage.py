@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.motion import MotionPlan, plan_move, plan_stop
-from eschorty_ros.hardware.protocols import DeviceIdentity, StageState
+from eschorty_ros.hardware.protocols import DeviceIdentity, PulseTrain, StageState
 
 _HOMING_MM_S = 100.0
 
@@ -38,6 +38,7 @@ class FakeStage:
         power_up_mm: float = 5.0,
     ) -> None:
         self.identity = DeviceIdentity("simulated linear stage", "SIM-STAGE")
+        self.trigger: PulseTrain | None = None
         self.travel_mm = travel_mm
         self.speed_max_mm_s = speed_max_mm_s
         self.acceleration_mm_s2 = acceleration_mm_s2

@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
 from action_msgs.msg import GoalStatus
 from eschorty_ros.action import MoveStage
-from eschorty_ros.msg import StageMotion
+from eschorty_ros.msg import PositionTrigger, StageMotion
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
 from ros_process import NodeProcess, Observer, wait_until
@@ -71,6 +71,13 @@ def stage() -> Iterator[Stage]:
 
 def test_activate_homes(stage: Stage) -> None:
     wait_until(lambda: stage.odometry[-1].pose.pose.position.y == 0.0, "the home position")
+
+
+def test_trigger_is_told_to_late_joiners(stage: Stage) -> None:
+    told = stage.observer.collect(PositionTrigger, "stage/trigger", qos.latched())
+    wait_until(lambda: told, "the position trigger")
+    assert told[0].interval == 0.0
+    assert told[0].count == 0
 
 
 def test_move_arrives(stage: Stage) -> None:
