@@ -73,6 +73,7 @@ def test_nine_posts_give_back_a_build_that_is_not_as_designed(command, tmp_path)
     assert before_mm > 20.0
     assert after_mm < 1.0
     assert "verdict: identifiable" in stdout
+    assert made.id in out.with_suffix(".html").read_text()
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert outputs(tmp_path)[-1] == "off"
     assert "on" in outputs(tmp_path)

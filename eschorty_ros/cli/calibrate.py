@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.calibration_sources import known, recorded
-from eschorty_ros.cli.console import show, table
 
 if TYPE_CHECKING:
-    from eschorty_ros.core.calibrate import CalibrationReport
+    from eschorty_ros.core.calibrate import Method
 
 BLOCKS = 8
 """Targets side by side that a moving target gives when the fit asks for roll or smile."""
@@ -106,7 +105,7 @@ def command(
     sources: tuple[Path, ...],
     nominal: str,
     out: Path,
-    method: str,
+    method: Method,
     distances: str | None,
     moving: float | None,
     range_per_stage: float,
@@ -172,13 +171,12 @@ def command(
         return
     _check_usage(sources, out, distances, moving)
     priors = _priors(prior)
+    from eschorty_ros.cli.calibration_output import finish
     from eschorty_ros.core.calibrate import calibrate
-    from eschorty_ros.core.calibration import load_calibration, save_calibration
+    from eschorty_ros.core.calibration import load_calibration
     from eschorty_ros.core.calibration_fit import COLUMN_TERMS
-    from eschorty_ros.core.files import atomic_write
     from eschorty_ros.core.targets import Targets
     from eschorty_ros.core.targets_file import read_targets
-    from eschorty_ros.report.calibration_page import calibration_html
 
     design = load_calibration(nominal)
     made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
@@ -195,19 +193,13 @@ def command(
     report = calibrate(
         targets,
         design,
-        "paper" if method == "paper" else "joint",
+        method,
         free=free or None,
         prior_sigma=priors,
         robust=robust,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
     )
-    page = calibration_html(report, made_with)
-    save_calibration(report.calibration, out)
-    with atomic_write(out.with_suffix(".html")) as stream:
-        stream.write(page.encode())
-    _show(report)
-    click.echo(str(out))
-    click.echo(str(out.with_suffix(".html")))
+    finish(report, made_with, out)
 
 
 def _check_usage(
@@ -240,26 +232,3 @@ def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
         if not equals:
             raise click.UsageError(f"--prior is {text!r}; write NAME=SIGMA, such as b_mm=3")
     return priors or None
-
-
-def _show(report: CalibrationReport) -> None:
-    """Print the parameters, how well the targets fit, and the verdicts."""
-    from eschorty_ros.report.calibration_page import parameters
-    from eschorty_ros.report.page import number
-
-    used = int(report.used.sum())
-    made = table(
-        f"{report.calibration.id}: {used} of {len(report.targets)} targets, residual "
-        f"{number(report.calibration.residual_rms_px or 0.0)} px, reduced chi-square "
-        f"{number(report.fit.reduced_chi_square)}",
-        *("", "value", "sigma", "design", "prior sigma"),
-    )
-    for entry in parameters(report):
-        sigma = "fixed" if math.isnan(entry.sigma) else number(entry.sigma)
-        prior = "" if math.isnan(entry.prior) else number(entry.prior)
-        made.add_row(entry.name, number(entry.value), sigma, number(entry.nominal), prior)
-    show(made)
-    for left_out in report.rejected:
-        click.echo(f"rejected: {left_out.label}: {left_out.reason}")
-    for line in report.verdicts:
-        click.echo(f"verdict: {line}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+import click
 import numpy as np
 
 from eschorty_ros.cli.console import pairs, progress_bar
@@ -13,15 +14,15 @@ from eschorty_ros.cli.instrument import ended_by_signals, one_process
 from eschorty_ros.core.errors import FitError
 
 if TYPE_CHECKING:
+    from eschorty_ros.core.calibrate import Method
     from eschorty_ros.core.calibration import Calibration
     from eschorty_ros.core.posts import KnownTarget
-    from eschorty_ros.nodes.one_process import CalibrationOutcome
 
 CHECK_MM = np.linspace(800.0, 2100.0, 131)
 
 
 def calibrate_simulated(
-    known: list[KnownTarget], nominal: str, as_built: str, method: str, out: Path
+    known: list[KnownTarget], nominal: str, as_built: str, method: Method, out: Path
 ) -> None:
     """Calibrate through the action; write the calibration, the picture and the errors.
 
@@ -31,9 +32,9 @@ def calibrate_simulated(
         What is known of the scene ``posts``.
     nominal, as_built : str
         The build as designed, and as the simulated world has it.
-    method : str
+    method : {"joint", "paper"}
     out : path
-        Calibration to write; the sum of all events goes beside it as .png.
+        Calibration to write; its page goes beside it as .html, the sum of all events as .png.
 
     Raises
     ------
@@ -43,30 +44,35 @@ def calibrate_simulated(
         Without ROS 2.
     """
     nodes = one_process("test")
-    from eschorty_ros.core.calibration import load_calibration, save_calibration
+    from matplotlib.image import imsave
+
+    from eschorty_ros.cli.calibration_output import finish
+    from eschorty_ros.core.calibrate import calibrate
+    from eschorty_ros.core.calibration import load_calibration
 
     design, built = load_calibration(nominal), load_calibration(as_built)
     with ended_by_signals(), TemporaryDirectory(prefix="eschorty_") as folder:
         job = nodes.OneCalibration(
             tuple(known), folder, calibration=nominal, as_built=as_built, method=method
         )
-        with progress_bar("calibrating") as report:
-            outcome = nodes.calibrate_once(job, report)
-    if outcome.calibration is None:
+        with progress_bar("calibrating") as feedback:
+            outcome = nodes.calibrate_once(job, feedback)
+    if outcome.calibration is None or outcome.targets is None:
         raise FitError(outcome.message)
-    save_calibration(outcome.calibration, out)
-    _picture(outcome, out.with_suffix(".png"))
-    _print(outcome, design, built, out)
+    report = calibrate(outcome.targets, design, method, date=outcome.calibration.date)
+    finish(report, {"targets from": "nine simulated posts", "design": nominal}, out)
+    shown = {f"target {entry.label}: {entry.reason}" for entry in report.rejected}
+    for line in outcome.rejected:
+        if line not in shown:
+            click.echo(f"rejected: {line}")
+    picture = out.with_suffix(".png")
+    imsave(picture, outcome.frame, cmap="gray", vmin=0, vmax=255)
+    _print_errors(picture, design, report.calibration, built)
 
 
-def _picture(outcome: CalibrationOutcome, path: Path) -> None:
-    from matplotlib.image import imsave
-
-    imsave(path, outcome.frame, cmap="gray", vmin=0, vmax=255)
-
-
-def _print(outcome: CalibrationOutcome, design: Calibration, built: Calibration, out: Path) -> None:
-    assert outcome.calibration is not None
+def _print_errors(
+    picture: Path, design: Calibration, made: Calibration, built: Calibration
+) -> None:
     true_row = built.model().row(CHECK_MM)
 
     def rms_mm(calibration: Calibration) -> str:
@@ -74,16 +80,9 @@ def _print(outcome: CalibrationOutcome, design: Calibration, built: Calibration,
         return f"{float(np.sqrt(np.mean(error**2))):.2f} mm"
 
     pairs(
-        f"{out}, {out.with_suffix('.png')}",
+        str(picture),
         {
-            "calibration": outcome.calibration.id or "",
-            "targets used": f"{len(outcome.row)}",
-            "residual": f"{outcome.calibration.residual_rms_px or 0.0:.3f} px",
             "range RMS 0.8-2.1 m, as designed": rms_mm(design),
-            "range RMS 0.8-2.1 m, calibrated": rms_mm(outcome.calibration),
+            "range RMS 0.8-2.1 m, calibrated": rms_mm(made),
         },
     )
-    for line in outcome.rejected:
-        print(f"rejected: {line}")
-    for line in outcome.verdicts:
-        print(f"verdict: {line}")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from eschorty_ros.core._checks import file_path
 from eschorty_ros.core.errors import FormatError
+from eschorty_ros.core.files import atomic_write
 from eschorty_ros.core.posts import KnownTarget
 from eschorty_ros.core.targets import SIGMA_ROW_PX, SIGMA_WIDTH_PX, Targets
 
@@ -76,6 +77,30 @@ def read_targets(
         for name in _COLUMNS
     }
     return Targets(**numbers, labels=[line.text("label") or f"line {line.at}" for line in table])
+
+
+def write_targets(path: str | os.PathLike[str], targets: Targets) -> None:
+    """Write targets so that :func:`read_targets` gives the same ones, to the last bit.
+
+    Parameters
+    ----------
+    path : path
+        Appears whole or not at all.
+    targets : Targets
+
+    Raises
+    ------
+    ArgumentError
+        When the file cannot be written.
+    """
+    columns = [getattr(targets, attribute).tolist() for attribute in _COLUMNS.values()]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(TARGET_COLUMNS)
+    for *values, label in zip(*columns, targets.labels, strict=True):
+        writer.writerow([*("" if math.isnan(value) else repr(value) for value in values), label])
+    with atomic_write(path) as stream:
+        stream.write(text.getvalue().encode())
 
 
 def read_distances(

@@ -17,6 +17,8 @@ from eschorty_ros.core.calibration import (
 )
 from eschorty_ros.core.calibration_identity import refuse_other_instrument
 from eschorty_ros.core.errors import ArgumentError, EschortyError
+from eschorty_ros.core.targets import Targets
+from eschorty_ros.core.targets_file import write_targets
 from eschorty_ros.msg import ActiveCalibration as ActiveCalibrationMessage
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.calibration_messages import active_message
@@ -60,8 +62,8 @@ class ActiveCalibration:
             node.create_service(kind, f"reconstruction/{name}", callback, callback_group=group)
         self._tell(file)
 
-    def store(self, calibration: Calibration) -> str:
-        """Write ``calibration``, then put it to use; the file's path.
+    def store(self, calibration: Calibration, targets: Targets) -> str:
+        """Write the targets and ``calibration``, then put it to use; the calibration's path.
 
         Raises
         ------
@@ -71,6 +73,7 @@ class ActiveCalibration:
         """
         refuse_other_instrument(calibration, self.calibration)
         path = self._default_path(calibration)
+        write_targets(targets_path(path), targets)
         save_calibration(calibration, path)
         self._exchange(calibration, str(path))
         return str(path)
@@ -116,6 +119,11 @@ class ActiveCalibration:
             return response
         response.success, response.file = True, str(path)
         return response
+
+
+def targets_path(calibration_path: Path) -> Path:
+    """Where the targets of a calibration fitted on the instrument lie."""
+    return calibration_path.with_name(f"{calibration_path.stem}-targets.csv")
 
 
 def _home() -> Path:

@@ -153,7 +153,7 @@ class Calibrator:
         targets = enough_targets(findings, len(request.targets))
         date = datetime.now(UTC).date().isoformat()
         report = calibrate(targets, self._nominal, request.method, date=date)  # type: ignore[arg-type]
-        file = self._active.store(report.calibration)
+        file = self._active.store(report.calibration, targets)
         fill_result(result, report, file)
 
     def _closed(self, goal: Any, end: End, result: Any) -> Any:

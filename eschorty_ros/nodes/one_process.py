@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,10 @@ from eschorty_ros.core.calibration import Calibration, load_calibration
 from eschorty_ros.core.cloud import POINT_DTYPE
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.posts import KnownTarget
+from eschorty_ros.core.targets import Targets
+from eschorty_ros.core.targets_file import read_targets
 from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.active_calibration import targets_path
 from eschorty_ros.nodes.calibration_messages import target_message
 from eschorty_ros.nodes.cloud_messages import points_from_message
 from eschorty_ros.nodes.composition import (
@@ -184,8 +188,8 @@ class CalibrationOutcome:
         As read back from ``file``.
     file : str
     verdicts, rejected : tuple of str
-    range_mm, row, residual_px : ndarray of float64
-        Of the targets used.
+    targets : Targets or None
+        What was found and fitted to.
     frame : ndarray of uint8, shape (rows, columns)
         All events of the capture.
     """
@@ -196,9 +200,7 @@ class CalibrationOutcome:
     file: str
     verdicts: tuple[str, ...]
     rejected: tuple[str, ...]
-    range_mm: NDArray[np.float64]
-    row: NDArray[np.float64]
-    residual_px: NDArray[np.float64]
+    targets: Targets | None
     frame: NDArray[np.uint8]
 
 
@@ -253,9 +255,7 @@ def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcom
         file=str(result.file),
         verdicts=tuple(result.verdicts),
         rejected=tuple(result.rejected),
-        range_mm=np.array(result.ranges) * 1e3,
-        row=np.array(result.rows),
-        residual_px=np.array(result.residuals),
+        targets=read_targets(targets_path(Path(result.file))) if result.success else None,
         frame=np.frombuffer(result.frame.data, np.uint8).reshape(
             result.frame.height, result.frame.width
         ),

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.errors import FormatError
-from eschorty_ros.core.targets_file import read_distances, read_targets
+from eschorty_ros.core.targets import Targets
+from eschorty_ros.core.targets_file import read_distances, read_targets, write_targets
 
 
 def written(tmp_path, text, name="targets.csv"):
@@ -38,6 +39,28 @@ def test_every_column_in_any_order_with_gaps_and_remarks(tmp_path):
     assert targets.has_width.tolist() == [True, False]
     assert targets.column[0] == 100.0
     assert math.isnan(targets.column[1])
+
+
+def test_written_targets_come_back_to_the_last_bit(tmp_path):
+    nan = math.nan
+    targets = Targets(
+        [53.1, 1.0 / 3.0],
+        [820.0, 2050.0000000000002],
+        [0.1, 0.3],
+        [0.0, 1e-9],
+        column=[nan, 639.5],
+        width_px=[nan, 154.2],
+        sigma_width_px=[nan, 0.4],
+        size_mm=[nan, 25.4],
+        labels=["near, left", "posts \u201cA\u201d"],
+    )
+    write_targets(tmp_path / "targets.csv", targets)
+    back = read_targets(tmp_path / "targets.csv")
+    assert back.labels == targets.labels
+    for name in ("row", "range_mm", "sigma_row_px", "sigma_range_mm", "column", "width_px",
+                 "size_mm", "spacing_px"):  # fmt: skip
+        np.testing.assert_array_equal(getattr(back, name), getattr(targets, name), err_msg=name)
+    assert back.has_width.tolist() == [False, True]
 
 
 def test_distances_with_sizes_and_hints(tmp_path):

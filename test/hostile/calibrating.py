@@ -77,6 +77,9 @@ CALLS: dict[str, Call] = {
             "prior_sigma": PRIORS,
         },
     ),
+    "targets_file.write_targets": Call(
+        lambda path: targets_file.write_targets(path, SEEN), {"path": "t.csv"}, {"path": path()}
+    ),
     "targets_file.read_targets": Call(
         reading(targets_file.read_targets, "row,range_mm\n100,900\n"),
         {"path": "t.csv", "sigma_row_px": 0.3, "sigma_range_mm": 1.0},
