@@ -23,3 +23,15 @@ class FitError(CalibrationError):
 
 class DeviceError(EschortyError):
     """A camera, laser or stage that refused or failed."""
+
+
+class DeviceGoneError(DeviceError):
+    """The device is no longer there: unplugged, switched off, its port closed."""
+
+
+class DeviceTimeoutError(DeviceError):
+    """The device did not answer in time."""
+
+
+class DeviceStallError(DeviceError):
+    """A USB endpoint refuses transfers until its halt is cleared."""
