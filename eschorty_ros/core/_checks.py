@@ -2,52 +2,42 @@
 
 from __future__ import annotations
 
-import math
-import os
-from numbers import Integral, Real
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from eschorty_ros.core._values import (
+    SMALLEST,
+    TIME_LIMIT,
+    file_path,
+    number,
+    number_or_nan,
+    positive,
+    short,
+    whole,
+)
 from eschorty_ros.core.errors import ArgumentError
 
-SMALLEST = 2.3e-308
-"""Positive numbers below have no reciprocal, or lose their digits."""
-TIME_LIMIT = 1 << 62
-"""Times, us or ns, stay within this, so that sums and differences of two fit 64 bits."""
-
-
-def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-    """``value`` as a finite float from ``low`` to ``high``."""
-    real = _float(value)
-    if not (math.isfinite(real) and low <= real <= high):
-        raise ArgumentError(f"{name} is {short(value)}; {_span('a finite number', low, high)}")
-    return real
-
-
-def number_or_nan(name: str, value: Any, low: float = -math.inf) -> float:
-    """``value`` as a float from ``low`` on, NaN where it is unknown."""
-    if isinstance(value, Real) and value != value:
-        return math.nan
-    return number(name, value, low)
-
-
-def positive(name: str, value: Any) -> float:
-    """``value`` as a finite float above 0, with a finite reciprocal."""
-    real = _float(value)
-    if not SMALLEST < real < math.inf:
-        raise ArgumentError(f"{name} is {short(value)}; choose a positive number")
-    return real
-
-
-def whole(name: str, value: Any, low: int, high: int) -> int:
-    """``value`` as an int from ``low`` to ``high``; no floats, not even whole ones."""
-    wrong = isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral)
-    if wrong or not low <= value <= high:
-        raise ArgumentError(f"{name} is {short(value)}; {_span('a whole number', low, high)}")
-    return int(value)
+__all__ = [
+    "SMALLEST",
+    "TIME_LIMIT",
+    "as_array",
+    "broadcast",
+    "exact",
+    "file_path",
+    "number",
+    "number_or_nan",
+    "octets",
+    "positive",
+    "reals",
+    "selection",
+    "short",
+    "times",
+    "vector",
+    "whole",
+    "whole_vector",
+]
 
 
 def reals(name: str, values: ArrayLike) -> NDArray[np.float64]:
@@ -121,13 +111,6 @@ def selection(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
     return array
 
 
-def file_path(name: str, value: Any) -> Path:
-    """``value`` as a path that an operating system can be asked for."""
-    if not isinstance(value, str | os.PathLike) or "\0" in os.fsdecode(value):
-        raise ArgumentError(f"{name} is {short(value)}; give the name of a file")
-    return Path(value)
-
-
 def octets(name: str, data: Any) -> memoryview:
     """``data`` as bytes; arrays of anything wider are refused, not reinterpreted."""
     try:
@@ -148,26 +131,10 @@ def broadcast(names: str, *arrays: NDArray[Any]) -> tuple[int, ...]:
         raise ArgumentError(f"{names} have shapes {shapes}; give shapes that fit") from None
 
 
-def short(value: Any) -> str:
-    """``repr`` on one line of bounded length."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def _form(values: Any) -> str:
     if isinstance(values, np.ndarray):
         return f"{values.dtype} of shape {values.shape}"
     return short(values)
-
-
-def _float(value: Any) -> float:
-    """``value`` as a float; NaN for what is no real number."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
-        return math.nan
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
 
 
 def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
@@ -176,11 +143,3 @@ def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
         return np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:
         raise ArgumentError(f"{name} is {short(values)}; give numbers") from error
-
-
-def _span(kind: str, low: float, high: float) -> str:
-    if math.isinf(low) and math.isinf(high):
-        return f"choose {kind}"
-    if math.isinf(high):
-        return f"choose {kind}, {low:g} or more"
-    return f"choose {kind} from {low} to {high}"

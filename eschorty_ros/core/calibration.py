@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from eschorty_ros.core._checks import file_path
 from eschorty_ros.core.errors import CalibrationError
-from eschorty_ros.core.files import atomic_write
+from eschorty_ros.core.files import atomic_write, config_folders
 from eschorty_ros.core.optics import (
     COLUMNS,
     PIXEL_UM,
@@ -249,13 +249,3 @@ def config_file(name: str) -> Path:
         if (folder / wanted).is_file():
             return folder / wanted
     raise CalibrationError(f"name is {name!r}, and config/ has no such file; give its path instead")
-
-
-def config_folders() -> list[Path]:
-    """List where builds may lie: source tree, inside a pip-installed package, colcon's share."""
-    here = Path(__file__).absolute()
-    return [
-        here.parents[2] / "config",
-        here.parents[1] / "config",
-        *(prefix / "share" / "eschorty_ros" / "config" for prefix in here.parents),
-    ]

@@ -1,13 +1,14 @@
-"""Files that are whole or absent: write beside the target, then rename."""
+"""Where configuration lies; files that are whole or absent: written beside, then renamed."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import BinaryIO
 
-from eschorty_ros.core._checks import file_path
+from eschorty_ros.core._values import file_path
 from eschorty_ros.core.errors import ArgumentError
 
 
@@ -38,3 +39,13 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):
             partial.unlink()
+
+
+def config_folders() -> list[Path]:
+    """List where ``config/`` may lie: source tree, pip-installed package, colcon's share."""
+    here = Path(__file__).absolute()
+    return [
+        here.parents[2] / "config",
+        here.parents[1] / "config",
+        *(prefix / "share" / "eschorty_ros" / "config" for prefix in here.parents),
+    ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 
-from eschorty_ros.core._checks import TIME_LIMIT, number, whole
+from eschorty_ros.core._values import TIME_LIMIT, number, whole
 from eschorty_ros.core.errors import ArgumentError
 
 WAVEFORMS = ("square", "sine", "pulse")

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from eschorty_ros.core._checks import file_path
+from eschorty_ros.core._values import file_path
 from eschorty_ros.core.errors import EschortyError
 
 

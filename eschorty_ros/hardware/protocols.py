@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.motion import MotionPlan
+if TYPE_CHECKING:
+    # Only names: the process that guards the laser starts without numpy.
+    from eschorty_ros.core.modulation import Modulation
+    from eschorty_ros.core.motion import MotionPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +60,15 @@ class LaserOutput(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class LaserReadback:
-    """What the generator says it does."""
+    """What the generator says it does.
+
+    ``phase_epoch_ns`` is the time of one rising edge, ``None`` where nobody knows it: a
+    generator does not tell its phase.
+    """
 
     output: LaserOutput
     modulation: Modulation
-    phase_epoch_ns: int
+    phase_epoch_ns: int | None
     output_since_ns: int
 
 

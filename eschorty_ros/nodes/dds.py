@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from eschorty_ros.core.calibration import config_folders
+from eschorty_ros.core.files import config_folders
 
 PROFILE = "fastdds.xml"
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")

@@ -16,11 +16,11 @@ from eschorty_ros.nodes.conversions import (
 
 def readback_from_state(message: LaserState) -> LaserReadback:
     """Take what the generator said from ``laser/state``."""
-    modulation, _ = modulation_from_laser_state(message)
+    modulation, epoch_ns = modulation_from_laser_state(message)
     return LaserReadback(
         LaserOutput(message.output),
         modulation,
-        ns_from_stamp(message.phase_epoch),
+        epoch_ns,
         ns_from_stamp(message.output_since),
     )
 

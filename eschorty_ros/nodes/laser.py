@@ -243,7 +243,7 @@ class LaserNode(DeviceNode):
             waveform=state.modulation.waveform,
             frequency=state.modulation.frequency_hz,
             duty=state.modulation.duty,
-            phase_epoch=stamp_from_ns(state.phase_epoch_ns),
+            phase_epoch=stamp_from_ns(state.phase_epoch_ns or 0),
             output_since=stamp_from_ns(state.output_since_ns),
             reason=self._reason,
         )

@@ -15,7 +15,7 @@ from launch.substitutions import (
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from eschorty_ros.core.calibration import config_folders
+from eschorty_ros.core.files import config_folders
 
 NAMESPACE = "eschorty"
 EVENTS = f"/{NAMESPACE}/camera/events"

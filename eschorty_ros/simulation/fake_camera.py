@@ -248,10 +248,13 @@ class FakeCamera:
     def _apply_laser(self, readback: LaserReadback) -> bool:
         """Hand a laser state to the world; whether it came after its time was simulated."""
         # Configuring leaves the output as it is: the change is then the new waveform's epoch.
-        since_ns = max(readback.output_since_ns, readback.phase_epoch_ns)
+        epoch_ns = readback.phase_epoch_ns
+        if epoch_ns is None:
+            epoch_ns = readback.output_since_ns
+        since_ns = max(readback.output_since_ns, epoch_ns)
         on = readback.output is not LaserOutput.OFF
         since_us, late = self._from_us(since_ns)
-        edge_us = (readback.phase_epoch_ns - self._zero_ns + 500) // 1000
+        edge_us = (epoch_ns - self._zero_ns + 500) // 1000
         self._world.set_laser(since_us, on, replace(readback.modulation, on_edge_us=edge_us))
         return late
 

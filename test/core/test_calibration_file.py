@@ -12,7 +12,7 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from eschorty_ros.core import calibration as module
+from eschorty_ros.core import files
 from eschorty_ros.core.calibration import (
     BUILDS,
     Calibration,
@@ -219,10 +219,10 @@ def test_a_name_that_names_itself_ends(tmp_path: Path) -> None:
 def test_names_are_found_where_colcon_pip_and_git_put_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, site: str, config: str
 ) -> None:
-    installed = tmp_path / site / "eschorty_ros" / "core" / "calibration.py"
+    installed = tmp_path / site / "eschorty_ros" / "core" / "files.py"
     (tmp_path / config).mkdir(parents=True)
     shutil.copy(ROOT / "config" / "config_2.yaml", tmp_path / config / "shop_floor.yaml")
-    monkeypatch.setattr(module, "__file__", str(installed))
+    monkeypatch.setattr(files, "__file__", str(installed))
     assert load_calibration("shop_floor").name == "config_2"
 
 
