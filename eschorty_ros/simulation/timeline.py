@@ -24,6 +24,8 @@ class Gate:
     modulation : Modulation
         ``on_edge_us`` must be known; edges agree with :meth:`Modulation.edge_us`. A sine is
         rendered in ``SINE_STEPS`` steps per flank, fewer where they would be below 1 us.
+    clock_rate : Fraction
+        Sensor time that passes per unit of the modulation's own time.
 
     Raises
     ------
@@ -32,6 +34,7 @@ class Gate:
     """
 
     modulation: Modulation
+    clock_rate: Fraction = Fraction(1)
     _period: tuple[int, int] = field(init=False, repr=False, compare=False)
     _duty: tuple[int, int] = field(init=False, repr=False, compare=False)
     _origin_us: int = field(init=False, repr=False, compare=False)
@@ -40,7 +43,7 @@ class Gate:
         if self.modulation.on_edge_us is None:
             raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")
         # Integers throughout: edges are asked for in the inner loop, Fraction objects are slow.
-        period = 1_000_000 / Fraction(self.modulation.frequency_hz)
+        period = 1_000_000 * self.clock_rate / Fraction(self.modulation.frequency_hz)
         object.__setattr__(self, "_period", period.as_integer_ratio())
         object.__setattr__(self, "_duty", Fraction(self.modulation.duty).as_integer_ratio())
         object.__setattr__(self, "_origin_us", self.modulation.on_edge_us)
@@ -68,6 +71,14 @@ class Gate:
         while self.rise_us(index + 1) <= t_us:
             index += 1
         return index
+
+    def high(self, t_us: int) -> bool:
+        """Whether the gate's signal is high at ``t_us``: from a rising to a falling edge."""
+        return self._flank(t_us)[2]
+
+    def flank_us(self, t_us: int) -> int:
+        """First edge of the gate's signal after ``t_us``."""
+        return self._flank(t_us)[1]
 
     def level(self, t_us: int) -> float:
         """Light at ``t_us``, 0 to 1."""
@@ -112,7 +123,13 @@ class LaserTimeline:
         self._times: list[int] = []
         self._gates: list[Gate | None] = []
 
-    def set(self, t_us: int, on: bool, modulation: Modulation | None) -> None:
+    def set(
+        self,
+        t_us: int,
+        on: bool,
+        modulation: Modulation | None,
+        clock_rate: Fraction = Fraction(1),
+    ) -> None:
         """Switch from ``t_us`` on; replaces what was set for later times.
 
         Raises
@@ -122,7 +139,7 @@ class LaserTimeline:
         """
         if on and modulation is None:
             raise ArgumentError("the laser is on without a modulation; give one")
-        gate = Gate(modulation) if on and modulation is not None else None
+        gate = Gate(modulation, clock_rate) if on and modulation is not None else None
         keep = len([t for t in self._times if t < t_us])
         self._times[keep:] = [t_us]
         self._gates[keep:] = [gate]
@@ -136,6 +153,23 @@ class LaserTimeline:
         """Whether ``t_us`` is a rising edge."""
         gate = self._gate(t_us)
         return gate is not None and gate.rise_us(gate.index(t_us)) == t_us
+
+    def edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
+        """Edges of the gate's signal from ``begin_us`` to before ``end_us``: time, rising."""
+        found = []
+        t_us, high = begin_us - 1, self._high(begin_us - 1)
+        while True:
+            gate = self._gate(t_us)
+            k = bisect_right(self._times, t_us)
+            ends = self._times[k : k + 1]
+            if gate is not None:
+                ends.append(gate.flank_us(t_us))
+            t_us = min(ends, default=end_us)
+            if t_us >= end_us:
+                return found
+            if self._high(t_us) != high:
+                high = not high
+                found.append((t_us, high))
 
     def next_us(self, t_us: int) -> int | None:
         """First time after ``t_us`` at which the laser may change, ``None`` for never."""
@@ -151,6 +185,10 @@ class LaserTimeline:
         k = max(bisect_right(self._times, t_us) - 1, 0)
         del self._times[:k], self._gates[:k]
 
+    def _high(self, t_us: int) -> bool:
+        gate = self._gate(t_us)
+        return gate is not None and gate.high(t_us)
+
     def _gate(self, t_us: int) -> Gate | None:
         k = bisect_right(self._times, t_us) - 1
         return self._gates[k] if k >= 0 else None
@@ -161,21 +199,27 @@ class StageTimeline:
 
     def __init__(self) -> None:
         self._times: list[int] = []
-        self._plans: list[tuple[MotionPlan, int]] = []
+        self._plans: list[tuple[MotionPlan, int, Fraction]] = []
 
-    def set(self, t_us: int, plan: MotionPlan, zero_ns: int) -> None:
-        """Follow ``plan``, whose clock read ``zero_ns`` at sensor time 0, from ``t_us`` on."""
+    def set(
+        self, t_us: int, plan: MotionPlan, zero_ns: int, clock_rate: Fraction = Fraction(1)
+    ) -> None:
+        """Follow ``plan`` from ``t_us`` on.
+
+        The plan's clock read ``zero_ns`` at sensor time 0; ``clock_rate`` is the sensor time that
+        passes per unit of the plan's.
+        """
         keep = len([t for t in self._times if t < t_us])
         self._times[keep:] = [t_us]
-        self._plans[keep:] = [(plan, zero_ns)]
+        self._plans[keep:] = [(plan, zero_ns, clock_rate)]
 
     def state(self, t_us: int) -> tuple[float, float]:
         """Position (mm) and velocity (mm/s) at ``t_us``."""
         k = bisect_right(self._times, t_us) - 1
         if k < 0:
             return 0.0, 0.0
-        plan, zero_ns = self._plans[k]
-        position, velocity = plan.state(zero_ns + t_us * 1000)
+        plan, zero_ns, rate = self._plans[k]
+        position, velocity = plan.state(zero_ns + t_us * 1000 * rate.denominator // rate.numerator)
         return float(position), float(velocity)
 
     def forget_before(self, t_us: int) -> None:

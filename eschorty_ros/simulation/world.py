@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from collections.abc import Callable
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +33,9 @@ _STEP_MIN_US = 50
 _ROW_STEP = 0.02
 _REFLECTANCE_STEP = 0.01
 _PIECE_US = 65_536
+
+EdgeSource = Callable[[int, int], list[tuple[int, bool]]]
+"""Edges from one sensor time (us) to before another: time, rising; in order of time."""
 _TIME_HIGH_US = 4_096
 _PHASES_KEPT = 1_000_000
 
@@ -50,6 +56,11 @@ class World:
     background_hz : float
         Background events per pixel and second.
     readout : ReadoutParameters, optional
+
+    Attributes
+    ----------
+    trigger_input : EdgeSource or None
+        What is wired to the camera's trigger input; asked once for every stretch of time.
     """
 
     def __init__(
@@ -66,6 +77,7 @@ class World:
         self.columns = self.model.columns
         self.rows = self.model.rows
         self.events = 0
+        self.trigger_input: EdgeSource | None = None
         pixels = parameters or PixelParameters()
         self._half_rows = pixels.half_width_rows
         self._pixels = PixelArray(self.columns, self.rows, pixels, seed, background_hz)
@@ -95,10 +107,17 @@ class World:
         """Events lost in the readout so far; the stream says when, not how many."""
         return self._readout.dropped
 
-    def set_laser(self, t_us: int, on: bool, modulation: Modulation | None = None) -> None:
+    def set_laser(
+        self,
+        t_us: int,
+        on: bool,
+        modulation: Modulation | None = None,
+        clock_rate: Fraction = Fraction(1),
+    ) -> None:
         """Switch the laser from ``t_us`` on; ``modulation.on_edge_us`` places the wave.
 
-        Replaces what was set for later times.
+        Replaces what was set for later times. ``clock_rate`` is the sensor time that passes per
+        unit of the generator's time.
 
         Raises
         ------
@@ -106,22 +125,33 @@ class World:
             When ``t_us`` has been simulated already, or the modulation's edge is unknown.
         """
         self._refuse_past("t_us", t_us)
-        self._laser.set(t_us, on, modulation)
+        self._laser.set(t_us, on, modulation, clock_rate)
 
-    def set_stage(self, plan: MotionPlan, zero_ns: int = 0, from_us: int | None = None) -> None:
+    def set_stage(
+        self,
+        plan: MotionPlan,
+        zero_ns: int = 0,
+        from_us: int | None = None,
+        clock_rate: Fraction = Fraction(1),
+    ) -> None:
         """Follow ``plan``, whose clock read ``zero_ns`` at sensor time 0.
 
         The plan holds from its own start on, or from ``from_us``; before the first plan the
-        stage rests at 0 mm.
+        stage rests at 0 mm. ``clock_rate`` is the sensor time that passes per unit of the plan's.
 
         Raises
         ------
         ArgumentError
             When that time has been simulated already.
         """
-        start_us = -((zero_ns - plan.start_ns) // 1000) if from_us is None else from_us
+        since_zero = (plan.start_ns - zero_ns) * clock_rate / 1000
+        start_us = math.ceil(since_zero) if from_us is None else from_us
         self._refuse_past("the plan's start", start_us)
-        self._stage.set(start_us, plan, zero_ns)
+        self._stage.set(start_us, plan, zero_ns, clock_rate)
+
+    def laser_edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
+        """Edges of the laser's gate signal, an ``EdgeSource``."""
+        return self._laser.edges(begin_us, end_us)
 
     def stage_mm(self, t_us: int) -> float:
         """Stage position at sensor time ``t_us``, as far as it is known now."""
@@ -145,7 +175,15 @@ class World:
             if self._encoder.time_us is None:
                 parts.append(self._encoder.advance(0))
             self.events += keys.size
-            parts.append(self._encoder.encode(*unpack(keys), drop_t=drops_us))
+            triggers = self.trigger_input(self._now_us, end_us) if self.trigger_input else []
+            parts.append(
+                self._encoder.encode(
+                    *unpack(keys),
+                    trigger_t=[t_us for t_us, _ in triggers],
+                    trigger_edge=[int(rising) for _, rising in triggers],
+                    drop_t=drops_us,
+                )
+            )
             # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
             step_us = end_us - end_us % _TIME_HIGH_US
             if step_us > (self._encoder.time_us or 0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -333,3 +334,42 @@ def test_recording_into_an_impossible_folder_is_refused(tmp_path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ArgumentError, match="cannot make the folder"):
         simulate_recording(tmp_path / "file" / "rec", Plane(), SMALL)
+
+
+def test_triggers_come_at_the_edges_of_the_gate_however_time_is_cut() -> None:
+    def with_triggers() -> World:
+        world = moving(Plane(1320.0))
+        world.trigger_input = world.laser_edges
+        return world
+
+    whole = with_triggers().advance(300_000)
+    world, parts = with_triggers(), []
+    while world.now_us < 300_000:
+        parts.append(world.advance(min(world.now_us + 1_777, 300_000)))
+    assert b"".join(parts) == whole
+    triggers = Decoder(96, 720).decode(whole).triggers
+    gates = [
+        (3_333, 150_007, Gate(WAVE)),
+        (170_000, 300_000, Gate(Modulation(200.0, 0.3, "square", -77))),
+    ]
+    expected = []
+    for begin_us, end_us, gate in gates:
+        high = np.array([gate.high(t) for t in range(begin_us, end_us)])
+        changes = np.flatnonzero(np.diff(high.astype(int))) + 1
+        expected += [(begin_us, 1)] * int(high[0])
+        expected += [(begin_us + int(k), int(high[k])) for k in changes]
+        if high[-1] and end_us < 300_000:
+            expected.append((end_us, 0))
+    assert list(zip(triggers.t.tolist(), triggers.edge.tolist(), strict=True)) == expected
+
+
+def test_a_fast_sensor_clock_stretches_wave_and_motion() -> None:
+    rate = 1 + Fraction(50, 1_000_000)
+    world = World(Plane(1320.0), SMALL, seed=SEED)
+    plan = plan_move(1_000_000_000, 10.0, 60.0, 50.0, 2000.0)
+    world.set_stage(plan, 1_000_000_000, 0, rate)
+    world.set_laser(0, True, Modulation(100.0, 0.5, "square", 0), rate)
+    edges = world.laser_edges(0, 1_000_200)
+    assert edges[-1] == (1_000_050, True)
+    at_us = 500_025
+    assert world.stage_mm(at_us) == pytest.approx(float(plan.state(1_500_000_000)[0]), abs=1e-6)
