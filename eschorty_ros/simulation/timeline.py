@@ -156,7 +156,7 @@ class LaserTimeline:
 
     def edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
         """Edges of the gate's signal from ``begin_us`` to before ``end_us``: time, rising."""
-        found = []
+        found: list[tuple[int, bool]] = []
         t_us, high = begin_us - 1, self._high(begin_us - 1)
         while True:
             gate = self._gate(t_us)
