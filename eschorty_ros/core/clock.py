@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core._checks import TIME_LIMIT, reals, times, whole
+from eschorty_ros.core.clock_line import NS_PER_US, T_US_LIMIT, ClockLine
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.lower_envelope import LowerEnvelope
+
+__all__ = [
+    "NM_PER_MM",
+    "NS_PER_US",
+    "POSITION_LIMIT_MM",
+    "SensorClock",
+    "StageTrack",
+    "quantise_nm",
+]
 
 NM_PER_MM = 1_000_000
-NS_PER_US = 1_000
 POSITION_LIMIT_MM = 1e9
-_T_US_LIMIT = TIME_LIMIT // NS_PER_US
 
 
 def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np.int64]:
@@ -157,16 +165,16 @@ class StageTrack:
 
 
 class SensorClock:
-    """Exact conversion between sensor microseconds and ROS nanoseconds.
+    """Conversion between sensor microseconds and ROS nanoseconds.
 
-    With ``zero_ns`` given (announced by the camera) the zero is fixed. Without it the zero is
-    the lower envelope of ``arrival - sensor time`` over a sliding window: a packet can be late
-    but never early, so the smallest difference seen is the closest to the truth, and the window
-    lets the estimate follow a drifting oscillator.
+    With ``zero_ns`` given (announced by the camera) the relation is fixed and exact. Without it
+    offset and drift are the lower envelope of the packets' arrivals over a sliding window, see
+    :class:`~eschorty_ros.core.lower_envelope.LowerEnvelope`, until a better relation is known from
+    trigger edges (:meth:`adopt`).
 
     The estimate may step at an observation, never between two of them: times converted between
-    two observations are monotone. When arrival or sensor time goes back (clock set, camera
-    restarted) the window starts anew and ``restarts`` counts it.
+    two observations are strictly monotone. When arrival or sensor time goes back (clock set,
+    camera restarted) everything starts anew and ``restarts`` counts it.
 
     Parameters
     ----------
@@ -180,34 +188,72 @@ class SensorClock:
     restarts : int
         Times the window was thrown away.
     residual_ns : int or None
-        How much later than the zero says the last observed packet arrived.
+        How much later than the clock says the last observed packet arrived.
     """
 
-    def __init__(self, zero_ns: int | None = None, window_ns: int = 10_000_000_000) -> None:
-        whole("window_ns", window_ns, 1, TIME_LIMIT)
-        if zero_ns is not None:
-            whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT)
-        self._announced = zero_ns is not None
-        self._zero_ns = zero_ns
-        self._window_ns = window_ns
-        self._candidates: deque[tuple[int, int]] = deque()
+    def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
+        self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
+        self._fixed = None if zero_ns is None else ClockLine(0, _zero(zero_ns))
+        self._adopted: ClockLine | None = None
+        self._envelope = LowerEnvelope(window_ns)
         self._last: tuple[int, int] | None = None
         self.restarts = 0
         self.residual_ns: int | None = None
 
     @property
+    def exact(self) -> bool:
+        """Whether the zero was announced."""
+        return self._fixed is not None
+
+    @property
+    def from_edges(self) -> bool:
+        """Whether the relation comes from trigger edges."""
+        return self._adopted is not None
+
+    @property
+    def line(self) -> ClockLine | None:
+        """The relation as known now, ``None`` while nothing is known."""
+        return self._fixed or self._adopted or self._envelope.line
+
+    @property
+    def arrival_line(self) -> ClockLine | None:
+        """The relation as the packets' arrivals alone show it."""
+        return self._fixed or self._envelope.line
+
+    @property
     def zero_ns(self) -> int | None:
         """ROS time of sensor time 0, ns; ``None`` while nothing is known."""
-        return self._zero_ns
+        return None if self.line is None else self.line.to_ns(0)
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster ROS time passes than sensor time; 0 while nothing is known."""
+        return 0.0 if self.line is None else self.line.drift_ppb * 1e-3
+
+    @property
+    def offset_age_us(self) -> int:
+        """Sensor time since the newest packet that arrived without delay."""
+        return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
 
     def observe(self, t_us: int, arrival_ns: int) -> None:
         """Take note that the event of sensor time ``t_us`` arrived at ROS time ``arrival_ns``."""
-        t_us = whole("t_us", t_us, -_T_US_LIMIT, _T_US_LIMIT)
+        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
-        if not self._announced:
-            self._estimate(t_us, arrival_ns)
+        if self._fixed is None:
+            if self._last is not None and (t_us < self._last[0] or arrival_ns < self._last[1]):
+                self._envelope = LowerEnvelope(self._window_ns)
+                self._adopted = None
+                self.restarts += 1
+            self._envelope.observe(t_us, arrival_ns)
         self._last = (t_us, arrival_ns)
         self.residual_ns = arrival_ns - self.to_ns(t_us)
+
+    def adopt(self, line: ClockLine | None) -> None:
+        """Use ``line``, known from edges, until another comes; ``None`` goes back to arrivals.
+
+        An announced zero stays.
+        """
+        self._adopted = line
 
     @overload
     def to_ns(self, t_us: int) -> int: ...
@@ -215,10 +261,7 @@ class SensorClock:
     def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
     def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
         """ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
-        zero = self._known_zero()
-        if isinstance(t_us, np.ndarray):
-            return _within("t_us", t_us, _T_US_LIMIT) * NS_PER_US + zero
-        return whole("t_us", t_us, -_T_US_LIMIT, _T_US_LIMIT) * NS_PER_US + zero
+        return self._known().to_ns(t_us)
 
     @overload
     def to_us(self, t_ns: int) -> int: ...
@@ -226,36 +269,16 @@ class SensorClock:
     def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
     def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
         """Sensor time (us, nearest, halves up) of ROS time ``t_ns``; undoes :meth:`to_ns`."""
-        zero = self._known_zero()
-        if isinstance(t_ns, np.ndarray):
-            return (_within("t_ns", t_ns, TIME_LIMIT) - zero + NS_PER_US // 2) // NS_PER_US
-        t_ns = whole("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT)
-        return (t_ns - zero + NS_PER_US // 2) // NS_PER_US
+        return self._known().to_us(t_ns)
 
-    def _known_zero(self) -> int:
-        if self._zero_ns is None:
+    def _known(self) -> ClockLine:
+        line = self.line
+        if line is None:
             raise ArgumentError(
                 "the ROS time of sensor time 0 is unknown; announce it or observe a packet first"
             )
-        return self._zero_ns
-
-    def _estimate(self, t_us: int, arrival_ns: int) -> None:
-        if self._last is not None and (t_us < self._last[0] or arrival_ns < self._last[1]):
-            self._candidates.clear()
-            self.restarts += 1
-        offset = arrival_ns - t_us * NS_PER_US
-        while self._candidates and self._candidates[-1][1] >= offset:
-            self._candidates.pop()
-        self._candidates.append((arrival_ns, offset))
-        while self._candidates[0][0] < arrival_ns - self._window_ns:
-            self._candidates.popleft()
-        self._zero_ns = self._candidates[0][1]
+        return line
 
 
-def _within(name: str, values: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
-    """Refuse times that would leave 64 bits when they are converted."""
-    checked = times(name, values)
-    wrong = (checked > limit) | (checked < -limit)
-    if wrong.any():
-        raise ArgumentError(f"{name} holds {checked[wrong].flat[0]}; choose within {limit}")
-    return checked
+def _zero(zero_ns: int) -> int:
+    return whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT)

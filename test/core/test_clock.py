@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.clock import SensorClock, StageTrack, quantise_nm
+from eschorty_ros.core.clock_line import ClockLine
 from eschorty_ros.core.errors import ArgumentError
 
 EPOCH_US = 1_760_000_000_000_000
@@ -174,10 +175,13 @@ def test_lower_envelope_finds_the_zero_under_late_packets() -> None:
 
 
 def test_sliding_window_follows_a_drifting_oscillator() -> None:
-    """50 ppm over 60 s is 3 ms; a window of 10 s lags by at most 0.5 ms either way."""
+    """50 ppm over 60 s is 3 ms, and the line follows it."""
     for drift in (50e-6, -50e-6):
-        errors = observe_all(SensorClock(), drift, 6, 60)
-        assert max(abs(error) for error in errors[2500:]) < 520_000
+        clock = SensorClock(window_ns=10_000_000_000)
+        errors = observe_all(clock, drift, 6, 60)
+        assert max(abs(error) for error in errors[2500:]) < 60_000
+        assert abs(clock.drift_ppm - drift * 1e6) < 6.0
+        assert 0 <= clock.offset_age_us < 10_000_000
 
 
 def test_window_equals_the_plain_minimum() -> None:
@@ -200,6 +204,25 @@ def test_time_going_back_starts_the_window_anew() -> None:
     clock.observe(200, EPOCH_NS - 10**9)
     assert clock.restarts == 2
     assert clock.to_ns(200) == EPOCH_NS - 10**9
+
+
+def test_a_line_known_from_edges_is_used_until_the_clock_starts_anew() -> None:
+    clock = SensorClock()
+    clock.observe(1_000_000, EPOCH_NS)
+    better = ClockLine(1_000_000, EPOCH_NS - 2_000_000, 50_000)
+    clock.adopt(better)
+    clock.observe(2_000_000, EPOCH_NS + 1_000_000_000)
+    assert clock.from_edges
+    assert clock.line == better
+    assert clock.residual_ns == 2_000_000 - 50_000
+    clock.adopt(None)
+    assert clock.line == clock.arrival_line
+    clock.adopt(better)
+    clock.observe(5, EPOCH_NS + 2_000_000_000)
+    assert (clock.restarts, clock.from_edges) == (1, False)
+    announced = SensorClock(EPOCH_NS)
+    announced.adopt(better)
+    assert (announced.zero_ns, announced.exact, announced.drift_ppm) == (EPOCH_NS, True, 0.0)
 
 
 def test_window_must_be_positive() -> None:

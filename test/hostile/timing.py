@@ -8,6 +8,8 @@ import numpy as np
 
 from eschorty_ros.core import (
     clock,
+    clock_line,
+    lower_envelope,
     modulation,
     motion,
     phase,
@@ -83,6 +85,35 @@ CALLS: dict[str, Call] = {
     ),
     "clock.SensorClock.to_us": Call(
         method(partial(clock.SensorClock, 7), "to_us"), {"t_ns": 3}, {"t_ns": whole()}
+    ),
+    "clock.SensorClock.adopt": Call(
+        method(clock.SensorClock, "adopt"), {"line": clock_line.ClockLine(0, 0)}
+    ),
+    "clock_line.ClockLine": Call(
+        clock_line.ClockLine,
+        {"origin_us": 5, "origin_ns": 7, "drift_ppb": 9},
+        {
+            "origin_us": whole(T_MAX),
+            "origin_ns": whole(T_MAX + 1, -T_MAX - 1),
+            "drift_ppb": whole(200_001, -200_001),
+        },
+    ),
+    "clock_line.ClockLine.to_ns": Call(
+        clock_line.ClockLine(5, 7, 9).to_ns, {"t_us": 3}, {"t_us": whole(T_MAX, -T_MAX)}
+    ),
+    "clock_line.ClockLine.to_us": Call(
+        clock_line.ClockLine(5, 7, 9).to_us, {"t_ns": 3}, {"t_ns": whole(T_MAX + 1)}
+    ),
+    "clock_line.ClockLine.shifted": Call(
+        clock_line.ClockLine(5, 7, 9).shifted, {"by_ns": 3}, {"by_ns": whole(2 * T_MAX + 1)}
+    ),
+    "lower_envelope.LowerEnvelope": Call(
+        lower_envelope.LowerEnvelope, {"window_ns": 10}, {"window_ns": whole(0, T_MAX + 1)}
+    ),
+    "lower_envelope.LowerEnvelope.observe": Call(
+        method(partial(lower_envelope.LowerEnvelope, 10), "observe"),
+        {"t_us": 5, "arrival_ns": 10},
+        {"t_us": whole(T_MAX), "arrival_ns": whole(T_MAX + 1)},
     ),
     "modulation.Modulation": Call(
         modulation.Modulation,

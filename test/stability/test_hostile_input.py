@@ -42,7 +42,7 @@ TESTED_ELSEWHERE = {
     "calibration.Calibration",
 }  # fmt: skip
 PACKAGE_OBJECTS = {
-    "calibration", "date", "design", "drain", "error", "frame", "known", "last",
+    "calibration", "date", "design", "drain", "error", "frame", "known", "last", "line",
     "model", "modulation", "nominal", "parts", "plan", "posts", "profiles", "progress", "schema",
     "settings", "targets",
 }  # fmt: skip
