@@ -65,8 +65,18 @@ class Composition:
         DeviceError
             When a node failed or takes far too long.
         """
-        wait(lambda: self._active() and action.server_is_ready(), START_S,
-             "the nodes are not active")  # fmt: skip
+        wait(
+            lambda: self._active() and action.server_is_ready(),
+            START_S,
+            lambda: "; ".join(("the nodes are not active", *self._waiting())),
+        )
+
+    def _waiting(self) -> list[str]:
+        return [
+            f"{node.get_name()}: {reason}"
+            for node in self._nodes
+            if (reason := getattr(node, "waiting", ""))
+        ]
 
     def _active(self) -> bool:
         failed = [
@@ -145,11 +155,12 @@ def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
             raise
 
 
-def wait(condition: Callable[[], Any], limit_s: float, fault: str) -> None:
+def wait(condition: Callable[[], Any], limit_s: float, fault: str | Callable[[], str]) -> None:
     """Wait for ``condition``; raises ``DeviceError`` with ``fault`` after ``limit_s``."""
     # Polled from the main thread, so that Ctrl-C arrives at once.
     end_s = time.monotonic() + limit_s
     while not condition():
         if time.monotonic() > end_s:
-            raise DeviceError(f"{fault} after {limit_s:.0f} s; look at the log above")
+            text = fault if isinstance(fault, str) else fault()
+            raise DeviceError(f"{text} after {limit_s:.0f} s; look at the log above")
         time.sleep(_POLL_S)

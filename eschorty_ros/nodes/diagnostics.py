@@ -43,7 +43,7 @@ class Diagnostics:
     node : rclpy.node.Node
     report : callable
         Returns level (``OK``, ``WARN``, ``ERROR``), one line, and named values with their units
-        in the names.
+        in the names. A node that says in ``waiting`` what it waits for is at ``WARN`` with that.
     callback_group : rclpy.callback_groups.CallbackGroup, optional
         Group of the timer; the node's default group when omitted.
     """
@@ -67,6 +67,9 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish now; also called every second."""
         level, message, values = self._report()
+        waiting = getattr(self._node, "waiting", "")
+        if waiting:
+            level, message = WARN, waiting
         status = DiagnosticStatus(
             level=level,
             name=self._node.get_fully_qualified_name().lstrip("/"),

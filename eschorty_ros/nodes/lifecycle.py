@@ -11,10 +11,11 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from eschorty_ros.core.errors import EschortyError
+from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.nodes.parameters import Param, Parameters
 
 AUTO_START = Param("auto_start", True, "configure and activate without being asked")
+RETRY_S = 2.0
 
 
 class DeviceNode(LifecycleNode):
@@ -27,6 +28,11 @@ class DeviceNode(LifecycleNode):
     ``fault`` at any time, stops and closes the device and leads through error processing to
     unconfigured. Every failure is logged: one line for an ``EschortyError``.
 
+    With ``auto_start``, a device that cannot be opened is waited for: the node stays unconfigured,
+    logs the reason when it changes, says it in ``waiting`` and tries again every 2 s. Once it was
+    active nothing starts by itself: after a failure in operation somebody has to look and to
+    configure and activate again.
+
     Parameters
     ----------
     name : str
@@ -35,6 +41,13 @@ class DeviceNode(LifecycleNode):
         The node's parameters besides ``auto_start``.
     on_change : callable, optional
         See ``Parameters``.
+
+    Attributes
+    ----------
+    failure : str
+        What failed last, empty after a successful configure.
+    waiting : str
+        What keeps the node from starting and when it tries again, empty when nothing does.
     """
 
     def __init__(
@@ -47,6 +60,9 @@ class DeviceNode(LifecycleNode):
         super().__init__(name, **kwargs)
         self.parameters = Parameters(self, (AUTO_START, *table), on_change)
         self.failure = ""
+        self.waiting = ""
+        self._auto_starting = False
+        self._told = ""
         self._faulted = threading.Event()
         self._fault_guard = self.create_guard_condition(self._leave_after_fault)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -104,9 +120,10 @@ class DeviceNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the device."""
-        self.failure = ""
+        self.failure = self.waiting = ""
         self._faulted.clear()
-        if not self._attempt("configure", self.open_device):
+        opening = self._open_if_there if self._auto_starting else self.open_device
+        if not self._attempt("configure", opening) or self.waiting:
             self._attempt("close", self.safe_state)
             return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
@@ -155,12 +172,30 @@ class DeviceNode(LifecycleNode):
         return False
 
     def _auto_start(self) -> None:
-        if self._start_timer is not None:
-            self._start_timer.cancel()
-        if self.state_label != "unconfigured":
+        assert self._start_timer is not None
+        configured = TransitionCallbackReturn.FAILURE
+        if self.state_label == "unconfigured":
+            self._auto_starting = True
+            configured = self.trigger_configure()
+            self._auto_starting = False
+        else:
+            self.waiting = ""
+        if self.waiting:
+            self._start_timer.timer_period_ns = round(RETRY_S * 1e9)
             return
-        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+        self._start_timer.cancel()
+        if configured == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
+
+    def _open_if_there(self) -> None:
+        """Open the device; one that cannot be opened is to be waited for."""
+        try:
+            self.open_device()
+        except DeviceError as error:
+            self.waiting = f"waiting: {error}; trying again every {RETRY_S:g} s"
+            if self.waiting != self._told:
+                self.get_logger().warning(self.waiting)
+            self._told = self.waiting
 
     def _leave_after_fault(self) -> None:
         if not self._faulted.is_set():
