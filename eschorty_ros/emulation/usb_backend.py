@@ -6,19 +6,19 @@ import array
 import errno
 import os
 from collections.abc import Callable, Iterator, Sequence
-from types import SimpleNamespace
 from typing import Any, NoReturn
 
-import usb.backend
 import usb.core
 
-from eschorty_ros.emulation.usb_descriptors import (
-    configuration_descriptor,
-    device_descriptor,
-    endpoint_descriptor,
-    interface_descriptor,
+from eschorty_ros.emulation.usb_descriptors import DescriptorBackend
+from eschorty_ros.emulation.usb_device import (
+    DIRECTION_IN,
+    EmulatedUsbDevice,
+    UsbFault,
+    UsbIdentity,
 )
-from eschorty_ros.emulation.usb_device import DIRECTION_IN, EmulatedUsbDevice, UsbFault
+
+Buffer = array.array | bytearray | memoryview
 
 # What libusb calls the same faults.
 _LIBUSB_CODES = {
@@ -40,20 +40,28 @@ def raise_usb_error(code: int) -> NoReturn:
     raise kind(os.strerror(code), _LIBUSB_CODES.get(code, -99), code)
 
 
-class _Handle:
-    """One opening of a device; dead for good once the device was unplugged."""
+class Handle:
+    """A device as listed or opened; dead for good once it was unplugged or closed."""
 
     def __init__(self, device: EmulatedUsbDevice):
         self.device = device
+        self.bus = device.bus
         self.address = device.address
+        self.closed = False
+
+    @property
+    def identity(self) -> UsbIdentity:
+        """Descriptors of the device."""
+        return self.device.identity
 
     def live(self) -> EmulatedUsbDevice:
-        if self.device.gone or self.device.address != self.address:
+        """Give the device; raises when it is not the one that was opened any more."""
+        if self.closed or self.device.gone or self.device.address != self.address:
             raise UsbFault(errno.ENODEV)
         return self.device
 
 
-class EmulatedBackend(usb.backend.IBackend):
+class EmulatedBackend(DescriptorBackend):
     """pyusb's backend interface over models.
 
     Parameters
@@ -65,66 +73,38 @@ class EmulatedBackend(usb.backend.IBackend):
     def __init__(self, models: Callable[[], Sequence[EmulatedUsbDevice]]):
         self._models = models
 
-    def enumerate_devices(self) -> Iterator[_Handle]:
+    def enumerate_devices(self) -> Iterator[Handle]:
         """Devices on the bus; unplugged ones are not listed."""
-        return (_Handle(device) for device in self._models() if not device.gone)
+        return (Handle(device) for device in self._models() if not device.gone)
 
-    def get_parent(self, dev: _Handle) -> None:
-        """No hub in between."""
-
-    def get_device_descriptor(self, dev: _Handle) -> SimpleNamespace:
-        """Describe the device."""
-        return device_descriptor(dev.device.identity, dev.device.bus, dev.address)
-
-    def get_configuration_descriptor(self, dev: _Handle, config: int) -> SimpleNamespace:
-        """Describe the only configuration."""
-        _index(config, 1)
-        return configuration_descriptor(dev.device.identity)
-
-    def get_interface_descriptor(
-        self, dev: _Handle, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
-        """Describe the only interface."""
-        _index(intf, 1)
-        _index(alt, 1)
-        return interface_descriptor(dev.device.identity)
-
-    def get_endpoint_descriptor(
-        self, dev: _Handle, ep: int, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
-        """Describe an endpoint."""
-        _index(ep, len(dev.device.identity.endpoints))
-        return endpoint_descriptor(dev.device.identity, ep)
-
-    def open_device(self, dev: _Handle) -> _Handle:
+    def open_device(self, dev: Handle) -> Handle:
         """Open; EACCES when the device is ``denied``."""
         device = self._run(dev.live)
         if device.denied:
             raise_usb_error(errno.EACCES)
-        return _Handle(device)
+        return Handle(device)
 
-    def close_device(self, dev_handle: _Handle) -> None:
+    def close_device(self, dev_handle: Handle) -> None:
         """Close and free what the handle claimed."""
-        claims = dev_handle.device.claims
-        for interface in [i for i, owner in claims.items() if owner is dev_handle]:
-            del claims[interface]
+        dev_handle.closed = True
+        dev_handle.device.free(dev_handle)
 
-    def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
+    def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
         """Take the only configuration."""
         self._run(dev_handle.live)
 
-    def get_configuration(self, dev_handle: _Handle) -> int:
+    def get_configuration(self, dev_handle: Handle) -> int:
         """Tell the only configuration."""
         self._run(dev_handle.live)
         return 1
 
-    def set_interface_altsetting(self, dev_handle: _Handle, intf: int, altsetting: int) -> None:
+    def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
         """Reset the device side of the interface."""
         device = self._owned(dev_handle, intf)
         with device.mutex:
             device.reset()
 
-    def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def claim_interface(self, dev_handle: Handle, intf: int) -> None:
         """Claim; EBUSY while a kernel driver or another handle holds it."""
         device = self._run(dev_handle.live)
         with device.mutex:
@@ -132,31 +112,25 @@ class EmulatedBackend(usb.backend.IBackend):
                 raise_usb_error(errno.EBUSY)
             device.claims[intf] = dev_handle
 
-    def release_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def release_interface(self, dev_handle: Handle, intf: int) -> None:
         """Give the interface back."""
-        device = self._owned(dev_handle, intf)
-        with device.mutex:
-            device.claims.pop(intf, None)
+        self._owned(dev_handle, intf).free(dev_handle)
 
-    def bulk_write(
-        self, dev_handle: _Handle, ep: int, intf: int, data: array.array[int], timeout: int
-    ) -> int:
+    def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: Buffer, timeout: int) -> int:
         """Send a transfer."""
         device = self._owned(dev_handle, intf)
 
         def transfer() -> int:
             device.before_transfer(ep, timeout)
             with device.mutex:
-                return device.bulk_out(ep, data.tobytes(), timeout)
+                return device.bulk_out(ep, bytes(data), timeout)
 
         return self._run(transfer)
 
-    def bulk_read(
-        self, dev_handle: _Handle, ep: int, intf: int, buff: array.array[int], timeout: int
-    ) -> int:
+    def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: Buffer, timeout: int) -> int:
         """Receive a transfer into ``buff``; returns the bytes received."""
         device = self._owned(dev_handle, intf)
-        size = len(buff) * buff.itemsize
+        size = memoryview(buff).nbytes
 
         def transfer() -> bytes:
             device.before_transfer(ep, timeout)
@@ -166,12 +140,12 @@ class EmulatedBackend(usb.backend.IBackend):
 
     def ctrl_transfer(
         self,
-        dev_handle: _Handle,
+        dev_handle: Handle,
         bmRequestType: int,
         bRequest: int,
         wValue: int,
         wIndex: int,
-        data: array.array[int],
+        data: Buffer,
         timeout: int,
     ) -> int:
         """Run a control request; returns the bytes sent or received."""
@@ -186,44 +160,44 @@ class EmulatedBackend(usb.backend.IBackend):
                     bRequest,
                     wValue,
                     wIndex,
-                    len(data) * data.itemsize if to_host else data.tobytes(),
+                    memoryview(data).nbytes if to_host else bytes(data),
                     timeout,
                 )
 
         answer = self._run(transfer)
         return answer if isinstance(answer, int) else _fill(data, answer)
 
-    def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
+    def clear_halt(self, dev_handle: Handle, ep: int) -> None:
         """Clear a stall."""
         device = self._run(dev_handle.live)
         with device.mutex:
             device.clear_halt(ep)
 
-    def reset_device(self, dev_handle: _Handle) -> None:
+    def reset_device(self, dev_handle: Handle) -> None:
         """Reset the device; its address stays."""
         device = self._run(dev_handle.live)
         with device.mutex:
             device.reset()
 
-    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
+    def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
         """Tell whether a kernel driver holds the interface."""
         return bool(self._run(dev_handle.live).kernel_driver)
 
-    def detach_kernel_driver(self, dev_handle: _Handle, intf: int) -> None:
+    def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
         """Take the interface from the kernel driver."""
         device = self._run(dev_handle.live)
         if not device.kernel_driver:
             raise_usb_error(errno.ENOENT)
         device.detached_driver, device.kernel_driver = device.kernel_driver, None
 
-    def attach_kernel_driver(self, dev_handle: _Handle, intf: int) -> None:
+    def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
         """Give the interface back to the kernel driver it was taken from."""
         device = self._run(dev_handle.live)
         if not device.detached_driver:
             raise_usb_error(errno.ENOENT)
         device.kernel_driver, device.detached_driver = device.detached_driver, None
 
-    def _owned(self, handle: _Handle, interface: int) -> EmulatedUsbDevice:
+    def _owned(self, handle: Handle, interface: int) -> EmulatedUsbDevice:
         """Give the live device, unless somebody else claimed the interface."""
         device = self._run(handle.live)
         if device.claims.get(interface, handle) is not handle:
@@ -238,12 +212,6 @@ class EmulatedBackend(usb.backend.IBackend):
             raise_usb_error(fault.errno)
 
 
-def _index(value: int, size: int) -> None:
-    """Tell pyusb, which counts until an IndexError, where the list ends."""
-    if not 0 <= value < size:
-        raise IndexError(value)
-
-
-def _fill(buffer: array.array[int], data: bytes) -> int:
+def _fill(buffer: Buffer, data: bytes) -> int:
     memoryview(buffer).cast("B")[: len(data)] = data
     return len(data)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Protocol
+
+import usb.backend
 
 from eschorty_ros.emulation.usb_device import BULK, SPEED_SUPER, UsbIdentity
 
 
-def device_descriptor(identity: UsbIdentity, bus: int, address: int) -> SimpleNamespace:
+def _device(identity: UsbIdentity, bus: int, address: int) -> SimpleNamespace:
     """Describe the device as it sits on the bus."""
     return SimpleNamespace(
         bLength=18,
@@ -32,7 +35,7 @@ def device_descriptor(identity: UsbIdentity, bus: int, address: int) -> SimpleNa
     )
 
 
-def configuration_descriptor(identity: UsbIdentity) -> SimpleNamespace:
+def _configuration(identity: UsbIdentity) -> SimpleNamespace:
     """Describe the only configuration."""
     return SimpleNamespace(
         bLength=9,
@@ -47,7 +50,7 @@ def configuration_descriptor(identity: UsbIdentity) -> SimpleNamespace:
     )
 
 
-def interface_descriptor(identity: UsbIdentity) -> SimpleNamespace:
+def _interface(identity: UsbIdentity) -> SimpleNamespace:
     """Describe the only interface."""
     return SimpleNamespace(
         bLength=9,
@@ -63,7 +66,7 @@ def interface_descriptor(identity: UsbIdentity) -> SimpleNamespace:
     )
 
 
-def endpoint_descriptor(identity: UsbIdentity, index: int) -> SimpleNamespace:
+def _endpoint(identity: UsbIdentity, index: int) -> SimpleNamespace:
     """Describe the bulk endpoint at this place in the list."""
     endpoint = identity.endpoints[index]
     return SimpleNamespace(
@@ -77,3 +80,57 @@ def endpoint_descriptor(identity: UsbIdentity, index: int) -> SimpleNamespace:
         bSynchAddress=0,
         extra_descriptors=[],
     )
+
+
+class Described(Protocol):
+    """A device as a bus lists it."""
+
+    @property
+    def identity(self) -> UsbIdentity:
+        """Its descriptors."""
+
+    @property
+    def bus(self) -> int:
+        """Number of the bus."""
+
+    @property
+    def address(self) -> int:
+        """Address on the bus."""
+
+
+class DescriptorBackend(usb.backend.IBackend):
+    """The part of pyusb's backend interface that reads descriptors.
+
+    pyusb counts configurations, interfaces and settings until an ``IndexError``.
+    """
+
+    def get_parent(self, dev: Described) -> None:
+        """No hub in between."""
+
+    def get_device_descriptor(self, dev: Described) -> SimpleNamespace:
+        """Describe the device."""
+        return _device(dev.identity, dev.bus, dev.address)
+
+    def get_configuration_descriptor(self, dev: Described, config: int) -> SimpleNamespace:
+        """Describe the only configuration."""
+        _only_one(config)
+        return _configuration(dev.identity)
+
+    def get_interface_descriptor(
+        self, dev: Described, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        """Describe the only interface."""
+        _only_one(intf)
+        _only_one(alt)
+        return _interface(dev.identity)
+
+    def get_endpoint_descriptor(
+        self, dev: Described, ep: int, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        """Describe an endpoint."""
+        return _endpoint(dev.identity, ep)
+
+
+def _only_one(index: int) -> None:
+    if index:
+        raise IndexError(index)

@@ -69,6 +69,7 @@ class InPipe:
         self._wait = wait
         self._queue: deque[memoryview] = deque()
         self._changed = threading.Condition()
+        self._cancelled = 0
 
     def put(self, data: bytes | memoryview, *, zero_length: bool = False) -> None:
         """Send a transfer; ``zero_length`` ends one of whole packets with an empty packet."""
@@ -88,6 +89,12 @@ class InPipe:
         with self._changed:
             self._changed.notify_all()
 
+    def cancel(self) -> None:
+        """End the reads under way: whoever asked is no longer there to take the data."""
+        with self._changed:
+            self._cancelled += 1
+            self._changed.notify_all()
+
     def take(self, size: int, timeout_s: float | None, check: Callable[[], None]) -> bytes:
         """One transfer as the host controller gives it: at most ``size`` bytes.
 
@@ -96,8 +103,11 @@ class InPipe:
         parts: list[memoryview] = []
         room = size
         with self._changed:
+            cancelled = self._cancelled
             while True:
                 check()
+                if cancelled != self._cancelled:
+                    raise UsbFault(errno.ENODEV)
                 while self._queue:
                     data = self._queue.popleft()
                     if len(data) > room:
@@ -193,6 +203,16 @@ class EmulatedUsbDevice:
         self.stalled.clear()
         for pipe in self._pipes.values():
             pipe.clear()
+
+    def free(self, owner: object) -> None:
+        """Drop the claims of ``owner``; the reads it left behind end at once."""
+        with self.mutex:
+            held = [interface for interface, holder in self.claims.items() if holder is owner]
+            for interface in held:
+                del self.claims[interface]
+        if held:
+            for pipe in self._pipes.values():
+                pipe.cancel()
 
     def reply(self, endpoint: int, data: bytes, *, zero_length: bool = False) -> None:
         """Queue a transfer for the host on an IN endpoint."""

@@ -1,0 +1,82 @@
+"""What travels between an emulated bus and the processes that use it: small binary frames.
+
+A request is an operation, four numbers and data; the answer an error number (0 = done) and data.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from enum import IntEnum
+
+_REQUEST = struct.Struct("<BxxxIIIII")
+_ANSWER = struct.Struct("<II")
+
+
+class Op(IntEnum):
+    """Operations, named after those of pyusb's backend interface."""
+
+    LIST = 0
+    OPEN = 1
+    JOIN = 2
+    CLAIM = 3
+    RELEASE = 4
+    ALT_SETTING = 5
+    CONFIGURATION = 6
+    CONTROL = 7
+    WRITE = 8
+    READ = 9
+    CLEAR_HALT = 10
+    RESET = 11
+    DRIVER_ACTIVE = 12
+    DRIVER_DETACH = 13
+    DRIVER_ATTACH = 14
+
+
+Request = tuple[Op, tuple[int, int, int, int], bytearray]
+
+
+class Closed(Exception):  # noqa: N818 -- an end, not an error
+    """The other side is no longer there."""
+
+
+def receive_into(link: socket.socket, view: memoryview) -> None:
+    """Fill ``view``; raises ``Closed`` when the link ends before."""
+    while view.nbytes:
+        count = link.recv_into(view)
+        if not count:
+            raise Closed
+        view = view[count:]
+
+
+def _receive(link: socket.socket, size: int) -> bytearray:
+    data = bytearray(size)
+    receive_into(link, memoryview(data))
+    return data
+
+
+def send_request(
+    link: socket.socket, op: Op, numbers: tuple[int, ...] = (), data: bytes = b""
+) -> None:
+    """Send a request; missing numbers are 0."""
+    padded = (*numbers, 0, 0, 0, 0)[:4]
+    link.sendall(_REQUEST.pack(op, *padded, len(data)) + data)
+
+
+def receive_request(link: socket.socket) -> Request:
+    """Wait for a request."""
+    op, a, b, c, d, size = _REQUEST.unpack(_receive(link, _REQUEST.size))
+    return Op(op), (a, b, c, d), _receive(link, size)
+
+
+def send_answer(link: socket.socket, code: int, data: bytes | memoryview = b"") -> None:
+    """Send an answer."""
+    link.sendall(_ANSWER.pack(code, len(data)))
+    if len(data):
+        link.sendall(data)
+
+
+def receive_answer(link: socket.socket) -> tuple[int, int]:
+    """Wait for the head of an answer: error number and bytes that follow."""
+    code, size = _ANSWER.unpack(_receive(link, _ANSWER.size))
+    return code, size
