@@ -63,13 +63,21 @@ class LaserReadback:
     """What the generator says it does.
 
     ``phase_epoch_ns`` is the time of one rising edge, ``None`` where nobody knows it: a
-    generator does not tell its phase.
+    generator does not tell its phase. ``reason`` says why the output is off, when the driver
+    knows.
     """
 
     output: LaserOutput
     modulation: Modulation
     phase_epoch_ns: int | None
     output_since_ns: int
+    reason: str = ""
+
+    output: LaserOutput
+    modulation: Modulation
+    phase_epoch_ns: int | None
+    output_since_ns: int
+    reason: str = ""
 
 
 class LaserModulator(Protocol):

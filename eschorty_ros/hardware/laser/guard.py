@@ -1,0 +1,262 @@
+"""The laser's guard: a process that owns the generator and outlives whatever its owner dies of.
+
+Started by ``GuardedLaser`` as ``python -m eschorty_ros.hardware.laser.guard <descriptor> <pid>``,
+in a session of its own and deaf to the terminal's signals. It switches the output off when the
+process that started it ends in any way, dumps core, is stopped, or is silent for too long.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import queue
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.laser.guard_wire import (
+    Message,
+    Wire,
+    failure_message,
+    readback_message,
+    standing_still,
+)
+from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput
+
+_LOOK_S = 0.02
+_RETRY_S = 0.25
+_INSIST_S = 30.0
+
+
+def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
+    """What opens the generator: ``module:callable`` with keywords.
+
+    Raises
+    ------
+    DeviceError
+        When there is no such callable.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        make = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise DeviceError(f"laser driver {name!r} cannot be loaded ({error}); install it") from error
+    return lambda: make(**settings)
+
+
+class Guard:
+    """Serves one owner over a wire and watches it.
+
+    A worker thread carries out what may take long. Switching off is done by the watching thread
+    at once, beside whatever the worker does: the generator's driver lets ``disable`` overtake.
+
+    Parameters
+    ----------
+    wire : Wire
+    owner_pid : int
+        Process to watch, the parent of this one.
+    """
+
+    def __init__(self, wire: Wire, owner_pid: int) -> None:
+        self._wire = wire
+        self._owner_pid = owner_pid
+        self._silence_s = float("inf")
+        self._make: Callable[[], LaserModulator] | None = None
+        self._laser: LaserModulator | None = None
+        self._jobs: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
+        # Jobs from before the last switching off are void.
+        self._epoch = 0
+        self._lit = False
+        self._tripped = ""
+        self._retry_at_s: float | None = None
+        self._heard_s = time.monotonic()
+        self._closing: Message | None = None
+
+    def run(self) -> None:
+        """Serve until the owner is gone or closes; the output is off then."""
+        threading.Thread(target=self._work, name="laser commands", daemon=True).start()
+        poller = select.poll()
+        poller.register(self._wire.fileno(), select.POLLIN)
+        owner = self._owner_descriptor()
+        if owner is not None:
+            poller.register(owner, select.POLLIN)
+        try:
+            while self._closing is None:
+                ready = dict(poller.poll(_LOOK_S * 1e3))
+                if owner in ready:
+                    break
+                messages = self._wire.receive()
+                if messages is None:
+                    break
+                for message in messages:
+                    self._take(message)
+                self._watch()
+        finally:
+            self._finish()
+
+    def _owner_descriptor(self) -> int | None:
+        """Descriptor that tells of the owner's end even if a child of its keeps the wire open."""
+        try:
+            owner = os.pidfd_open(self._owner_pid)
+        except OSError:
+            return None
+        return owner
+
+    def _take(self, message: Message) -> None:
+        self._heard_s = time.monotonic()
+        command = message["do"]
+        if command == "beat":
+            return
+        if command == "close":
+            self._closing = message
+        elif command == "disable":
+            self._answer(message, self._switch_off)
+        else:
+            if command == "open":
+                self._silence_s = message["silence_s"]
+            self._jobs.put((self._epoch, message))
+
+    def _watch(self) -> None:
+        """Switch off for an owner that stands still or is silent; once, until armed again."""
+        now_s = time.monotonic()
+        if not self._tripped:
+            why = standing_still(self._owner_pid)
+            if not why and now_s - self._heard_s > self._silence_s:
+                why = f"silent for {self._silence_s:g} s"
+            if why:
+                self._tripped = f"laser guard: process {self._owner_pid} is {why}"
+                self._try_to_switch_off(self._tripped)
+        if self._retry_at_s is not None and now_s > self._retry_at_s:
+            self._try_to_switch_off("")
+
+    def _switch_off(self) -> None:
+        self._epoch += 1
+        laser = self._laser
+        if laser is None:
+            return
+        try:
+            if self._retry_at_s is not None and self._make is not None:
+                with contextlib.suppress(Exception):
+                    laser.close()
+                laser = self._laser = self._make()
+            laser.disable()
+        except Exception:
+            self._retry_at_s = time.monotonic() + _RETRY_S
+            raise
+        self._lit, self._retry_at_s = False, None
+
+    def _try_to_switch_off(self, reason: str) -> bool:
+        lit = self._lit
+        try:
+            self._switch_off()
+        except Exception as error:
+            if reason:
+                _say(f"{reason}; laser state unknown: {error}")
+            return False
+        if reason and lit:
+            _say(f"{reason}; output off")
+        return True
+
+    def _finish(self) -> None:
+        if self._closing is not None:
+            self._answer(self._closing, self._close)
+        reason = "" if self._closing is not None else f"laser guard: {self._owner_pid} is gone"
+        end_s = time.monotonic() + _INSIST_S
+        while not self._try_to_switch_off(reason) and self._lit and time.monotonic() < end_s:
+            reason = ""
+            time.sleep(_RETRY_S)
+        if self._laser is not None:
+            with contextlib.suppress(Exception):
+                self._laser.close()
+
+    def _close(self) -> None:
+        self._switch_off()
+        if self._laser is not None:
+            self._laser.close()
+            self._laser = None
+
+    def _answer(self, message: Message, step: Callable[[], Any]) -> None:
+        try:
+            answer = {"value": step()}
+        except Exception as error:
+            answer = failure_message(error)
+        self._wire.send({"id": message["id"], **answer})
+
+    def _work(self) -> None:
+        while True:
+            epoch, message = self._jobs.get()
+            self._answer(message, lambda: self._carry_out(epoch, message))  # noqa: B023
+
+    def _carry_out(self, epoch: int, message: Message) -> Any:
+        command = message["do"]
+        if command == "open":
+            return self._open(message)
+        laser = self._laser
+        if laser is None:
+            raise DeviceError("the laser is not open; open it first")
+        if command == "configure":
+            return laser.configure(Modulation(**message["modulation"]))
+        if command == "readback":
+            state = laser.readback()
+            self._lit |= state.output is not LaserOutput.OFF
+            return readback_message(replace(state, reason=state.reason or self._tripped))
+        if epoch != self._epoch:
+            raise DeviceError(f"laser {command} refused: switched off meanwhile; arm it again")
+        if command == "arm":
+            laser.arm()
+            self._tripped = ""
+            return None
+        return self._enable(laser, epoch)
+
+    def _open(self, message: Message) -> Message:
+        self._make = maker(message["make"], message["settings"])
+        laser = self._make()
+        self._laser = laser
+        identity = laser.identity
+        return {
+            "model": identity.model,
+            "serial": identity.serial,
+            "firmware": identity.firmware,
+        }
+
+    def _enable(self, laser: LaserModulator, epoch: int) -> None:
+        if self._tripped:
+            raise DeviceError(f"laser refused: {self._tripped}; arm it again")
+        self._lit = True
+        laser.enable()
+        if epoch != self._epoch:
+            laser.disable()
+            raise DeviceError("laser enable refused: switched off meanwhile; arm it again")
+
+
+def _say(text: str) -> None:
+    # Whoever read it may be gone.
+    with contextlib.suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Entry point of the guard process."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
+        signal.signal(number, signal.SIG_IGN)
+    descriptor, owner_pid = (int(argument) for argument in sys.argv[1:])
+    end = socket.socket(fileno=descriptor)
+    end.set_inheritable(False)
+    try:
+        Guard(Wire(end), owner_pid).run()
+    except EschortyError as error:
+        _say(f"laser guard: {error}")
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
