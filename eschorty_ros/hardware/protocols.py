@@ -73,12 +73,6 @@ class LaserReadback:
     output_since_ns: int
     reason: str = ""
 
-    output: LaserOutput
-    modulation: Modulation
-    phase_epoch_ns: int | None
-    output_since_ns: int
-    reason: str = ""
-
 
 class LaserModulator(Protocol):
     """The generator that gates the laser. Off at construction and after every failure."""

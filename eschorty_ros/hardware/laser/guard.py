@@ -38,7 +38,7 @@ _INSIST_S = 30.0
 
 
 def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
-    """What opens the generator: ``module:callable`` with keywords.
+    """Look up what opens the generator: ``module:callable`` with keywords.
 
     Raises
     ------
@@ -49,7 +49,9 @@ def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator
     try:
         make = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise DeviceError(f"laser driver {name!r} cannot be loaded ({error}); install it") from error
+        raise DeviceError(
+            f"laser driver {name!r} cannot be loaded ({error}); install it"
+        ) from error
     return lambda: make(**settings)
 
 
@@ -99,6 +101,9 @@ class Guard:
                     break
                 for message in messages:
                     self._take(message)
+                if messages:
+                    # Only now: what has just been done may have taken its time.
+                    self._heard_s = time.monotonic()
                 self._watch()
         finally:
             self._finish()
@@ -112,7 +117,6 @@ class Guard:
         return owner
 
     def _take(self, message: Message) -> None:
-        self._heard_s = time.monotonic()
         command = message["do"]
         if command == "beat":
             return

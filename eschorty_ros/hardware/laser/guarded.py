@@ -26,6 +26,7 @@ from eschorty_ros.hardware.laser.guard import maker
 from eschorty_ros.hardware.laser.guard_wire import (
     Message,
     Wire,
+    failure_message,
     modulation_message,
     raise_failure,
     readback_from,
@@ -98,7 +99,8 @@ class GuardedLaser:
             identity = self._call("open", OPEN_S, make=make, settings=self._settings,
                                   silence_s=silence_s)  # fmt: skip
         except BaseException:
-            self.close()
+            with contextlib.suppress(EschortyError):
+                self.close()
             raise
         self.identity = DeviceIdentity(**identity)
         self._opened = True

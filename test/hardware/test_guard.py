@@ -1,0 +1,309 @@
+"""Whatever happens to the process that wants light, its guard makes it dark."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import generator_double
+import pytest
+from generator_double import MAKE, Generator
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.laser.guarded import GuardedLaser
+from eschorty_ros.hardware.protocols import LaserOutput
+
+OFF_LIMIT_S = 0.25
+TEST_FOLDER = str(Path(__file__).parents[1])
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guard imports the double."""
+    monkeypatch.setenv("PYTHONPATH", f"{TEST_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[Generator]:
+    with generator_double.generator(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def laser(device: Generator) -> Iterator[GuardedLaser]:
+    made = GuardedLaser(MAKE, device.settings)
+    yield made
+    with contextlib.suppress(DeviceError):
+        made.close()
+    assert not device.lit()
+
+
+def light(laser: GuardedLaser) -> None:
+    laser.arm()
+    laser.enable()
+
+
+def test_output_follows_and_is_read_back(laser: GuardedLaser, device: Generator) -> None:
+    assert laser.identity.serial == "42"
+    laser.configure(Modulation(100.0, 0.25, "pulse"))
+    light(laser)
+    assert device.lit()
+    state = laser.readback()
+    assert (state.output, state.modulation) == (LaserOutput.ON, Modulation(100.0, 0.25, "pulse"))
+    laser.disable()
+    laser.disable()
+    assert not device.lit()
+    assert laser.readback().output is LaserOutput.OFF
+
+
+def test_enable_needs_arming_each_time(laser: GuardedLaser, device: Generator) -> None:
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="not armed"):
+            laser.enable()
+        light(laser)
+        laser.disable()
+    assert [output for _, output in device.lines()] == ["OFF", "ON", "OFF", "ON", "OFF"]
+
+
+def test_close_switches_off_and_releases(device: Generator) -> None:
+    laser = GuardedLaser(MAKE, device.settings)
+    light(laser)
+    laser.close()
+    laser.close()
+    assert not device.lit()
+    GuardedLaser(MAKE, device.settings).close()
+
+
+def test_generator_that_is_absent_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGoneError, match="no generator"):
+        GuardedLaser(MAKE, {"path": str(tmp_path / "nowhere")})
+
+
+def test_driver_that_is_absent_is_one_line() -> None:
+    with pytest.raises(DeviceError, match="'nowhere:laser' cannot be loaded"):
+        GuardedLaser("nowhere:laser", {})
+
+
+def test_second_client_is_refused(laser: GuardedLaser, device: Generator) -> None:
+    with pytest.raises(DeviceError, match="busy"):
+        GuardedLaser(MAKE, device.settings)
+
+
+OWNER = """
+import ctypes, faulthandler, os, signal, subprocess, sys, time
+from eschorty_ros.hardware.laser.guarded import GuardedLaser
+laser = GuardedLaser("generator_double:GeneratorLaser", {"path": sys.argv[1]})
+laser.arm()
+laser.enable()
+print(laser.guard_pid, flush=True)
+way = sys.stdin.readline().strip()
+child = subprocess.Popen(["sleep", "2"], close_fds=False) if way == "child" else None
+if way == "fork" and os.fork() == 0:
+    time.sleep(2.0)
+    os._exit(0)
+print(time.monotonic_ns(), flush=True)
+if way == "abort":
+    os.abort()
+elif way == "segfault":
+    ctypes.string_at(0)
+elif way == "exit":
+    os._exit(3)
+elif way == "exception":
+    raise RuntimeError("nobody catches this")
+elif way == "gil":
+    # A library that never comes back and keeps the interpreter to itself.
+    ctypes.PyDLL(None).sleep(3)
+elif way in ("child", "fork"):
+    os.kill(os.getpid(), signal.SIGKILL)
+time.sleep(30.0)
+"""
+
+
+class Owner:
+    """A process that has switched the light on."""
+
+    def __init__(self, device: Generator) -> None:
+        self.device = device
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", OWNER, str(device.path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        self.guard_pid = int(self._line())
+        assert device.lit()
+
+    def die(self, way: str) -> float:
+        """Seconds from the order to darkness."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{way}\n")
+        self.process.stdin.flush()
+        return self.device.off_after_s(int(self._line()))
+
+    def send(self, number: int) -> float:
+        """Seconds from the signal to darkness."""
+        sent_ns = time.monotonic_ns()
+        self.process.send_signal(number)
+        return self.device.off_after_s(sent_ns)
+
+    def _line(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline()
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def owner(device: Generator) -> Iterator[Owner]:
+    made = Owner(device)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("way", ["abort", "segfault", "exit", "exception", "child", "fork"])
+def test_dark_when_the_owner_ends(owner: Owner, way: str) -> None:
+    took_s = owner.die(way)
+    print(f"{way}: dark after {took_s * 1e3:.1f} ms")
+    assert took_s < OFF_LIMIT_S
+    _wait_for_end(owner.guard_pid)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGSTOP])
+def test_dark_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
+    took_s = owner.send(number)
+    print(f"signal {number}: dark after {took_s * 1e3:.1f} ms")
+    assert took_s < OFF_LIMIT_S
+
+
+def test_dark_when_the_owner_hangs(owner: Owner) -> None:
+    took_s = owner.die("gil")
+    print(f"silent: dark after {took_s * 1e3:.1f} ms")
+    assert took_s < 0.5 + OFF_LIMIT_S
+
+
+def test_guard_is_deaf_to_the_terminal(owner: Owner) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(owner.guard_pid, number)
+    time.sleep(0.2)
+    assert owner.device.lit()
+    assert os.getsid(owner.guard_pid) == owner.guard_pid
+    assert owner.send(signal.SIGKILL) < OFF_LIMIT_S
+
+
+def test_silence_disarms_until_armed_again(laser: GuardedLaser, device: Generator) -> None:
+    light(laser)
+    began_ns = time.monotonic_ns()
+    ctypes.PyDLL(None).usleep(900_000)
+    assert device.off_after_s(began_ns) < 0.5 + OFF_LIMIT_S
+    state = laser.readback()
+    assert state.output is LaserOutput.OFF
+    assert "silent for 0.5 s" in state.reason
+    with pytest.raises(DeviceError, match="arm it again"):
+        laser.enable()
+    light(laser)
+    assert laser.readback().reason == ""
+    assert device.lit()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])
+def test_dark_when_the_guard_dies(laser: GuardedLaser, device: Generator, number: int) -> None:
+    light(laser)
+    sent_ns = time.monotonic_ns()
+    os.kill(laser.guard_pid, number)
+    took_s = device.off_after_s(sent_ns)
+    print(f"guard gets signal {number}: dark after {took_s * 1e3:.1f} ms")
+    assert took_s < OFF_LIMIT_S
+    for call in (laser.arm, laser.enable, laser.readback):
+        with pytest.raises(DeviceGoneError, match="output switched off; configure"):
+            call()
+    laser.disable()
+    assert not device.lit()
+
+
+def test_guard_whose_driver_crashes(device: Generator) -> None:
+    laser = GuardedLaser(MAKE, {**device.settings, "crash": "readback"})
+    light(laser)
+    with pytest.raises(DeviceGoneError, match="exit code 7"):
+        laser.readback()
+    assert not device.lit()
+    laser.close()
+
+
+def test_switching_off_overtakes(device: Generator) -> None:
+    """Reading back takes 1.2 s here; nobody waits for it in the light."""
+    laser = GuardedLaser(MAKE, {**device.settings, "slow_s": 0.2})
+    light(laser)
+    failures: list[Exception] = []
+    reader = _thread(lambda: laser.readback(), failures)
+    time.sleep(0.1)
+    asked_ns = time.monotonic_ns()
+    laser.disable()
+    assert device.off_after_s(asked_ns) < OFF_LIMIT_S
+    reader()
+    assert "interrupted by switching off" in str(failures[0])
+    laser.close()
+
+
+def test_what_was_asked_before_switching_off_is_void(device: Generator) -> None:
+    laser = GuardedLaser(MAKE, {**device.settings, "slow_s": 0.1})
+    light(laser)
+    failures: list[Exception] = []
+    waits = [_thread(step, failures) for step in (laser.readback, laser.arm, laser.enable)
+             if not time.sleep(0.02)]  # fmt: skip
+    laser.disable()
+    for wait in waits:
+        wait()
+    assert len(failures) == 3, failures
+    assert not device.lit()
+    laser.close()
+
+
+def test_mute_generator_is_unknown_and_the_guard_insists(device: Generator) -> None:
+    laser = GuardedLaser(MAKE, device.settings)
+    light(laser)
+    device.press("MUTE")
+    with pytest.raises(DeviceError, match="gone"):
+        laser.readback()
+    with pytest.raises((DeviceGoneError, DeviceTimeoutError)):
+        laser.disable()
+    with contextlib.suppress(DeviceError):
+        laser.close()
+    assert device.lit()
+    device.press("SPEAK")
+    assert device.off_after_s(time.monotonic_ns()) < 3.0
+
+
+def _thread(step: Callable[[], object], failures: list[Exception]) -> Callable[[], None]:
+    def attempt() -> None:
+        try:
+            step()
+        except DeviceError as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=attempt)
+    thread.start()
+    return thread.join
+
+
+def _wait_for_end(pid: int) -> None:
+    end_s = time.monotonic() + 5.0
+    while time.monotonic() < end_s:
+        if (
+            not Path(f"/proc/{pid}").exists()
+            or "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
+        ):
+            return
+        time.sleep(0.02)
+    raise AssertionError("the guard does not end")
