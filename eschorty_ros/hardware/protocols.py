@@ -21,6 +21,28 @@ class DeviceIdentity:
     firmware: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class EventChunk:
+    """Bytes of one arrival.
+
+    Parameters
+    ----------
+    data : bytes
+        Whole 16-bit EVT3 words.
+    arrival_ns : int
+        Host time at which they were received.
+    gap : bool
+        Bytes were lost between the previous chunk and this one.
+    restarted : bool
+        The stream begins anew here: sensor time and decoder state of before are void.
+    """
+
+    data: bytes
+    arrival_ns: int
+    gap: bool = False
+    restarted: bool = False
+
+
 class EventSource(Protocol):
     """A camera that hands out raw EVT3 bytes."""
 
@@ -28,16 +50,19 @@ class EventSource(Protocol):
     width: int
     height: int
 
+    def open(self) -> None:
+        """Find, probe and initialise the camera; may take seconds, ``close`` interrupts it."""
+
     def start(self) -> None:
         """Begin streaming."""
 
     def stop(self) -> None:
         """End streaming; idempotent."""
 
-    def read(self, timeout_s: float) -> bytes:
-        """Whole 16-bit EVT3 words that have arrived, ``b""`` when none came in ``timeout_s``.
+    def read(self, timeout_s: float) -> EventChunk | None:
+        """Take what arrived next, ``None`` when nothing came in ``timeout_s``.
 
-        Raises ``DeviceError`` when the camera is gone.
+        Raises ``DeviceError`` when the camera is gone for good.
         """
 
     def sensor_zero_ns(self) -> int:

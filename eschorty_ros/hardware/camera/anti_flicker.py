@@ -1,0 +1,88 @@
+"""Anti-flicker filter: removes (or keeps alone) what flickers at 50 to 520 Hz.
+
+Source: openeb 5.1.1 ``antiflicker_filter.cpp``. A laser modulated within the band is erased by
+the band-stop; at kHz it is out of reach. Unconfirmed on hardware.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.hardware.camera.registers import Registers, await_bits, update
+
+FREQUENCY_HZ = (50, 520)
+
+_PIPELINE, _INITIALISATION, _INVALIDATION = 0xC000, 0xC0C4, 0xC0C0
+_PARAMETERS, _PERIOD = 0xC004, 0xC008
+_BYPASS, _ON = 0b101, 0b001
+_READY = 1 << 2
+_TRIES = 3
+_STOP_COUNT, _START_COUNT = 4, 6
+
+
+@dataclass(frozen=True, slots=True)
+class AntiFlicker:
+    """Band of the filter.
+
+    Parameters
+    ----------
+    low_hz, high_hz : int
+        Band edges, 50 to 520 Hz.
+    band_pass : bool
+        Keep what flickers and drop the rest, instead of dropping it.
+    duty_percent : float
+        Duty cycle of the light, above 0 to 100 %; resolved to sixteenths.
+
+    Raises
+    ------
+    ArgumentError
+        For values outside their ranges.
+    """
+
+    low_hz: int = 50
+    high_hz: int = 520
+    band_pass: bool = False
+    duty_percent: float = 50.0
+
+    def __post_init__(self) -> None:
+        low, high = FREQUENCY_HZ
+        if not low <= self.low_hz <= self.high_hz <= high:
+            raise ArgumentError(
+                f"anti-flicker band is {self.low_hz} to {self.high_hz} Hz; "
+                f"choose {low} <= low <= high <= {high}"
+            )
+        if not 0.0 < self.duty_percent <= 100.0:
+            raise ArgumentError(
+                f"anti-flicker duty is {self.duty_percent:g} %; choose above 0 to 100"
+            )
+
+    def touches(self, frequency_hz: float) -> bool:
+        """Whether light modulated at ``frequency_hz`` lies in the band."""
+        return self.low_hz <= frequency_hz <= self.high_hz
+
+
+def set_anti_flicker(registers: Registers, band: AntiFlicker | None) -> None:
+    """Switch the filter on with ``band``, off with ``None``.
+
+    Raises
+    ------
+    DeviceError
+        When the filter's memory does not become ready.
+    """
+    registers.write(_PIPELINE, _BYPASS)
+    if band is None:
+        return
+    await_bits(registers, _INITIALISATION, _READY, _TRIES, "the anti-flicker filter")
+    update(registers, _INVALIDATION, 0xFFF, 1630)
+    inverted_duty = min(round(16.0 * (100.0 - band.duty_percent) / 100.0), 15)
+    period = _period(band.high_hz) | _period(band.low_hz) << 8 | inverted_duty << 16
+    update(registers, _PERIOD, 0xF_FFFF, period)
+    counts = _STOP_COUNT | _START_COUNT << 3 | int(band.band_pass) << 6
+    update(registers, _PARAMETERS, 0x7F, counts)
+    registers.write(_PIPELINE, _ON)
+
+
+def _period(frequency_hz: int) -> int:
+    """Period in the filter's unit of 128 us."""
+    return 1_000_000 // frequency_hz >> 7

@@ -1,0 +1,163 @@
+"""Pixel biases as offsets from the factory trim, and the ``.bias`` files that keep them.
+
+Source: openeb 5.1.1 ``imx636_ll_biases.cpp``, ``imx636_bias_settings*.h``. A bias register holds
+an 8-bit DAC value below its enable bits; the factory's trim is what it reads after the sensor's
+initialisation. Unconfirmed on hardware.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from eschorty_ros.core.errors import ArgumentError, DeviceError, FormatError
+from eschorty_ros.hardware.camera.registers import Registers
+
+ENABLED = 0x11A1_0000
+_DAC = 0xFF
+
+
+@dataclass(frozen=True, slots=True)
+class BiasInfo:
+    """Where a bias lives and which offsets it takes (inclusive)."""
+
+    address: int
+    normal: tuple[int, int]
+    wide: tuple[int, int]
+    acts_on: str
+
+
+BIASES: Mapping[str, BiasInfo] = {
+    "bias_diff_on": BiasInfo(0x1010, (-85, 140), (-150, 200), "ON threshold"),
+    "bias_diff_off": BiasInfo(0x1018, (-35, 190), (-150, 200), "OFF threshold"),
+    "bias_fo": BiasInfo(0x1004, (-35, 55), (-150, 200), "pixel low-pass: bandwidth, latency"),
+    "bias_hpf": BiasInfo(0x100C, (0, 120), (0, 255), "high-pass: removes slow changes"),
+    "bias_refr": BiasInfo(0x1020, (-20, 235), (-50, 255), "refractory (dead) time"),
+}
+"""The biases users set. ``bias_diff``, the common reference, stays as it is."""
+
+
+class BiasBank:
+    """Biases of an initialised sensor.
+
+    Parameters
+    ----------
+    registers : Registers
+    wide : bool
+        Allow the wide ranges, which may make the sensor noisy or deaf.
+
+    Attributes
+    ----------
+    factory : dict of str to int
+        DAC values read before anything was written.
+
+    Raises
+    ------
+    DeviceError
+        When the camera does not answer.
+    """
+
+    def __init__(self, registers: Registers, wide: bool = False) -> None:
+        self._registers = registers
+        self._wide = wide
+        self.factory = {
+            name: registers.read(info.address) & _DAC for name, info in BIASES.items()
+        }
+
+    def read(self) -> dict[str, int]:
+        """Offsets from the factory trim that the camera has now."""
+        return {
+            name: (self._registers.read(info.address) & _DAC) - self.factory[name]
+            for name, info in BIASES.items()
+        }
+
+    def write(self, name: str, offset: int) -> int:
+        """Set one bias; returns the offset the camera reads back.
+
+        The DAC is clamped to 0..255, so the offset read back may be nearer to 0 than asked.
+
+        Raises
+        ------
+        ArgumentError
+            For an unknown name or an offset outside the range.
+        DeviceError
+            When the camera keeps another value than was written.
+        """
+        info = check_offset(name, offset, self._wide)
+        dac = min(max(self.factory[name] + offset, 0), _DAC)
+        self._registers.write(info.address, ENABLED | dac)
+        kept = self._registers.read(info.address) & _DAC
+        if kept != dac:
+            raise DeviceError(
+                f"camera: {name} was set to DAC {dac} and reads back {kept}; "
+                "close and open the camera, or power-cycle it"
+            )
+        return kept - self.factory[name]
+
+
+def check_offset(name: str, offset: int, wide: bool = False) -> BiasInfo:
+    """Check a bias by name and range.
+
+    Raises
+    ------
+    ArgumentError
+        Naming what is allowed.
+    """
+    if name not in BIASES:
+        raise ArgumentError(f"bias {name!r} is unknown; choose one of {', '.join(BIASES)}")
+    low, high = BIASES[name].wide if wide else BIASES[name].normal
+    if not low <= offset <= high:
+        raise ArgumentError(f"{name} is {offset}; choose {low} to {high}")
+    return BIASES[name]
+
+
+def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:
+    """Read offsets from a ``.bias`` file: ``value % name`` per line, ``%`` begins a comment.
+
+    Names of biases that users do not set (``bias_diff``) are passed over.
+
+    Raises
+    ------
+    FormatError
+        Naming file and line.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"cannot read the bias file {str(path)!r} ({error}); check it") from error
+    offsets: dict[str, int] = {}
+    for number, line in enumerate(lines, 1):
+        value, _, name = (part.strip() for part in line.partition("%"))
+        if not value:
+            continue
+        try:
+            offset = int(value)
+        except ValueError as error:
+            raise FormatError(
+                f"{path} line {number}: {line!r} is no bias; write 'value % name'"
+            ) from error
+        name = name.split()[0] if name else ""
+        if name in BIASES:
+            offsets[name] = offset
+        elif not name.startswith("bias_"):
+            raise FormatError(f"{path} line {number}: {line!r} names no bias; write 'value % name'")
+    return offsets
+
+
+def save_bias_file(path: str | os.PathLike[str], offsets: Mapping[str, int]) -> None:
+    """Write offsets as a ``.bias`` file.
+
+    Raises
+    ------
+    ArgumentError
+        When it cannot be written.
+    """
+    text = "".join(f"{offset}  % {name}\n" for name, offset in offsets.items())
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot write the bias file {str(path)!r} ({error.strerror}); choose another path"
+        ) from error

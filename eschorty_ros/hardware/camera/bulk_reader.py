@@ -1,0 +1,83 @@
+"""Receiving from the data endpoint: what a reader offers, and the one over synchronous pyusb."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Protocol
+
+import usb.core
+
+from eschorty_ros.core.errors import DeviceTimeoutError
+from eschorty_ros.hardware.usb import translate
+
+TRANSFER_BYTES = 128 << 10
+_NAME = "camera: reading events"
+
+ClockNs = Callable[[], int]
+
+
+class BulkReader(Protocol):
+    """Reads one bulk endpoint; used by one thread."""
+
+    def start(self) -> None:
+        """Throw away what waits in the device, then be ready to receive."""
+
+    def read(self, timeout_s: float) -> tuple[bytes, int]:
+        """Bytes and their arrival time (ns); ``b""`` when none came.
+
+        Raises ``DeviceStallError``, ``DeviceGoneError`` or ``DeviceError``.
+        """
+
+    def stop(self) -> None:
+        """Receive no more; idempotent."""
+
+
+class SyncReader:
+    """One transfer at a time over pyusb, into a buffer that is reused.
+
+    Between two reads only the camera's bridge holds data: enough for a line scene, unconfirmed
+    on hardware for more.
+    """
+
+    def __init__(self, device: usb.core.Device, endpoint: int, clock_ns: ClockNs) -> None:
+        self._device = device
+        self._endpoint = endpoint
+        self._clock_ns = clock_ns
+        self._buffer = array.array("B", bytes(TRANSFER_BYTES))
+        self._view = memoryview(self._buffer)
+
+    def start(self) -> None:
+        """Clear a halt and empty the endpoint."""
+        try:
+            self._device.clear_halt(self._endpoint)
+        except usb.core.USBError as error:
+            raise translate(error, _NAME) from error
+        drain(self._device, self._endpoint, self._buffer)
+
+    def read(self, timeout_s: float) -> tuple[bytes, int]:
+        """Read one transfer."""
+        try:
+            # A reader wakes often enough for an end of the stream.
+            count = self._device.read(self._endpoint, self._buffer, max(int(timeout_s * 1e3), 1))
+        except usb.core.USBError as error:
+            failure = translate(error, _NAME)
+            if isinstance(failure, DeviceTimeoutError):
+                return b"", self._clock_ns()
+            raise failure from error
+        return bytes(self._view[:count]), self._clock_ns()
+
+    def stop(self) -> None:
+        """Nothing is under way between two reads."""
+
+
+def drain(device: usb.core.Device, endpoint: int, buffer: array.array[int]) -> None:
+    """Read ``endpoint`` until it has nothing more, at most 64 transfers."""
+    with suppress(usb.core.USBError):
+        for _ in range(_DRAIN_MAX):
+            device.read(endpoint, buffer, _DRAIN_MS)
+
+
+_DRAIN_MAX = 64
+_DRAIN_MS = 10

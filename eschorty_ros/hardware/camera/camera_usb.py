@@ -1,0 +1,223 @@
+"""The EVK4 on the bus: found by the shape of its interface, opened, its three endpoints.
+
+Source: openeb 5.1.1 ``tz_libusb_board_command.cpp``, ``psee_universal.cpp``. Unconfirmed on
+hardware.
+"""
+
+from __future__ import annotations
+
+import array
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+
+import usb.backend
+import usb.core
+import usb.util
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError, EschortyError
+from eschorty_ros.hardware import usb as bus
+from eschorty_ros.hardware.camera import treuzell
+from eschorty_ros.hardware.camera.bulk_reader import drain
+
+NAME = "EVK4 camera"
+VENDOR = 0x04B4
+PRODUCT = 0x00F5
+
+_INTERFACE = 0
+_SHAPE = (0xFF, 0x19, 0x00)
+_DIRECTIONS = (usb.util.ENDPOINT_IN, usb.util.ENDPOINT_OUT, usb.util.ENDPOINT_IN)
+_ALTSETTING_SINCE = 0x0307
+_ANSWER_BYTES = 1024
+_TIMEOUT_MS = 1000
+_HURRY_MS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoints:
+    """Addresses of the three bulk endpoints."""
+
+    control_in: int
+    control_out: int
+    data_in: int
+
+
+def endpoints_of(device: usb.core.Device) -> Endpoints | None:
+    """Endpoints of a camera, ``None`` when the device has another shape."""
+    try:
+        interface = device[0][(_INTERFACE, 0)]
+    except (usb.core.USBError, IndexError, KeyError, NotImplementedError):
+        return None
+    shape = (
+        interface.bInterfaceClass,
+        interface.bInterfaceSubClass,
+        interface.bInterfaceProtocol,
+    )
+    endpoints = list(interface.endpoints())
+    bulk = all(
+        usb.util.endpoint_type(e.bmAttributes) == usb.util.ENDPOINT_TYPE_BULK for e in endpoints
+    )
+    addresses = [e.bEndpointAddress for e in endpoints]
+    directions = tuple(usb.util.endpoint_direction(address) for address in addresses)
+    if shape != _SHAPE or not bulk or directions != _DIRECTIONS:
+        return None
+    return Endpoints(*addresses)
+
+
+def is_camera(device: usb.core.Device) -> bool:
+    """Whether descriptors are those of an EVK4."""
+    return (
+        device.idVendor == VENDOR
+        and device.idProduct == PRODUCT
+        and endpoints_of(device) is not None
+    )
+
+
+class CameraUsb:
+    """A claimed camera; a :class:`~eschorty_ros.hardware.camera.treuzell.ControlLink`.
+
+    Attributes
+    ----------
+    device : usb.core.Device
+    endpoints : Endpoints
+    slow : bool
+        Whether the link is slower than 5 Gbit/s.
+    """
+
+    def __init__(self, device: usb.core.Device) -> None:
+        endpoints = endpoints_of(device)
+        if endpoints is None:
+            raise DeviceError(f"{NAME}: the device has other endpoints than an EVK4; unplug it")
+        self.device = device
+        self.endpoints = endpoints
+        self.slow = device.speed is not None and device.speed < usb.util.SPEED_SUPER
+        self._timeout_ms = _TIMEOUT_MS
+        self._answer = array.array("B", bytes(_ANSWER_BYTES))
+        self._reattach = bus.claim(device, _INTERFACE, NAME)
+        try:
+            if device.bcdDevice >= _ALTSETTING_SINCE:
+                device.set_interface_altsetting(_INTERFACE, 0)
+        except usb.core.USBError as error:
+            self.close()
+            raise bus.translate(error, f"{NAME}: selecting its interface") from error
+
+    def send(self, frame: bytes) -> None:
+        """Write a request."""
+        try:
+            self.device.write(self.endpoints.control_out, frame, self._timeout_ms)
+        except usb.core.USBError as error:
+            raise bus.translate(error, f"{NAME}: request {_name(frame)}") from error
+
+    def receive(self) -> bytes:
+        """Read an answer."""
+        try:
+            count = self.device.read(self.endpoints.control_in, self._answer, self._timeout_ms)
+        except usb.core.USBError as error:
+            raise bus.translate(error, f"{NAME}: waiting for an answer") from error
+        return self._answer[:count].tobytes()
+
+    def recover(self) -> None:
+        """Clear halts of both control endpoints and throw waiting answers away."""
+        for endpoint in (self.endpoints.control_out, self.endpoints.control_in):
+            try:
+                self.device.clear_halt(endpoint)
+            except usb.core.USBError as error:
+                raise bus.translate(error, f"{NAME}: clearing endpoint {endpoint:#x}") from error
+        drain(self.device, self.endpoints.control_in, self._answer)
+
+    def hurry(self) -> None:
+        """Wait less for answers from now on: the camera is being closed."""
+        self._timeout_ms = _HURRY_MS
+
+    def close(self) -> None:
+        """Give the interface back; never raises."""
+        bus.release(self.device, _INTERFACE, reattach=self._reattach)
+
+
+def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
+    """Claim the camera with that serial (hex, upper or lower case), or the only one there is.
+
+    The serial is asked of the camera itself, as its USB descriptors need not carry it.
+
+    Raises
+    ------
+    DeviceGoneError
+        When none is there, or none with that serial.
+    DeviceError
+        When several are there, or it may not be opened.
+    """
+    if not serial:
+        return CameraUsb(bus.find_device(backend, name=NAME, matches=is_camera))
+    seen: list[str] = []
+    for place in _places(backend):
+        try:
+            camera = CameraUsb(_at(backend, place))
+        except DeviceError as error:
+            seen.append(str(error))
+            continue
+        try:
+            found = read_serial(treuzell.Treuzell(camera))
+        except EschortyError as error:
+            camera.close()
+            seen.append(str(error))
+            continue
+        if same_serial(found, serial):
+            return camera
+        camera.close()
+        seen.append(found)
+    if not seen:
+        raise DeviceGoneError(
+            f"{NAME}: none with serial {serial} on the bus; check cable, power and serial"
+        )
+    raise DeviceGoneError(
+        f"{NAME}: none with serial {serial} can be opened, but there is {', '.join(seen)}; "
+        "check cable, power and serial"
+    )
+
+
+def read_serial(control: treuzell.Treuzell) -> str:
+    """Ask the camera's serial number: lower-case hex, at least 8 digits, as openeb prints it."""
+    payload = control.request(treuzell.SERIAL)
+    if len(payload) not in (4, 8):
+        raise DeviceError(
+            f"{NAME}: its serial number has {len(payload)} bytes, not 4 or 8; update the camera"
+        )
+    return f"{int.from_bytes(payload, 'little'):08x}"
+
+
+def read_firmware(control: treuzell.Treuzell) -> int:
+    """Ask the firmware version: 0xMMmmpp."""
+    payload = control.request(treuzell.FIRMWARE)
+    if len(payload) < 4:
+        raise DeviceError(
+            f"{NAME}: its firmware version has {len(payload)} bytes, not 4; update the camera"
+        )
+    return int(struct.unpack_from("<I", payload)[0])
+
+
+def same_serial(one: str, other: str) -> bool:
+    """Whether two ways to write a serial (openeb's, neuromorphic's 8 digits) mean one camera."""
+    with suppress(ValueError):
+        return int(one, 16) & 0xFFFF_FFFF == int(other, 16) & 0xFFFF_FFFF
+    return one.lower() == other.lower()
+
+
+def _places(backend: usb.backend.IBackend) -> Iterator[tuple[int, int]]:
+    try:
+        found = list(usb.core.find(find_all=True, backend=backend, custom_match=is_camera))
+    except usb.core.USBError as error:
+        raise bus.translate(error, f"{NAME}: looking for it on the bus") from error
+    return iter([(device.bus, device.address) for device in found])
+
+
+def _at(backend: usb.backend.IBackend, place: tuple[int, int]) -> usb.core.Device:
+    return bus.find_device(
+        backend,
+        name=NAME,
+        matches=lambda device: is_camera(device) and (device.bus, device.address) == place,
+    )
+
+
+def _name(frame: bytes) -> str:
+    return f"{int.from_bytes(frame[:4], 'little'):X}"
