@@ -65,9 +65,6 @@ class EventSource(Protocol):
         Raises ``DeviceError`` when the camera is gone for good.
         """
 
-    def sensor_zero_ns(self) -> int:
-        """Host time (ns) at which the sensor's clock read zero, as well as it is known."""
-
     def statistics(self) -> dict[str, float]:
         """Counters for diagnostics, by name with unit."""
 

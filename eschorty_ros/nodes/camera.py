@@ -13,7 +13,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from sensor_msgs.msg import TimeReference
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
-from eschorty_ros.hardware.protocols import EventSource
+from eschorty_ros.hardware.protocols import EventChunk, EventSource
 from eschorty_ros.msg import LaserState, StageMotion
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import ns_from_stamp, stamp_from_ns
@@ -108,6 +108,7 @@ class CameraNode(DeviceNode):
     def open_device(self) -> None:
         """Open the camera."""
         self._source = drivers.make(drivers.CAMERAS, self.parameters, self.now_ns)
+        self._source.open()
         identity = self._source.identity
         self.get_logger().info(
             f"{identity.model} {identity.serial}, {self._source.width} x {self._source.height}"
@@ -123,10 +124,11 @@ class CameraNode(DeviceNode):
             self.parameters["event_message_size_threshold"],
         )
         source.start()
-        reference = TimeReference(source=source.identity.serial)
-        reference.header.stamp = stamp_from_ns(source.sensor_zero_ns())
-        reference.header.frame_id = self.parameters["frame_id"]
-        self._clock_reference.publish(reference)
+        if isinstance(source, FakeCamera):
+            reference = TimeReference(source=source.identity.serial)
+            reference.header.stamp = stamp_from_ns(source.sensor_zero_ns())
+            reference.header.frame_id = self.parameters["frame_id"]
+            self._clock_reference.publish(reference)
         self._ending.clear()
         self._thread = threading.Thread(
             target=self._stream, args=(source, packetizer), name="camera stream", daemon=True
@@ -153,8 +155,14 @@ class CameraNode(DeviceNode):
     def _stream(self, source: EventSource, packetizer: Packetizer) -> None:
         try:
             while not self._ending.is_set():
-                data = source.read(READ_TIMEOUT_S)
-                for stamp_ns, payload in packetizer.push(data, self.now_ns()):
+                chunk = source.read(READ_TIMEOUT_S)
+                if chunk is None:
+                    ready = packetizer.push(b"", self.now_ns())
+                else:
+                    if chunk.gap or chunk.restarted:
+                        self._break(source, packetizer, chunk)
+                    ready = packetizer.push(chunk.data, chunk.arrival_ns)
+                for stamp_ns, payload in ready:
                     self._publish(source, stamp_ns, payload)
             for stamp_ns, payload in packetizer.flush():
                 self._publish(source, stamp_ns, payload)
@@ -165,6 +173,12 @@ class CameraNode(DeviceNode):
             # A signal ends the context while this thread may be publishing.
             if self.context.ok():
                 self.fault(f"camera stream failed: {error!r}")
+
+    def _break(self, source: EventSource, packetizer: Packetizer, chunk: EventChunk) -> None:
+        """Tell downstream by the numbering: one left out is a loss, 0 a new stream."""
+        for stamp_ns, payload in packetizer.flush():
+            self._publish(source, stamp_ns, payload)
+        self._seq = 0 if chunk.restarted else self._seq + 1
 
     def _publish(self, source: EventSource, stamp_ns: int, payload: bytes) -> None:
         if self._events.get_subscription_count() == 0:

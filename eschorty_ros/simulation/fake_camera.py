@@ -15,7 +15,12 @@ from dataclasses import dataclass, replace
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.motion import MotionPlan
-from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserReadback
+from eschorty_ros.hardware.protocols import (
+    DeviceIdentity,
+    EventChunk,
+    LaserOutput,
+    LaserReadback,
+)
 from eschorty_ros.simulation.world import World
 
 SILENCE_NS = 1_000_000_000
@@ -93,6 +98,9 @@ class FakeCamera:
         self._closed = False
         self._bytes = 0
 
+    def open(self) -> None:
+        """Nothing to wait for: it is there once it is made."""
+
     def start(self) -> None:
         """Begin streaming; sensor time runs on from where it stopped, from 0 at first.
 
@@ -142,8 +150,8 @@ class FakeCamera:
         """Learn that the stage follows ``plan``, with nothing more up to ``confirmed_ns``."""
         self._report(plan, confirmed_ns)
 
-    def read(self, timeout_s: float) -> bytes:
-        """Return the next few milliseconds of EVT3, ``b""`` when none come within ``timeout_s``.
+    def read(self, timeout_s: float) -> EventChunk | None:
+        """Return the next few milliseconds of EVT3, ``None`` when none come within ``timeout_s``.
 
         Raises
         ------
@@ -157,10 +165,10 @@ class FakeCamera:
                 data = self._piece() if self._running else b""
                 if data:
                     self._bytes += len(data)
-                    return data
+                    return EventChunk(data, self._clock_ns())
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
-                return b""
+                return None
             with self._news:
                 if not self._inbox:
                     self._news.wait(min(_POLL_S, left_s))

@@ -16,6 +16,7 @@ from rclpy.executors import MultiThreadedExecutor
 from ros_process import Observer, wait_until
 
 from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.hardware.protocols import EventChunk
 from eschorty_ros.nodes import drivers, qos
 from eschorty_ros.nodes.camera import CameraNode
 from eschorty_ros.nodes.domain import free_domain
@@ -48,18 +49,15 @@ class Silent:
     identity = FakeLaser(lambda: 0).identity
     width, height = 1280, 720
 
-    def read(self, timeout_s: float) -> bytes:
-        return b"\x00\x80"
-
-    def sensor_zero_ns(self) -> int:
-        return 0
+    def read(self, timeout_s: float) -> EventChunk:
+        return EventChunk(b"\x00\x80", 0)
 
     def statistics(self) -> dict[str, float]:
         return {}
 
     def start(self) -> None: ...
 
-    stop = close = start
+    open = stop = close = start
 
 
 Run = Callable[[type[DeviceNode]], DeviceNode]

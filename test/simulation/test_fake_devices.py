@@ -13,7 +13,7 @@ from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan
-from eschorty_ros.hardware.protocols import LaserOutput, LaserReadback
+from eschorty_ros.hardware.protocols import EventChunk, LaserOutput, LaserReadback
 from eschorty_ros.simulation.devices import FakeCamera, FakeLaser, FakeStage
 from eschorty_ros.simulation.pixel_parameters import PixelParameters
 from eschorty_ros.simulation.scene import Plane
@@ -180,8 +180,8 @@ def drive(delay_ns: int, every_ns: int, seed: int) -> tuple[bytes, dict[str, flo
         while mail and mail[0][0] <= clock.now_ns:
             _, name, content, confirmed = mail.pop(0)
             (camera.observe_laser if name == "laser" else camera.observe_stage)(content, confirmed)
-        while data := camera.read(0.0):
-            out.append(data)
+        while chunk := camera.read(0.0):
+            out.append(chunk.data)
 
     end = zero + 400 * MS
     while clock.now_ns < end + delay_ns + every_ns:
@@ -247,8 +247,8 @@ def test_silence_leaves_the_laser_dark_and_is_counted() -> None:
             camera.observe_stage(rest, clock.now_ns)
             if laser:
                 camera.observe_laser(on, clock.now_ns)
-            while data := camera.read(0.0):
-                out += data
+            while chunk := camera.read(0.0):
+                out += chunk.data
         return out
 
     run_to(200, laser=True)
@@ -272,7 +272,7 @@ def test_read_waits_for_news_and_stop_ends_the_stream() -> None:
     camera = FakeCamera(small_world(), clock)
     camera.start()
     zero = camera.sensor_zero_ns()
-    got: list[bytes] = []
+    got: list[EventChunk | None] = []
     reader = threading.Thread(target=lambda: got.append(camera.read(20.0)))
     reader.start()
     clock.now_ns += 50 * MS
@@ -284,7 +284,7 @@ def test_read_waits_for_news_and_stop_ends_the_stream() -> None:
     assert got[0]
     camera.stop()
     camera.stop()
-    assert camera.read(0.0) == b""
+    assert camera.read(0.0) is None
     camera.start()
     assert camera.sensor_zero_ns() > zero
     camera.close()
@@ -306,8 +306,8 @@ def test_sensor_time_goes_on_after_a_restart() -> None:
             clock.now_ns += 10 * MS
             camera.observe_laser(on, clock.now_ns)
             camera.observe_stage(MotionPlan(zero, 0.0), clock.now_ns)
-            while data := camera.read(0.0):
-                times.extend(decoder.decode(data).t.tolist())
+            while chunk := camera.read(0.0):
+                times.extend(decoder.decode(chunk.data).t.tolist())
 
     run(100)
     camera.stop()

@@ -62,9 +62,7 @@ class BiasBank:
     def __init__(self, registers: Registers, wide: bool = False) -> None:
         self._registers = registers
         self._wide = wide
-        self.factory = {
-            name: registers.read(info.address) & _DAC for name, info in BIASES.items()
-        }
+        self.factory = {name: registers.read(info.address) & _DAC for name, info in BIASES.items()}
 
     def read(self) -> dict[str, int]:
         """Offsets from the factory trim that the camera has now."""

@@ -24,9 +24,7 @@ _PERIOD_MASK = 0xFFF0
 _TRIGGER = Write(0x7004, 1 << 10, 1 << 10)
 
 _ADC_CONTROL, _ADC_STATUS, _ADC_MISC = 0x4C, 0x50, 0x54
-_ADC_SETUP = parse_sequence(
-    "4C[1]=1 4C[2]=2 54[2]=2 /100us/ 5C[2]=2 5C[1]=1 /100us/ 4C[2]=0"
-)
+_ADC_SETUP = parse_sequence("4C[1]=1 4C[2]=2 54[2]=2 /100us/ 5C[2]=2 5C[1]=1 /100us/ 4C[2]=0")
 _ADC_BEGIN = parse_sequence("4C[2]=2 54[1000]=1000 4C[4]=4")
 _ADC_END = parse_sequence("4C[2]=0")
 _ADC_DONE = 1 << 11

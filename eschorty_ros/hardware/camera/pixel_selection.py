@@ -37,9 +37,7 @@ def windows_of(flat: Sequence[int]) -> tuple[Window, ...]:
     """
     if len(flat) % 4:
         raise ArgumentError(f"roi has {len(flat)} numbers; give x, y, width, height per window")
-    windows = [
-        (flat[i], flat[i + 1], flat[i + 2], flat[i + 3]) for i in range(0, len(flat), 4)
-    ]
+    windows = [(flat[i], flat[i + 1], flat[i + 2], flat[i + 3]) for i in range(0, len(flat), 4)]
     for x, y, width, height in windows:
         inside = 0 <= x < x + width <= WIDTH and 0 <= y < y + height <= HEIGHT
         if not inside:

@@ -103,8 +103,13 @@ class Treuzell:
     def __init__(self, link: ControlLink) -> None:
         self._link = link
         self._lock = threading.Lock()
+        self._retries = True
         self.requests = 0
         self.recoveries = 0
+
+    def hurry(self) -> None:
+        """Ask once only from now on: the camera is being closed."""
+        self._retries = False
 
     def request(self, property_id: int, payload: bytes = b"") -> bytes:
         """Ask and return the answer's payload.
@@ -136,6 +141,8 @@ class Treuzell:
         try:
             return self._once(property_id, frame, payload)
         except (DeviceTimeoutError, DeviceStallError, FrameError):
+            if not self._retries:
+                raise
             self.recoveries += 1
             self._link.recover()
         return self._once(property_id, frame, payload)

@@ -1,0 +1,157 @@
+"""One opened EVK4, from claim to release: no reconnection, no threads.
+
+The order of the steps is openeb 5.1.1's. Unconfirmed on hardware.
+"""
+
+from __future__ import annotations
+
+import struct
+from contextlib import suppress
+
+import usb.backend
+
+from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.hardware.camera import event_rate, imx636, monitors, treuzell
+from eschorty_ros.hardware.camera.async_reader import make_reader
+from eschorty_ros.hardware.camera.biases import BiasBank
+from eschorty_ros.hardware.camera.bulk_reader import BulkReader, ClockNs
+from eschorty_ros.hardware.camera.camera_usb import (
+    NAME,
+    open_camera,
+    read_firmware,
+    read_serial,
+)
+from eschorty_ros.hardware.camera.registers import Sleep, run_sequence
+from eschorty_ros.hardware.camera.settings import CameraSettings, apply_settings
+from eschorty_ros.hardware.protocols import DeviceIdentity
+
+FIRMWARE_OLDEST = 0x030800
+
+
+class Session:
+    """A camera that has been initialised and set up; stopped until ``start``.
+
+    Parameters
+    ----------
+    backend : usb.backend.IBackend
+    serial : str
+        Hex serial number; ``""`` takes the only camera there is.
+    settings : CameraSettings
+    clock_ns : callable
+        Clock of the arrival times.
+    sleep : callable
+        Waits some seconds; may raise to give up.
+
+    Attributes
+    ----------
+    identity : DeviceIdentity
+    warnings : tuple of str
+        One line each, for the user.
+    applied : dict of str to float
+        Settings as the camera has them.
+    control : Treuzell
+    biases : BiasBank
+
+    Raises
+    ------
+    DeviceError
+        When it cannot be opened, is no IMX636, or does not take its settings. Nothing stays open.
+    """
+
+    def __init__(
+        self,
+        backend: usb.backend.IBackend,
+        serial: str,
+        settings: CameraSettings,
+        clock_ns: ClockNs,
+        sleep: Sleep,
+    ) -> None:
+        self._sleep = sleep
+        self._usb = open_camera(backend, serial)
+        self.control = treuzell.Treuzell(self._usb)
+        self._streaming = False
+        self.warnings: tuple[str, ...] = ()
+        try:
+            self.identity = self._identify()
+            self._initialise()
+            self.biases = BiasBank(self.control, settings.wide_biases)
+            self.applied = apply_settings(self.control, self.biases, settings)
+            self.reader: BulkReader = make_reader(
+                backend, self._usb.device, self._usb.endpoints.data_in, clock_ns
+            )
+        except BaseException:
+            # Ctrl-C may come in the 2.5 s of the initialisation.
+            self._usb.close()
+            raise
+
+    def start(self) -> None:
+        """Queue the reads, then let the sensor stream; its time starts at 0."""
+        self.reader.start()
+        run_sequence(self.control, imx636.START, self._sleep)
+        self._streaming = True
+
+    def stop(self) -> None:
+        """End streaming: the sensor first, then the reads."""
+        if self._streaming:
+            self._streaming = False
+            try:
+                run_sequence(self.control, imx636.STOP, _no_pause)
+            finally:
+                self.reader.stop()
+
+    def is_streaming(self) -> bool:
+        """Ask the sensor whether its time runs."""
+        return imx636.is_streaming(self.control)
+
+    def temperature_c(self) -> float:
+        """Temperature of the sensor (C)."""
+        return monitors.read_temperature_c(self.control, self._sleep)
+
+    def close(self, *, gone: bool = False) -> None:
+        """Power the sensor down and release it, or only release it when ``gone``; never raises."""
+        self.control.hurry()
+        self._usb.hurry()
+        with suppress(EschortyError):
+            if not gone:
+                self.stop()
+                monitors.end_monitors(self.control, _no_pause)
+                run_sequence(self.control, imx636.DESTROY, _no_pause)
+        self.reader.stop()
+        self._usb.close()
+
+    def _identify(self) -> DeviceIdentity:
+        serial = read_serial(self.control)
+        version = read_firmware(self.control)
+        text = _version_text(version)
+        if version < FIRMWARE_OLDEST:
+            raise DeviceError(
+                f"{NAME} {serial}: its firmware is {text}, {_version_text(FIRMWARE_OLDEST)} is the "
+                "oldest supported; update it with the maker's tool"
+            )
+        devices = self.control.request(treuzell.DEVICE_COUNT)
+        if len(devices) < 4 or struct.unpack_from("<I", devices)[0] < 1:
+            raise DeviceError(f"{NAME} {serial}: it reports no sensor; power-cycle it")
+        if self._usb.slow:
+            self.warnings += (
+                f"{NAME} {serial}: the link is slower than USB 3 (5 Gbit/s); use a blue port and "
+                "the camera's own cable",
+            )
+        return DeviceIdentity("Prophesee EVK4", serial, text)
+
+    def _initialise(self) -> None:
+        run_sequence(self.control, imx636.STOP + imx636.DESTROY + imx636.INIT, self._sleep)
+        if not imx636.is_imx636(self.control):
+            raise DeviceError(
+                f"{NAME} {self.identity.serial}: its sensor does not answer as an IMX636 "
+                f"(register 0014 reads {self.control.read(imx636.CHIP_ID):08X}); power-cycle it"
+            )
+        monitors.begin_monitors(self.control, self._sleep)
+        event_rate.initialise(self.control)
+
+
+def _version_text(version: int) -> str:
+    return f"{version >> 16 & 0xFF}.{version >> 8 & 0xFF}.{version & 0xFF}"
+
+
+def _no_pause(_seconds: float) -> None:
+    """Skip waits of at most 1 ms on the way down: the transfers take longer."""

@@ -1,0 +1,98 @@
+"""What a user sets on the camera, and how it is written to the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
+from eschorty_ros.hardware.camera.biases import BiasBank, check_offset
+from eschorty_ros.hardware.camera.event_rate import RATE_DEFAULT, set_event_rate
+from eschorty_ros.hardware.camera.event_trail import clear_event_trail, set_event_trail
+from eschorty_ros.hardware.camera.monitors import (
+    PACKET_PERIOD_DEFAULT_US,
+    set_packet_period,
+    set_trigger_input,
+)
+from eschorty_ros.hardware.camera.pixel_selection import Window, set_hot_pixels, set_windows
+from eschorty_ros.hardware.camera.registers import Registers
+
+LEAVE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """Settings of an EVK4; the defaults leave the sensor as its initialisation made it.
+
+    Parameters
+    ----------
+    biases : mapping of str to int
+        Offsets from the factory trim; biases not named keep it.
+    wide_biases : bool
+        Allow the wide ranges.
+    packet_period_us : int
+        Period of the sensor's packets, the latency of the stream; -1 leaves 4000 us.
+    erc_rate : int or None
+        Events/s beyond which the sensor drops some; ``None`` switches the control off.
+    anti_flicker : AntiFlicker or None
+    trail_filter : str
+        ``""`` (off) or a type of :mod:`~eschorty_ros.hardware.camera.event_trail`.
+    trail_threshold_us : int
+    windows : tuple of (int, int, int, int)
+        Regions of interest: first column, first row, width, height.
+    hot_pixels : tuple of (int, int)
+        Columns and rows to silence, at most 64.
+    trigger_input : bool
+    """
+
+    biases: Mapping[str, int] = field(default_factory=dict)
+    wide_biases: bool = False
+    packet_period_us: int = PACKET_PERIOD_DEFAULT_US
+    erc_rate: int | None = None
+    anti_flicker: AntiFlicker | None = None
+    trail_filter: str = ""
+    trail_threshold_us: int = 10_000
+    windows: tuple[Window, ...] = ()
+    hot_pixels: tuple[tuple[int, int], ...] = ()
+    trigger_input: bool = False
+
+    def __post_init__(self) -> None:
+        for name, offset in self.biases.items():
+            check_offset(name, offset, self.wide_biases)
+
+    def with_bias(self, name: str, offset: int) -> CameraSettings:
+        """Make the same settings but for one bias."""
+        return replace(self, biases={**self.biases, name: offset})
+
+
+def apply_settings(
+    registers: Registers, biases: BiasBank, settings: CameraSettings
+) -> dict[str, float]:
+    """Write every setting; returns what the camera has then, by name with unit.
+
+    Raises
+    ------
+    ArgumentError
+        For a value outside its range.
+    DeviceError
+        When the camera does not answer or keeps another value.
+    """
+    for name, offset in settings.biases.items():
+        biases.write(name, offset)
+    applied: dict[str, float] = dict(biases.read())
+    if settings.packet_period_us != LEAVE:
+        applied["packet_period_us"] = set_packet_period(registers, settings.packet_period_us)
+    enabled = settings.erc_rate is not None
+    rate = set_event_rate(registers, enabled, settings.erc_rate or RATE_DEFAULT)
+    applied["erc_rate_hz"] = rate if enabled else 0
+    set_anti_flicker(registers, settings.anti_flicker)
+    if settings.trail_filter:
+        applied["trail_threshold_us"] = set_event_trail(
+            registers, settings.trail_filter, settings.trail_threshold_us
+        )
+    else:
+        clear_event_trail(registers)
+    set_windows(registers, settings.windows)
+    set_hot_pixels(registers, settings.hot_pixels)
+    set_trigger_input(registers, settings.trigger_input)
+    return applied

@@ -1,0 +1,22 @@
+"""Registers in a dictionary: what the sensor's facilities are tested on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+class RegisterFile:
+    """Holds what is written; some bits may be stuck, and every access is noted in order."""
+
+    def __init__(self, values: Mapping[int, int] | None = None) -> None:
+        self.values = dict(values or {})
+        self.always_set: dict[int, int] = {}
+        self.writes: list[tuple[int, int]] = []
+
+    def read(self, address: int) -> int:
+        return self.values.get(address, 0) | self.always_set.get(address, 0)
+
+    def write(self, address: int, value: int) -> None:
+        assert 0 <= value <= 0xFFFF_FFFF
+        self.values[address] = value
+        self.writes.append((address, value))
