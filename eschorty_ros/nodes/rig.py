@@ -96,18 +96,31 @@ class LaserStageRig:
     def check_nodes(self) -> None:
         """See ``Rig``."""
         begun_ns = self.monitor.until_ns
-        for what, there in (
+        for there, failure in self._needed(begun_ns):
+            self._wait(there, self._node_timeout_s, failure)
+
+    def missing(self) -> str:
+        """Name what is not there yet, one thing of each node; empty when a sequence can begin."""
+        absent = [failure for there, failure in self._needed(0) if not there()]
+        named = {text.split(":")[0]: text for text in reversed(absent) if isinstance(text, str)}
+        if absent and not named:
+            # Whatever is missing keeps events from being reconstructed, so it comes first.
+            return self.monitor.why_no_progress()
+        return "; ".join(reversed(named.values()))
+
+    def _needed(self, begun_ns: int) -> list[tuple[Callable[[], bool], str | Callable[[], str]]]:
+        """List what a sequence needs, in order, each with what to say without it."""
+        servers = (
             *((name, client.service_is_ready) for name, client in self._clients.items()),
             ("stage/move", self._stage.server_is_ready),
-        ):
-            self._wait(there, self._node_timeout_s, f"{what.split('/')[0]}: no {what}")
-        for there, failure in (
-            (lambda: self.monitor.stage_heard, lambda: "stage: no odometry"),
-            (lambda: self.monitor.at_rest, lambda: "stage: another move does not end"),
-            (lambda: self.monitor.laser is not None, lambda: "laser: no state"),
+        )
+        return [
+            *((there, f"{what.split('/')[0]}: no {what}") for what, there in servers),
+            (lambda: self.monitor.stage_heard, "stage: no odometry"),
+            (lambda: self.monitor.at_rest, "stage: another move does not end"),
+            (lambda: self.monitor.laser is not None, "laser: no state"),
             (lambda: self.monitor.until_ns > begun_ns, self.monitor.why_no_progress),
-        ):
-            self._wait(there, self._node_timeout_s, failure)
+        ]
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """See ``Rig``."""

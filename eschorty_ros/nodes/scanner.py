@@ -56,6 +56,8 @@ TABLE = (
 )  # fmt: skip
 
 _FEEDBACK_S = 0.1
+# So long the other nodes may take to come up before anybody is told.
+_STARTING_S = 5.0
 
 
 class ScannerNode(Node):
@@ -89,6 +91,8 @@ class ScannerNode(Node):
         self._idle.set()
         self._scans = 0
         self._last = "no scan yet"
+        self.waiting = ""
+        self._begun_s = time.monotonic()
         group = ReentrantCallbackGroup()
         self._server = ActionServer(
             self,
@@ -204,12 +208,22 @@ class ScannerNode(Node):
         return result
 
     def _auto_scan(self) -> None:
-        if not self._self_client.server_is_ready():
+        missing = self._rig.missing()
+        if missing or not self._self_client.server_is_ready():
+            self._wait_for(missing or "scanner: no scan")
             return
+        self.waiting = ""
         self._auto_timer.cancel()
         values = {name: self.parameters[name]
                   for name in ("start", "stop", "speed", "frequency", "duty")}  # fmt: skip
         self._self_client.send_goal_async(Scan.Goal(**values))
+
+    def _wait_for(self, missing: str) -> None:
+        waiting = f"waiting: {missing}; the scan begins when it is there"
+        if waiting == self.waiting or time.monotonic() - self._begun_s < _STARTING_S:
+            return
+        self.waiting = waiting
+        self.get_logger().warning(waiting)
 
     def _report(self) -> diagnostics.Report:
         scanning = not self._idle.is_set()
