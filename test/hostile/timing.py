@@ -9,11 +9,14 @@ import numpy as np
 from eschorty_ros.core import (
     clock,
     clock_line,
+    edge_clock,
     lower_envelope,
     modulation,
     motion,
     phase,
     phase_gate,
+    position_edges,
+    pulses,
 )
 from hostile.kinds import (
     Call,
@@ -21,6 +24,7 @@ from hostile.kinds import (
     exactly,
     integers,
     number,
+    reals,
     text,
     vector,
     whole,
@@ -47,6 +51,8 @@ def a_schedule() -> phase.EdgeSchedule:
     schedule.anchor(0, 0)
     return schedule
 
+
+GRID = pulses.PulseGrid(0.0, 2.0, 3)
 
 CALLS: dict[str, Call] = {
     "clock.quantise_nm": Call(
@@ -114,6 +120,42 @@ CALLS: dict[str, Call] = {
         method(partial(lower_envelope.LowerEnvelope, 10), "observe"),
         {"t_us": 5, "arrival_ns": 10},
         {"t_us": whole(T_MAX), "arrival_ns": whole(T_MAX + 1)},
+    ),
+    "edge_clock.EdgeClock": Call(edge_clock.EdgeClock, {"grid": None}),
+    "edge_clock.EdgeClock.add": Call(
+        method(edge_clock.EdgeClock, "add"),
+        {"t_us": TIMES, "polarity": SIGNS},
+        {"t_us": integers(2**63, size=N), "polarity": POLARITY},
+    ),
+    "edge_clock.EdgeClock.update": Call(
+        method(edge_clock.EdgeClock, "update"),
+        {"track": a_track(), "arrivals": clock_line.ClockLine(0, 0), "now": True},
+    ),
+    "position_edges.fit_edges": Call(
+        position_edges.fit_edges,
+        {
+            "t_us": np.arange(8),
+            "track": a_track(),
+            "grid": GRID,
+            "arrivals": clock_line.ClockLine(0, 0),
+        },
+        {"t_us": integers(2**63, size=8)},
+    ),
+    "pulses.PulseGrid": Call(
+        pulses.PulseGrid,
+        {"first_mm": 0.0, "interval_mm": 2.0, "count": 3},
+        {"first_mm": number(1e7, -1e7), "interval_mm": number(0.0, -1.0), "count": whole(-1)},
+    ),
+    "pulses.PulseGrid.pulse": Call(
+        GRID.pulse, {"position_mm": np.zeros(2)}, {"position_mm": reals()}
+    ),
+    "pulses.PulseGrid.off_mm": Call(
+        GRID.off_mm, {"position_mm": np.zeros(2)}, {"position_mm": reals()}
+    ),
+    "pulses.leading_edges": Call(
+        pulses.leading_edges,
+        {"t_us": TIMES, "polarity": SIGNS},
+        {"t_us": integers(2**63, size=N), "polarity": POLARITY},
     ),
     "modulation.Modulation": Call(
         modulation.Modulation,

@@ -23,9 +23,9 @@ HANDED_OUT = {
     "calibrate.CalibrationReport", "calibrate.Rejected", "calibration_diagnostics.KProfile",
     "aggregate_frame.Pixels", "calibration_fit.CalibrationFit", "centroid.Centroids",
     "design.Design", "design.DesignTable", "evt3.Counters", "evt3.Events", "evt3.Triggers",
-    "noise.FilterCounters", "offline.Result", "phase.PhaseEstimate", "post_finder.Post",
-    "post_matching.PostMatch", "profiles.Profiles", "raw_file.Header", "recording.Recording",
-    "yaml_file.Schema",
+    "noise.FilterCounters", "offline.Result", "phase.PhaseEstimate", "position_edges.EdgeFit",
+    "post_finder.Post", "post_matching.PostMatch", "profiles.Profiles", "raw_file.Header",
+    "recording.Recording", "yaml_file.Schema",
 }  # fmt: skip
 """Plain records that the package makes; nobody else has to."""
 TESTED_ELSEWHERE = {
@@ -42,9 +42,9 @@ TESTED_ELSEWHERE = {
     "calibration.Calibration",
 }  # fmt: skip
 PACKAGE_OBJECTS = {
-    "calibration", "date", "design", "drain", "error", "frame", "known", "last", "line",
-    "model", "modulation", "nominal", "parts", "plan", "posts", "profiles", "progress", "schema",
-    "settings", "targets",
+    "arrivals", "calibration", "date", "design", "drain", "error", "frame", "grid", "known", "last",
+    "line", "model", "modulation", "nominal", "parts", "plan", "posts", "profiles", "progress",
+    "schema", "now", "settings", "targets", "track",
 }  # fmt: skip
 TAKES_EVENTS = {"noise.ActivityFilter.filter", "aggregate_frame.AggregateFrame.add"}
 """Their tables give the arrays of the events one by one."""
