@@ -71,6 +71,9 @@ class InPipe:
         self._changed = threading.Condition()
         self._cancelled = 0
 
+    def __bool__(self) -> bool:
+        return bool(self._queue)
+
     def put(self, data: bytes | memoryview, *, zero_length: bool = False) -> None:
         """Send a transfer; ``zero_length`` ends one of whole packets with an empty packet."""
         with self._changed:
@@ -217,6 +220,10 @@ class EmulatedUsbDevice:
     def reply(self, endpoint: int, data: bytes, *, zero_length: bool = False) -> None:
         """Queue a transfer for the host on an IN endpoint."""
         self._pipes[endpoint].put(data, zero_length=zero_length)
+
+    def pending(self, endpoint: int) -> bool:
+        """Whether the host has something to read on an IN endpoint."""
+        return bool(self._pipes[endpoint])
 
     def control(
         self,

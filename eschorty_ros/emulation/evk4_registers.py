@@ -1,0 +1,145 @@
+"""The register file of an IMX636 behind an EVK4: reset values, and the few registers that act.
+
+Everything else is memory: what was written is read back. Reset values are those the public
+drivers rely on; the rest reads 0. *Unconfirmed on hardware.*
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+CHIP_ID = 0xA0401806
+FACTORY_DACS = {
+    "bias_fo": 0x53,
+    "bias_hpf": 0x00,
+    "bias_diff_on": 0x66,
+    "bias_diff": 0x4D,
+    "bias_diff_off": 0x49,
+    "bias_refr": 0x14,
+}
+BIAS_ADDRESSES = {
+    "bias_fo": 0x1004,
+    "bias_hpf": 0x100C,
+    "bias_diff_on": 0x1010,
+    "bias_diff": 0x1014,
+    "bias_diff_off": 0x1018,
+    "bias_refr": 0x1020,
+}
+_BIAS_WORD = 0x11A10000
+
+_RESET = {
+    0x0004: 0xF0005042,
+    0x0014: CHIP_ID,
+    0x002C: 0x0022C324,
+    0x003C: 0x02CF04FF,
+    0x6000: 0x00155400,
+    0x602C: 0x00000002,
+    0x7004: 0x0000C5FF,
+    0x9000: 0x00000200,
+    0x9008: 0x00000644,
+    0x9014: 0x02CF04FF,
+    0xB028: 0x00000FA0,
+    0xC000: 0x5,
+    0xC0C4: 0x4,
+    0xD000: 0x5,
+}
+
+ADC_CONTROL, ADC_STATUS, ADC_MISC, TEMPERATURE_CONTROL = 0x4C, 0x50, 0x54, 0x5C
+LIGHT_COUNT, LIGHT_ENABLE, LIGHT_CONTROL = 0x10, 0x74, 0x0C
+DEAD_TIME, WINDOW_CONTROL = 0x20, 0x34
+AFK_FLAGS, STC_FLAGS = 0xC0C4, 0xD0C4
+SENSOR_RESET = 0x400004
+
+
+@dataclass
+class Surroundings:
+    """What the monitors of the sensor measure."""
+
+    temperature_c: float = 35.0
+    illumination_lux: float = 300.0
+    dead_time_us: float = 12.0
+
+
+class Registers:
+    """Addresses (multiples of 4) to 32-bit values.
+
+    Parameters
+    ----------
+    factory_dacs : mapping
+        The unit's trim, DAC value by bias name; names left out take the common one.
+
+    Attributes
+    ----------
+    surroundings : Surroundings
+    busy_polls : int
+        How often temperature and dead time read "not ready" before they read ready; more than a
+        driver's patience makes a monitor that never answers.
+    """
+
+    def __init__(self, factory_dacs: Mapping[str, int] | None = None):
+        self.factory_dacs = {**FACTORY_DACS, **(factory_dacs or {})}
+        self.surroundings = Surroundings()
+        self.busy_polls = 1
+        self._values: dict[int, int] = {}
+        self._polls = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Take on the values after power-up or a sensor reset."""
+        self._values = dict(_RESET)
+        for name, address in BIAS_ADDRESSES.items():
+            self._values[address] = _BIAS_WORD | self.factory_dacs[name]
+
+    def __getitem__(self, address: int) -> int:
+        return self._values.get(address, 0)
+
+    def read(self, address: int) -> int:
+        """Read over the bus: monitors are polled by reading."""
+        if address == ADC_STATUS:
+            return self._temperature()
+        if address == DEAD_TIME:
+            return self._dead_time()
+        if address == LIGHT_COUNT:
+            return self._light()
+        return self[address]
+
+    def write(self, address: int, value: int) -> None:
+        """Write over the bus."""
+        if address == SENSOR_RESET and self[address] and not value:
+            self.reset()
+        elif address == WINDOW_CONTROL:
+            # The window is taken over at once: go, then done.
+            value = (value & ~1) | 2 if value & 1 else value
+        elif address in (AFK_FLAGS, STC_FLAGS):
+            value = self._flags(address, value)
+        elif address in (ADC_CONTROL, DEAD_TIME):
+            self._polls = 0
+        self._values[address] = value
+
+    def _flags(self, address: int, value: int) -> int:
+        """Bit 2 is set by the sensor when ready and cleared by writing 1; bit 0 asks for it."""
+        return (value & ~4) | (4 if value & 1 else self[address] & 4 & ~value)
+
+    def _ready(self) -> bool:
+        self._polls += 1
+        return self._polls > self.busy_polls
+
+    def _temperature(self) -> int:
+        running = self[ADC_CONTROL] & 0b110 == 0b110 and self[TEMPERATURE_CONTROL] & 0b11 == 0b11
+        if not (running and self[ADC_MISC] & 1 << 12 and self._ready()):
+            return 0
+        return 1 << 11 | round((self.surroundings.temperature_c + 56.0) / 0.190) & 0x3FF
+
+    def _dead_time(self) -> int:
+        value = self[DEAD_TIME]
+        if value >> 30 != 0b11 or not self._ready():
+            return value
+        return value | 1 << 28 | round(self.surroundings.dead_time_us * 200)
+
+    def _light(self) -> int:
+        if self[LIGHT_ENABLE] & 0b11 != 0b11 or self[LIGHT_CONTROL] & 0b111 != 0b111:
+            return 0
+        count = 100 / 0.37 * 10 ** (3.5 - math.log10(self.surroundings.illumination_lux))
+        return 1 << 29 | round(count)
