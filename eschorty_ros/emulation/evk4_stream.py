@@ -76,7 +76,7 @@ class Packetiser:
         return [int(cut) for cut in self._before_high(kinds, at[~is_high][changed])]
 
     @staticmethod
-    def _before_high(kinds: Words, cuts: NDArray[np.integer]) -> NDArray[np.integer]:
+    def _before_high(kinds: NDArray[np.integer], cuts: NDArray[np.intp]) -> NDArray[np.intp]:
         """Keep a TIME_HIGH with the TIME_LOW that follows it."""
         follows = (cuts > 0) & (kinds[cuts - 1] == _TIME_HIGH)
         return cuts - follows
