@@ -22,7 +22,7 @@ from rclpy.parameter import Parameter
 
 from eschorty_ros.core.errors import ArgumentError, EschortyError
 
-Value = bool | int | float | str
+Value = bool | int | float | str | tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Param:
     Parameters
     ----------
     name : str
-    default : bool, int, float or str
+    default : bool, int, float, str or tuple of int
         Its type is the parameter's type; an integer given for a float is taken as one.
     description : str
     unit : str

@@ -10,9 +10,10 @@ from typing import Protocol
 
 from eschorty_ros.core.errors import DeviceError
 
-SILENCE_S = 1.0
+SILENCE_S = 0.1
+ALIVE_S = 0.2
 TEMPERATURE_EVERY_S = 5.0
-_TURN_S = 0.25
+_TURN_S = 0.03
 _JOIN_S = 0.5
 
 
@@ -65,6 +66,11 @@ class Health:
         if thread is not None:
             thread.join(_JOIN_S)
 
+    @property
+    def alive(self) -> bool:
+        """Whether the camera gave a sign of life within the last 0.2 s."""
+        return time.monotonic() - self._heard_s < ALIVE_S
+
     def heard(self) -> None:
         """Take note that events came: the camera lives."""
         self._heard_s = time.monotonic()
@@ -82,21 +88,24 @@ class Health:
         if patient is None:
             return
         try:
-            if not patient.is_streaming():
-                self._finding = DeviceError(
-                    "camera: it has stopped streaming by itself (reset or power dip); "
-                    "check its power"
-                )
+            if patient.is_streaming():
+                self._heard_s = time.monotonic()
+                return
+            finding = DeviceError(
+                "camera: it has stopped streaming by itself (reset or power dip); check its power"
+            )
         except DeviceError as error:
             self.failures += 1
-            self._finding = error
-        # The next question comes after as long a silence again.
-        self._heard_s = time.monotonic()
+            finding = error
+        # Not about a camera that was replaced while it was asked.
+        if self._patient() is patient:
+            self._finding = finding
 
     def measure(self) -> None:
         """Read the temperature."""
         patient = self._patient()
         if patient is None:
+            self.temperature_c = math.nan
             return
         try:
             self.temperature_c = patient.temperature_c()

@@ -6,6 +6,7 @@ The order of the steps is openeb 5.1.1's. Unconfirmed on hardware.
 from __future__ import annotations
 
 import struct
+import threading
 from contextlib import suppress
 
 import usb.backend
@@ -50,7 +51,10 @@ class Session:
     applied : dict of str to float
         Settings as the camera has them.
     control : Treuzell
-    biases : BiasBank
+    reader : BulkReader
+        For one thread.
+    streaming : bool
+        Whether it was told to stream.
 
     Raises
     ------
@@ -69,13 +73,15 @@ class Session:
         self._sleep = sleep
         self._usb = open_camera(backend, serial)
         self.control = treuzell.Treuzell(self._usb)
-        self._streaming = False
+        self.streaming = False
+        # A sequence, and a value that is read, changed and written, must not be interleaved.
+        self._sequence = threading.RLock()
         self.warnings: tuple[str, ...] = ()
         try:
             self.identity = self._identify()
             self._initialise()
-            self.biases = BiasBank(self.control, settings.wide_biases)
-            self.applied = apply_settings(self.control, self.biases, settings)
+            self._biases = BiasBank(self.control, settings.wide_biases)
+            self.applied = apply_settings(self.control, self._biases, settings)
             self.reader: BulkReader = make_reader(
                 backend, self._usb.device, self._usb.endpoints.data_in, clock_ns
             )
@@ -87,17 +93,20 @@ class Session:
     def start(self) -> None:
         """Queue the reads, then let the sensor stream; its time starts at 0."""
         self.reader.start()
-        run_sequence(self.control, imx636.START, self._sleep)
-        self._streaming = True
+        with self._sequence:
+            run_sequence(self.control, imx636.START, self._sleep)
+            self.streaming = True
 
-    def stop(self) -> None:
-        """End streaming: the sensor first, then the reads."""
-        if self._streaming:
-            self._streaming = False
-            try:
+    def stop_sensor(self) -> None:
+        """End streaming; the reads are still to be stopped."""
+        with self._sequence:
+            if self.streaming:
+                self.streaming = False
                 run_sequence(self.control, imx636.STOP, _no_pause)
-            finally:
-                self.reader.stop()
+
+    def stop_reads(self) -> None:
+        """Stop the reads, once nobody reads any more; idempotent."""
+        self.reader.stop()
 
     def is_streaming(self) -> bool:
         """Ask the sensor whether its time runs."""
@@ -105,17 +114,34 @@ class Session:
 
     def temperature_c(self) -> float:
         """Temperature of the sensor (C)."""
-        return monitors.read_temperature_c(self.control, self._sleep)
+        with self._sequence:
+            return monitors.read_temperature_c(self.control, _no_pause)
+
+    def set_bias(self, name: str, offset: int) -> int:
+        """Set one bias; returns the offset the camera reads back."""
+        with self._sequence:
+            kept = self._biases.write(name, offset)
+        self.applied[name] = kept
+        return kept
+
+    def read_biases(self) -> dict[str, int]:
+        """Offsets the camera has now."""
+        return self._biases.read()
+
+    def hurry(self) -> None:
+        """Wait less for answers from now on: the camera is being closed."""
+        self.control.hurry()
+        self._usb.hurry()
 
     def close(self, *, gone: bool = False) -> None:
         """Power the sensor down and release it, or only release it when ``gone``; never raises."""
-        self.control.hurry()
-        self._usb.hurry()
+        self.hurry()
         with suppress(EschortyError):
             if not gone:
-                self.stop()
-                monitors.end_monitors(self.control, _no_pause)
-                run_sequence(self.control, imx636.DESTROY, _no_pause)
+                self.stop_sensor()
+                with self._sequence:
+                    monitors.end_monitors(self.control, _no_pause)
+                    run_sequence(self.control, imx636.DESTROY, _no_pause)
         self.reader.stop()
         self._usb.close()
 
