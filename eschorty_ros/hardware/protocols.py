@@ -46,9 +46,12 @@ class EventChunk:
 class EventSource(Protocol):
     """A camera that hands out raw EVT3 bytes."""
 
-    identity: DeviceIdentity
     width: int
     height: int
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Who it is, as far as known before ``open``."""
 
     def open(self) -> None:
         """Find, probe and initialise the camera; may take seconds, ``close`` interrupts it."""

@@ -1,8 +1,7 @@
-"""Camera node: raw EVT3 as event packets, and the sensor clock's zero."""
+"""Camera node: raw EVT3 as event packets, and the camera's settings as parameters."""
 
 from __future__ import annotations
 
-import array
 import contextlib
 import sys
 import threading
@@ -10,21 +9,30 @@ from typing import Any
 
 from event_camera_msgs.msg import EventPacket
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import TimeReference
+from std_srvs.srv import Trigger
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
-from eschorty_ros.hardware.protocols import EventChunk, EventSource
+from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
+from eschorty_ros.hardware.camera.evk4 import Evk4
+from eschorty_ros.hardware.camera.neuromorphic import NeuromorphicEvk4
+from eschorty_ros.hardware.protocols import EventSource
 from eschorty_ros.msg import LaserState, StageMotion
 from eschorty_ros.nodes import diagnostics, drivers, qos
+from eschorty_ros.nodes.camera_packets import PacketPublisher
+from eschorty_ros.nodes.camera_parameters import (
+    EVK4_TABLE,
+    FAKE_TABLE,
+    missing_bias_file,
+)
 from eschorty_ros.nodes.conversions import ns_from_stamp, stamp_from_ns
 from eschorty_ros.nodes.device_messages import plan_from_motion, readback_from_state
 from eschorty_ros.nodes.lifecycle import DeviceNode
-from eschorty_ros.nodes.packets import SIZE_MAX_BYTES, Packetizer
+from eschorty_ros.nodes.packets import SIZE_MAX_BYTES
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
 from eschorty_ros.simulation.fake_camera import FakeCamera
-from eschorty_ros.simulation.presets import PRESETS
-from eschorty_ros.simulation.world import BACKGROUND_HZ
 
 READ_TIMEOUT_S = 0.02
 STOP_TIMEOUT_S = 3.0
@@ -32,24 +40,8 @@ REPORT_DEPTH = 1000
 
 TABLE = (
     drivers.DRIVER,
-    Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
-    Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
-    Param("as_built", "", "fake camera: build as it really is; empty: as calibration says"),
-    Param(
-        "pixels",
-        "paper",
-        "fake camera: preset of the event pixels",
-        choices=tuple(PRESETS),
-    ),
-    Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
-    Param(
-        "background_rate",
-        BACKGROUND_HZ,
-        "fake camera: background events of one pixel",
-        "Hz",
-        0.0,
-        100.0,
-    ),
+    *FAKE_TABLE,
+    *EVK4_TABLE,
     Param("frame_id", "eschorty_optical", "frame of the packets' headers"),
     Param("event_message_time_threshold", 0.004, "age at which a packet leaves", "s", 0.0, 1.0),
     Param(
@@ -64,29 +56,29 @@ TABLE = (
 
 
 class CameraNode(DeviceNode):
-    """Topics ``camera/events`` and ``camera/clock``.
+    """Topics ``camera/events`` and ``camera/clock``; biases as parameters.
 
-    A packet's stamp is the host time at which its first byte arrived. A simulated camera is told
-    what ``laser/state`` and ``stage/motion`` say, with their stamps as the times until which they
-    are final, so it sees both exactly, however late the messages come.
+    A packet's stamp is the host time at which its first byte arrived. While a lost camera is
+    looked for the node stays active and reports an error; the stream then restarts at ``seq`` 0.
+    A simulated camera is told what ``laser/state`` and ``stage/motion`` say, with their stamps as
+    the times until which they are final, so it sees both exactly, however late the messages come.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         self._source: EventSource | None = None
         self._thread: threading.Thread | None = None
         self._ending = threading.Event()
-        self._seq = 0
-        self._published_bytes = 0
-        self._unheard_bytes = 0
-        self._packet_rate = diagnostics.Rate()
-        self._byte_rate = diagnostics.Rate()
-        super().__init__("camera", TABLE, **kwargs)
-        self._events = self.create_lifecycle_publisher(
+        self._laser_hz: float | None = None
+        self._rates = {name: diagnostics.Rate() for name in ("packets", "bytes", "on", "off")}
+        self._kept: dict[str, int] = {}
+        super().__init__("camera", TABLE, self._on_change, **kwargs)
+        events = self.create_lifecycle_publisher(
             EventPacket,
             "camera/events",
             qos.events(),
             qos_overriding_options=qos.overridable(),
         )
+        self._packets = PacketPublisher(events, 1280, 720, self.parameters["frame_id"])
         self._clock_reference = self.create_publisher(TimeReference, "camera/clock", qos.latched())
         reports = MutuallyExclusiveCallbackGroup()
         self.create_subscription(
@@ -103,23 +95,35 @@ class CameraNode(DeviceNode):
             qos.stream(REPORT_DEPTH),
             callback_group=reports,
         )
-        diagnostics.Diagnostics(self, self._report)
+        self.create_service(Trigger, "~/save_biases", self._save_biases)
+        self.create_service(Trigger, "~/dump_statistics", self._dump_statistics)
+        self._read_back = self.create_guard_condition(self._write_parameters)
+        self._diagnostics = diagnostics.Diagnostics(self, self._report)
 
     def open_device(self) -> None:
         """Open the camera."""
         self._source = drivers.make(drivers.CAMERAS, self.parameters, self.now_ns)
+        if isinstance(self._source, Evk4):
+            self._source.on_loss = self._on_loss
+            self.get_logger().info("initialising the camera, 3 s")
         self._source.open()
         identity = self._source.identity
         self.get_logger().info(
-            f"{identity.model} {identity.serial}, {self._source.width} x {self._source.height}"
+            f"{identity.model} {identity.serial} {identity.firmware}, "
+            f"{self._source.width} x {self._source.height}"
         )
+        for line in (*getattr(self._source, "warnings", ()), missing_bias_file(self.parameters)):
+            if line:
+                self.get_logger().warning(line)
+        if isinstance(self._source, Evk4 | NeuromorphicEvk4):
+            self._read_biases_back(self._source.read_biases())
 
     def start_device(self) -> None:
-        """Stream, and tell when the sensor's clock read zero."""
+        """Stream."""
         source = self._source
         if source is None:
             raise DeviceError("camera refused: not open; configure it first")
-        packetizer = Packetizer(
+        self._packets.cut_by(
             round(self.parameters["event_message_time_threshold"] * 1e9),
             self.parameters["event_message_size_threshold"],
         )
@@ -131,20 +135,22 @@ class CameraNode(DeviceNode):
             self._clock_reference.publish(reference)
         self._ending.clear()
         self._thread = threading.Thread(
-            target=self._stream, args=(source, packetizer), name="camera stream", daemon=True
+            target=self._stream, args=(source,), name="camera stream", daemon=True
         )
         self._thread.start()
 
     def stop_device(self) -> None:
         """End streaming; what has been read is still published."""
         self._ending.set()
-        if self._source is not None:
-            self._source.stop()
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread.join(STOP_TIMEOUT_S)
-            if thread.is_alive():
-                raise DeviceError(f"the camera does not stop within {STOP_TIMEOUT_S:g} s")
+        try:
+            if self._source is not None:
+                self._source.stop()
+        finally:
+            thread, self._thread = self._thread, None
+            if thread is not None:
+                thread.join(STOP_TIMEOUT_S)
+        if thread is not None and thread.is_alive():
+            raise DeviceError(f"the camera does not stop within {STOP_TIMEOUT_S:g} s")
 
     def close_device(self) -> None:
         """Release the camera."""
@@ -152,20 +158,18 @@ class CameraNode(DeviceNode):
         if source is not None:
             source.close()
 
-    def _stream(self, source: EventSource, packetizer: Packetizer) -> None:
+    @property
+    def healthy(self) -> bool:
+        """Whether events can come right now."""
+        thread, source = self._thread, self._source
+        alive = thread is not None and thread.is_alive() and not self._ending.is_set()
+        return alive and bool(getattr(source, "healthy", True))
+
+    def _stream(self, source: EventSource) -> None:
         try:
             while not self._ending.is_set():
-                chunk = source.read(READ_TIMEOUT_S)
-                if chunk is None:
-                    ready = packetizer.push(b"", self.now_ns())
-                else:
-                    if chunk.gap or chunk.restarted:
-                        self._break(source, packetizer, chunk)
-                    ready = packetizer.push(chunk.data, chunk.arrival_ns)
-                for stamp_ns, payload in ready:
-                    self._publish(source, stamp_ns, payload)
-            for stamp_ns, payload in packetizer.flush():
-                self._publish(source, stamp_ns, payload)
+                self._packets.take(source.read(READ_TIMEOUT_S), self.now_ns())
+            self._packets.flush()
         except EschortyError as error:
             if not self._ending.is_set():
                 self.fault(f"camera lost: {error}")
@@ -174,36 +178,65 @@ class CameraNode(DeviceNode):
             if self.context.ok():
                 self.fault(f"camera stream failed: {error!r}")
 
-    def _break(self, source: EventSource, packetizer: Packetizer, chunk: EventChunk) -> None:
-        """Tell downstream by the numbering: one left out is a loss, 0 a new stream."""
-        for stamp_ns, payload in packetizer.flush():
-            self._publish(source, stamp_ns, payload)
-        self._seq = 0 if chunk.restarted else self._seq + 1
+    def _on_loss(self, line: str) -> None:
+        """Say at once that the camera is looked for; from its receiving thread."""
+        if self.context.ok() and not self._ending.is_set():
+            self.get_logger().error(f"camera lost, looking for it: {line}")
+            self._diagnostics.publish()
 
-    def _publish(self, source: EventSource, stamp_ns: int, payload: bytes) -> None:
-        if self._events.get_subscription_count() == 0:
-            self._unheard_bytes += len(payload)
+    def _on_change(self, proposed: dict[str, Any]) -> None:
+        """Apply biases as they are set; what the camera kept becomes the parameter."""
+        source = self._source
+        if not isinstance(source, Evk4 | NeuromorphicEvk4):
             return
-        message = EventPacket(
-            height=source.height,
-            width=source.width,
-            seq=self._seq,
-            encoding="evt3",
-            is_bigendian=False,
-            events=array.array("B", payload),
-        )
-        message.header.stamp = stamp_from_ns(stamp_ns)
-        message.header.frame_id = self.parameters["frame_id"]
-        self._events.publish(message)
-        self._seq += 1
-        self._published_bytes += len(payload)
+        for name in BIASES:
+            offset = proposed[name]
+            if offset != self._kept.get(name):
+                kept = self._kept[name] = source.set_bias(name, offset)
+                if kept != offset:
+                    self._read_back.trigger()
+
+    def _read_biases_back(self, kept: dict[str, int]) -> None:
+        self._kept = dict(kept)
+        self._write_parameters()
+
+    def _write_parameters(self) -> None:
+        changed = [
+            Parameter(name, value=offset)
+            for name, offset in self._kept.items()
+            if self.parameters[name] != offset
+        ]
+        if changed:
+            self.set_parameters_atomically(changed)
+
+    def _save_biases(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        path, source = self.parameters["bias_file"], self._source
+        try:
+            if not path:
+                raise DeviceError("no file to save biases to; set the parameter bias_file")
+            if not isinstance(source, Evk4 | NeuromorphicEvk4):
+                raise DeviceError("no biases to save; this camera has none or is not open")
+            save_bias_file(path, source.read_biases())
+        except EschortyError as error:
+            response.success, response.message = False, str(error)
+        else:
+            response.success, response.message = True, f"biases saved to {path}"
+        return response
+
+    def _dump_statistics(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        source = self._source
+        values = source.statistics() if source is not None else {}
+        response.success = source is not None
+        response.message = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        self.get_logger().info(f"statistics: {response.message or 'the camera is not open'}")
+        return response
 
     def _on_laser(self, message: LaserState) -> None:
-        if isinstance(self._source, FakeCamera):
-            with self._refused():
-                self._source.observe_laser(
-                    readback_from_state(message), ns_from_stamp(message.header.stamp)
-                )
+        with self._refused():
+            readback = readback_from_state(message)
+            self._laser_hz = readback.modulation.frequency_hz
+            if isinstance(self._source, FakeCamera):
+                self._source.observe_laser(readback, ns_from_stamp(message.header.stamp))
 
     def _on_stage(self, message: StageMotion) -> None:
         if isinstance(self._source, FakeCamera):
@@ -220,19 +253,34 @@ class CameraNode(DeviceNode):
             self.get_logger().error(f"report refused: {error}")
 
     def _report(self) -> diagnostics.Report:
-        source = self._source
+        source, packets, words = self._source, self._packets, self._packets.words
         values: dict[str, Any] = {
             "device": source.identity.model if source is not None else "",
+            "serial": source.identity.serial if source is not None else "",
+            "firmware": source.identity.firmware if source is not None else "",
             "state": self.state_label,
-            "seq": self._seq,
-            "packets_per_s": self._packet_rate.read(self._seq),
-            "bytes_per_s": self._byte_rate.read(self._published_bytes),
-            "bytes_without_subscriber": self._unheard_bytes,
+            "seq": packets.seq,
+            "packets_per_s": self._rates["packets"].read(packets.packets),
+            "bytes_per_s": self._rates["bytes"].read(packets.published_bytes),
+            "on_events_per_s": self._rates["on"].read(words.on),
+            "off_events_per_s": self._rates["off"].read(words.off),
+            "trigger_edges": words.triggers,
+            "sensor_drop_words": words.drop_words,
+            "bytes_without_subscriber": packets.unheard_bytes,
         }
         if source is not None:
             values |= source.statistics()
         if self.failure:
             return diagnostics.ERROR, self.failure, values
+        trouble = getattr(source, "trouble", "")
+        if trouble:
+            return diagnostics.ERROR, f"looking for the camera: {trouble}", values
+        band = source.settings.anti_flicker if isinstance(source, Evk4) else None
+        if band is not None and self._laser_hz is not None and band.erases(self._laser_hz):
+            line = (
+                f"the anti-flicker filter erases the laser's {self._laser_hz:g} Hz; switch it off"
+            )
+            return diagnostics.WARN, line, values
         return diagnostics.OK, "streaming" if self.active else self.state_label, values
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.errors import ArgumentError
@@ -15,6 +16,29 @@ from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACK
 from eschorty_ros.hardware.camera.pixel_selection import windows_of
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
 from eschorty_ros.nodes.parameters import Param
+from eschorty_ros.simulation.presets import PRESETS
+from eschorty_ros.simulation.world import BACKGROUND_HZ
+
+FAKE_TABLE = (
+    Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
+    Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
+    Param("as_built", "", "fake camera: build as it really is; empty: as calibration says"),
+    Param(
+        "pixels",
+        "paper",
+        "fake camera: preset of the event pixels",
+        choices=tuple(PRESETS),
+    ),
+    Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
+    Param(
+        "background_rate",
+        BACKGROUND_HZ,
+        "fake camera: background events of one pixel",
+        "Hz",
+        0.0,
+        100.0,
+    ),
+)
 
 _FULL_FRAME = (0, 0, WIDTH, HEIGHT)
 
@@ -77,7 +101,7 @@ EVK4_TABLE = (
 
 
 def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
-    """Settings of an EVK4 from the node's parameters.
+    """Make the settings of an EVK4 from the node's parameters.
 
     Raises
     ------
@@ -119,10 +143,19 @@ def anti_flicker(parameters: Mapping[str, Any]) -> AntiFlicker | None:
     )
 
 
+def missing_bias_file(parameters: Mapping[str, Any]) -> str:
+    """Tell in one line that the bias file is still to be made; empty when it is there."""
+    path = parameters["bias_file"]
+    if not path or Path(path).exists():
+        return ""
+    return f"bias_file {path!r} does not exist yet; save_biases makes it"
+
+
 def _biases(parameters: Mapping[str, Any]) -> dict[str, int]:
     given = {name: parameters[name] for name in BIASES if parameters[name]}
     path = parameters["bias_file"]
-    return {**(load_bias_file(path) if path else {}), **given}
+    kept = load_bias_file(path) if path and not missing_bias_file(parameters) else {}
+    return {**kept, **given}
 
 
 def _pixels(text: str) -> tuple[tuple[int, int], ...]:

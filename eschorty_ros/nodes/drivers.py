@@ -44,6 +44,28 @@ def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSourc
     return FakeCamera(world, clock_ns)
 
 
+def _evk4(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
+    from eschorty_ros.hardware.camera.evk4 import Evk4
+    from eschorty_ros.hardware.camera.keeper import Reconnection
+    from eschorty_ros.hardware.usb import open_backend
+    from eschorty_ros.nodes.camera_parameters import camera_settings
+
+    return Evk4(
+        open_backend(parameters["backend"]),
+        clock_ns,
+        parameters["serial"],
+        camera_settings(parameters),
+        Reconnection(parameters["reconnect_attempts"]),
+    )
+
+
+def _neuromorphic(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
+    from eschorty_ros.hardware.camera.neuromorphic import NeuromorphicEvk4
+    from eschorty_ros.nodes.camera_parameters import camera_settings
+
+    return NeuromorphicEvk4(clock_ns, parameters["serial"], camera_settings(parameters))
+
+
 def _fake_laser(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
     from eschorty_ros.simulation.fake_laser import FakeLaser
 
@@ -56,7 +78,11 @@ def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage
     return FakeStage(clock_ns)
 
 
-CAMERAS: Registry[EventSource] = {"fake": _fake_camera}
+CAMERAS: Registry[EventSource] = {
+    "fake": _fake_camera,
+    "evk4": _evk4,
+    "neuromorphic": _neuromorphic,
+}
 LASERS: Registry[LaserModulator] = {"fake": _fake_laser}
 STAGES: Registry[LinearStage] = {"fake": _fake_stage}
 

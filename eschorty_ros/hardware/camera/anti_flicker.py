@@ -57,9 +57,10 @@ class AntiFlicker:
                 f"anti-flicker duty is {self.duty_percent:g} %; choose above 0 to 100"
             )
 
-    def touches(self, frequency_hz: float) -> bool:
-        """Whether light modulated at ``frequency_hz`` lies in the band."""
-        return self.low_hz <= frequency_hz <= self.high_hz
+    def erases(self, frequency_hz: float) -> bool:
+        """Whether light modulated at ``frequency_hz`` does not get past."""
+        inside = self.low_hz <= frequency_hz <= self.high_hz
+        return inside != self.band_pass
 
 
 def set_anti_flicker(registers: Registers, band: AntiFlicker | None) -> None:

@@ -49,7 +49,10 @@ class Evk4:
         Bytes that may wait to be read; more is dropped, counted and reported as a gap.
     sleep : callable, optional
         Waits some seconds in place of real time, for tests.
-    on_loss : callable, optional
+
+    Attributes
+    ----------
+    on_loss : callable
         Called with one line from the receiving thread when the camera was lost.
     """
 
@@ -65,8 +68,8 @@ class Evk4:
         reconnection: Reconnection | None = None,
         queue_bytes: int = BYTES_MAX,
         sleep: Sleep | None = None,
-        on_loss: Callable[[str], None] | None = None,
     ) -> None:
+        self.on_loss: Callable[[str], None] = lambda _line: None
         self._keeper = Keeper(
             backend,
             clock_ns,
@@ -76,7 +79,6 @@ class Evk4:
             self._pause,
         )
         self._sleep = sleep
-        self._on_loss = on_loss or (lambda _line: None)
         self._queue = ChunkQueue(queue_bytes)
         self._health = Health(self._streaming_session)
         self._ending = threading.Event()
@@ -292,7 +294,7 @@ class Evk4:
 
     def _reconnect(self, error: DeviceError) -> None:
         self._keeper.lose(error)
-        self._on_loss(self._keeper.loss)
+        self.on_loss(self._keeper.loss)
         self._keeper.regain(self._begin_anew)
         self._health.heard()
 

@@ -111,8 +111,9 @@ def test_anti_flicker_band() -> None:
     assert [value for address, value in registers.writes if address == 0xC000] == [5, 1]
     set_anti_flicker(registers, None)
     assert registers.values[0xC000] == 5
-    assert AntiFlicker(90, 110).touches(100.0)
-    assert not AntiFlicker(90, 110).touches(1000.0)
+    assert AntiFlicker(90, 110).erases(100.0)
+    assert not AntiFlicker(90, 110).erases(1000.0)
+    assert not AntiFlicker(90, 110, band_pass=True).erases(100.0)
 
 
 def test_anti_flicker_without_memory_is_named() -> None:
