@@ -26,9 +26,11 @@ TRIGGERS = ("none", "laser", "stage")
 Pulses = Callable[[int, int], list[tuple[int, bool]]]
 """Edges of the stage's trigger output from one bench time (ns) to before another: time, rising."""
 
-_PIECE_US = 4_000
-_LEAST_US = 1_000
-_POLL_S = 0.002
+PACKET_US = 1_008
+"""The sensor hands out what it has once in so much of its time."""
+
+_PACKETS_AT_ONCE = 4
+_PACKET_S = PACKET_US * 1e-6
 _PPB = 1_000_000_000
 
 
@@ -212,7 +214,7 @@ class Physics:
             left_s = deadline_s - time.monotonic()
             if data or left_s <= 0.0 or not self._running.is_set():
                 return data
-            time.sleep(min(_POLL_S, left_s))
+            time.sleep(min(_PACKET_S, left_s))
 
     def statistics(self) -> dict[str, float]:
         """Count events, lag behind the bench's clock, late changes and trigger edges."""
@@ -242,10 +244,10 @@ class Physics:
                 self._apply_light(world, change)
             else:
                 self._apply_plan(world, change)
-        horizon_us = self._sensor_us(horizon_ns)
-        if horizon_us - world.now_us < _LEAST_US:
+        packets = (self._sensor_us(horizon_ns) - world.now_us) // PACKET_US
+        if packets < 1:
             return False
-        data = world.advance(min(horizon_us, world.now_us + _PIECE_US))
+        data = world.advance(world.now_us + min(packets, _PACKETS_AT_ONCE) * PACKET_US)
         if data:
             late_ns = round(self._usb_chance.uniform(0.0, self._flaws.usb_jitter_ms) * 1e6)
             self._on_the_way.append((horizon_ns + late_ns, data))

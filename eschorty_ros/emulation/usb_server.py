@@ -77,6 +77,11 @@ class UsbServer:
     ) -> None:
         self.close()
 
+    @property
+    def clients(self) -> int:
+        """Connections under way."""
+        return len(self._links)
+
     def close(self) -> None:
         """End the service; clients find their devices gone."""
         self._closed = True
