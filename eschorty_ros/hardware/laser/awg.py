@@ -1,0 +1,329 @@
+"""The generator that gates the laser: dark unless told otherwise and read back to be so."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from eschorty_ros.core.errors import ArgumentError, DeviceError
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_settings
+from eschorty_ros.hardware.laser.awg_link import open_link
+from eschorty_ros.hardware.laser.awg_profile import load_profile
+from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+from eschorty_ros.hardware.laser.scpi import InterruptedByOffError
+from eschorty_ros.hardware.protocols import (
+    DeviceIdentity,
+    LaserModulator,
+    LaserOutput,
+    LaserReadback,
+)
+
+FREQUENCY_DEFAULT_HZ = 70.0
+"""Told before the first ``configure``."""
+OFF_LIMIT_S = 2.0
+"""Time after which switching off stops trying and the state is unknown."""
+
+
+class AwgLaser:
+    """A waveform generator as laser modulator; off at construction and after every failure.
+
+    Thread-safe. ``disable`` may come at any time from any thread: whatever else is under way
+    gives up before its next USB transfer.
+
+    Parameters
+    ----------
+    settings : AwgSettings
+    clock_ns : callable
+        The clock of ``LaserReadback.output_since_ns``.
+
+    Attributes
+    ----------
+    identity : DeviceIdentity
+        As ``*IDN?`` gives it.
+
+    Raises
+    ------
+    DeviceError
+        No generator, or it does not confirm that it is off.
+    """
+
+    def __init__(
+        self, settings: AwgSettings, clock_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._settings = settings
+        self._profile = load_profile(settings.profile)
+        if settings.channel > self._profile.channels:
+            raise ArgumentError(
+                f"channel is {settings.channel}; the generator has {self._profile.channels}"
+            )
+        self._clock_ns = clock_ns
+        self._lock = threading.RLock()
+        self._counting = threading.Lock()
+        self._offs_waiting = 0
+        self._darkening = False
+        self._closed = False
+        self._armed = False
+        self._modulation = Modulation(FREQUENCY_DEFAULT_HZ)
+        self._ready = False
+        self._output = LaserOutput.UNKNOWN
+        self._since_ns = clock_ns()
+        self._serial = ""
+        self._channel: AwgChannel | None = None
+        self._counts = {"opened": 0, "switch_off_failures": 0}
+        self.identity = DeviceIdentity(self._profile.name, settings.serial)
+        self._notes: list[str] = []
+        with self._lock:
+            self._open()
+            try:
+                self._darken()
+                self.identity = self._channel_open().introduce()
+            except DeviceError:
+                self._drop()
+                raise
+
+    def configure(self, modulation: Modulation) -> None:
+        """Set everything from the load to the duty, read all back; a lit output is lit again.
+
+        Raises
+        ------
+        ArgumentError
+            For a modulation the generator cannot do; nothing has changed then.
+        DeviceError
+            When the generator fails, or reads back something else; it is dark then.
+        """
+        with self._lock:
+            self._refuse_closed()
+            wanted = wanted_settings(self._settings, self._profile, modulation)
+            lit = self._output is LaserOutput.ON
+            with self._dark_on_failure():
+                self._ready = False
+                self._darken(keep_armed=True)
+                channel = self._channel_open()
+                channel.apply(wanted)
+                channel.unlock()
+                self._modulation, self._ready = modulation, True
+                if lit:
+                    self._light()
+
+    def arm(self) -> None:
+        """Allow the next ``enable``; raises ``DeviceError`` when closed."""
+        with self._lock:
+            self._refuse_closed()
+            self._armed = True
+
+    def enable(self) -> None:
+        """Read all settings back, switch on, read that back.
+
+        Raises
+        ------
+        DeviceError
+            Not armed, not configured, a setting that is not as set, a failure: it is dark then.
+        """
+        with self._lock:
+            self._refuse_closed()
+            if not self._armed:
+                raise DeviceError(f"{NAME}: not armed; arm it before switching on")
+            if not self._ready:
+                raise DeviceError(f"{NAME}: not configured since it was lost; configure it again")
+            with self._dark_on_failure():
+                self._armed = False
+                self._light()
+
+    def disable(self) -> None:
+        """Switch off and disarm; idempotent, over in about 2 s at most.
+
+        OUTPut OFF, then levels down, then read back; else clear and again; else reset, open anew
+        and again.
+
+        Raises
+        ------
+        DeviceError
+            ``laser state unknown``: the generator did not confirm; ``readback`` says UNKNOWN.
+        """
+        with self._counting:
+            self._offs_waiting += 1
+        try:
+            with self._lock:
+                self._armed = False
+                if not self._closed:
+                    self._darken()
+        finally:
+            with self._counting:
+                self._offs_waiting -= 1
+
+    def readback(self) -> LaserReadback:
+        """Read output and, while it is lit, levels and waveform back; UNKNOWN counts as on.
+
+        Raises
+        ------
+        DeviceError
+            The generator does not answer, or a lit output is not as it was set: dark then.
+        """
+        with self._lock:
+            self._refuse_closed()
+            channel = self._channel
+            if channel is not None and self._output is not LaserOutput.UNKNOWN:
+                with self._dark_on_failure():
+                    self._look(channel)
+            return LaserReadback(self._output, self._modulation, None, self._since_ns)
+
+    def take_warnings(self) -> list[str]:
+        """What was odd since the last call but is no failure, for the log."""
+        with self._lock:
+            taken, self._notes = self._notes, []
+            if self._channel is not None:
+                taken += self._channel.take_warnings()
+            return taken
+
+    def statistics(self) -> dict[str, float]:
+        """Counters for diagnostics."""
+        with self._lock:
+            counts: dict[str, float] = dict(self._counts)
+            if self._channel is not None:
+                counts |= self._channel.statistics()
+            return counts
+
+    def close(self) -> None:
+        """Switch off and release; idempotent.
+
+        Raises
+        ------
+        DeviceError
+            ``laser state unknown``; the generator is released all the same.
+        """
+        try:
+            self.disable()
+        finally:
+            with self._lock:
+                self._closed = True
+                self._drop()
+
+    def _look(self, channel: AwgChannel) -> None:
+        """Compare belief and generator."""
+        on = channel.output()
+        if on is not None and on != (self._output is LaserOutput.ON):
+            if on:
+                raise DeviceError(f"{NAME}: output found on; it was not switched on from here")
+            self._believe(LaserOutput.OFF)
+            self._ready = False
+            self._notes.append(f"{NAME}: output found off; restarted, or switched off by hand")
+        elif self._output is LaserOutput.ON:
+            channel.verify_waveform()
+        channel.unlock()
+
+    def _light(self) -> None:
+        channel = self._channel_open()
+        channel.verify()
+        channel.unlock()
+        self._output = LaserOutput.UNKNOWN
+        channel.set_output(True)
+        self._believe(LaserOutput.ON)
+        if channel.output() is False:
+            raise DeviceError(f"{NAME}: output stays off; check the generator's display")
+        channel.unlock()
+
+    def _believe(self, output: LaserOutput) -> None:
+        if output is not self._output:
+            self._output, self._since_ns = output, self._clock_ns()
+
+    @contextmanager
+    def _dark_on_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            self._ready = False
+            self._armed = False
+            try:
+                self._darken()
+            except DeviceError as second:
+                raise DeviceError(f"{second} (after: {error})") from error
+            raise
+
+    def _darken(self, *, keep_armed: bool = False) -> None:
+        """Off by all means; the flag lets only this go on while others wait to switch off."""
+        self._armed = self._armed and keep_armed
+        before, self._darkening = self._darkening, True
+        ends = time.monotonic() + OFF_LIMIT_S
+        was_off = self._output is LaserOutput.OFF
+        failure: DeviceError | None = None
+        try:
+            for remedy in (self._no_remedy, self._clear, self._open_again):
+                if time.monotonic() > ends:
+                    break
+                try:
+                    remedy()
+                    self._channel_open().darken()
+                except DeviceError as error:
+                    failure = failure or error
+                    continue
+                if not was_off:
+                    self._output = LaserOutput.UNKNOWN
+                self._believe(LaserOutput.OFF)
+                return
+        finally:
+            self._darkening = before
+        self._counts["switch_off_failures"] += 1
+        self._ready = False
+        self._believe(LaserOutput.UNKNOWN)
+        raise DeviceError(f"laser state unknown: {failure}; {_BY_HAND}") from failure
+
+    def _no_remedy(self) -> None:
+        if self._channel is None:
+            self._open()
+
+    def _clear(self) -> None:
+        self._channel_open().clear()
+
+    def _open_again(self) -> None:
+        if self._channel is not None:
+            self._channel.reset()
+        self._drop()
+        self._open()
+
+    def _open(self) -> None:
+        link = open_link(self._settings, self._profile, self._serial)
+        self._serial = link.serial
+        self._ready = False
+        self._counts["opened"] += 1
+        self._channel = AwgChannel(link, self._settings, self._profile, self._may_go_on)
+
+    def _drop(self) -> None:
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            channel.close()
+
+    def _channel_open(self) -> AwgChannel:
+        if self._channel is None:
+            raise DeviceError(f"{NAME}: lost; check cable and power")
+        return self._channel
+
+    def _may_go_on(self) -> None:
+        if self._offs_waiting and not self._darkening:
+            raise InterruptedByOffError(f"{NAME}: interrupted by switching off")
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise DeviceError(f"{NAME}: closed; open it again")
+
+
+_BY_HAND = "treat the laser as on and switch the generator off by hand"
+
+
+def open_laser(**settings: Any) -> LaserModulator:
+    """Open the generator from keywords, those of ``AwgSettings``.
+
+    Raises
+    ------
+    ArgumentError
+        For a keyword or value that is not accepted.
+    DeviceError
+        As ``AwgLaser``.
+    """
+    try:
+        return AwgLaser(AwgSettings(**settings))
+    except TypeError as error:
+        raise ArgumentError(f"laser settings: {error}; see AwgSettings") from error

@@ -1,0 +1,249 @@
+"""One output of the generator: settings in the safe order, read back and compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import TypeVar
+
+from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceGoneError
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
+from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+from eschorty_ros.hardware.laser.scpi import InterruptedByOffError, Scpi
+from eschorty_ros.hardware.laser.usbtmc import MessageLink
+from eschorty_ros.hardware.protocols import DeviceIdentity
+
+NAME = "laser generator"
+Result = TypeVar("Result")
+Wanted = dict[str, Value]
+
+
+def wanted_settings(
+    settings: AwgSettings, profile: AwgProfile, modulation: Modulation
+) -> Wanted:
+    """Every setting of a lit output, in the order in which it is safe to make them.
+
+    The load first, since it changes what a volt means; then the clamp, before any level.
+
+    Raises
+    ------
+    ArgumentError
+        For what the generator cannot do.
+    """
+    if modulation.waveform not in profile.waveforms:
+        raise ArgumentError(
+            f"waveform is {modulation.waveform!r}; the generator has "
+            f"{', '.join(profile.waveforms)}"
+        )
+    wanted: Wanted = {
+        "load": settings.load_ohm,
+        "limit_lower": 0.0,
+        "limit_upper": settings.high_max_v,
+        "limit_enable": True,
+        "mode": profile.mode_continuous,
+        "inversion": False,
+        "waveform": profile.waveforms[modulation.waveform],
+        "frequency": modulation.frequency_hz,
+        "high": settings.high_v,
+        "low": settings.low_v,
+    }
+    if modulation.waveform in profile.duty_waveforms:
+        wanted["duty"] = modulation.duty * 100.0
+    elif modulation.duty != 0.5:
+        raise ArgumentError(
+            f"duty is {modulation.duty:g}; waveform {modulation.waveform} has none but 0.5"
+        )
+    for name, value in wanted.items():
+        profile.settings[name].check(name, value)
+    return wanted
+
+
+class AwgChannel:
+    """The output that gates the laser, over one link.
+
+    What reading back decides is the settings' ``readback``: ``required`` makes silence a
+    failure; ``best_effort`` stops asking after the first silence and goes on; ``off`` never asks.
+    A reply that contradicts what was set is a failure always.
+
+    Parameters
+    ----------
+    link : MessageLink
+    settings : AwgSettings
+    profile : AwgProfile
+    may_go_on : callable
+        Called before every transfer; raises to give up.
+    """
+
+    def __init__(
+        self,
+        link: MessageLink,
+        settings: AwgSettings,
+        profile: AwgProfile,
+        may_go_on: Callable[[], None],
+    ) -> None:
+        self._link = link
+        self._scpi = Scpi(link, profile, may_go_on)
+        self._settings = settings
+        self._profile = profile
+        self._wanted: Wanted = {}
+        self._silent = False
+        self._new_warnings: list[str] = []
+        self._told: set[str] = set()
+
+    @property
+    def asks(self) -> bool:
+        """Whether replies are to be expected."""
+        return self._settings.readback != "off" and not self._silent
+
+    def introduce(self) -> DeviceIdentity:
+        """Ask for maker, model, serial and firmware; empty the error queue if there is one."""
+        reply = self._asked(lambda: self._scpi.ask(self._profile.identify))
+        if reply is None:
+            return DeviceIdentity(self._profile.name, self._link.serial)
+        if re.search(self._profile.model, reply) is None:
+            self._warn(
+                f"{NAME}: it says {reply[:60]!r}, profile {self._profile.name} was asked for; "
+                "check every setting on its display"
+            )
+        for error in self._scpi.drain_errors() or ():
+            self._warn(f"{NAME}: its error queue held {error[:60]!r}")
+        parts = [part.strip() for part in reply.split(",")] + [""] * 4
+        return DeviceIdentity(
+            f"{parts[0]} {parts[1]}".strip(), parts[2] or self._link.serial, parts[3]
+        )
+
+    def apply(self, wanted: Wanted) -> None:
+        """Make every setting of a dark output, then read all of them back.
+
+        Raises
+        ------
+        DeviceError
+            A failure, or a setting that reads back as something else.
+        """
+        self._wanted = dict(wanted)
+        for name, value in wanted.items():
+            if name == "high":
+                self._set_levels(float(value), float(wanted["low"]))
+            elif name != "low":
+                self._set(name, value)
+        self.verify()
+
+    def verify(self) -> None:
+        """Read every setting back and compare; raises ``DeviceError`` naming what differs."""
+        self._compare(self._wanted)
+
+    def verify_waveform(self) -> None:
+        """Read back what changes the light: levels, waveform, frequency and duty."""
+        light = ("waveform", "frequency", "high", "low", "duty")
+        self._compare({name: self._wanted[name] for name in light if name in self._wanted})
+
+    def set_output(self, on: bool) -> None:
+        """Switch the output; raises ``DeviceError``."""
+        self._set("output", on)
+
+    def output(self) -> bool | None:
+        """Whether the output is on; ``None`` where replies are not to be expected."""
+        found = self._get("output", self._settings.channel)
+        return None if found is None else bool(found)
+
+    def darken(self) -> None:
+        """OUTPut OFF on all channels, levels down, read back.
+
+        Raises
+        ------
+        DeviceError
+            A failure, or an output that says it is on.
+        """
+        own = self._settings.channel
+        others = [n for n in range(1, self._profile.channels + 1) if n != own]
+        for channel in (own, *others):
+            self._scpi.set_at_once("output", False, channel)
+        self._scpi.set_at_once("low", 0.0, own)
+        self._scpi.set_at_once("high", self._profile.dark_high_v, own)
+        for channel in (own, *others):
+            if self._get("output", channel):
+                raise DeviceError(f"{NAME}: output {channel} stays on")
+        high = self._get("high", own)
+        if high is not None and float(high) > self._profile.dark_limit_v:
+            self._warn(f"{NAME}: output off, but its level stayed at {float(high):g} V")
+        self.unlock()
+
+    def unlock(self) -> None:
+        """Free the front panel: whoever stands there must be able to switch off by hand."""
+        if self._profile.unlock is not None:
+            self._scpi.command(self._profile.unlock)
+
+    def clear(self) -> None:
+        """Make both sides of the link forget what is under way; raises ``DeviceError``."""
+        self._link.clear()
+
+    def reset(self) -> None:
+        """Reset the link's port; raises ``DeviceError``."""
+        self._link.reset()
+
+    def close(self) -> None:
+        """Release the generator; never raises."""
+        self._link.close()
+
+    def take_warnings(self) -> list[str]:
+        """Hand out what was odd since the last call."""
+        taken, self._new_warnings = self._new_warnings, []
+        return taken
+
+    def statistics(self) -> dict[str, float]:
+        """Counters for diagnostics."""
+        return {
+            "faults": self._scpi.faults,
+            "retries": self._scpi.retries,
+            "write_only": float(not self.asks),
+        }
+
+    def _set(self, name: str, value: Value) -> None:
+        self._scpi.set(name, value, self._settings.channel)
+
+    def _set_levels(self, high: float, low: float) -> None:
+        """HIGH stays above LOW on the way: raising begins with HIGH, lowering with LOW."""
+        found = self._get("high", self._settings.channel)
+        present = self._profile.dark_high_v if found is None else float(found)
+        levels: list[tuple[str, Value]] = [("high", high), ("low", low)]
+        for name, value in levels if high >= present else reversed(levels):
+            self._set(name, value)
+
+    def _compare(self, wanted: Wanted) -> None:
+        wrong = []
+        for name, value in wanted.items():
+            found = self._get(name, self._settings.channel)
+            if found is not None and not self._profile.settings[name].agrees(value, found):
+                wrong.append(f"{name} is {_shown(found)} instead of {_shown(value)}")
+        if wrong:
+            raise DeviceError(
+                f"{NAME}: {', '.join(wrong)}; check its display and the profile, then configure it"
+            )
+
+    def _get(self, name: str, channel: int) -> Value | None:
+        return self._asked(lambda: self._scpi.get(name, channel))
+
+    def _asked(self, query: Callable[[], Result]) -> Result | None:
+        """Reply, or ``None`` where the policy can do without."""
+        if not self.asks:
+            return None
+        try:
+            return query()
+        except (DeviceGoneError, InterruptedByOffError):
+            raise
+        except DeviceError as error:
+            if self._settings.readback == "required":
+                raise
+            self._silent = True
+            self._warn(f"{NAME}: reading back given up, settings are not verified ({error})")
+            return None
+
+    def _warn(self, text: str) -> None:
+        if text not in self._told:
+            self._told.add(text)
+            self._new_warnings.append(text)
+
+
+def _shown(value: Value) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

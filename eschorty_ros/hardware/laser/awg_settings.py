@@ -1,0 +1,81 @@
+"""What a user sets about the generator that gates the laser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from eschorty_ros.core._values import number, whole
+from eschorty_ros.core.errors import ArgumentError
+
+READBACK_POLICIES = ("required", "best_effort", "off")
+HIGH_LIMIT_V = 10.0
+"""More than any gate input takes."""
+
+
+def _field(default: Any, description: str, unit: str = "", **more: Any) -> Any:
+    return field(default=default, metadata={"description": description, "unit": unit, **more})
+
+
+@dataclass(frozen=True, slots=True)
+class AwgSettings:
+    """Generator, wiring and caution; the fields are the laser node's parameters.
+
+    Raises
+    ------
+    ArgumentError
+        For a HIGH above ``high_max_v``, a LOW below 0, LOW not below HIGH, and values out of
+        range.
+    """
+
+    profile: str = _field("utg900e", "command set of the generator: config/awg_<name>.yaml, or a path")
+    backend: str = _field("libusb", "USB library: libusb, or module:callable[?argument]")
+    device: str = _field("", "kernel device such as /dev/usbtmc0 instead of libusb; empty = libusb")
+    serial: str = _field("", "serial number of the generator; empty = the only one there is")
+    vendor_ids: str = _field("", "USB vendor ids in hex, separated by blanks; empty = the profile's")
+    channel: int = _field(1, "output that gates the laser", range=(1, 8))
+    low_v: float = _field(0.0, "gate voltage without light", "V", range=(0.0, HIGH_LIMIT_V))
+    high_v: float = _field(5.0, "gate voltage with light", "V", range=(0.0, HIGH_LIMIT_V))
+    high_max_v: float = _field(
+        5.0, "the most the laser's input takes; clamped in the generator", "V", range=(0.0, HIGH_LIMIT_V)
+    )
+    load_ohm: float = _field(
+        10000.0, "resistance at the output; 10000 = high impedance", "ohm", range=(50.0, 10000.0)
+    )
+    readback: str = _field(
+        "required", "what reading settings back decides", choices=READBACK_POLICIES
+    )
+    usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 2.0))
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            self._check(item.name, item.default, item.metadata)
+        if self.high_v > self.high_max_v:
+            raise ArgumentError(
+                f"high_v is {self.high_v:g} V, above high_max_v, {self.high_max_v:g} V; lower it, "
+                "or raise high_max_v if the laser's input takes that"
+            )
+        if self.low_v >= self.high_v:
+            raise ArgumentError(
+                f"low_v is {self.low_v:g} V, not below high_v, {self.high_v:g} V; lower it"
+            )
+        self.vendors()
+
+    def vendors(self) -> tuple[int, ...]:
+        """Vendor ids, empty for the profile's."""
+        try:
+            return tuple(int(text, 16) for text in self.vendor_ids.split())
+        except ValueError:
+            raise ArgumentError(
+                f"vendor_ids is {self.vendor_ids!r}; write hexadecimal numbers such as 6656 664F"
+            ) from None
+
+    def _check(self, name: str, default: Any, metadata: Any) -> None:
+        value = getattr(self, name)
+        choices = metadata.get("choices", ())
+        if choices and value not in choices:
+            raise ArgumentError(f"{name} is {value!r}; choose one of {', '.join(choices)}")
+        if "range" in metadata:
+            (whole if isinstance(default, int) else number)(name, value, *metadata["range"])
+        elif not isinstance(value, str):
+            raise ArgumentError(f"{name} is {value!r}; give a text")

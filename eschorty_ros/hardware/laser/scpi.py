@@ -1,0 +1,170 @@
+"""SCPI over a message link: one command per message, replies parsed, one retry after recovery."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import TypeVar
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
+from eschorty_ros.hardware.laser.usbtmc import MessageLink
+
+Result = TypeVar("Result")
+
+_ERRORS_DRAINED = 32
+
+
+class InterruptedByOffError(DeviceError):
+    """Given up because the laser is being switched off."""
+
+
+class Scpi:
+    """Settings of one channel of one generator.
+
+    Every command is absolute, so that any may be sent twice: after a fault the link is cleared
+    and the command sent once more; a second fault is the caller's.
+
+    Parameters
+    ----------
+    link : MessageLink
+    profile : AwgProfile
+    may_go_on : callable
+        Called before every transfer; raises to give up.
+
+    Attributes
+    ----------
+    faults, retries : int
+        Transfers that failed, and those sent once more.
+    """
+
+    def __init__(
+        self, link: MessageLink, profile: AwgProfile, may_go_on: Callable[[], None]
+    ) -> None:
+        self.link = link
+        self._profile = profile
+        self._may_go_on = may_go_on
+        self.faults = 0
+        self.retries = 0
+
+    def set(self, name: str, value: Value, channel: int) -> None:
+        """Set ``name`` (a key of the profile's ``settings``); raises ``DeviceError``."""
+        self.command(self._spelt(name, value, channel))
+
+    def set_at_once(self, name: str, value: Value, channel: int) -> None:
+        """Set without asking whether to go on and without a retry: for switching off."""
+        self._write(self._spelt(name, value, channel))
+
+    def get(self, name: str, channel: int) -> Value:
+        """Read ``name`` back: bool, float or keyword, as its kind says.
+
+        Raises
+        ------
+        DeviceError
+            No answer, or twice one that is no value of that kind.
+        """
+        query = self._profile.settings[name].command.format(channel=channel) + "?"
+        return self._attempt(lambda: self._parsed(name, query, self._ask(query)))
+
+    def command(self, text: str) -> None:
+        """Send a command without a reply; raises ``DeviceError``."""
+        self._attempt(lambda: self._write(text))
+
+    def ask(self, text: str) -> str:
+        """Send a query, return its reply without line ends; raises ``DeviceError``."""
+        return self._attempt(lambda: self._ask(text))
+
+    def drain_errors(self) -> list[str] | None:
+        """Empty the error queue, 32 entries at most; ``None`` when the generator has none.
+
+        Asked without retry: silence or garbage mean that there is no queue, not a fault.
+        """
+        query = self._profile.error_queue
+        if query is None:
+            return None
+        found: list[str] = []
+        for _ in range(_ERRORS_DRAINED):
+            self._may_go_on()
+            try:
+                reply = self._ask(query)
+            except (DeviceGoneError, InterruptedByOffError):
+                raise
+            except DeviceError:
+                self.link.clear()
+                return None
+            match = re.match(r"\s*([-+]?\d+)\s*(,.*)?$", reply)
+            if match is None:
+                return None
+            if int(match[1]) == 0:
+                break
+            found.append(reply)
+        return found
+
+    def _spelt(self, name: str, value: Value, channel: int) -> str:
+        setting = self._profile.settings[name]
+        setting.check(name, value)
+        return f"{setting.command.format(channel=channel)} {_text(value)}"
+
+    def _attempt(self, step: Callable[[], Result]) -> Result:
+        self._may_go_on()
+        try:
+            return step()
+        except (DeviceGoneError, InterruptedByOffError):
+            raise
+        except DeviceError:
+            self.faults += 1
+            self._may_go_on()
+            self.link.clear()
+        self._may_go_on()
+        self.retries += 1
+        try:
+            return step()
+        except (DeviceGoneError, InterruptedByOffError):
+            raise
+        except DeviceError:
+            self.faults += 1
+            self._may_go_on()
+            self.link.clear()
+            raise
+
+    def _write(self, text: str) -> None:
+        self.link.write((text + self._profile.terminator).encode("ascii"))
+
+    def _ask(self, text: str) -> str:
+        self._write(text)
+        self._may_go_on()
+        reply = self.link.read()
+        try:
+            return reply.decode("ascii").strip("\r\n \0")
+        except UnicodeDecodeError:
+            raise DeviceError(
+                f"{text} was answered with {reply[:20]!r}, which is no text; check cable and hub"
+            ) from None
+
+    def _parsed(self, name: str, query: str, reply: str) -> Value:
+        setting, replies = self._profile.settings[name], self._profile.replies
+        word = reply.strip("\"' ").upper()
+        if setting.kind == "switch":
+            if word in replies.on:
+                return True
+            if word in replies.off:
+                return False
+        elif setting.kind == "number":
+            match = re.fullmatch(replies.number, reply)
+            if match is not None:
+                return float(match[1])
+        elif re.fullmatch(r"[A-Z][A-Z0-9]*", word):
+            return word
+        raise DeviceError(
+            f"{query} was answered with {reply[:40]!r}, which is no {setting.kind}; "
+            "check that the profile fits the generator"
+        )
+
+
+def _text(value: Value) -> str:
+    """Spell a value as SCPI: plain decimals, no exponents."""
+    if isinstance(value, bool):
+        return "ON" if value else "OFF"
+    if isinstance(value, str):
+        return value.upper()
+    return f"{value:.9f}".rstrip("0").rstrip(".")

@@ -1,0 +1,273 @@
+"""USBTMC on a pyusb device: messages out, replies in, every header checked.
+
+USB-IF "Universal Serial Bus Test and Measurement Class" 1.0, tables 1 to 9. Nothing here waits for
+a newline: a reply ends where its header says so (EOM), and nothing is asked for after that, since
+a second request for the same reply wedges some instruments until they are plugged in again.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Any, Protocol
+
+import usb.core
+import usb.util
+
+from eschorty_ros.core.errors import DeviceError, DeviceStallError
+from eschorty_ros.hardware.usb import claim, release, translate
+
+INTERFACE_CLASS, INTERFACE_SUBCLASS = 0xFE, 0x03
+REPLY_LIMIT = 65_536
+"""Longest reply taken, bytes; more is an instrument that has lost its way."""
+
+_HEADER = struct.Struct("<BBBBIB3x")
+_MESSAGE_OUT, _REQUEST_IN, _REPLY_IN = 1, 2, 2
+_END_OF_MESSAGE = 0x01
+_ASKED_AT_ONCE = 4096
+_INITIATE_CLEAR, _CHECK_CLEAR = 5, 6
+_CLASS_INTERFACE_IN = 0xA1
+_STATUS_SUCCESS, _STATUS_PENDING = 0x01, 0x02
+_CLEAR_TRIES = 32
+
+
+class MessageLink(Protocol):
+    """Whole messages to and from one instrument."""
+
+    serial: str
+
+    def write(self, message: bytes) -> None:
+        """Send one message; raises ``DeviceError``."""
+
+    def read(self) -> bytes:
+        """Take one whole reply; raises ``DeviceError``."""
+
+    def clear(self) -> None:
+        """Make both sides forget what is under way; raises ``DeviceError``."""
+
+    def reset(self) -> None:
+        """Reset the instrument's port; the link is to be closed and made anew afterwards."""
+
+    def close(self) -> None:
+        """Release the instrument; never raises."""
+
+
+def is_usbtmc(device: usb.core.Device) -> bool:
+    """Tell whether a device has a USBTMC interface, from its descriptors alone."""
+    return any(_is_tmc(interface) for configuration in device for interface in configuration)
+
+
+def _is_tmc(interface: Any) -> bool:
+    kind = (interface.bInterfaceClass, interface.bInterfaceSubClass)
+    return kind == (INTERFACE_CLASS, INTERFACE_SUBCLASS)
+
+
+class UsbTmc:
+    """A USBTMC instrument on a pyusb device; the interface is claimed until ``close``.
+
+    Parameters
+    ----------
+    device : usb.core.Device
+    name : str
+        What errors call the instrument.
+    timeout_s : float
+        Longest wait for one transfer.
+
+    Raises
+    ------
+    DeviceError
+        When there is no USBTMC interface, or another program holds it.
+    """
+
+    def __init__(self, device: usb.core.Device, *, name: str, timeout_s: float) -> None:
+        self._device = device
+        self._name = name
+        self._timeout_ms = max(1, round(timeout_s * 1e3))
+        self._tag = 0
+        interface = self._tmc_interface()
+        self._interface = interface.bInterfaceNumber
+        self._out = self._endpoint(interface, usb.util.ENDPOINT_OUT)
+        self._in = self._endpoint(interface, usb.util.ENDPOINT_IN)
+        self._packet = self._in.wMaxPacketSize
+        try:
+            self._detached = claim(device, self._interface, name)
+        except DeviceError:
+            usb.util.dispose_resources(device)
+            raise
+        self.serial = self._read_serial()
+
+    def write(self, message: bytes) -> None:
+        """Send one message in one transfer.
+
+        Raises
+        ------
+        DeviceError
+            Gone, timed out, stalled or cut short; after that call ``clear``.
+        """
+        header = _HEADER.pack(*self._tags(_MESSAGE_OUT), 0, len(message), _END_OF_MESSAGE)
+        self._send(header + message + bytes(-len(message) % 4), "sending a command")
+
+    def read(self) -> bytes:
+        """Take one reply, joined up to its end of message.
+
+        Raises
+        ------
+        DeviceError
+            Gone, timed out, stalled, a wrong header, or a reply above 64 kB; after that call
+            ``clear``.
+        """
+        reply = b""
+        while True:
+            part, ended = self._read_transfer()
+            reply += part
+            if ended:
+                return reply
+            if len(reply) > REPLY_LIMIT:
+                raise DeviceError(
+                    f"{self._name}: a reply is longer than {REPLY_LIMIT} bytes; "
+                    "check that the profile fits the instrument"
+                )
+
+    def clear(self) -> None:
+        """INITIATE_CLEAR, CHECK_CLEAR until done, then clear the halt of both endpoints.
+
+        Raises
+        ------
+        DeviceError
+            When the instrument does not answer.
+        """
+        try:
+            self._clear_buffers()
+        except DeviceStallError:
+            pass  # It does not know the request.
+        finally:
+            self._clear_halts()
+
+    def reset(self) -> None:
+        """Reset the USB port.
+
+        Raises
+        ------
+        DeviceError
+            When the port cannot be reset.
+        """
+        try:
+            self._device.reset()
+        except usb.core.USBError as error:
+            raise translate(error, f"{self._name}: resetting the port") from error
+
+    def close(self) -> None:
+        """Release the interface, give it back to the kernel driver it came from; never raises."""
+        release(self._device, self._interface, reattach=self._detached)
+
+    def _tmc_interface(self) -> Any:
+        try:
+            configuration = self._device.get_active_configuration()
+        except usb.core.USBError as error:
+            raise translate(error, f"{self._name}: opening") from error
+        for interface in configuration:
+            if _is_tmc(interface):
+                return interface
+        raise DeviceError(f"{self._name}: it has no USBTMC interface; check vendor and product id")
+
+    def _endpoint(self, interface: Any, direction: int) -> Any:
+        for endpoint in interface:
+            address, kind = endpoint.bEndpointAddress, endpoint.bmAttributes
+            bulk = usb.util.endpoint_type(kind) == usb.util.ENDPOINT_TYPE_BULK
+            if bulk and usb.util.endpoint_direction(address) == direction:
+                return endpoint
+        raise DeviceError(f"{self._name}: a bulk endpoint is missing; it is no USBTMC instrument")
+
+    def _read_serial(self) -> str:
+        try:
+            return self._device.serial_number or ""
+        except (usb.core.USBError, ValueError):
+            return ""
+
+    def _tags(self, message_id: int) -> tuple[int, int, int]:
+        self._tag = self._tag % 255 + 1
+        return message_id, self._tag, self._tag ^ 0xFF
+
+    def _send(self, data: bytes, what: str) -> None:
+        try:
+            sent = self._device.write(self._out.bEndpointAddress, data, self._timeout_ms)
+        except usb.core.USBError as error:
+            raise translate(error, f"{self._name}: {what}") from error
+        if sent != len(data):
+            raise DeviceError(f"{self._name}: {what}: {sent} of {len(data)} bytes went out")
+
+    def _receive(self, size: int) -> bytes:
+        try:
+            return bytes(self._device.read(self._in.bEndpointAddress, size, self._timeout_ms))
+        except usb.core.USBError as error:
+            raise translate(error, f"{self._name}: reading a reply") from error
+
+    def _read_transfer(self) -> tuple[bytes, bool]:
+        """One reply transfer: its data, and whether the message ends with it.
+
+        The first packet is read alone: it tells the size, and a reply of whole packets that no
+        empty packet follows would block a larger read until the time-out.
+        """
+        header = _HEADER.pack(*self._tags(_REQUEST_IN), 0, _ASKED_AT_ONCE, 0)
+        self._send(header, "asking for a reply")
+        # An empty packet may still end the transfer before.
+        data = self._receive(self._packet) or self._receive(self._packet)
+        size, ended = self._checked(data)
+        missing = _HEADER.size + size - len(data)
+        if missing > 0 and len(data) == self._packet:
+            data += self._receive(-(-missing // self._packet) * self._packet)
+        if len(data) < _HEADER.size + size:
+            raise DeviceError(
+                f"{self._name}: a reply announced {size} bytes and brought "
+                f"{len(data) - _HEADER.size}"
+            )
+        return data[_HEADER.size : _HEADER.size + size], ended
+
+    def _checked(self, data: bytes) -> tuple[int, bool]:
+        """Size and end mark of a reply header that belongs to the last request."""
+        if len(data) < _HEADER.size:
+            raise DeviceError(f"{self._name}: a reply of {len(data)} bytes is too short")
+        kind, tag, inverse, _, size, attributes = _HEADER.unpack_from(data)
+        if (kind, tag, inverse) != (_REPLY_IN, self._tag, self._tag ^ 0xFF):
+            raise DeviceError(
+                f"{self._name}: a reply header reads message {kind}, tag {tag}, {inverse}; "
+                f"{_REPLY_IN}, {self._tag}, {self._tag ^ 0xFF} was due"
+            )
+        if size > _ASKED_AT_ONCE:
+            raise DeviceError(
+                f"{self._name}: a reply announced {size} bytes where {_ASKED_AT_ONCE} were asked"
+            )
+        return size, bool(attributes & _END_OF_MESSAGE)
+
+    def _clear_buffers(self) -> None:
+        if self._control(_INITIATE_CLEAR, 1)[0] != _STATUS_SUCCESS:
+            raise DeviceError(f"{self._name}: refused to clear its buffers; switch it off and on")
+        ends = time.monotonic() + self._timeout_ms * 1e-3
+        for _ in range(_CLEAR_TRIES):
+            status, more = self._control(_CHECK_CLEAR, 2)
+            if status != _STATUS_PENDING:
+                return
+            if more & 1:
+                # Data that must be taken before the instrument can go on.
+                self._receive(self._packet)
+            if time.monotonic() > ends:
+                break
+        raise DeviceError(f"{self._name}: does not end clearing; switch it off and on")
+
+    def _control(self, request: int, size: int) -> bytes:
+        try:
+            answer = self._device.ctrl_transfer(
+                _CLASS_INTERFACE_IN, request, 0, self._interface, size, self._timeout_ms
+            )
+        except usb.core.USBError as error:
+            raise translate(error, f"{self._name}: clearing") from error
+        if len(answer) < size:
+            raise DeviceError(f"{self._name}: clearing was answered with {len(answer)} bytes")
+        return bytes(answer)
+
+    def _clear_halts(self) -> None:
+        for endpoint in (self._out, self._in):
+            try:
+                self._device.clear_halt(endpoint.bEndpointAddress)
+            except usb.core.USBError as error:
+                raise translate(error, f"{self._name}: clearing a halt") from error
