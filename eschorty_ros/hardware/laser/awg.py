@@ -51,9 +51,7 @@ class AwgLaser:
         No generator, or it does not confirm that it is off.
     """
 
-    def __init__(
-        self, settings: AwgSettings, clock_ns: Callable[[], int] = time.time_ns
-    ) -> None:
+    def __init__(self, settings: AwgSettings, clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._settings = settings
         self._profile = load_profile(settings.profile)
         if settings.channel > self._profile.channels:
@@ -81,6 +79,7 @@ class AwgLaser:
             try:
                 self._darken()
                 self.identity = self._channel_open().introduce()
+                self._channel_open().unlock()
             except DeviceError:
                 self._drop()
                 raise
@@ -172,7 +171,7 @@ class AwgLaser:
             return LaserReadback(self._output, self._modulation, None, self._since_ns)
 
     def take_warnings(self) -> list[str]:
-        """What was odd since the last call but is no failure, for the log."""
+        """Hand out what was odd since the last call but is no failure, for the log."""
         with self._lock:
             taken, self._notes = self._notes, []
             if self._channel is not None:

@@ -19,9 +19,7 @@ Result = TypeVar("Result")
 Wanted = dict[str, Value]
 
 
-def wanted_settings(
-    settings: AwgSettings, profile: AwgProfile, modulation: Modulation
-) -> Wanted:
+def wanted_settings(settings: AwgSettings, profile: AwgProfile, modulation: Modulation) -> Wanted:
     """Every setting of a lit output, in the order in which it is safe to make them.
 
     The load first, since it changes what a volt means; then the clamp, before any level.
@@ -33,8 +31,7 @@ def wanted_settings(
     """
     if modulation.waveform not in profile.waveforms:
         raise ArgumentError(
-            f"waveform is {modulation.waveform!r}; the generator has "
-            f"{', '.join(profile.waveforms)}"
+            f"waveform is {modulation.waveform!r}; the generator has {', '.join(profile.waveforms)}"
         )
     wanted: Wanted = {
         "load": settings.load_ohm,

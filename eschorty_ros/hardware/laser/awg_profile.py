@@ -99,9 +99,7 @@ class Setting(Schema):
         low = self.minimum if self.minimum is not None else float("-inf")
         high = self.maximum if self.maximum is not None else float("inf")
         if not low <= float(value) <= high:
-            raise ArgumentError(
-                f"{name} is {value:g}; the generator takes {low:g} to {high:g}"
-            )
+            raise ArgumentError(f"{name} is {value:g}; the generator takes {low:g} to {high:g}")
 
 
 class AwgProfile(Schema):

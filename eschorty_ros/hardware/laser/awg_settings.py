@@ -28,16 +28,21 @@ class AwgSettings:
         range.
     """
 
-    profile: str = _field("utg900e", "command set of the generator: config/awg_<name>.yaml, or a path")
+    profile: str = _field("utg900e", "command set: config/awg_<name>.yaml, or a path")
     backend: str = _field("libusb", "USB library: libusb, or module:callable[?argument]")
     device: str = _field("", "kernel device such as /dev/usbtmc0 instead of libusb; empty = libusb")
     serial: str = _field("", "serial number of the generator; empty = the only one there is")
-    vendor_ids: str = _field("", "USB vendor ids in hex, separated by blanks; empty = the profile's")
+    vendor_ids: str = _field(
+        "", "USB vendor ids in hex, with blanks between; empty = the profile's"
+    )
     channel: int = _field(1, "output that gates the laser", range=(1, 8))
     low_v: float = _field(0.0, "gate voltage without light", "V", range=(0.0, HIGH_LIMIT_V))
     high_v: float = _field(5.0, "gate voltage with light", "V", range=(0.0, HIGH_LIMIT_V))
     high_max_v: float = _field(
-        5.0, "the most the laser's input takes; clamped in the generator", "V", range=(0.0, HIGH_LIMIT_V)
+        5.0,
+        "the most the laser's input takes; clamped in the generator",
+        "V",
+        range=(0.0, HIGH_LIMIT_V),
     )
     load_ohm: float = _field(
         10000.0, "resistance at the output; 10000 = high impedance", "ohm", range=(50.0, 10000.0)

@@ -124,7 +124,7 @@ class UsbTmcFile:
         )
 
     def clear(self) -> None:
-        """Clear the instrument's buffers and the halts of both endpoints; raises ``DeviceError``."""
+        """Clear buffers and the halts of both endpoints; raises ``DeviceError``."""
         for request in (_CLEAR, _CLEAR_OUT_HALT, _CLEAR_IN_HALT):
             self._ioctl(request, b"", "clearing")
 
