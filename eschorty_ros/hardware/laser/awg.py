@@ -24,8 +24,8 @@ from eschorty_ros.hardware.protocols import (
 
 FREQUENCY_DEFAULT_HZ = 70.0
 """Told before the first ``configure``."""
-OFF_LIMIT_S = 2.0
-"""Time after which switching off stops trying and the state is unknown."""
+OFF_LIMIT_S = 1.0
+"""Time after which switching off begins no further try: the state is unknown then."""
 
 
 class AwgLaser:
@@ -133,7 +133,7 @@ class AwgLaser:
                 self._light()
 
     def disable(self) -> None:
-        """Switch off and disarm; idempotent, over in about 2 s at most.
+        """Switch off and disarm; idempotent, over in about 1 s, also when nothing answers.
 
         OUTPut OFF, then levels down, then read back; else clear and again; else reset, open anew
         and again.
