@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.protocols import EventSource, LaserModulator, LinearStage
-from eschorty_ros.nodes.parameters import Param
+from eschorty_ros.nodes.parameters import Param, from_settings
 
 ClockNs = Callable[[], int]
 Device = TypeVar("Device")
@@ -18,8 +19,10 @@ Registry = dict[str, Callable[[Mapping[str, Any], ClockNs], Device]]
 
 DRIVER = Param("driver", "fake", "device driver; 'fake' simulates the device")
 
+LASER_AWG = from_settings(AwgSettings)
 LASER_TABLE = (
     Param("fake_log", "", "fake laser: file that gets one line per change of the output"),
+    *LASER_AWG,
 )
 
 
@@ -72,6 +75,15 @@ def _fake_laser(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModula
     return FakeLaser(clock_ns, log_path=parameters["fake_log"] or None)
 
 
+def _awg(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
+    from eschorty_ros.hardware.laser.guarded import GuardedLaser
+
+    settings = {param.name: parameters[param.name] for param in LASER_AWG}
+    # Refused here, before a process is started for it.
+    AwgSettings(**settings)
+    return GuardedLaser("eschorty_ros.hardware.laser.awg:open_laser", settings)
+
+
 def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
     from eschorty_ros.simulation.fake_stage import FakeStage
 
@@ -83,7 +95,7 @@ CAMERAS: Registry[EventSource] = {
     "evk4": _evk4,
     "neuromorphic": _neuromorphic,
 }
-LASERS: Registry[LaserModulator] = {"fake": _fake_laser}
+LASERS: Registry[LaserModulator] = {"fake": _fake_laser, "awg": _awg}
 STAGES: Registry[LinearStage] = {"fake": _fake_stage}
 
 
