@@ -122,8 +122,11 @@ class EmulatedBackend(DescriptorBackend):
 
         def transfer() -> int:
             device.before_transfer(ep, timeout)
+            sent = bytes(data)
             with device.mutex:
-                return device.bulk_out(ep, bytes(data), timeout)
+                count = device.bulk_out(ep, sent, timeout)
+            device.after_transfer(ep, sent)
+            return count
 
         return self._run(transfer)
 
@@ -134,7 +137,9 @@ class EmulatedBackend(DescriptorBackend):
 
         def transfer() -> bytes:
             device.before_transfer(ep, timeout)
-            return device.bulk_in(ep, size, timeout)
+            received = device.bulk_in(ep, size, timeout)
+            device.after_transfer(ep, received)
+            return received
 
         return _fill(buff, self._run(transfer))
 

@@ -26,6 +26,7 @@ _ENGLISH = b"\x04\x03\x09\x04"
 _addresses = itertools.count(2)
 
 Wait = Callable[[threading.Condition, float | None], bool]
+OnTransfer = Callable[[int, bytes], None]
 
 
 class UsbFault(Exception):  # noqa: N818 -- the bus reports faults, the backend makes errors of them
@@ -159,6 +160,8 @@ class EmulatedUsbDevice:
         Name of the driver that holds the interface until it is detached.
     address : int
         Address on the bus; a new one after every ``replug``.
+    on_transfer : callable or None
+        Told endpoint and data of every bulk transfer that went through.
     """
 
     def __init__(self, identity: UsbIdentity, *, wait: Wait = threading.Condition.wait):
@@ -170,6 +173,7 @@ class EmulatedUsbDevice:
         self.denied = False
         self.kernel_driver: str | None = None
         self.detached_driver: str | None = None
+        self.on_transfer: OnTransfer | None = None
         self.claims: dict[int, object] = {}
         self.mutex = threading.RLock()
         self._gone = False
@@ -268,6 +272,11 @@ class EmulatedUsbDevice:
             raise UsbFault(errno.ENODEV)
         if endpoint in self.stalled:
             raise UsbFault(errno.EPIPE)
+
+    def after_transfer(self, endpoint: int, data: bytes) -> None:
+        """Tell of a bulk transfer that went through."""
+        if self.on_transfer:
+            self.on_transfer(endpoint, data)
 
     def before_transfer(self, endpoint: int, timeout_ms: int) -> None:
         """Raise what the switches say of a transfer about to begin (endpoint 0 = control)."""
