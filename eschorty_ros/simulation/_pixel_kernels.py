@@ -13,6 +13,9 @@ import numpy as np
 from numba import njit
 
 from eschorty_ros.simulation._draw_kernels import _bits, _gaussian, _mix, _uniform
+from eschorty_ros.simulation._highpass_kernels import _forgotten, _nearest_levels
+from eschorty_ros.simulation._highpass_passage_kernels import _passage_highpass
+from eschorty_ros.simulation._light_kernels import _add_patch, _window
 from eschorty_ros.simulation._passage_kernels import GAP_MAX, _noisy
 from eschorty_ros.simulation._prompt_kernels import _prompt
 from eschorty_ros.simulation._response_kernels import (
@@ -28,7 +31,7 @@ PIXEL_DTYPE = np.dtype(
     [
         ("u", "f8"),  # photoreceptor at the anchor
         ("y", "f8"),  # source follower at the anchor
-        ("y_ref", "f8"),  # comparator reference
+        ("y_ref", "f8"),  # comparator reference at the anchor
         ("u_settled", "f8"),  # 1 / I: where both are heading
         ("t", "f8"),  # anchor, us
         ("t_next", "f8"),  # when something is due, us; what is told by state
@@ -57,11 +60,13 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
     """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
     An empty ``light`` leaves theirs as it is. ``model`` = omega0 (per us), follower (us), noise,
-    refractory time (us) and its relative spread, latency and its spread (us). Returns the number
-    of events in ``out`` and the earliest time something is due in these rows, ``_FULL`` when the
-    output did not suffice: call again with more room.
+    refractory time (us) and its relative spread, latency and its spread (us), time constant of
+    the high-pass (us; ``inf`` for none). Returns the number of events in ``out`` and the earliest
+    time something is due in these rows, ``_FULL`` when the output did not suffice: call again
+    with more room.
     """
-    omega, follower_us, noise = model[0], model[1], model[2]
+    omega, follower_us, noise, highpass_us = model[0], model[1], model[2], model[7]
+    forgets = highpass_us < np.inf
     table = tables[0]
     reach = math.exp(GAP_MAX * noise)
     earliest = np.inf
@@ -81,7 +86,13 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
         full = False
         while t_next <= until_us:
             if state == WAITS:
-                if noise > 0.0:
+                if forgets:
+                    after_us, what = _passage_highpass(
+                        u, y, y_ref, settled, tau_us, follower_us, highpass_us,
+                        np.float64(pixel.on_factor), np.float64(pixel.off_factor), noise, table,
+                        t_next - t, until_us - t, _uniform(_bits(t, column, row, seed, 1)),
+                    )  # fmt: skip
+                elif noise > 0.0:
                     budget = -math.log(_uniform(_bits(t, column, row, seed, 1)))
                     after_us, what = _noisy(
                         u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
@@ -104,6 +115,8 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
                     y_ref *= _fade(noise * _gaussian(_bits(t, column, row, seed, 2)))
                 on_level = y_ref * np.float64(pixel.on_factor)
                 off_level = y_ref * np.float64(pixel.off_factor)
+                if forgets:
+                    on_level, off_level = _nearest_levels(pixel, u, y, y_ref)
                 state = WAITS
                 t_next = _earliest_us(
                     u, y, settled, t, tau_us, follower_us, on_level, off_level, reach
@@ -122,6 +135,10 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
                     held_us *= max(0.0, 1.0 + model[4] * _gaussian(_mix(bits)))
                 t_next += max(1.0, held_us)
         if relit and not full:
+            if forgets and state != HELD:
+                y_ref = _forgotten(
+                    u, y, y_ref, settled, tau_us, follower_us, highpass_us, until_us - t
+                )  # fmt: skip
             u, y = _advanced(u, y, settled, tau_us, follower_us, until_us - t)
             t = until_us
             settled = 1.0 / light[np.uintp(row)]
@@ -129,6 +146,8 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
             if state != HELD:
                 state = WAITS
                 tau_us = settled / omega
+                if forgets:
+                    on_level, off_level = _nearest_levels(pixel, u, y, y_ref)
                 t_next = _earliest_us(
                     u, y, settled, t, tau_us, follower_us, on_level, off_level, reach
                 )
@@ -149,7 +168,7 @@ def _foresee(pixels, column, lo, hi, model, tables, seed):
     """Look up the next event of the rows [lo, hi) just lit that set out from rest.
 
     A pass of its own, since without branches on what a pixel does the processor works at
-    several pixels at once. Other rows are left to :func:`_live`.
+    several pixels at once; not for references that forget. Other rows are left to :func:`_live`.
     """
     omega, follower_us, noise = model[0], model[1], model[2]
     ways, gaps = tables[1], tables[2]
@@ -167,37 +186,6 @@ def _foresee(pixels, column, lo, hi, model, tables, seed):
         if what != UNKNOWN:
             pixel.state = what
             pixel.t_next = t + after_us
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _window(patch, sigma, least, rows):
-    """Rows [lo, hi) in which a patch adds at least ``least``; (0, 0) for none."""
-    line_row, contrast = patch[0], patch[1]
-    if not (contrast > least and abs(line_row) < 1e6):
-        return 0, 0
-    half = sigma * math.sqrt(2.0 * math.log(contrast / least))
-    first = max(math.ceil(line_row - half), math.floor(max(patch[2] + 0.5, 0.0)))
-    last = min(math.floor(line_row + half), math.ceil(min(patch[3] - 0.5, rows - 1.0)))
-    lo = min(max(0, first), rows)
-    return (lo, min(rows, last + 1)) if lo <= last else (0, 0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_patch(light, lo, hi, patch, sigma):
-    """Add a patch of the footprint to ``light`` in rows [lo, hi): a Gaussian by recurrence.
-
-    ``patch`` = row of the line, contrast there, and the rows between which it is lit; a row that
-    is lit in part gets its share.
-    """
-    offset = lo - patch[0]
-    value = patch[1] * math.exp(-0.5 * offset * offset / (sigma * sigma))
-    ratio = math.exp(-(offset + 0.5) / (sigma * sigma))
-    step_ratio = math.exp(-1.0 / (sigma * sigma))
-    for row in range(lo, hi):
-        share = min(1.0, min(row + 0.5 - patch[2], patch[3] - row + 0.5))
-        light[np.uintp(row)] += max(0.0, share) * value
-        value *= ratio
-        ratio *= step_ratio
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -241,7 +229,7 @@ def _relight(
             earliest = min(earliest, other)
         if earliest == _FULL:
             return k, n
-        if model[2] > 0.0:
+        if model[2] > 0.0 and model[7] == np.inf:
             _foresee(pixels, column, lo, hi, model, tables, seed)
             if apart or old_lo < lo or old_hi > hi:
                 _foresee(pixels, column, old_lo, old_hi, model, tables, seed)

@@ -2,9 +2,9 @@
 
 Per pixel: relative photocurrent ``I = I_bg + A rho g(y) w(t)`` with a Gaussian ``g`` over the
 rows, a photoreceptor whose bandwidth grows with ``I``, a source follower, comparator noise, an
-ON/OFF comparator with fixed mismatch, a refractory time during which the reference follows the
-signal, leak and background activity, a latency with jitter. Times of
-threshold crossings are solved, never stepped through.
+ON/OFF comparator with fixed mismatch whose reference may forget slow changes, a refractory time
+during which the reference follows the signal, leak and background activity, a latency with
+jitter. Times of threshold crossings are solved, never stepped through.
 """
 
 from __future__ import annotations
@@ -76,11 +76,12 @@ class PixelArray:
             [
                 p.omega_per_us,
                 p.follower_us,
-                p.noise,
+                p.comparator_noise,
                 p.refractory_us,
                 p.refractory_jitter,
                 p.latency_us,
                 p.latency_jitter_us,
+                p.highpass_us,
             ]
         )
         correlation_us = max(p.follower_us, DECISION_US)
@@ -91,7 +92,7 @@ class PixelArray:
             np.random.default_rng(hot_seed).random(columns * rows) < p.hot_fraction
         )
         both_hz = background_hz * columns * rows + p.hot_hz * self._hot.size
-        total_hz = both_hz + p.leak_hz * columns * rows
+        total_hz = both_hz + p.leak_events_hz * columns * rows
         self._background_per_us = total_hz * 1e-6
         self._shares = np.zeros(2)
         if total_hz:
