@@ -27,10 +27,8 @@ from eschorty_ros.core._phase_kernels import (
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 
-# Edges handed out per call; bounds the work between two looks at the events.
-EDGES_MAX = 1 << 14
-# Gaps longer than this many periods are jumped over instead of counted through.
-JUMP_PERIODS = 4096
+EDGES_MAX = 1 << 14  # handed out per call; bounds the work between two looks at the events
+JUMP_PERIODS = 4096  # longer gaps are jumped over instead of counted through
 _HISTOGRAM_BINS = 200
 _RAYLEIGH_MIN = 30.0
 WINDOW_PERIODS = 4
@@ -83,6 +81,28 @@ class EdgeSchedule:
     def first_trigger_us(self) -> int | None:
         """Earliest trigger not used yet."""
         return int(self._triggers[0]) if self._triggers.size else None
+
+    @property
+    def triggered(self) -> bool:
+        """Whether triggers set the edges."""
+        return bool(self._state[S_TRIGGERED])
+
+    @property
+    def last_us(self) -> int:
+        """Time of the last edge handed out or skipped."""
+        return int(self._state[S_LAST])
+
+    def middle_after(self, multiple: int) -> int:
+        """Middle of the period that begins with the next edge whose index is a multiple."""
+        whole("multiple", multiple, 1, 1 << 31)
+        ahead = multiple - int(self._state[S_INDEX]) % multiple
+        step = int(self._state[S_STEP]) + ahead
+        return int(self._state[S_ANCHOR]) + round(step * self.period) + self._step // 2
+
+    def shift(self, by_us: int) -> None:
+        """Move all edges not handed out yet by less than half a period."""
+        half_us = (self._step + 1) // 2
+        self._state[S_ANCHOR] += whole("by_us", by_us, -half_us, half_us)
 
     def add_triggers(self, t_us: NDArray[np.int64]) -> None:
         """Append rising edges of the trigger input, in time order."""
@@ -217,10 +237,7 @@ def estimate_phase(
     -------
     PhaseEstimate
 
-    Raises
-    ------
-    ArgumentError
-        When there are no events, or they are not in time order.
+    Raises ``ArgumentError`` when there are no events, or they are not in time order.
     """
     t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     fall = np.flatnonzero(np.diff(t_us) < 0)
@@ -266,8 +283,8 @@ def decide_window(
 ) -> tuple[int, int] | None:
     """Leading events of one estimation window and its end (us), ``None`` while it is still open.
 
-    A window is a whole number of ``WINDOW_PERIODS`` periods from the first event on, the fewest
-    that hold ``WINDOW_EVENTS`` events; only events decide it, not when they arrived.
+    A window is the fewest times ``WINDOW_PERIODS`` periods from the first event on that hold
+    ``WINDOW_EVENTS`` events; only events decide it, not when they arrived.
     """
     t_us = exact("t_us", t_us, np.int64)
     whole("watermark_us", watermark_us, -TIME_LIMIT, TIME_LIMIT)

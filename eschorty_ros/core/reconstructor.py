@@ -16,20 +16,13 @@ from eschorty_ros.core.finishing import Finisher
 from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.noise import ActivityFilter
-from eschorty_ros.core.phase import (
-    EDGES_MAX,
-    EdgeSchedule,
-    PhaseEstimate,
-    decide_window,
-    estimate_phase,
-)
+from eschorty_ros.core.phase import EDGES_MAX, PhaseEstimate
+from eschorty_ros.core.phase_lock import FLUSH_US, PhaseLock
 from eschorty_ros.core.profile_assembler import ProfileAssembler
 from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.core.settings import Settings
 
 PIECE_BYTES = 1 << 17
-_FLUSH_US = 1 << 61
-_HELD_EVENTS_MAX = 1 << 22
 
 
 class Reconstructor:
@@ -82,11 +75,9 @@ class Reconstructor:
                 f"{int(TIME_LIMIT_US / modulation.period_us) - 1}"
             )
         self._modulation = modulation
-        self._schedule = EdgeSchedule(modulation, self.settings.periods_per_profile)
+        self._lock = PhaseLock(modulation, self.settings.periods_per_profile)
         self._finisher.restart(modulation, self._assembler.take())
         self._assembler.restart(modulation)
-        self.phase: PhaseEstimate | None = None
-        self._phase_missing = False
 
     @property
     def modulation(self) -> Modulation:
@@ -101,7 +92,12 @@ class Reconstructor:
     @property
     def phase_missing(self) -> bool:
         """Whether a flush found no phase and cut from the first event's time on."""
-        return self._phase_missing
+        return self._lock.missing
+
+    @property
+    def phase(self) -> PhaseEstimate | None:
+        """The first estimate of the phase, ``None`` where it is known or not found yet."""
+        return self._lock.estimate
 
     @property
     def counters(self) -> dict[str, int]:
@@ -115,7 +111,7 @@ class Reconstructor:
         """
         counts = dict(self._counts)
         bins = self._assembler.counters
-        counts["events_outside_phase"] += bins.pop("events_before_first_edge")
+        counts["events_outside_phase"] += bins.pop("events_before_first_edge") + self._lock.refused
         counts.update(bins)
         counts["points"] = self._assembler.points
         counts["points_beyond_pole"] = self._assembler.points_beyond_pole
@@ -126,9 +122,9 @@ class Reconstructor:
             + counts["events_outside_sensor"]
             + counts["events_outside_phase"]
         )
-        for name, value in self._schedule.counters.items():
+        for name, value in self._lock.counters.items():
             counts[name] = value + self._schedule_counts.get(name, 0)
-        counts["periods_empty"] += self._schedule.periods_jumped + self._schedule_counts.get(
+        counts["periods_empty"] += self._lock.schedule.periods_jumped + self._schedule_counts.get(
             "periods_jumped", 0
         )
         decoder = self._decoder.counters
@@ -173,8 +169,8 @@ class Reconstructor:
         if modulation == self._modulation:
             return
         self._drain()
-        counts = self._schedule.counters
-        counts["periods_jumped"] = self._schedule.periods_jumped
+        counts = self._lock.counters
+        counts["periods_jumped"] = self._lock.schedule.periods_jumped
         self._begin(modulation)
         for name, value in counts.items():
             self._schedule_counts[name] = self._schedule_counts.get(name, 0) + value
@@ -183,7 +179,7 @@ class Reconstructor:
         self._counts["events"] += len(events)
         triggers = events.triggers
         if len(triggers):
-            self._schedule.add_triggers(triggers.t[triggers.edge == 1])
+            self._lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
         if len(events):
             if self.first_t_us is None:
                 self.first_t_us = int(events.t[0])
@@ -192,72 +188,27 @@ class Reconstructor:
             decoded = len(events)
             events = self._filter.filter(events)
             self._counts["events_filtered"] += decoded - len(events)
-        if not self._schedule.anchored:
+        if not self._lock.schedule.anchored:
             self._held.append(events.t, events.x, events.y, events.p)
-            if not self._find_phase(now_us):
+            if not self._lock.find(self._held, now_us):
                 return
             self._assign(None, now_us)
         else:
             self._assign(events, now_us)
 
-    def _find_phase(self, now_us: int, last: bool = False) -> bool:
-        """Anchor the schedule as soon as the held events allow; drops windows beyond the limit."""
-        held = self._held
-        if len(held) == 0:
-            return False
-        first_us = int(held.t[0])
-        if self._modulation.on_edge_us is not None:
-            self._schedule.anchor(self._modulation.on_edge_us, first_us)
-            return True
-        begin = held.refused
-        while True:
-            decided = decide_window(held.t[begin:], now_us, self._modulation)
-            size, end_us = decided or (0, _FLUSH_US)
-            trigger = self._schedule.first_trigger_us
-            if trigger is not None and trigger <= end_us:
-                self._schedule.anchor(trigger, min(first_us, trigger))
-                return True
-            if decided is None:
-                break
-            window = slice(begin, begin + size)
-            estimate = estimate_phase(held.t[window], held.p[window], self._modulation)
-            if estimate.found:
-                return self._anchor_estimate(estimate, first_us)
-            begin += size
-            held.refused = begin
-            if begin > _HELD_EVENTS_MAX:
-                self._counts["events_outside_phase"] += begin
-                held.drop(begin)
-                begin = 0
-                if len(held) == 0:
-                    return False
-                first_us = int(held.t[0])
-        if last:
-            estimate = estimate_phase(held.t, held.p, self._modulation)
-            if estimate.found:
-                return self._anchor_estimate(estimate, first_us)
-            self._phase_missing = True
-            self._schedule.anchor(first_us, first_us)
-        return last
-
-    def _anchor_estimate(self, estimate: PhaseEstimate, first_us: int) -> bool:
-        self.phase = estimate
-        self._schedule.anchor(estimate.edge_us, first_us)
-        return True
-
     def _assign(self, events: Events | None, watermark_us: int) -> None:
         """Put everything certain before ``watermark_us`` into periods; hold the rest back."""
-        held = self._held
+        held, schedule = self._held, self._lock.schedule
         first, count = 0, 0 if events is None else len(events)
         more = True
         while more:
             if len(held):
-                self._schedule.jump(int(held.t[0]))
+                self._lock.skip_to(int(held.t[0]))
             elif events is not None and first < count:
-                self._schedule.jump(int(events.t[first]))
-            edges, indices = self._schedule.advance(watermark_us)
+                self._lock.skip_to(int(events.t[first]))
+            edges, indices = schedule.advance(self._lock.limit(watermark_us))
             more = len(edges) == EDGES_MAX
-            safe_us = self._schedule.safe_us
+            safe_us = schedule.safe_us
             edge = 0
             stop = int(np.searchsorted(held.t, safe_us))
             waiting = stop < len(held)
@@ -273,6 +224,7 @@ class Reconstructor:
                 first = last
             if edge < len(edges):
                 self._merge(held, slice(0, 0), edges, indices, edge, True)
+            more = more or self._lock.settle(watermark_us)
         if events is not None and first < count:
             held.append(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
 
@@ -286,15 +238,16 @@ class Reconstructor:
         drain: bool,
     ) -> int:
         t, x, y, p = source.t[part], source.x[part], source.y[part], source.p[part]
+        self._lock.observe(t, p)
         return self._assembler.merge(t, x, y, p, edges, indices, edge, drain)
 
     def _drain(self) -> None:
-        if self._schedule.anchored or self._find_phase(_FLUSH_US, last=True):
+        if self._lock.schedule.anchored or self._lock.find(self._held, FLUSH_US, last=True):
             self._finish()
 
     def _finish(self) -> None:
         """Assign what is held back and close the open period."""
         newest = self.newest_t_us
         if newest is not None:
-            self._assign(None, self._schedule.watermark_after(newest))
+            self._assign(None, self._lock.schedule.watermark_after(newest))
         self._assembler.close()

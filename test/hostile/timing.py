@@ -10,11 +10,13 @@ from eschorty_ros.core import (
     clock,
     clock_line,
     edge_clock,
+    held_events,
     lower_envelope,
     modulation,
     motion,
     phase,
     phase_gate,
+    phase_lock,
     position_edges,
     pulses,
 )
@@ -50,6 +52,12 @@ def a_schedule() -> phase.EdgeSchedule:
     schedule = phase.EdgeSchedule(LASER)
     schedule.anchor(0, 0)
     return schedule
+
+
+def a_lock() -> phase_lock.PhaseLock:
+    lock = phase_lock.PhaseLock(LASER)
+    lock.schedule.anchor(0, 0)
+    return lock
 
 
 GRID = pulses.PulseGrid(0.0, 2.0, 3)
@@ -235,6 +243,34 @@ CALLS: dict[str, Call] = {
         method(a_schedule, "advance"),
         {"watermark_us": 50_000},
         {"watermark_us": whole(T_MAX + 1)},
+    ),
+    "phase.EdgeSchedule.middle_after": Call(
+        method(a_schedule, "middle_after"), {"multiple": 8}, {"multiple": whole(0, T_MAX)}
+    ),
+    "phase.EdgeSchedule.shift": Call(
+        method(a_schedule, "shift"), {"by_us": 8}, {"by_us": whole(7200, -7200)}
+    ),
+    "phase_lock.PhaseLock": Call(
+        phase_lock.PhaseLock, {"modulation": LASER, "every": 2}, {"every": whole(0)}
+    ),
+    "phase_lock.PhaseLock.find": Call(
+        method(a_lock, "find"),
+        {"held": held_events.HeldEvents(), "now_us": 5, "last": False},
+        {"now_us": whole(T_MAX + 1)},
+    ),
+    "phase_lock.PhaseLock.skip_to": Call(
+        method(a_lock, "skip_to"), {"t_us": 5}, {"t_us": whole(T_MAX + 1)}
+    ),
+    "phase_lock.PhaseLock.limit": Call(
+        method(a_lock, "limit"), {"watermark_us": 5}, {"watermark_us": whole(T_MAX + 1)}
+    ),
+    "phase_lock.PhaseLock.observe": Call(
+        method(a_lock, "observe"),
+        {"t_us": TIMES, "polarity": SIGNS},
+        {"t_us": exactly("i8", N, alone=True), "polarity": exactly("u1", N)},
+    ),
+    "phase_lock.PhaseLock.settle": Call(
+        method(a_lock, "settle"), {"watermark_us": 5}, {"watermark_us": whole(T_MAX + 1)}
     ),
     "phase.estimate_phase": Call(
         phase.estimate_phase,

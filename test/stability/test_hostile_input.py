@@ -42,9 +42,9 @@ TESTED_ELSEWHERE = {
     "calibration.Calibration",
 }  # fmt: skip
 PACKAGE_OBJECTS = {
-    "arrivals", "calibration", "date", "design", "drain", "error", "frame", "grid", "known", "last",
-    "line", "model", "modulation", "nominal", "parts", "plan", "posts", "profiles", "progress",
-    "schema", "now", "settings", "targets", "track",
+    "arrivals", "calibration", "date", "design", "drain", "error", "frame", "grid", "held", "known",
+    "last", "line", "model", "modulation", "nominal", "parts", "plan", "posts", "profiles",
+    "progress", "schema", "now", "settings", "targets", "track",
 }  # fmt: skip
 TAKES_EVENTS = {"noise.ActivityFilter.filter", "aggregate_frame.AggregateFrame.add"}
 """Their tables give the arrays of the events one by one."""
