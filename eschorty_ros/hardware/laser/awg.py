@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from eschorty_ros.core.errors import ArgumentError, DeviceError
@@ -257,7 +257,7 @@ class AwgLaser:
                     remedy()
                     self._channel_open().darken()
                 except DeviceError as error:
-                    failure = failure or error
+                    failure = error
                     continue
                 if not was_off:
                     self._output = LaserOutput.UNKNOWN
@@ -279,7 +279,8 @@ class AwgLaser:
 
     def _open_again(self) -> None:
         if self._channel is not None:
-            self._channel.reset()
+            with suppress(DeviceError):
+                self._channel.reset()
         self._drop()
         self._open()
 
