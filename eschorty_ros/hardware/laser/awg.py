@@ -248,7 +248,7 @@ class AwgLaser:
         before, self._darkening = self._darkening, True
         ends = time.monotonic() + OFF_LIMIT_S
         was_off = self._output is LaserOutput.OFF
-        failure: DeviceError | None = None
+        failures: list[DeviceError] = []
         try:
             for remedy in (self._no_remedy, self._clear, self._open_again):
                 if time.monotonic() > ends:
@@ -257,7 +257,7 @@ class AwgLaser:
                     remedy()
                     self._channel_open().darken()
                 except DeviceError as error:
-                    failure = error
+                    failures.append(error)
                     continue
                 if not was_off:
                     self._output = LaserOutput.UNKNOWN
@@ -268,7 +268,9 @@ class AwgLaser:
         self._counts["switch_off_failures"] += 1
         self._ready = False
         self._believe(LaserOutput.UNKNOWN)
-        raise DeviceError(f"laser state unknown: {failure}; {_BY_HAND}") from failure
+        first, last = str(failures[0]), str(failures[-1])
+        told = first if first == last else f"{first}; opened anew: {last}"
+        raise DeviceError(f"laser state unknown: {told}; {_BY_HAND}") from failures[0]
 
     def _no_remedy(self) -> None:
         if self._channel is None:
