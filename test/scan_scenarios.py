@@ -258,7 +258,7 @@ def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     status, result = bench.result()
     print(f"goal ended {time.monotonic() - killed_s:.1f} s after the camera: {result.message}")
     assert status == GoalStatus.STATUS_ABORTED
-    assert result.message.startswith("camera"), result.message
+    assert "camera" in result.message, result.message
     bench.assert_dark_and_at_rest()
     assert bench.odometry[-1].pose.pose.position.y < 0.195
     _assert_partial(bench.cloud_after(before), result, 0.200)

@@ -28,6 +28,7 @@ from eschorty_ros.nodes.camera_parameters import (
 )
 from eschorty_ros.nodes.conversions import ns_from_stamp, stamp_from_ns
 from eschorty_ros.nodes.device_messages import plan_from_motion, readback_from_state
+from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.packets import SIZE_MAX_BYTES
 from eschorty_ros.nodes.parameters import Param
@@ -99,6 +100,7 @@ class CameraNode(DeviceNode):
         self.create_service(Trigger, "~/dump_statistics", self._dump_statistics)
         self._read_back = self.create_guard_condition(self._write_parameters)
         self._diagnostics = diagnostics.Diagnostics(self, self._report)
+        Heartbeat(self, "camera/heartbeat", lambda: self.healthy)
 
     def open_device(self) -> None:
         """Open the camera."""

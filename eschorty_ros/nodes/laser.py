@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import threading
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
-from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.errors import ArgumentError, DeviceError, EschortyError
 from eschorty_ros.core.modulation import (
     FREQUENCY_MAX_HZ,
     FREQUENCY_MIN_HZ,
     WAVEFORMS,
     Modulation,
 )
-from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput
+from eschorty_ros.hardware.protocols import LaserOutput
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import stamp_from_ns
-from eschorty_ros.nodes.laser_gate import LaserGate
+from eschorty_ros.nodes.laser_gate import LEASE, LaserGate
+from eschorty_ros.nodes.laser_keeper import LaserKeeper, LaserSnapshot
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
 
 STATE_RATE_HZ = 20.0
-WATCHDOG_PERIOD_S = 0.02
+WATCHED = ("camera", "stage")
 
 TABLE = (
     drivers.DRIVER,
@@ -44,8 +46,13 @@ TABLE = (
     Param("duty", 0.5, "share of the period with light", "", 0.001, 0.999, dynamic=True),
     Param("waveform", "square", "shape of the gate", choices=WAVEFORMS, dynamic=True),
     Param("arm_timeout", 10.0, "how long laser/arm allows laser/enable", "s", 0.1, 3600.0),
-    Param("heartbeat_timeout", 1.0, "age at which the heartbeat is stale", "s", 0.1, 60.0),
+    Param("heartbeat_timeout", 0.18, "age at which laser/heartbeat is stale", "s", 0.05, 60.0),
     Param("max_on_time", 600.0, "longest time on", "s", 0.1, 86400.0),
+    Param("interlock_required", False, "interlock is open until laser/interlock says closed"),
+    Param("watch", " ".join(WATCHED), "nodes whose heartbeats light needs: camera, stage, none"),
+    Param("camera_timeout", 0.18, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
+    Param("stage_timeout", 0.18, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
+    Param("readback_rate", 5.0, "how often the generator is read back", "Hz", 0.1, 20.0),
     *drivers.LASER_TABLE,
 )
 
@@ -53,227 +60,197 @@ TABLE = (
 class LaserNode(DeviceNode):
     """``laser/arm``, ``laser/enable``, ``laser/heartbeat``, ``laser/interlock`` -> ``laser/state``.
 
-    ``laser/interlock`` (std_msgs/Bool): true means open, and open means dark; taken as closed
-    until a message says otherwise. A watchdog thread on the steady clock switches off on a stale
-    heartbeat, an open interlock or ``max_on_time``, also when the executor is stuck.
+    ``laser/interlock`` (std_msgs/Bool): true means open, and open means dark; until a message says
+    otherwise it is open when ``interlock_required``, else closed. Light ends on a stale
+    ``laser/heartbeat`` (whoever wants light), ``camera/heartbeat`` or ``stage/heartbeat``, an open
+    interlock, after ``max_on_time``, and when the generator does not read back as asked. This is
+    looked after by threads on the steady clock, also when the executor is stuck. Spin it with
+    several threads: commands take their time, heartbeats do not wait.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        self._lock = threading.RLock()
-        self._laser: LaserModulator | None = None
-        self._requested = LaserOutput.OFF
-        self._reason = "off at start"
-        self._watchdog_end = threading.Event()
-        self._watchdog: threading.Thread | None = None
-        self.switch_offs = 0
         super().__init__("laser", TABLE, self._apply, **kwargs)
-        self._gate = self._new_gate()
         self._state = self.create_publisher(
             LaserState, "laser/state", qos.latched(qos.STATE_HISTORY)
+        )
+        gate = self._new_gate()
+        self._keeper = LaserKeeper(
+            gate,
+            living=self.context.ok,
+            changed=self._publish,
+            alarm=self._alarm,
+            log=self._log,
+            readback_period_s=1.0 / self.parameters["readback_rate"],
         )
         control = MutuallyExclusiveCallbackGroup()
         self.create_service(Trigger, "laser/arm", self._on_arm, callback_group=control)
         self.create_service(SetBool, "laser/enable", self._on_enable, callback_group=control)
-        self.create_subscription(Bool, "laser/interlock", self._on_interlock, qos.stream(10))
-        self.create_subscription(Header, "laser/heartbeat", self._on_heartbeat, qos.stream(10))
-        self.create_timer(1.0 / STATE_RATE_HZ, self._publish_state, clock=self.steady_clock)
+        signs = MutuallyExclusiveCallbackGroup()
+        self.create_subscription(
+            Bool, "laser/interlock", self._on_interlock, qos.stream(10), callback_group=signs
+        )
+        for topic in gate.topics:
+            self.create_subscription(
+                Header,
+                topic,
+                partial(self._on_heartbeat, topic),
+                qos.heartbeat(),
+                callback_group=signs,
+            )
+        self.create_timer(1.0 / STATE_RATE_HZ, self._keeper.tell, clock=self.steady_clock)
         diagnostics.Diagnostics(self, self._report)
 
     def open_device(self) -> None:
         """Open the generator, dark, with the modulation of the parameters."""
-        with self._lock:
-            self._laser = drivers.make(drivers.LASERS, self.parameters, self.now_ns)
-            self._laser.disable()
-            self._laser.configure(_modulation(dict(self.parameters)))
-            self._gate = self._new_gate()
-            self._requested, self._reason = LaserOutput.OFF, "off at start"
-            self._publish_state()
-        self._watchdog_end.clear()
-        self._watchdog = threading.Thread(target=self._watch, name="laser watchdog", daemon=True)
-        self._watchdog.start()
-        self.get_logger().info(f"{self._laser.identity.model} {self._laser.identity.serial}: off")
+        laser = drivers.make(drivers.LASERS, self.parameters, self.now_ns)
+        self._keeper.open(laser, _modulation(dict(self.parameters)))
+        self.get_logger().info(f"{laser.identity.model} {laser.identity.serial}: off")
 
     def start_device(self) -> None:
         """From here on the laser may be switched on."""
-        self._switch_off("ready")
+        self._keeper.switch_off("ready")
 
     def stop_device(self) -> None:
-        """Switch off."""
-        self._switch_off("not active")
+        """Switch off; an output that nobody confirms is told as unknown."""
+        try:
+            self._keeper.switch_off("not active")
+        except EschortyError as error:
+            self._alarm(str(error))
 
     def close_device(self) -> None:
-        """Switch off and release the generator."""
-        self._watchdog_end.set()
-        if self._watchdog is not None and self._watchdog is not threading.current_thread():
-            self._watchdog.join(1.0)
-        with self._lock:
-            laser, self._laser = self._laser, None
-        if laser is not None:
-            laser.close()
+        """Switch off and release the generator; see ``stop_device``."""
+        try:
+            self._keeper.close()
+        except EschortyError as error:
+            self._alarm(f"laser state unknown: {error}")
 
     def _new_gate(self) -> LaserGate:
+        timeouts = {LEASE: self.parameters["heartbeat_timeout"]}
+        names = self.parameters["watch"].replace(",", " ").split()
+        for name in names if names != ["none"] else ():
+            if name not in WATCHED:
+                raise ArgumentError(
+                    f"parameter watch is {self.parameters['watch']!r}; "
+                    f"choose from {', '.join(WATCHED)}, or none"
+                )
+            timeouts[f"{name}/heartbeat"] = self.parameters[f"{name}_timeout"]
         return LaserGate(
             self.parameters["arm_timeout"],
-            self.parameters["heartbeat_timeout"],
             self.parameters["max_on_time"],
+            timeouts,
+            interlock_open=self.parameters["interlock_required"],
         )
 
     def _apply(self, values: dict[str, Any]) -> None:
-        modulation = _modulation(values)
-        with self._lock:
-            if self._laser is not None:
-                self._laser.configure(modulation)
-                self._publish_state()
+        self._keeper.configure(_modulation(values))
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        with self._lock:
-            response.success, response.message = self._attempted(self._arm)
-            self._publish_state()
+        response.success, response.message = self._attempted(self._arm)
         return response
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if request.data:
-            with self._lock:
-                response.success, response.message = self._attempted(self._switch_on)
-                self._publish_state()
-        else:
-            response.success, response.message = self._attempted(
-                lambda: self._switch_off("switched off by request")
-            )
+        step = self._enable if request.data else self._disable
+        response.success, response.message = self._attempted(step)
         return response
 
-    def _attempted(self, step: Any) -> tuple[bool, str]:
+    def _attempted(self, step: Callable[[], str]) -> tuple[bool, str]:
         try:
-            step()
+            return True, step()
         except EschortyError as error:
             self.get_logger().warning(str(error))
             return False, str(error)
-        return True, self._reason
 
-    def _arm(self) -> None:
-        laser = self._active_laser()
-        if self._gate.interlock_open:
-            raise DeviceError("laser refused: interlock open; close it")
-        laser.arm()
-        self._gate.arm()
-        self._reason = "armed"
+    def _arm(self) -> str:
+        self._refuse_inactive()
+        self._keeper.arm()
+        return "armed"
 
-    def _switch_on(self) -> None:
-        laser = self._active_laser()
-        refusal = self._gate.refusal()
-        if refusal is not None:
-            raise DeviceError(f"laser refused: {refusal}")
-        self._requested = LaserOutput.ON
+    def _enable(self) -> str:
+        self._refuse_inactive()
+        self._keeper.enable()
+        return "switched on by request"
+
+    def _disable(self) -> str:
+        reason = "switched off by request"
         try:
-            self._gate.switched_on()
-            laser.enable()
+            self._keeper.switch_off(reason)
         except EschortyError as error:
-            self._switch_off(str(error))
+            self._alarm(str(error))
             raise
-        self._reason = "switched on by request"
+        return reason
 
-    def _active_laser(self) -> LaserModulator:
-        if self._laser is None or not self.active:
+    def _refuse_inactive(self) -> None:
+        if not self.active:
             raise DeviceError(f"laser refused: node is {self.state_label}; activate it first")
-        return self._laser
-
-    def _switch_off(self, reason: str) -> None:
-        """Off first, everything else after."""
-        with self._lock:
-            if self._laser is None:
-                return
-            try:
-                self._laser.disable()
-            finally:
-                if self._requested == LaserOutput.ON:
-                    self.switch_offs += 1
-                self._gate.switched_off()
-                self._requested, self._reason = LaserOutput.OFF, reason
-            self._publish_state()
-
-    def _watch(self) -> None:
-        while not self._watchdog_end.wait(WATCHDOG_PERIOD_S):
-            with self._lock:
-                reason = self._gate.must_end()
-                if reason is None:
-                    continue
-                try:
-                    self._switch_off(reason)
-                except EschortyError as error:
-                    self.fault(f"laser state unknown: {error}")
-                    continue
-            with contextlib.suppress(Exception):
-                self.get_logger().warning(f"laser off: {reason}")
 
     def _on_interlock(self, message: Bool) -> None:
-        with self._lock:
-            self._gate.interlock_open = bool(message.data)
+        self._keeper.gate.interlock_open = bool(message.data)
         if message.data:
-            self._switch_off("interlock open")
-        else:
-            self._publish_state()
+            self._keeper.darken("interlock open")
+        self._keeper.tell()
 
-    def _on_heartbeat(self, _: Header) -> None:
-        with self._lock:
-            self._gate.beat()
+    def _on_heartbeat(self, topic: str, _: Header) -> None:
+        self._keeper.gate.beat(topic)
 
-    def _publish_state(self) -> None:
-        """Under the lock, so that stamp and state agree and every change is told."""
+    def _alarm(self, text: str) -> None:
+        # As in _log.
+        with contextlib.suppress(Exception):
+            self.fault(text)
+
+    def _log(self, text: str) -> None:
+        # On the way out there may be nobody left to tell.
+        with contextlib.suppress(Exception):
+            self.get_logger().warning(text)
+
+    def _publish(self, snapshot: LaserSnapshot) -> None:
+        """Under the keeper's lock, so that stamp and state agree and every change is told."""
         if not self.context.ok():
             return
+        told, gate = snapshot.told, self._keeper.gate
+        message = LaserState(
+            requested=int(snapshot.requested),
+            output=int(told.output),
+            armed=gate.armed,
+            interlock_open=gate.interlock_open,
+            waveform=told.modulation.waveform,
+            frequency=told.modulation.frequency_hz,
+            duty=told.modulation.duty,
+            phase_epoch=stamp_from_ns(told.phase_epoch_ns or 0),
+            output_since=stamp_from_ns(told.output_since_ns),
+            reason=snapshot.reason,
+        )
+        message.header.stamp = stamp_from_ns(self.now_ns())
         try:
-            with self._lock:
-                if self._laser is not None:
-                    self._state.publish(self._state_message(self._laser))
-        except EschortyError as error:
-            self.fault(f"laser state unknown: {error}")
+            self._state.publish(message)
         except Exception:
             # A signal may end the context between the check and the publication.
             if self.context.ok():
                 raise
 
-    def _state_message(self, laser: LaserModulator) -> LaserState:
-        stamp_ns = self.now_ns()
-        state = laser.readback()
-        message = LaserState(
-            requested=int(self._requested),
-            output=int(state.output),
-            armed=self._gate.armed,
-            interlock_open=self._gate.interlock_open,
-            waveform=state.modulation.waveform,
-            frequency=state.modulation.frequency_hz,
-            duty=state.modulation.duty,
-            phase_epoch=stamp_from_ns(state.phase_epoch_ns or 0),
-            output_since=stamp_from_ns(state.output_since_ns),
-            reason=self._reason,
-        )
-        message.header.stamp = stamp_from_ns(stamp_ns)
-        return message
-
     def _report(self) -> diagnostics.Report:
-        with self._lock:
-            laser = self._laser
-            output = LaserOutput.OFF
-            if laser is not None:
-                try:
-                    output = laser.readback().output
-                except EschortyError:
-                    output = LaserOutput.UNKNOWN
-            values = {
-                "device": laser.identity.model if laser is not None else "",
-                "state": self.state_label,
-                "output": output.name,
-                "requested": self._requested.name,
-                "armed": self._gate.armed,
-                "interlock_open": self._gate.interlock_open,
-                "reason": self._reason,
-                "switch_offs": self.switch_offs,
-            }
+        keeper = self._keeper
+        snapshot = keeper.snapshot()
+        output = snapshot.told.output if snapshot is not None else LaserOutput.OFF
+        values: dict[str, Any] = {
+            "device": keeper.device,
+            "state": self.state_label,
+            "output": output.name,
+            "requested": snapshot.requested.name if snapshot is not None else "OFF",
+            "armed": keeper.gate.armed,
+            "interlock_open": keeper.gate.interlock_open,
+            "reason": snapshot.reason if snapshot is not None else "",
+            "switch_offs": keeper.switch_offs,
+        }
+        for topic, gap_s in keeper.gate.gap_max_s.items():
+            values[f"{topic} longest gap, s"] = gap_s
+        if keeper.unknown:
+            return diagnostics.ERROR, f"laser state unknown: {keeper.unknown}", values
         if self.failure:
             return diagnostics.ERROR, self.failure, values
-        mismatch = output != self._requested
-        level = diagnostics.WARN if mismatch or self._gate.interlock_open else diagnostics.OK
-        return level, f"{output.name}: {self._reason}", values
+        if snapshot is None:
+            return diagnostics.OK, self.state_label, values
+        level = diagnostics.WARN if keeper.gate.interlock_open else diagnostics.OK
+        return level, f"{output.name}: {snapshot.reason}", values
 
 
 def _modulation(values: dict[str, Any]) -> Modulation:
@@ -282,7 +259,7 @@ def _modulation(values: dict[str, Any]) -> Modulation:
 
 def main() -> None:
     """Entry point of the laser node."""
-    sys.exit(run(LaserNode))
+    sys.exit(run(LaserNode, threads=3))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""When the laser may be on: arming, interlock, heartbeat, longest time on. No ROS, no device."""
+"""When the laser may be on: arming, interlock, leases, longest time on. No ROS, no device."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+
+LEASE = "laser/heartbeat"
 
 
 class LaserGate:
@@ -13,44 +15,64 @@ class LaserGate:
     ----------
     arm_timeout_s : float
         How long ``arm`` allows ``enable``.
-    heartbeat_timeout_s : float
-        Age at which the heartbeat is stale.
     max_on_s : float
         Longest time on.
+    leases : mapping of str to float
+        Topics that must beat, and the age in seconds at which each one's last beat is stale.
+    interlock_open : bool
+        What the interlock is taken for until somebody says otherwise.
     now_s : callable
         Steady clock in seconds.
+
+    Attributes
+    ----------
+    gap_max_s : dict of str to float
+        Longest time between two beats of each topic while on: tells what timeout is safe.
     """
 
     def __init__(
         self,
         arm_timeout_s: float,
-        heartbeat_timeout_s: float,
         max_on_s: float,
+        leases: Mapping[str, float],
+        *,
+        interlock_open: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._arm_timeout_s = arm_timeout_s
-        self._heartbeat_timeout_s = heartbeat_timeout_s
         self._max_on_s = max_on_s
+        self._leases = dict(leases)
         self._now_s = now_s
         self._armed_s: float | None = None
-        self._heartbeat_s: float | None = None
+        self._beat_s: dict[str, float] = {}
         self._on_s: float | None = None
-        self.interlock_open = False
+        self.gap_max_s: dict[str, float] = {}
+        self.interlock_open = interlock_open
 
     @property
     def armed(self) -> bool:
         """Armed and not expired, or on."""
+        armed_s = self._armed_s
         return self._on_s is not None or (
-            self._armed_s is not None and self._now_s() - self._armed_s <= self._arm_timeout_s
+            armed_s is not None and self._now_s() - armed_s <= self._arm_timeout_s
         )
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Topics that must beat."""
+        return tuple(self._leases)
 
     def arm(self) -> None:
         """Allow ``enable`` for a while."""
         self._armed_s = self._now_s()
 
-    def beat(self) -> None:
+    def beat(self, topic: str = LEASE) -> None:
         """Note that a heartbeat has arrived."""
-        self._heartbeat_s = self._now_s()
+        now_s = self._now_s()
+        if self._on_s is not None and topic in self._beat_s:
+            gap_s = now_s - self._beat_s[topic]
+            self.gap_max_s[topic] = max(gap_s, self.gap_max_s.get(topic, 0.0))
+        self._beat_s[topic] = now_s
 
     def switched_on(self) -> None:
         """Note that the output has been switched on; asked again while on, its time runs on."""
@@ -71,20 +93,27 @@ class LaserGate:
 
     def must_end(self) -> str | None:
         """Why an output that is on must go off now, ``None`` when it may stay."""
-        if self._on_s is None:
+        on_s = self._on_s
+        if on_s is None:
             return None
-        if self._now_s() - self._on_s > self._max_on_s:
+        if self._now_s() - on_s > self._max_on_s:
             return f"on for max_on_time, {self._max_on_s:g} s"
         return self._unsafe()
 
     def _unsafe(self) -> str | None:
         if self.interlock_open:
             return "interlock open; close it"
-        if self._heartbeat_s is None:
-            return "no heartbeat; publish laser/heartbeat while light is wanted"
-        if self._now_s() - self._heartbeat_s > self._heartbeat_timeout_s:
-            return (
-                f"heartbeat older than {self._heartbeat_timeout_s:g} s; "
-                "publish laser/heartbeat while light is wanted"
-            )
+        now_s = self._now_s()
+        for topic, timeout_s in self._leases.items():
+            beat_s = self._beat_s.get(topic)
+            if beat_s is None:
+                return f"no {topic}; {_remedy(topic)}"
+            if now_s - beat_s > timeout_s:
+                return f"{topic} older than {timeout_s:g} s; {_remedy(topic)}"
         return None
+
+
+def _remedy(topic: str) -> str:
+    if topic == LEASE:
+        return "publish it while light is wanted"
+    return f"look at the {topic.partition('/')[0]} node, or take it out of the parameter watch"

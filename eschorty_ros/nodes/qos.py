@@ -47,6 +47,16 @@ def stream(depth: int = STREAM_DEPTH) -> QoSProfile:
     )
 
 
+def heartbeat() -> QoSProfile:
+    """Signs of life: only the newest counts, and none is worth repeating."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=1,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
 def overridable() -> QoSOverridingOptions:
     """History, depth and reliability settable by the parameters ``qos_overrides.<topic>...``."""
     return QoSOverridingOptions.with_default_policies()

@@ -21,12 +21,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import LaserState
+from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.conversions import m_from_mm, stamp_from_ns
 from eschorty_ros.nodes.scan_monitor import ScanMonitor
 from eschorty_ros.nodes.scan_sequence import ScanCanceled, ScanFailure
 
-_TICK_S = 0.02
-_HEARTBEAT_S = 0.1
+_TICK_S = 0.01
+_HEARTBEAT_S = 0.03
 _RESEND_S = 2.0
 
 
@@ -59,7 +60,7 @@ class LaserStageRig:
         group = ReentrantCallbackGroup()
         # In a group of its own, one message at a time, so that samples stay in order.
         self.monitor = ScanMonitor(node, MutuallyExclusiveCallbackGroup())
-        self._heartbeat = node.create_publisher(Header, "laser/heartbeat", 10)
+        self._heartbeat = node.create_publisher(Header, "laser/heartbeat", qos.heartbeat())
         self._clients = {
             name: node.create_client(kind, name, callback_group=group)
             for name, kind in (

@@ -19,6 +19,7 @@ from eschorty_ros.msg import PositionTrigger, StageMotion
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
 from eschorty_ros.nodes.device_messages import motion_message, trigger_message
+from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
@@ -74,6 +75,7 @@ class StageNode(DeviceNode):
         ):
             self.create_timer(period_s, tick, callback_group=ticking, clock=self.steady_clock)
         diagnostics.Diagnostics(self, self._report, ticking)
+        Heartbeat(self, "stage/heartbeat", self._healthy)
 
     def open_device(self) -> None:
         """Open the stage."""
@@ -119,6 +121,10 @@ class StageNode(DeviceNode):
         with contextlib.suppress(ValueError):
             self._move.destroy()
         super().destroy_node()
+
+    def _healthy(self) -> bool:
+        """Whether light is of use: the stage can be moved."""
+        return self._stage is not None and self.active and not self.failure
 
     def _opened(self) -> LinearStage:
         stage = self._stage

@@ -100,6 +100,8 @@ def test_second_client_is_refused(laser: GuardedLaser, device: Generator) -> Non
 
 OWNER = """
 import ctypes, faulthandler, os, signal, subprocess, sys, time
+for number in (signal.SIGHUP, signal.SIGTERM):
+    signal.signal(number, signal.SIG_DFL)  # inherited as ignored under nohup
 from eschorty_ros.hardware.laser.guarded import GuardedLaser
 laser = GuardedLaser("generator_double:GeneratorLaser", {"path": sys.argv[1]})
 laser.arm()

@@ -21,7 +21,7 @@ from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.domain import free_domain
 
 MODULE = "eschorty_ros.nodes.laser"
-PARAMETERS = {"arm_timeout": 1.0, "heartbeat_timeout": 0.5, "max_on_time": 3.0}
+PARAMETERS = {"arm_timeout": 1.0, "max_on_time": 3.0, "watch": "none"}
 
 
 class Bench:
@@ -36,7 +36,7 @@ class Bench:
         )
         self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
         self._heart = observer.node.create_publisher(Header, "laser/heartbeat", qos.stream(10))
-        self._timer = observer.node.create_timer(0.05, self._beat)
+        self._timer = observer.node.create_timer(0.03, self._beat)
         self.interlock = observer.node.create_publisher(Bool, "laser/interlock", qos.stream(10))
         observer.wait_for_state("laser", "active")
         wait_until(self._heart.get_subscription_count, "the heartbeat's subscriber")

@@ -79,7 +79,9 @@ class Guard:
         self._epoch = 0
         self._lit = False
         self._tripped = ""
-        self._retry_at_s: float | None = None
+        # Why the output may be on although it was switched off, and who tries again.
+        self._unknown = ""
+        self._insisting: threading.Thread | None = None
         self._heard_s = time.monotonic()
         self._closing: Message | None = None
 
@@ -131,62 +133,75 @@ class Guard:
 
     def _watch(self) -> None:
         """Switch off for an owner that stands still or is silent; once, until armed again."""
-        now_s = time.monotonic()
-        if not self._tripped:
-            why = standing_still(self._owner_pid)
-            if not why and now_s - self._heard_s > self._silence_s:
-                why = f"silent for {self._silence_s:g} s"
-            if why:
-                self._tripped = f"laser guard: process {self._owner_pid} is {why}"
-                self._try_to_switch_off(self._tripped)
-        if self._retry_at_s is not None and now_s > self._retry_at_s:
-            self._try_to_switch_off("")
+        if self._tripped:
+            return
+        why = standing_still(self._owner_pid)
+        if not why and time.monotonic() - self._heard_s > self._silence_s:
+            why = f"silent for {self._silence_s:g} s"
+        if why:
+            self._tripped = f"laser guard: process {self._owner_pid} is {why}"
+            self._try_to_switch_off(self._tripped)
 
     def _switch_off(self) -> None:
         self._epoch += 1
         laser = self._laser
         if laser is None:
             return
+        if self._unknown:
+            raise DeviceError(self._unknown)
         try:
-            if self._retry_at_s is not None and self._make is not None:
-                with contextlib.suppress(Exception):
-                    laser.close()
-                laser = self._laser = self._make()
             laser.disable()
-        except Exception:
-            self._retry_at_s = time.monotonic() + _RETRY_S
+        except Exception as error:
+            self._unknown = f"{error}; trying again"
+            if self._lit:
+                self._insisting = threading.Thread(target=self._insist, name="laser off")
+                self._insisting.start()
             raise
-        self._lit, self._retry_at_s = False, None
+        self._lit = False
 
-    def _try_to_switch_off(self, reason: str) -> bool:
+    def _insist(self) -> None:
+        """Open the generator anew until it is off; the means at hand have failed."""
+        end_s = time.monotonic() + _INSIST_S
+        while self._unknown and time.monotonic() < end_s:
+            time.sleep(_RETRY_S)
+            try:
+                if self._laser is not None:
+                    with contextlib.suppress(Exception):
+                        self._laser.close()
+                if self._make is not None:
+                    self._laser = self._make()
+            except Exception as error:
+                self._unknown = f"{error}; trying again"
+            else:
+                self._lit, self._unknown = False, ""
+                _say("laser guard: output off at last")
+
+    def _try_to_switch_off(self, reason: str) -> None:
         lit = self._lit
         try:
             self._switch_off()
         except Exception as error:
-            if reason:
-                _say(f"{reason}; laser state unknown: {error}")
-            return False
-        if reason and lit:
-            _say(f"{reason}; output off")
-        return True
+            _say(f"{reason}; {error}")
+        else:
+            if lit:
+                _say(f"{reason}; output off")
 
     def _finish(self) -> None:
         if self._closing is not None:
             self._answer(self._closing, self._close)
-        reason = "" if self._closing is not None else f"laser guard: {self._owner_pid} is gone"
-        end_s = time.monotonic() + _INSIST_S
-        while not self._try_to_switch_off(reason) and self._lit and time.monotonic() < end_s:
-            reason = ""
-            time.sleep(_RETRY_S)
+        else:
+            self._try_to_switch_off(f"laser guard: process {self._owner_pid} is gone")
+        if self._insisting is not None:
+            self._insisting.join()
         if self._laser is not None:
             with contextlib.suppress(Exception):
                 self._laser.close()
 
     def _close(self) -> None:
         self._switch_off()
-        if self._laser is not None:
-            self._laser.close()
-            self._laser = None
+        laser, self._laser = self._laser, None
+        if laser is not None:
+            laser.close()
 
     def _answer(self, message: Message, step: Callable[[], Any]) -> None:
         try:
@@ -207,6 +222,8 @@ class Guard:
         laser = self._laser
         if laser is None:
             raise DeviceError("the laser is not open; open it first")
+        if self._unknown:
+            raise DeviceError(self._unknown)
         if command == "configure":
             return laser.configure(Modulation(**message["modulation"]))
         if command == "readback":

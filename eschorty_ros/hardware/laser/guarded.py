@@ -37,7 +37,7 @@ from eschorty_ros.hardware.protocols import DeviceIdentity, LaserReadback
 GUARD = "eschorty_ros.hardware.laser.guard"
 BEATS_PER_SILENCE = 5
 OPEN_S = 20.0
-OFF_S = 1.5
+OFF_S = 2.0
 EXIT_S = 2.0
 _DIRECT_S = 1.0
 _LOOK_S = 0.02

@@ -1,0 +1,317 @@
+"""Keeps a laser dark unless its gate lets it be on; no ROS."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput, LaserReadback
+from eschorty_ros.nodes.laser_gate import LaserGate
+
+WATCH_PERIOD_S = 0.01
+FREQUENCY_TOLERANCE = 1e-4
+DUTY_TOLERANCE = 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class LaserSnapshot:
+    """What was asked, what was read back, and why."""
+
+    requested: LaserOutput
+    told: LaserReadback
+    reason: str
+
+
+class LaserKeeper:
+    """Carries out commands on a laser and switches it off when its gate says so.
+
+    Two threads run while it is open: one asks the gate, the other reads the generator back, and
+    switches off when that is not what was asked. Commands wait for each other; switching off waits
+    for none of them.
+
+    Parameters
+    ----------
+    gate : LaserGate
+    living : callable
+        Whether the process means to go on; light ends when it does not.
+    changed : callable
+        Called with the snapshot after every change, in order.
+    alarm : callable
+        Called with one line when the device failed or its output is unknown.
+    log : callable
+        Called with one line when the output was switched off for a reason of the keeper's own.
+    readback_period_s : float
+
+    Attributes
+    ----------
+    switch_offs : int
+        How often light ended.
+    unknown : str
+        Why the state of the output is unknown, empty when it is known.
+    """
+
+    def __init__(
+        self,
+        gate: LaserGate,
+        living: Callable[[], bool],
+        changed: Callable[[LaserSnapshot], None],
+        alarm: Callable[[str], None],
+        log: Callable[[str], None],
+        readback_period_s: float,
+    ) -> None:
+        self.gate = gate
+        self._living, self._changed, self._alarm, self._log = living, changed, alarm, log
+        self._readback_period_s = readback_period_s
+        # Held briefly: by whoever tells the state and by whoever switches off.
+        self._lock = threading.RLock()
+        # Held as long as a command takes.
+        self._commands = threading.Lock()
+        self._commanding = False
+        # Counts what may have changed the output; a read-back that began before is void.
+        self._generation = 0
+        self._laser: LaserModulator | None = None
+        self._asked: Modulation | None = None
+        self._told: LaserReadback | None = None
+        self._requested = LaserOutput.OFF
+        self._reason = "off at start"
+        self._ending = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self.switch_offs = 0
+        self.unknown = ""
+
+    @property
+    def device(self) -> str:
+        """Model of the generator, empty while none is open."""
+        laser = self._laser
+        return laser.identity.model if laser is not None else ""
+
+    def open(self, laser: LaserModulator, modulation: Modulation) -> None:
+        """Take over a laser: off, with this modulation; raises ``DeviceError`` when refused."""
+        with self._lock:
+            self._laser, self._asked = laser, modulation
+            self._requested, self._reason = LaserOutput.OFF, "off at start"
+            self.gate.switched_off()
+        laser.disable()
+        laser.configure(modulation)
+        told = laser.readback()
+        self._refuse_difference(told)
+        self._hear(told)
+        self._ending.clear()
+        self._threads = [
+            threading.Thread(target=target, name=name, daemon=True)
+            for target, name in ((self._watch, "laser watchdog"), (self._read, "laser read-back"))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Switch off and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
+        self._ending.set()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(1.0)
+        with self._lock:
+            laser, self._laser = self._laser, None
+            self._generation += 1
+            if laser is None:
+                return
+            try:
+                laser.close()
+            except EschortyError as error:
+                self._note_unknown(error)
+                raise
+            finally:
+                if not self.unknown:
+                    self._told = None
+
+    def configure(self, modulation: Modulation) -> None:
+        """Set another modulation; light that is on goes on with it, unless it is refused."""
+        if self._laser is None:
+            return
+        with self._command() as laser:
+            before, self._asked = self._asked, modulation
+            try:
+                laser.configure(modulation)
+                told = laser.readback()
+                self._refuse_difference(told)
+            except EschortyError as error:
+                self._asked = before
+                if self._requested is LaserOutput.ON:
+                    self.switch_off(str(error))
+                raise
+            self._hear(told)
+
+    def arm(self) -> None:
+        """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be."""
+        if self.gate.interlock_open:
+            raise DeviceError("laser refused: interlock open; close it")
+        with self._command() as laser:
+            laser.arm()
+            self.gate.arm()
+            self._reason = "armed"
+
+    def enable(self) -> None:
+        """Switch on; raises ``DeviceError`` with the reason when it must not be, or fails."""
+        with self._command() as laser:
+            with self._lock:
+                refusal = self.gate.refusal()
+                if refusal is not None:
+                    raise DeviceError(f"laser refused: {refusal}")
+                self._requested = LaserOutput.ON
+                self.gate.switched_on()
+            try:
+                laser.enable()
+                told = laser.readback()
+                self._refuse_difference(told)
+            except EschortyError as error:
+                if self._requested is LaserOutput.ON:
+                    self.switch_off(str(error))
+                raise
+            with self._lock:
+                if self._requested is not LaserOutput.ON:
+                    laser.disable()
+                    raise DeviceError(f"laser refused: {self._reason}")
+                self._reason = "switched on by request"
+                self._hear(told)
+
+    def switch_off(self, reason: str) -> None:
+        """Switch off before anything else; raises ``DeviceError`` when it is not confirmed."""
+        with self._lock:
+            laser = self._laser
+            if laser is None:
+                return
+            try:
+                laser.disable()
+                told = laser.readback()
+            except EschortyError as error:
+                self._note_unknown(error)
+                raise DeviceError(f"laser state unknown: {error}") from error
+            finally:
+                self._generation += 1
+                self.switch_offs += self._requested is LaserOutput.ON
+                self.gate.switched_off()
+                self._requested, self._reason = LaserOutput.OFF, reason
+            self._hear(told)
+
+    def darken(self, reason: str) -> bool:
+        """Switch off for a reason of the keeper's own; alarm when it is not confirmed."""
+        try:
+            self.switch_off(reason)
+        except EschortyError as error:
+            self._alarm(str(error))
+            return False
+        self._log(f"laser off: {reason}")
+        return True
+
+    def tell(self) -> None:
+        """Tell the state as it is now."""
+        with self._lock:
+            told = self._told
+            # While a command is under way nobody knows; what comes of it is told at its end.
+            if told is not None and not self._commanding:
+                self._changed(LaserSnapshot(self._requested, told, self._reason))
+
+    def snapshot(self) -> LaserSnapshot | None:
+        """Return what is known now, ``None`` before the generator has been opened."""
+        with self._lock:
+            told = self._told
+            return None if told is None else LaserSnapshot(self._requested, told, self._reason)
+
+    @contextlib.contextmanager
+    def _command(self) -> Iterator[LaserModulator]:
+        with self._commands:
+            with self._lock:
+                laser = self._laser
+                if laser is None:
+                    raise DeviceError("laser refused: not open; configure it first")
+                self._generation += 1
+                self._commanding = True
+            try:
+                yield laser
+            finally:
+                with self._lock:
+                    self._generation += 1
+                    self._commanding = False
+                    self.tell()
+
+    def _hear(self, told: LaserReadback) -> None:
+        """Note what the generator says."""
+        self._told = told
+        self.unknown = ""
+        if told.output is LaserOutput.UNKNOWN:
+            self.unknown = told.reason or "the generator does not say"
+        self.tell()
+
+    def _note_unknown(self, error: Exception) -> None:
+        self.unknown = str(error)
+        if self._told is not None:
+            self._told = replace(self._told, output=LaserOutput.UNKNOWN)
+        self.tell()
+
+    def _refuse_difference(self, told: LaserReadback) -> None:
+        difference = self._wrong_output(told) or self._wrong_waveform(told)
+        if difference:
+            raise DeviceError(f"laser: {difference}; look at the generator")
+
+    def _wrong_output(self, told: LaserReadback) -> str:
+        """How the output differs from what was asked, ``""`` when it does not or is unknown."""
+        if told.output in (self._requested, LaserOutput.UNKNOWN):
+            return ""
+        why = f" ({told.reason})" if told.reason else ""
+        return f"output reads back {told.output.name}, asked {self._requested.name}{why}"
+
+    def _wrong_waveform(self, told: LaserReadback) -> str:
+        asked, now = self._asked, told.modulation
+        if asked is None:
+            return ""
+        if not math.isclose(now.frequency_hz, asked.frequency_hz, rel_tol=FREQUENCY_TOLERANCE):
+            return f"frequency reads back {now.frequency_hz:g} Hz, asked {asked.frequency_hz:g} Hz"
+        if abs(now.duty - asked.duty) > DUTY_TOLERANCE:
+            return f"duty reads back {now.duty:g}, asked {asked.duty:g}"
+        if now.waveform != asked.waveform:
+            return f"waveform reads back {now.waveform}, asked {asked.waveform}"
+        return ""
+
+    def _watch(self) -> None:
+        while not self._ending.wait(WATCH_PERIOD_S):
+            reason = self.gate.must_end()
+            if reason is None and not self._living() and self._requested is LaserOutput.ON:
+                reason = "the node is shutting down"
+            if reason is not None:
+                self.darken(reason)
+
+    def _read(self) -> None:
+        while not self._ending.wait(self._readback_period_s):
+            with self._lock:
+                laser, generation = self._laser, self._generation
+                if laser is None or self._commanding:
+                    continue
+            try:
+                told = laser.readback()
+            except EschortyError as error:
+                self._lost(generation, error)
+                continue
+            with self._lock:
+                if generation != self._generation:
+                    continue
+                self._hear(told)
+                wrong = self._wrong_output(told)
+                if self._requested is LaserOutput.ON:
+                    wrong = wrong or self._wrong_waveform(told)
+                elif self.unknown:
+                    wrong = f"state unknown: {self.unknown}"
+            if wrong:
+                self.darken(wrong)
+
+    def _lost(self, generation: int, error: EschortyError) -> None:
+        """Give the laser up unless switching off is what interrupted the read-back."""
+        with self._lock:
+            if generation != self._generation:
+                return
+        if self.darken(f"not read back: {error}"):
+            self._alarm(f"laser lost, output off: {error}")
