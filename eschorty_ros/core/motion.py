@@ -86,6 +86,48 @@ class MotionPlan:
         velocity[ended] = 0.0
         return position, velocity
 
+    def passing_s(self, position_mm: ArrayLike) -> NDArray[np.float64]:
+        """Time after ``start_ns`` (s) at which each position is first reached.
+
+        Parameters
+        ----------
+        position_mm : array_like, shape (n,)
+
+        Returns
+        -------
+        float64, shape (n,)
+            NaN where the motion does not come by.
+        """
+        wanted = vector("position_mm", position_mm)
+        passing = np.where(wanted == self.position_mm, 0.0, np.nan)
+        position, velocity, began_s = self.position_mm, self.velocity_mm_s, 0.0
+        for duration_s, acceleration in zip(
+            self.durations_s, self.accelerations_mm_s2, strict=True
+        ):
+            with np.errstate(all="ignore"):
+                elapsed_s = _first_root(wanted - position, velocity, acceleration, duration_s)
+            passing = np.where(np.isnan(passing), began_s + elapsed_s, passing)
+            position += velocity * duration_s + 0.5 * acceleration * duration_s**2
+            velocity += acceleration * duration_s
+            began_s += duration_s
+        return passing
+
+
+def _first_root(
+    distance: NDArray[np.float64], velocity: float, acceleration: float, duration_s: float
+) -> NDArray[np.float64]:
+    """Smallest time from 0 to ``duration_s`` after which ``distance`` is covered, else NaN."""
+    slack_s = 1e-9 * duration_s
+    discriminant = velocity * velocity + 2.0 * acceleration * distance
+    # At the turning point rounding may leave less than nothing.
+    rounding = 1e-12 * (velocity * velocity + np.abs(2.0 * acceleration * distance))
+    root = np.sqrt(np.where(np.abs(discriminant) <= rounding, 0.0, discriminant))
+    q = -0.5 * (velocity + math.copysign(1.0, velocity) * root)
+    candidates = np.stack((np.divide(q, np.float64(0.5 * acceleration)), np.divide(-distance, q)))
+    valid = (candidates >= -slack_s) & (candidates <= duration_s + slack_s)
+    first = np.where(valid, candidates, np.inf).min(axis=0)
+    return np.where(np.isfinite(first), np.clip(first, 0.0, duration_s), np.nan)
+
 
 def plan_move(
     start_ns: int,
