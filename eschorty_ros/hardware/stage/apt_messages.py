@@ -87,7 +87,7 @@ TO_CONTROLLER: Final = {
         Layout("resume_end_of_move", 0x046C),
         Layout("request_status", 0x0490, _CHANNEL),
         Layout("keep_alive", 0x0492),
-        Layout("set_profile_mode", 0x04E3, ("channel", "mode", "jerk", "reserved", "spare"), "2HI2H"),
+        Layout("set_profile_mode", 0x04E3, ("channel", "mode", "jerk"), "2HI4x"),
         Layout("request_axis", 0x04F1, _CHANNEL),
         Layout("set_ports", 0x0523, _PORTS, "6H"),
         Layout("request_ports", 0x0524, _CHANNEL),
@@ -273,15 +273,15 @@ class Scale:
     cycle_s: float = 102.4e-6
 
     def position(self, mm: float) -> int:
-        """Counts of a position."""
+        """Convert to counts of a position."""
         return round(mm * self.counts_per_mm)
 
     def velocity(self, mm_s: float) -> int:
-        """Counts of a velocity parameter."""
+        """Convert to counts of a velocity parameter."""
         return round(mm_s * self.velocity_unit)
 
     def acceleration(self, mm_s2: float) -> int:
-        """Counts of an acceleration parameter."""
+        """Convert to counts of an acceleration parameter."""
         return round(mm_s2 * self.acceleration_unit)
 
     def mm(self, counts: int) -> float:

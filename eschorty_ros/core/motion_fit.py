@@ -1,0 +1,166 @@
+"""A stage's motion from encoder readings that arrive late: position as a function of time.
+
+A reading is exact in place and vague in time: it was taken after it was asked for and before it
+arrived. The motion is known but for when it began: pieces of constant acceleration. Each reading
+bounds the beginning from both sides, and many readings settle it far better than their delays
+spread. Where the motion is not known, or does not fit, positions lie on lines between readings.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core._checks import TIME_LIMIT, number, positive, times, whole
+from eschorty_ros.core._motion_legs import Leg, Move, Reading, Stop, Unknown
+from eschorty_ros.core.clock import POSITION_LIMIT_MM
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.motion import MotionPlan
+
+_HISTORY_NS = 60_000_000_000
+_LEGS_MAX = 64
+_READINGS_MAX = 20_000
+
+
+class MotionFit:
+    """Readings of the encoder joined with the motions that were ordered.
+
+    All times are int64 nanoseconds of one clock. Not thread-safe.
+
+    Parameters
+    ----------
+    tolerance_mm : float
+        How far the carriage may lie beside its ordered motion; also when it counts as resting.
+
+    Attributes
+    ----------
+    late_readings : int
+        Readings not later than the one before, which were not used.
+    """
+
+    def __init__(self, tolerance_mm: float = 1e-3) -> None:
+        self._tolerance_mm = positive("tolerance_mm", tolerance_mm)
+        self.late_readings = 0
+        self._readings: deque[Reading] = deque(maxlen=_READINGS_MAX)
+        self._legs: list[Leg] = [Unknown(-TIME_LIMIT)]
+
+    @property
+    def until_ns(self) -> int | None:
+        """Time up to which positions are known; ``None`` before the first reading."""
+        return self._readings[-1].middle_ns if self._readings else None
+
+    @property
+    def residual_mm(self) -> float:
+        """How far readings lie outside the motion under way, root mean square; NaN if unknown."""
+        return self._legs[-1].residual_mm
+
+    @property
+    def sigma_mm(self) -> float:
+        """Standard deviation of the position at full speed; NaN if unknown."""
+        return self._legs[-1].sigma_mm
+
+    @property
+    def strays(self) -> int:
+        """Readings that contradict the motion under way."""
+        return self._legs[-1].strays
+
+    def observe(self, position_mm: float, latest_ns: int, earliest_ns: int | None = None) -> None:
+        """Add one reading.
+
+        Parameters
+        ----------
+        position_mm : float
+        latest_ns, earliest_ns : int
+            When it can have been taken at the latest (receipt, less the line's own time) and at
+            the earliest (request).
+
+        Raises
+        ------
+        ArgumentError
+            When a value is not finite or the earliest lies after the latest.
+        """
+        number("position_mm", position_mm, -POSITION_LIMIT_MM, POSITION_LIMIT_MM)
+        latest_ns = whole("latest_ns", latest_ns, -TIME_LIMIT, TIME_LIMIT)
+        if earliest_ns is not None:
+            earliest_ns = whole("earliest_ns", earliest_ns, -TIME_LIMIT, TIME_LIMIT)
+            if earliest_ns > latest_ns:
+                raise ArgumentError(
+                    f"earliest_ns is {earliest_ns}, after latest_ns {latest_ns}; swap them"
+                )
+        reading = Reading(float(position_mm), earliest_ns, latest_ns)
+        if self._readings and reading.middle_ns <= self._readings[-1].middle_ns:
+            self.late_readings += 1
+            return
+        self._readings.append(reading)
+        while self._readings[0].latest_ns < latest_ns - _HISTORY_NS:
+            self._readings.popleft()
+        self._legs[-1].add(reading)
+
+    def follow(self, plan: MotionPlan) -> None:
+        """Expect ``plan``, from rest to rest, to begin at its ``start_ns`` or soon after."""
+        self._begin(Move(plan, self._tolerance_mm))
+
+    def stop(self, at_ns: int, deceleration_mm_s2: float) -> None:
+        """Expect the motion under way to end in a ramp that begins at ``at_ns`` or soon after."""
+        positive("deceleration_mm_s2", deceleration_mm_s2)
+        whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)
+        before = self._legs[-1].plan()
+        if before is None:
+            self.wander(at_ns)
+        elif at_ns < before.end_ns:
+            self._begin(Stop(before, at_ns, deceleration_mm_s2, self._tolerance_mm))
+
+    def wander(self, at_ns: int) -> None:
+        """Expect nothing from ``at_ns`` on."""
+        self._begin(Unknown(whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)))
+
+    def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
+        """Lowest and highest position of a reading between two times; ``None`` if unknown."""
+        for name, value in (("earliest_ns", earliest_ns), ("latest_ns", latest_ns)):
+            whole(name, value, -TIME_LIMIT, TIME_LIMIT)
+        return self._legs[-1].expected_mm(earliest_ns, latest_ns)
+
+    def state(self, t_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position (mm) and velocity (mm/s) at integer times ``t_ns``, same shape as ``t_ns``.
+
+        Beyond :attr:`until_ns` the ordered motion is trusted, or the last reading held.
+
+        Raises
+        ------
+        ArgumentError
+            Before the first reading.
+        """
+        wanted = times("t_ns", t_ns)
+        if not self._readings:
+            raise ArgumentError("the position is unknown; observe a reading first")
+        flat = wanted.reshape(-1)
+        position, velocity = self._between(flat)
+        begins = [leg.from_ns for leg in self._legs]
+        which = np.array([bisect_right(begins, int(t)) - 1 for t in flat], dtype=np.intp)
+        for index in np.unique(which):
+            plan = self._legs[max(int(index), 0)].plan()
+            if plan is not None:
+                chosen = which == index
+                position[chosen], velocity[chosen] = plan.state(flat[chosen])
+        return position.reshape(wanted.shape), velocity.reshape(wanted.shape)
+
+    def _between(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions on lines between readings."""
+        origin_ns = self._readings[0].middle_ns
+        at_s = np.array([reading.middle_ns - origin_ns for reading in self._readings]) * 1e-9
+        places = np.array([reading.position_mm for reading in self._readings])
+        wanted_s = (np.clip(t_ns, -TIME_LIMIT, TIME_LIMIT) - origin_ns) * 1e-9
+        position = np.interp(wanted_s, at_s, places)
+        if len(at_s) < 2:
+            return position, np.zeros_like(position)
+        slopes = np.diff(places) / np.diff(at_s)
+        piece = np.clip(np.searchsorted(at_s, wanted_s) - 1, 0, len(slopes) - 1)
+        inside = (wanted_s >= at_s[0]) & (wanted_s <= at_s[-1])
+        return position, np.where(inside, slopes[piece], 0.0)
+
+    def _begin(self, leg: Leg) -> None:
+        self._legs.append(leg)
+        del self._legs[:-_LEGS_MAX]

@@ -1,0 +1,400 @@
+"""A brushless stage controller that speaks APT: bytes in, bytes out, in the time of its clock.
+
+What it answers follows the protocol description, not the driver: the layouts are shared data, and
+the tests check those against thorlabs-apt-protocol. Behaviour that no source settles is the
+simplest one: a move while another is under way is ignored, a homed axis reads 0 at its lower end.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from eschorty_ros.core.motion import MotionPlan
+from eschorty_ros.emulation.apt_axis import EMERGENCY_MM_S2, Axis, PulsePattern
+from eschorty_ros.emulation.apt_wire import BYTE_NS, Disturbance, Wire
+from eschorty_ros.hardware.stage import apt_messages as apt
+
+UPDATE_NS = 100_000_000
+SILENT_AFTER = 50
+CONTROLLERS = ("kbd101", "bbd30x")
+
+_HOST_LAYOUTS = {layout.id: layout for layout in apt.TO_CONTROLLER.values()}
+_ANSWERS = {
+    layout.name: layout
+    for layouts in apt.FROM_CONTROLLER.values()
+    for layout in layouts  # the long form of a message comes last
+}
+
+
+class AptModel:
+    """KBD101 or BBD30x with a DDS220.
+
+    Not thread-safe: whoever serves it holds a lock around ``feed`` and ``step``.
+
+    Parameters
+    ----------
+    clock_ns : callable
+    controller : {"kbd101", "bbd30x"}
+    bay : int
+        Bay of the rack that holds the axis, from 1.
+    travel_mm : tuple of float
+        Hard ends of the carriage.
+    power_up_mm : float
+        Where the carriage stands at power-up; the encoder reads 0 there.
+    speed_max_mm_s, acceleration_max_mm_s2 : float
+        What the stage data report and the controller obeys.
+    byte_ns : int
+        Time of one byte on the line; 0 for an infinitely fast one.
+    late_ns : callable, optional
+        Extra delay of each frame to the host, as a USB adapter adds.
+    on_plan : callable, optional
+        Told every new motion, in the clock's time.
+    sampled_pulses : bool
+        Whether trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
+    seed : int
+        Of drawn disturbances.
+
+    Attributes
+    ----------
+    axis : Axis
+        The carriage.
+    disturbance : Disturbance
+        What happens to its bytes.
+    gone, mute, panel_disabled, ignores_moves : bool
+        Unplugged; hears but never answers; cannot be enabled; accepts moves without moving.
+    extra_bits : int
+        Status bits set on top.
+    withheld : set of str
+        Names of messages it never sends.
+    """
+
+    def __init__(
+        self,
+        clock_ns: Callable[[], int],
+        *,
+        controller: str = "kbd101",
+        bay: int = 1,
+        travel_mm: tuple[float, float] = (0.0, 220.0),
+        power_up_mm: float = 5.0,
+        speed_max_mm_s: float = 250.0,
+        acceleration_max_mm_s2: float = 2000.0,
+        byte_ns: int = BYTE_NS,
+        late_ns: Callable[[], int] | None = None,
+        on_plan: Callable[[MotionPlan], None] | None = None,
+        sampled_pulses: bool = False,
+        seed: int = 0,
+    ) -> None:
+        assert controller in CONTROLLERS
+        self.scale = apt.Scale()
+        self.serial = 28_000_001 if controller == "kbd101" else 103_000_001
+        self.gone = self.mute = self.panel_disabled = self.ignores_moves = False
+        self.extra_bits = 0
+        self.withheld: set[str] = set()
+        self.disturbance = Disturbance(seed)
+        self.axis = Axis(
+            clock_ns(), power_up_mm, travel_mm, on_plan or (lambda plan: None), sampled_pulses
+        )
+        self._clock_ns = clock_ns
+        self._rack = controller == "bbd30x"
+        self._bay = bay
+        self._address = apt.bay_address(bay) if self._rack else apt.SINGLE_UNIT
+        self._limits = (speed_max_mm_s, acceleration_max_mm_s2)
+        self._in = Wire(byte_ns)
+        self._out = Wire(byte_ns, late_ns)
+        self._heard = bytearray()
+        self._power_up()
+
+    def _power_up(self) -> None:
+        self.enabled = self.homed = False
+        self._velocity = {"channel": 1, "minimum": 0, "acceleration": 0, "velocity": 0}
+        self._velocity["velocity"] = self.scale.velocity(100.0)
+        self._velocity["acceleration"] = self.scale.acceleration(1000.0)
+        self._home = {"channel": 1, "direction": 2, "limit": 1, "velocity": 0, "offset": 0}
+        self._home["velocity"] = self.scale.velocity(10.0)
+        self._settings: dict[str, dict[str, int]] = {}
+        self._armed = False
+        self._ending = ""
+        self._updates_ns: int | None = None
+        self._unacknowledged = 0
+
+    def reboot(self) -> None:
+        """Lose power for a moment: settings, bits and counters are as at power-up."""
+        now_ns = self._clock_ns()
+        self.axis.stop(now_ns, EMERGENCY_MM_S2)
+        self._power_up()
+        self.axis.encoder_offset_mm = self.axis.position_mm(now_ns)
+        self._program_pulses()
+
+    def plan(self) -> MotionPlan:
+        """Tell the motion under way or the rest after it, in the clock's time."""
+        return self.axis.plan
+
+    def trigger_pulses(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
+        """Edges of the trigger output from ``from_ns`` to before ``until_ns``: time, rising."""
+        return self.axis.pulses(from_ns, until_ns)
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes of the host; they arrive one after the other from now on."""
+        if not self.gone:
+            for byte in data:
+                self._in.put(bytes((byte,)), self._clock_ns())
+
+    def step(self) -> bytes:
+        """Carry on until now; the bytes the host gets."""
+        if self.gone:
+            return b""
+        now_ns = self._clock_ns()
+        for at_ns, data in self._in.take(now_ns):
+            self._heard += data
+            self._listen(at_ns)
+        self._complete(now_ns)
+        while self._updates_ns is not None and self._updates_ns <= now_ns:
+            self._say_status("status", self._updates_ns)
+            self._updates_ns += UPDATE_NS
+        return b"".join(data for _, data in self._out.take(now_ns))
+
+    def next_ns(self) -> int | None:
+        """Time at which ``step`` has something to do next."""
+        moving = self.axis.plan.end_ns if self._ending else None
+        due = [self._in.next_ns, self._out.next_ns, self._updates_ns, moving]
+        return min((at_ns for at_ns in due if at_ns is not None), default=None)
+
+    def complain(self, code: int, text: str = "") -> None:
+        """Send an error message nobody asked for; the long form with ``text``."""
+        if text:
+            self._say("error_text", message=0, code=code, text=text.encode())
+        else:
+            self._say("error")
+
+    # What the host sends
+
+    def _listen(self, at_ns: int) -> None:
+        heard = self._heard
+        while len(heard) >= apt.HEADER_BYTES:
+            id, length = struct.unpack_from("<HH", heard)
+            layout = _HOST_LAYOUTS.get(id)
+            long = bool(heard[4] & apt.LONG)
+            known = layout is not None and long == bool(layout.payload) and heard[5] == apt.HOST
+            if layout is None or not known or (long and length != layout.payload_bytes):
+                del heard[0]
+                continue
+            size = apt.HEADER_BYTES + layout.payload_bytes
+            if len(heard) < size:
+                return
+            body = bytes(heard[:size])
+            del heard[:size]
+            fields = (
+                struct.unpack_from("<" + layout.payload, body, apt.HEADER_BYTES)
+                if layout.payload
+                else body[2:4]
+            )
+            self._obey(
+                layout.name,
+                body[4] & ~apt.LONG,
+                dict(zip(layout.fields, fields, strict=False)),
+                at_ns,
+            )
+
+    def _obey(self, name: str, address: int, values: dict[str, int], at_ns: int) -> None:
+        self._complete(at_ns)
+        if name == "request_bay" and self._rack and address == apt.RACK:
+            occupied = 1 if values["bay"] == self._bay - 1 else 2
+            self._say("bay", apt.RACK, at_ns, bay=values["bay"], state=occupied)
+        elif name == "set_rack_port" and address in (apt.RACK, apt.SINGLE_UNIT):
+            self._settings[name] = values
+            self._program_pulses()
+        elif name == "request_info" and (address == self._address or address == apt.RACK):
+            self._tell_info(address, at_ns)
+        elif address == self._address:
+            self._obey_axis(name, values, at_ns)
+
+    def _obey_axis(self, name: str, values: dict[str, int], at_ns: int) -> None:
+        match name:
+            case "keep_alive":
+                self._unacknowledged = 0
+            case "start_updates":
+                self._updates_ns = at_ns + UPDATE_NS
+            case "stop_updates":
+                self._updates_ns = None
+            case "set_enabled":
+                self.enabled = values["state"] == 1 and not self.panel_disabled
+                if not self.enabled:
+                    self.axis.stop(at_ns, EMERGENCY_MM_S2)
+            case "set_velocity":
+                self._velocity = values
+            case "set_home":
+                self._home = values
+            case "set_ports" | "set_pulses" | "set_rack_trigger":
+                self._settings[name] = values
+                self._program_pulses()
+            case "set_rack_trigger_state":
+                self._armed = values["state"] == 1
+                self._program_pulses()
+            case "home" | "move_absolute" | "stop":
+                self._motion(name, values, at_ns)
+            case _:
+                self._answer(name, at_ns)
+
+    def _motion(self, name: str, values: dict[str, int], at_ns: int) -> None:
+        # A motion begins now, not when its command came: the past has been told already.
+        at_ns = max(at_ns, self._clock_ns())
+        speed, acceleration = self._obeyed()
+        if name == "stop":
+            if self._ending:
+                self._ending = "stopped"
+            self.axis.stop(at_ns, EMERGENCY_MM_S2 if values["mode"] == 1 else acceleration)
+            return
+        if not self.enabled or self._ending or self.ignores_moves or self.axis.stalled:
+            return
+        if name == "home":
+            self.homed = False
+            speed = min(self._home["velocity"] / self.scale.velocity_unit, speed)
+            target = self.axis.travel_mm[0]
+        else:
+            target = self.scale.mm(values["position"]) + self.axis.encoder_offset_mm
+        self._ending = "homed" if name == "home" else "moved"
+        self.axis.move(at_ns, target, speed, acceleration)
+
+    def _obeyed(self) -> tuple[float, float]:
+        speed = self._velocity["velocity"] / self.scale.velocity_unit
+        acceleration = self._velocity["acceleration"] / self.scale.acceleration_unit
+        return min(speed, self._limits[0]), min(acceleration, self._limits[1])
+
+    def _complete(self, now_ns: int) -> None:
+        if not self._ending or self.axis.moving(now_ns) or self.axis.stalled:
+            return
+        ended, self._ending = self._ending, ""
+        end_ns = self.axis.plan.end_ns
+        if ended == "homed":
+            self.homed = True
+            self.axis.encoder_offset_mm = self.axis.travel_mm[0]
+            self._say("homed", at_ns=end_ns, channel=1)
+        else:
+            self._say_status(ended, end_ns)
+
+    def _program_pulses(self) -> None:
+        """Make the pattern of what ports and pulses are set to."""
+        ports = self._settings.get("set_ports", {})
+        modes = {ports.get("mode_1"), ports.get("mode_2")}
+        pulses = self._settings.get("set_pulses")
+        if self._rack:
+            pulses = self._settings.get("set_rack_trigger")
+            wired = self._settings.get("set_rack_port", {}).get("mode") == 1
+            modes = {pulses["out_mode"]} if pulses and wired and self._armed else set()
+        self.axis.pattern = None
+        if pulses is None:
+            return
+        steps: list[tuple[float, float, int] | None] = []
+        for sense, own_mode in (("forward", 0x0D), ("reverse", 0x0E)):
+            first, interval, count = (
+                pulses[f"{field}_{sense}"] for field in ("start", "interval", "count")
+            )
+            on = bool(modes & {own_mode, 0x0F}) and interval > 0
+            steps.append((self.scale.mm(first), self.scale.mm(interval), count) if on else None)
+        self.axis.pattern = PulsePattern(steps[0], steps[1], pulses["width_us"] * 1000)
+
+    # What the controller sends
+
+    def _answer(self, name: str, at_ns: int) -> None:
+        match name:
+            case "request_status":
+                self._say_status("status", at_ns)
+            case "request_axis":
+                self._tell_axis(at_ns)
+            case "request_velocity":
+                self._say("velocity", at_ns=at_ns, **self._velocity)
+            case "request_home":
+                self._say("home_parameters", at_ns=at_ns, **self._home)
+            case "request_enabled":
+                self._say("enabled", at_ns=at_ns, channel=1, state=1 if self.enabled else 2)
+            case "request_ports" | "request_pulses" | "request_rack_trigger":
+                kind = name.removeprefix("request_")
+                values = self._settings.get(f"set_{kind}")
+                if values is not None:
+                    self._say(kind, at_ns=at_ns, **values)
+
+    def _tell_info(self, address: int, at_ns: int) -> None:
+        model = b"BBD301" if self._rack else b"KBD101"
+        values = {"serial": self.serial, "type": 45 if address == apt.RACK else 44}
+        versions = {"minor": 4, "interim": 1, "major": 2, "hardware": 1, "modification": 0}
+        self._say("info", address, at_ns, model=model, notes=b"", channels=1, **values, **versions)
+
+    def _tell_axis(self, at_ns: int) -> None:
+        speed, acceleration = self._limits
+        low, high = self.axis.travel_mm
+        counts = self.scale
+        self._say(
+            "axis",
+            at_ns=at_ns,
+            channel=1,
+            stage=0,
+            axis=0,
+            part=b"DDS220",
+            serial=45_000_001,
+            counts_per_unit=round(counts.counts_per_mm),
+            minimum=0,
+            maximum=counts.position(high - low),
+            acceleration=counts.acceleration(acceleration),
+            deceleration=counts.acceleration(EMERGENCY_MM_S2),
+            velocity=counts.velocity(speed),
+        )
+
+    def _say_status(self, name: str, at_ns: int) -> None:
+        self._unacknowledged += 1
+        if self._unacknowledged > SILENT_AFTER:
+            return
+        velocity = self.axis.velocity_mm_s(at_ns) * self.scale.counts_per_mm * self.scale.cycle_s
+        self._say(
+            name,
+            at_ns=at_ns,
+            channel=1,
+            position=round(self.axis.encoder_mm(at_ns) * self.scale.counts_per_mm),
+            velocity=round(velocity),
+            current=0,
+            bits=self._bits(at_ns),
+        )
+
+    def _bits(self, at_ns: int) -> int:
+        velocity = self.axis.velocity_mm_s(at_ns)
+        moving = bool(self._ending)
+        here, (low, high) = self.axis.position_mm(at_ns), self.axis.travel_mm
+        blocked = self.axis.obstacle_mm is not None and abs(here - self.axis.obstacle_mm) < 1e-6
+        return self.extra_bits | sum(
+            mask
+            for mask, holds in (
+                (0x0000_0001, here >= high + 1e-6 or blocked),
+                (0x0000_0002, here <= low - 1e-6),
+                (0x0000_0010, moving and velocity > 0.0),
+                (0x0000_0020, moving and velocity < 0.0),
+                (0x0000_0100, True),
+                (0x0000_0200, self._ending == "homed"),
+                (0x0000_0400, self.homed),
+                (0x0000_1000, self.enabled),
+                (0x0000_2000, self.enabled and not moving),
+                (0x0000_4000, self.axis.stalled and moving),
+                (0x1000_0000, True),
+                (0x8000_0000, self.enabled),
+            )
+            if holds
+        )
+
+    def _say(
+        self, name: str, source: int = 0, at_ns: int | None = None, **values: int | bytes
+    ) -> None:
+        if self.mute or name in self.withheld:
+            return
+        layout = _ANSWERS[name]
+        if name in ("moved", "stopped") and not values:
+            layout = apt.FROM_CONTROLLER[layout.id][0]
+        fields = [values.get(field, 0) for field in layout.fields]
+        source = source or self._address
+        if layout.payload:
+            payload = struct.pack("<" + layout.payload, *fields)
+            head = struct.pack("<HHBB", layout.id, len(payload), apt.HOST | apt.LONG, source)
+        else:
+            payload = b""
+            head = struct.pack("<H", layout.id) + bytes([*fields, 0, 0][:2])
+            head += bytes((apt.HOST, source))
+        frame = self.disturbance.apply(head + payload)
+        self._out.put(frame, self._clock_ns() if at_ns is None else at_ns)
