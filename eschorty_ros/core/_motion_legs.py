@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core._motion_timing import Timing, refined_shape, start_of
+from eschorty_ros.core._motion_timing import Delays, Timing, refined_shape, start_of
 from eschorty_ros.core.motion import MotionPlan, plan_stop
 
 _READINGS_MAX = 512
 _LEAST_TO_JUDGE = 6
-_AGREEING_SHARE = 0.75
+_AGREEING_SHARE = 0.8
+# A shape that readings have changed is looked at again with so many times the readings.
+_AGAIN = 1.2
 # A motion that does not begin by then after it was ordered is not the one expected.
 LATEST_START_S = 0.5
 
@@ -65,9 +67,11 @@ class Move:
         Starts at rest, as early as it can.
     tolerance_mm : float
         How far a reading may lie beside the motion.
+    usual : Delays
+        Of the readings of earlier motions.
     """
 
-    def __init__(self, planned: MotionPlan, tolerance_mm: float) -> None:
+    def __init__(self, planned: MotionPlan, tolerance_mm: float, usual: Delays) -> None:
         self.from_ns = planned.start_ns
         self.residual_mm = 0.0
         self.sigma_mm = math.nan
@@ -77,10 +81,11 @@ class Move:
         self._readings: list[Reading] = []
         self._passing_s: list[float] = []
         self._speed: list[float] = []
+        self._usual = usual
         self._not_before_s = 0.0
         self._not_after_s = math.inf
         self._timing: Timing | None = None
-        self._reshaped = False
+        self._reshaped_at = 0
         self._fits = True
 
     def plan(self) -> MotionPlan | None:
@@ -110,10 +115,15 @@ class Move:
             return
         if len(self._readings) == _READINGS_MAX:
             for values in (self._readings, self._passing_s, self._speed):
-                del values[0]  # type: ignore[attr-defined]
+                del values[0]
         self._readings.append(reading)
         self._time([reading])
         self._fit()
+
+    @property
+    def delays(self) -> Delays:
+        """Delays of the readings so far."""
+        return self._usual if self._timing is None else self._timing.delays
 
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
         """Lowest and highest position a reading between the two times can have."""
@@ -151,8 +161,12 @@ class Move:
     def _fit(self) -> None:
         earliest_s, latest_s = self._bounds()
         agreeing = self._estimate(earliest_s, latest_s)
-        if agreeing >= _AGREEING_SHARE or len(self._readings) < _LEAST_TO_JUDGE:
+        count = len(self._readings)
+        if count < _LEAST_TO_JUDGE or count < _AGAIN * self._reshaped_at:
             return
+        if agreeing >= _AGREEING_SHARE and not self._reshaped_at:
+            return
+        self._reshaped_at = count
         positions = np.array([reading.position_mm for reading in self._readings])
         shape = refined_shape(self._shape, positions, earliest_s, latest_s)
         if shape is not None:
@@ -173,6 +187,7 @@ class Move:
             latest_s[there] - passing_s[there],
             slack_s,
             speed[there],
+            self._usual,
         )
         start_s = max(min(timing.start_s, self._not_after_s), self._not_before_s)
         self._timing = replace(timing, start_s=start_s)
@@ -190,7 +205,7 @@ class Move:
         latest_ns = np.array([reading.latest_ns for reading in self._readings])
         earliest_ns = np.array(
             [
-                reading.latest_ns if reading.earliest_ns is None else reading.earliest_ns
+                self.from_ns if reading.earliest_ns is None else reading.earliest_ns
                 for reading in self._readings
             ]
         )

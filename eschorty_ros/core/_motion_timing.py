@@ -20,12 +20,24 @@ _ACCELERATION_PRIOR = 0.3
 
 
 @dataclass(frozen=True, slots=True)
+class Delays:
+    """Mean time (s) from request to sample and from sample to receipt, the line's own left out.
+
+    A request is written to an idle line; an answer waits for adapter, kernel and scheduler.
+    """
+
+    before_s: float = 1e-4
+    after_s: float = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
 class Timing:
     """Start of a motion (s), its standard deviation (s), and which samples agree with it."""
 
     start_s: float
     sigma_s: float
     agreeing: NDArray[np.bool_]
+    delays: Delays
 
 
 def widest_agreement(low: Array, high: Array) -> tuple[float, float]:
@@ -38,12 +50,14 @@ def widest_agreement(low: Array, high: Array) -> tuple[float, float]:
     return float(ends[order][best]), float(ends[order][min(best + 1, ends.size - 1)])
 
 
-def start_of(earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array) -> Timing:
+def start_of(
+    earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array, usual: Delays
+) -> Timing:
     """Start from each sample's earliest and latest, as the sample alone would have it.
 
     Delays are positive: the true start is after all ``earliest`` and before all ``latest``. The
-    extremes miss it by about the mean distance to the extreme over the number of samples, which
-    is exact for exponential delays; both sides are joined by the inverse squares of that.
+    extremes miss it by the mean delay over the number of samples, as for exponential delays; both
+    sides are joined by the inverse squares of that. The usual delay counts as one sample more.
 
     Parameters
     ----------
@@ -52,34 +66,34 @@ def start_of(earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array) -
     slack_s : float64, shape (n,)
         Uncertainty of time that the position's own brings.
     speed : float64, shape (n,)
+    usual : Delays
+        Of earlier motions.
     """
     begin, end = widest_agreement(earliest_s - slack_s, latest_s + slack_s)
     middle = 0.5 * (begin + end) if np.isfinite(begin) else end
     agreeing = (earliest_s - slack_s <= middle) & (latest_s + slack_s >= middle)
     use = agreeing & (speed >= _FAST * speed[agreeing].max(initial=0.0))
-    count = max(int(np.count_nonzero(use)), 1)
     if not use.any():
-        return Timing(middle, float(end - begin), agreeing)
+        return Timing(middle, float(end - begin), agreeing, usual)
     floor_s = float(slack_s[use].min()) + 1e-9
-    after, late_s = _extreme(latest_s[use], count, floor_s)
+    after, late_s, after_s = _extreme(latest_s[use], usual.after_s, floor_s)
     known = use & np.isfinite(earliest_s)
     if not known.any():
-        return Timing(after, late_s, agreeing)
-    before, early_s = _extreme(-earliest_s[known], int(np.count_nonzero(known)), floor_s)
+        return Timing(after, late_s, agreeing, Delays(usual.before_s, after_s))
+    before, early_s, before_s = _extreme(-earliest_s[known], usual.before_s, floor_s)
     weights = np.array([late_s**-2, early_s**-2])
     joined = float(weights @ np.array([after, -before]) / weights.sum())
-    bounds = sorted((float(latest_s[use].min()), float(earliest_s[known].max())))
-    return Timing(float(np.clip(joined, *bounds)), float(weights.sum() ** -0.5), agreeing)
+    low, high = sorted((float(latest_s[use].min()), float(earliest_s[known].max())))
+    sigma_s = float(weights.sum() ** -0.5)
+    return Timing(min(max(joined, low), high), sigma_s, agreeing, Delays(before_s, after_s))
 
 
-def _extreme(values: Array, count: int, floor_s: float) -> tuple[float, float]:
-    """Lower end of positive delays and the error of it."""
-    least = float(values.min())
-    excess = float(values.mean()) - least
-    if count == 1:
-        return least, 1e-3
-    correction = excess / (count - 1)
-    return least - correction, max(correction, floor_s)
+def _extreme(values: Array, usual_s: float, floor_s: float) -> tuple[float, float, float]:
+    """Lower end of positive delays, the error of it, and the mean delay."""
+    least, count = float(values.min()), values.size
+    mean_s = float(values.mean()) - least + usual_s / count
+    correction = mean_s / count
+    return least - correction, max(correction, floor_s), mean_s
 
 
 def refined_shape(

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core._checks import TIME_LIMIT, number, positive, times, whole
 from eschorty_ros.core._motion_legs import Leg, Move, Reading, Stop, Unknown
+from eschorty_ros.core._motion_timing import Delays
 from eschorty_ros.core.clock import POSITION_LIMIT_MM
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.motion import MotionPlan
@@ -46,6 +47,7 @@ class MotionFit:
         self.late_readings = 0
         self._readings: deque[Reading] = deque(maxlen=_READINGS_MAX)
         self._legs: list[Leg] = [Unknown(-TIME_LIMIT)]
+        self._delays = Delays()
 
     @property
     def until_ns(self) -> int | None:
@@ -101,7 +103,7 @@ class MotionFit:
 
     def follow(self, plan: MotionPlan) -> None:
         """Expect ``plan``, from rest to rest, to begin at its ``start_ns`` or soon after."""
-        self._begin(Move(plan, self._tolerance_mm))
+        self._begin(Move(plan, self._tolerance_mm, self._delays))
 
     def stop(self, at_ns: int, deceleration_mm_s2: float) -> None:
         """Expect the motion under way to end in a ramp that begins at ``at_ns`` or soon after."""
@@ -137,30 +139,52 @@ class MotionFit:
         if not self._readings:
             raise ArgumentError("the position is unknown; observe a reading first")
         flat = wanted.reshape(-1)
-        position, velocity = self._between(flat)
+        position, velocity = np.empty(flat.shape), np.empty(flat.shape)
         begins = [leg.from_ns for leg in self._legs]
         which = np.array([bisect_right(begins, int(t)) - 1 for t in flat], dtype=np.intp)
         for index in np.unique(which):
-            plan = self._legs[max(int(index), 0)].plan()
-            if plan is not None:
-                chosen = which == index
+            chosen = which == index
+            plan = self._legs[index].plan()
+            if plan is None:
+                position[chosen], velocity[chosen] = self._between(int(index), flat[chosen])
+            else:
                 position[chosen], velocity[chosen] = plan.state(flat[chosen])
         return position.reshape(wanted.shape), velocity.reshape(wanted.shape)
 
-    def _between(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions on lines between readings."""
-        origin_ns = self._readings[0].middle_ns
-        at_s = np.array([reading.middle_ns - origin_ns for reading in self._readings]) * 1e-9
-        places = np.array([reading.position_mm for reading in self._readings])
-        wanted_s = (np.clip(t_ns, -TIME_LIMIT, TIME_LIMIT) - origin_ns) * 1e-9
+    def _between(
+        self, index: int, t_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions on lines between the readings of a leg, and the known motions beside it."""
+        begin_ns = self._legs[index].from_ns
+        end_ns = self._legs[index + 1].from_ns if index + 1 < len(self._legs) else TIME_LIMIT
+        before = self._legs[index - 1].plan() if index else None
+        after = self._legs[index + 1].plan() if index + 1 < len(self._legs) else None
+        # Beside another unknown leg its readings count, too.
+        low_ns = begin_ns if before is not None else -TIME_LIMIT
+        high_ns = end_ns if after is not None else TIME_LIMIT
+        knots = [
+            (reading.middle_ns, reading.position_mm)
+            for reading in self._readings
+            if low_ns < reading.middle_ns < high_ns
+        ]
+        if before is not None:
+            knots.insert(0, (begin_ns, float(before.state(begin_ns)[0])))
+        if after is not None:
+            knots.append((end_ns, float(after.state(end_ns)[0])))
+        at_s = np.array([at_ns - knots[0][0] for at_ns, _ in knots]) * 1e-9
+        places = np.array([place for _, place in knots])
+        wanted_s = (np.clip(t_ns, -TIME_LIMIT, TIME_LIMIT) - knots[0][0]) * 1e-9
         position = np.interp(wanted_s, at_s, places)
-        if len(at_s) < 2:
+        if len(knots) < 2:
             return position, np.zeros_like(position)
-        slopes = np.diff(places) / np.diff(at_s)
+        slopes = np.diff(places) / np.maximum(np.diff(at_s), 1e-9)
         piece = np.clip(np.searchsorted(at_s, wanted_s) - 1, 0, len(slopes) - 1)
         inside = (wanted_s >= at_s[0]) & (wanted_s <= at_s[-1])
         return position, np.where(inside, slopes[piece], 0.0)
 
     def _begin(self, leg: Leg) -> None:
+        last = self._legs[-1]
+        if isinstance(last, Move) and last.plan() is not None:
+            self._delays = last.delays
         self._legs.append(leg)
         del self._legs[:-_LEGS_MAX]

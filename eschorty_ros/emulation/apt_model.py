@@ -394,7 +394,7 @@ class AptModel:
             head = struct.pack("<HHBB", layout.id, len(payload), apt.HOST | apt.LONG, source)
         else:
             payload = b""
-            head = struct.pack("<H", layout.id) + bytes([*fields, 0, 0][:2])
-            head += bytes((apt.HOST, source))
+            first, second = (*fields, 0, 0)[:2]
+            head = struct.pack("<HBBBB", layout.id, first, second, apt.HOST, source)
         frame = self.disturbance.apply(head + payload)
         self._out.put(frame, self._clock_ns() if at_ns is None else at_ns)

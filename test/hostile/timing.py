@@ -14,6 +14,7 @@ from eschorty_ros.core import (
     lower_envelope,
     modulation,
     motion,
+    motion_fit,
     phase,
     phase_gate,
     phase_lock,
@@ -61,6 +62,14 @@ def a_lock() -> phase_lock.PhaseLock:
 
 
 GRID = pulses.PulseGrid(0.0, 2.0, 3)
+
+
+def a_fit() -> motion_fit.MotionFit:
+    fit = motion_fit.MotionFit()
+    fit.observe(0.0, 10, 5)
+    fit.follow(motion.plan_move(20, 0.0, 5.0, 1.0, 1.0))
+    return fit
+
 
 CALLS: dict[str, Call] = {
     "clock.quantise_nm": Call(
@@ -195,6 +204,44 @@ CALLS: dict[str, Call] = {
     ),
     "motion.MotionPlan.state": Call(
         motion.plan_move(0, 0.0, 5.0, 1.0, 1.0).state,
+        {"t_ns": [3, 4]},
+        {"t_ns": integers(2**63, size=2, any_shape=True)},
+    ),
+    "motion.MotionPlan.passing_s": Call(
+        motion.plan_move(0, 0.0, 5.0, 1.0, 1.0).passing_s,
+        {"position_mm": [1.0, 2.0]},
+        {"position_mm": vector(size=2)},
+    ),
+    "motion_fit.MotionFit": Call(
+        motion_fit.MotionFit, {"tolerance_mm": 1e-3}, {"tolerance_mm": number(0.0)}
+    ),
+    "motion_fit.MotionFit.observe": Call(
+        method(a_fit, "observe"),
+        {"position_mm": 1.0, "latest_ns": 10**9, "earliest_ns": 10**9 - 5},
+        {
+            "position_mm": number(2e9, -2e9),
+            "latest_ns": whole(),
+            "earliest_ns": whole(10**9 + 1, optional=True),
+        },
+    ),
+    "motion_fit.MotionFit.follow": Call(
+        method(a_fit, "follow"), {"plan": motion.plan_move(0, 0.0, 5.0, 1.0, 1.0)}, {}
+    ),
+    "motion_fit.MotionFit.stop": Call(
+        method(a_fit, "stop"),
+        {"at_ns": 10**9, "deceleration_mm_s2": 1.0},
+        {"at_ns": whole(), "deceleration_mm_s2": number(0.0)},
+    ),
+    "motion_fit.MotionFit.wander": Call(
+        method(a_fit, "wander"), {"at_ns": 10**9}, {"at_ns": whole()}
+    ),
+    "motion_fit.MotionFit.expected_mm": Call(
+        method(a_fit, "expected_mm"),
+        {"earliest_ns": 10**9, "latest_ns": 2 * 10**9},
+        {"earliest_ns": whole(), "latest_ns": whole()},
+    ),
+    "motion_fit.MotionFit.state": Call(
+        method(a_fit, "state"),
         {"t_ns": [3, 4]},
         {"t_ns": integers(2**63, size=2, any_shape=True)},
     ),

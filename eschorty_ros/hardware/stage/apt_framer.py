@@ -47,7 +47,7 @@ class AptFramer:
     def _take(self, frames: list[Frame]) -> None:
         buffer = self._buffer
         while len(buffer) >= HEADER_BYTES:
-            size = frame_bytes(buffer[:HEADER_BYTES])
+            size = frame_bytes(bytes(buffer[:HEADER_BYTES]))
             if size == 0:
                 self._skip()
             elif len(buffer) < size:

@@ -1,4 +1,4 @@
-"""The controller's serial port: found by its USB serial number, opened as the controllers want it."""
+"""The controller's serial port: found by its USB serial number, opened for one program."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def find_port(controller: str, serial_number: str = "") -> str:
         fitting = [port for port in ports if port.serial_number == serial_number]
         wanted = f"with USB serial number {serial_number}"
     else:
-        fitting = [port for port in ports if port.serial_number.startswith(PREFIXES[controller])]
+        fitting = [
+            port for port in ports if str(port.serial_number).startswith(PREFIXES[controller])
+        ]
         wanted = f"of a {controller}"
     if not fitting:
         found = ", ".join(f"{port.device} ({port.serial_number})" for port in ports) or "none"
@@ -77,7 +79,7 @@ def open_port(name: str) -> SerialPort:
     except (serial.SerialException, OSError) as error:
         port.close()
         raise _refusal(name, error) from error
-    return port  # type: ignore[no-any-return]
+    return port
 
 
 def _refusal(name: str, error: Exception) -> DeviceError:

@@ -1,0 +1,87 @@
+"""The framer finds frames in a stream without checksum or sync byte."""
+
+from __future__ import annotations
+
+import random
+import struct
+
+from eschorty_ros.hardware.stage.apt_framer import AptFramer
+
+MS = 1_000_000
+
+
+def status(position: int) -> bytes:
+    return struct.pack("<HHBBHihHI", 0x0491, 14, 0x81, 0x50, 1, position, 0, 0, 0x8000_2400)
+
+
+def positions(frames: list) -> list[int]:
+    return [frame.whole("position") for frame in frames if frame.name == "status"]
+
+
+def test_frames_in_any_pieces() -> None:
+    data = b"".join(status(k) for k in range(50)) + b"\x44\x04\x01\x00\x01\x50"
+    for size in (1, 3, 7, 19, 20, 1000):
+        framer = AptFramer()
+        frames = []
+        for first in range(0, len(data), size):
+            frames += framer.feed(data[first : first + size], 0)
+        assert positions(frames) == list(range(50))
+        assert frames[-1].name == "homed"
+        assert framer.frames == 51
+        assert framer.skipped_bytes == 0
+
+
+def test_fault_s1_garbage_between_frames() -> None:
+    """driver: skips it byte by byte and counts. user reads: skipped_bytes in the diagnostics."""
+    chance = random.Random(1)
+    for _ in range(200):
+        garbage = chance.randbytes(chance.randrange(1, 40))
+        framer = AptFramer()
+        frames = framer.feed(status(1) + garbage, 0)
+        # What looks like the beginning of a frame is given up when nothing follows it.
+        frames += framer.feed(status(2), 60 * MS) + framer.feed(status(3), 120 * MS)
+        frames += framer.feed(b"", 200 * MS)
+        assert positions(frames) == [1, 2, 3]
+        assert framer.skipped_bytes == len(garbage)
+
+
+def test_nothing_but_known_frames_for_the_host_passes() -> None:
+    good = status(7)
+    wrong = {
+        "identifier": b"\x93" + good[1:],
+        "length": good[:2] + b"\x0d" + good[3:],
+        "destination": good[:4] + b"\x85" + good[5:],
+        "source": good[:5] + b"\x33" + good[6:],
+        "short form": good[:4] + b"\x01" + good[5:],
+    }
+    for what, data in wrong.items():
+        framer = AptFramer()
+        assert positions(framer.feed(data + good, 0)) == [7], what
+        assert framer.skipped_bytes == len(data), what
+
+
+def test_fault_s2_lost_bytes() -> None:
+    """driver: loses one or two frames a cut, never more. user reads: broken_frames counted."""
+    chance = random.Random(2)
+    framer = AptFramer()
+    kept = []
+    cuts = 0
+    for k in range(20_000):
+        data = status(k)
+        if chance.random() < 0.01:
+            cut = chance.randrange(len(data))
+            data = data[:cut] + data[cut + 1 :]
+            cuts += 1
+        kept += framer.feed(data, k * 20 * MS)
+    right = set(range(20_000))
+    assert len(right.intersection(positions(kept))) >= 20_000 - 2 * cuts
+
+
+def test_incomplete_frame_is_given_up_after_50_ms() -> None:
+    framer = AptFramer()
+    assert framer.feed(status(1)[:12], 0) == []
+    assert framer.feed(b"", 49 * MS) == []
+    assert framer.broken_frames == 0
+    assert framer.feed(b"", 51 * MS) == []
+    assert framer.broken_frames == 1
+    assert positions(framer.feed(status(2), 52 * MS)) == [2]

@@ -1,0 +1,162 @@
+"""APT layouts against thorlabs-apt-protocol, the manual's frames, and the protocol's scaling."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+import thorlabs_apt_protocol as oracle
+
+from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.hardware.stage import apt_messages as apt
+
+BAY = 0x21
+PULSES = {
+    "start_forward": 40_000,
+    "interval_forward": 40_000,
+    "count_forward": 109,
+    "start_reverse": 4_360_000,
+    "interval_reverse": 40_000,
+    "count_reverse": 109,
+    "width_us": 500,
+    "cycles": 7,
+}
+
+PACKED = [
+    (apt.pack("disconnect", 0x50), oracle.hw_disconnect(0x50, 1)),
+    (apt.pack("request_info", 0x11), oracle.hw_req_info(0x11, 1)),
+    (apt.pack("start_updates", BAY), oracle.hw_start_updatemsgs(BAY, 1)),
+    (apt.pack("stop_updates", BAY), oracle.hw_stop_updatemsgs(BAY, 1)),
+    (apt.pack("request_bay", 0x11, bay=2), oracle.rack_req_bayused(0x11, 1, 2)),
+    (
+        apt.pack("set_enabled", BAY, channel=1, state=1),
+        oracle.mod_set_chanenablestate(BAY, 1, 1, 1),
+    ),
+    (
+        apt.pack(
+            "set_velocity", BAY, channel=1, minimum=0, acceleration=27_488, velocity=33_554_432
+        ),
+        oracle.mot_set_velparams(BAY, 1, 1, 0, 27_488, 33_554_432),
+    ),
+    (apt.pack("request_velocity", BAY, channel=1), oracle.mot_req_velparams(BAY, 1, 1)),
+    (
+        apt.pack("set_home", BAY, channel=1, direction=2, limit=1, velocity=1_342_177, offset=-5),
+        oracle.mot_set_homeparams(BAY, 1, 1, 2, 1, 1_342_177, -5),
+    ),
+    (apt.pack("home", BAY, channel=1), oracle.mot_move_home(BAY, 1, 1)),
+    (
+        apt.pack("move_absolute", BAY, channel=1, position=-4_400_000),
+        oracle.mot_move_absolute(BAY, 1, 1, -4_400_000),
+    ),
+    (apt.pack("stop", BAY, channel=1, mode=2), oracle.mot_move_stop(BAY, 1, 1, 2)),
+    (apt.pack("resume_end_of_move", BAY), oracle.mot_resume_endofmovemsges(BAY, 1)),
+    (apt.pack("request_status", BAY, channel=1), oracle.mot_req_dcstatusupdate(BAY, 1, 1)),
+    (apt.pack("keep_alive", BAY), oracle.mot_ack_dcstatusupdate(BAY, 1)),
+    (apt.pack("request_axis", BAY, channel=1), oracle.mot_req_stageaxisparams(BAY, 1, 1)),
+    (
+        apt.pack("set_profile_mode", BAY, channel=1, mode=0, jerk=100),
+        oracle.mot_set_profilemodeparams(BAY, 1, 1, 0, 100),
+    ),
+    (
+        apt.pack(
+            "set_ports",
+            0x50,
+            channel=1,
+            mode_1=15,
+            polarity_1=1,
+            mode_2=0,
+            polarity_2=1,
+            reserved=0,
+        ),
+        oracle.mot_set_kcubetrigioconfig(0x50, 1, 1, 15, 1, 0, 1),
+    ),
+    (
+        apt.pack("set_pulses", 0x50, channel=1, **PULSES),
+        oracle.mot_set_kcubeposttrigparams(0x50, 1, 1, *PULSES.values()),
+    ),
+]
+
+
+@pytest.mark.parametrize(("ours", "theirs"), PACKED, ids=[ours[:2].hex() for ours, _ in PACKED])
+def test_frames_are_those_of_the_oracle(ours: bytes, theirs: bytes) -> None:
+    assert ours.hex(" ") == theirs.hex(" ")
+
+
+def test_frames_of_the_manual() -> None:
+    scale = apt.Scale()
+    velocity = apt.pack(
+        "set_velocity",
+        apt.bay_address(2),
+        channel=1,
+        minimum=0,
+        acceleration=scale.acceleration(1000.0),
+        velocity=scale.velocity(100.0),
+    )
+    assert velocity.hex(" ") == "13 04 0e 00 a2 01 01 00 00 00 00 00 b0 35 00 00 cd cc cc 00"
+    assert apt.pack("keep_alive", BAY) == bytes.fromhex("920400002101")
+    assert scale.velocity(25.0) == struct.unpack("<i", bytes.fromhex("33333300"))[0]
+    assert scale.velocity(200.0) == 26_843_546
+    assert scale.acceleration(2000.0) == 27_488
+    assert scale.position(220.0) == 4.4e6
+
+
+def frame(id: int, payload: bytes, source: int = BAY) -> bytes:
+    return struct.pack("<HHBB", id, len(payload), 0x81, source) + payload
+
+
+INCOMING = [
+    (0x0491, struct.pack("<HihHI", 1, -123_456, -205, 3, 0x8000_2410)),
+    (0x0464, struct.pack("<HihHI", 1, 4_400_000, 0, 3, 0x8000_2400)),
+    (0x0466, struct.pack("<HihHI", 1, 5, 0, 3, 0x8000_2400)),
+    (0x0415, struct.pack("<H3i", 1, 0, 13_744, 13_421_773)),
+    (0x0442, struct.pack("<3H2i", 1, 2, 1, 1_342_177, 0)),
+    (0x0528, struct.pack("<H8i", 1, *PULSES.values())),
+]
+
+
+@pytest.mark.parametrize(("id", "payload"), INCOMING, ids=[hex(id) for id, _ in INCOMING])
+def test_fields_are_those_of_the_oracle(id: int, payload: bytes) -> None:
+    data = frame(id, payload)
+    ours = apt.parse(data)
+    (theirs,) = oracle.Unpacker(__import__("io").BytesIO(data))
+    values = list(theirs._asdict().values())
+    assert ours.source == BAY
+    for field, value in ours.values.items():
+        if field not in ("bits", "current"):
+            assert value in values, field
+    if "bits" in ours.values:
+        names = {
+            "homed": theirs.homed,
+            "settled": theirs.settled,
+            "enabled": theirs.channel_enabled,
+            "moving_forward": theirs.moving_forward,
+            "position_error": theirs.motion_error,
+        }
+        decoded = apt.decode_bits(ours.whole("bits"))
+        assert {name for name, holds in names.items() if holds} == set(decoded) & set(names)
+
+
+def test_axis_data_of_the_manual() -> None:
+    values = (1, 0, 0, b"MLS203", 94_000_001, 20_000, 0, 1_500_000, 27_488, 27_488, 26_843_546)
+    data = frame(0x04F2, struct.pack("<3H16s2I5i24x", *values))
+    ours = apt.parse(data)
+    (theirs,) = oracle.Unpacker(__import__("io").BytesIO(data))
+    assert ours.whole("counts_per_unit") == theirs.counts_per_unit == 20_000
+    assert ours.whole("maximum") == theirs.max_pos == 1_500_000
+    assert ours.whole("velocity") == theirs.max_vel
+    assert ours.text("part") == "MLS203"
+
+
+def test_every_status_bit_has_one_name() -> None:
+    assert sum(apt.STATUS_BITS) == 0xFFFF_FFFF
+    assert len(set(apt.STATUS_BITS.values())) == 32
+    assert apt.decode_bits(0x401) == ("forward_hard_limit", "homed")
+
+
+def test_wrong_use_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="bay is 11"):
+        apt.bay_address(11)
+    with pytest.raises(ArgumentError, match="no field speed"):
+        apt.pack("home", BAY, channel=1, speed=3)
+    with pytest.raises(ArgumentError, match="whole known message"):
+        apt.parse(b"\x91\x04\x00\x00\x01\x21")
