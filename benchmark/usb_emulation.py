@@ -1,5 +1,7 @@
 """How fast the emulated bus delivers, in this process and from another: one table.
 
+The last rows are the EVK4 model's events as it hands them out, one packet of the sensor a read.
+
 Usage: python benchmark/usb_emulation.py [--megabytes 512]
 """
 
@@ -8,45 +10,83 @@ import array
 import multiprocessing
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import usb.core
 import usb.util
 
+from eschorty_ros.emulation.evk4_model import DATA_IN, Evk4Model
+from eschorty_ros.emulation.evk4_sequences import SEQUENCES
 from eschorty_ros.emulation.usb_backend import EmulatedBackend
-from eschorty_ros.emulation.usb_device import (
-    SPEED_SUPER,
-    EmulatedUsbDevice,
-    EndpointIdentity,
-    UsbIdentity,
-)
 from eschorty_ros.emulation.usb_remote import backend
 from eschorty_ros.emulation.usb_server import UsbServer
 
-DATA_IN = 0x81
-IDENTITY = UsbIdentity(
-    0x04B4,
-    0x00F5,
-    interface_class=0xFF,
-    interface_subclass=0x19,
-    interface_protocol=0,
-    endpoints=(EndpointIdentity(DATA_IN, 1024),),
-    speed=SPEED_SUPER,
-)
-SIZES_KIB = (16, 128, 512)
+PERIODS_US = (1008, 4000)
+EVENTS_PER_US = 20
+WARM_UP_READS = 20
 
 
-class Spring(EmulatedUsbDevice):
-    """Always has as much data as is asked for."""
+class Spring:
+    """An endless stream of sparse events, 4 bytes each and two more a microsecond."""
 
-    _data = bytes(1 << 20)
+    def __init__(self):
+        low = 0x6000 | np.arange(4096, dtype=np.uint16)[:, None]
+        y = np.broadcast_to(np.arange(EVENTS_PER_US, dtype=np.uint16), (4096, EVENTS_PER_US))
+        pairs = np.stack((y, 0x2000 | y), axis=2).reshape(4096, -1)
+        self._piece = np.concatenate((low, pairs), axis=1).ravel()
+        self._high = 0
+
+    def start(self):
+        self._high = 0
+
+    def stop(self):
+        pass
+
+    def read(self, max_bytes, timeout_s):
+        self._high += 1
+        high = np.array([0x8000 | self._high & 0xFFF], np.uint16)
+        return np.concatenate((high, self._piece)).tobytes()
+
+
+class Firehose(Evk4Model):
+    """A camera that always has as much data as is asked for."""
+
+    _data = memoryview(bytes(1 << 20))
 
     def bulk_in(self, endpoint, size, timeout_ms):
-        return memoryview(self._data)[:size]
+        return self._data[:size]
 
 
-def serve(path, ready, done):
-    device = Spring(IDENTITY)
+def streaming_camera(period_us):
+    camera = Evk4Model(Spring())
+    for name in ("init", "start"):
+        for step in SEQUENCES[name]:
+            camera.write(step.address, camera.read(step.address) & ~step.mask | step.value)
+    camera.write(0xB028, period_us)
+    return camera
+
+
+@dataclass(frozen=True)
+class Row:
+    text: str
+    size: int
+    make: object
+    arguments: tuple = ()
+
+
+ROWS = (
+    *(
+        Row(f"any bytes, reads of {kib} KiB", kib << 10, Firehose, (None,))
+        for kib in (16, 128, 512)
+    ),
+    *(Row(f"events, packets of {us} us", 128 << 10, streaming_camera, (us,)) for us in PERIODS_US),
+)
+
+
+def serve(path, row, ready, done):
+    device = row.make(*row.arguments)
     with UsbServer(path, lambda: [device]):
         ready.set()
         done.wait()
@@ -55,34 +95,39 @@ def serve(path, ready, done):
 def rate_mb_s(bus, size, total):
     device = usb.core.find(backend=bus)
     buffer = array.array("B", bytes(size))
-    device.read(DATA_IN, buffer)
-    begun = time.perf_counter()
-    for _ in range(total // size):
+    for _ in range(WARM_UP_READS):
         device.read(DATA_IN, buffer)
+    begun, received = time.perf_counter(), 0
+    while received < total:
+        received += device.read(DATA_IN, buffer)
     seconds = time.perf_counter() - begun
     usb.util.dispose_resources(device)
-    return total // size * size / seconds / 1e6
+    return received / seconds / 1e6
+
+
+def measure(row, path, total):
+    device = row.make(*row.arguments)
+    here = rate_mb_s(EmulatedBackend(lambda: [device]), row.size, total)
+    spawn = multiprocessing.get_context("spawn")
+    ready, done = spawn.Event(), spawn.Event()
+    server = spawn.Process(target=serve, args=(path, row, ready, done))
+    server.start()
+    ready.wait()
+    there = rate_mb_s(backend(path), row.size, total)
+    done.set()
+    server.join()
+    return here, there
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--megabytes", type=int, default=512)
     total = parser.parse_args().megabytes * 1_000_000
-    spawn = multiprocessing.get_context("spawn")
-    ready, done = spawn.Event(), spawn.Event()
+    print("| what | same process | another process |\n|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder) / "usb.sock")
-        server = spawn.Process(target=serve, args=(path, ready, done))
-        server.start()
-        ready.wait()
-        device = Spring(IDENTITY)
-        here = EmulatedBackend(lambda: [device])
-        print("| read size | same process | another process |\n|---|---|---|")
-        for kib in SIZES_KIB:
-            rates = [rate_mb_s(bus, kib * 1024, total) for bus in (here, backend(path))]
-            print(f"| {kib} KiB | {rates[0]:.0f} MB/s | {rates[1]:.0f} MB/s |")
-        done.set()
-        server.join()
+        for row in ROWS:
+            here, there = measure(row, str(Path(folder) / "usb.sock"), total)
+            print(f"| {row.text} | {here:.0f} MB/s | {there:.0f} MB/s |", flush=True)
 
 
 if __name__ == "__main__":

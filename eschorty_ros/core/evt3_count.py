@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from eschorty_ros.core import _evt3_count_kernels as kernels
+from eschorty_ros.core._checks import octets
 
 
 class WordCounter:
@@ -32,6 +33,12 @@ class WordCounter:
     drop_words = property(lambda self: int(self._counts[kernels.DROP_WORDS]))
 
     def add(self, data: bytes | bytearray | memoryview) -> None:
-        """Count whole 16-bit words; a lone last byte is left out."""
-        view = memoryview(data).cast("B")
+        """Count whole 16-bit words; a lone last byte is left out.
+
+        Raises
+        ------
+        ArgumentError
+            For anything but bytes.
+        """
+        view = octets("data", data)
         kernels.count_words(np.frombuffer(view[: len(view) & ~1], "<u2"), self._counts)

@@ -1,5 +1,6 @@
 """Fault plans: what a file may say, and that it happens to the models when it says."""
 
+import copy
 import errno
 import struct
 from types import SimpleNamespace
@@ -9,6 +10,8 @@ import usb.core
 from usb_loop import IN, OUT, Loop
 
 from eschorty_ros.core.errors import FormatError
+from eschorty_ros.emulation.awg_model import AwgModel
+from eschorty_ros.emulation.evk4_model import Evk4Model
 from eschorty_ros.emulation.fault_catalogue import CATALOGUE, Dose
 from eschorty_ros.emulation.faults import FaultPlan, FaultScript, load_fault_plan
 from eschorty_ros.emulation.usb_backend import EmulatedBackend
@@ -175,3 +178,57 @@ def test_the_catalogue_says_what_its_faults_do():
             assert kind.means, name
             assert kind.id[0] in "USX", name
     assert Dose().amount == 1
+
+
+@pytest.mark.parametrize(
+    ("device", "name"), [(device, name) for device, kinds in CATALOGUE.items() for name in kinds]
+)
+def test_every_fault_begins_and_ends_on_the_model_of_its_device(device, name):
+    model, before = fresh(device)
+    kind = CATALOGUE[device][name]
+    kind.begin(model, Dose(3, TARGETS.get(name, "moved"), now_ns=0))
+    if kind.end:
+        assert switches(model) != before
+        kind.end(model, Dose(3, TARGETS.get(name, "moved"), now_ns=0))
+        assert switches(model) == before
+
+
+TARGETS = {"changed": "BASE:FREQuency=19999", "ignored": "BASE:FREQuency", "touched": "OUTPut=ON"}
+
+
+def fresh(device):
+    models = {
+        "camera": lambda: Evk4Model(Silence()),
+        "laser": lambda: AwgModel(lambda: 0),
+        "stage": lambda: pytest.importorskip("eschorty_ros.emulation.apt_model").AptModel(
+            lambda: 0
+        ),
+    }
+    model = models[device]()
+    return model, switches(model)
+
+
+def switches(model):
+    """Public state that faults work on; the address alone changes for good."""
+    parts = (model, *(getattr(model, n, None) for n in ("faults", "answer_faults", "axis")))
+    values = {}
+    for part in parts:
+        values |= {
+            f"{type(part).__name__}.{name}": copy.copy(value)
+            for name, value in getattr(part, "__dict__", {}).items()
+            if isinstance(value, (bool, int, str, set, dict, type(None)))
+            and name.lstrip("_") == name
+            and name not in ("address", "on_transfer")
+        }
+    return values | {"gone": model.gone}
+
+
+class Silence:
+    def start(self):
+        pass
+
+    def stop(self):
+        pass
+
+    def read(self, max_bytes, timeout_s):
+        return b""

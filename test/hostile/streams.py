@@ -7,6 +7,7 @@ from typing import Any
 
 from eschorty_ros.core import (
     evt3,
+    evt3_count,
     held_events,
     modulation,
     noise,
@@ -91,6 +92,10 @@ CALLS: dict[str, Call] = {
     "evt3.Decoder.note_gap": Call(method(evt3.Decoder, "note_gap"), {}),
     "evt3.Decoder.decode": Call(
         method(evt3.Decoder, "decode"), {"data": b"\x00\x80"}, {"data": octets()}
+    ),
+    "evt3_count.WordCounter": Call(evt3_count.WordCounter, {}),
+    "evt3_count.WordCounter.add": Call(
+        method(evt3_count.WordCounter, "add"), {"data": b"\x00\x80"}, {"data": octets()}
     ),
     "evt3.event_arrays": Call(evt3.event_arrays, {"size": 3}, {"size": whole(-1, 1 << 40)}),
     "held_events.HeldEvents": Call(held_events.HeldEvents, {}),
