@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 from eschorty_ros.core.errors import ArgumentError, DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_settings
-from eschorty_ros.hardware.laser.awg_link import open_link
+from eschorty_ros.hardware.laser.awg_connection import AwgConnection
 from eschorty_ros.hardware.laser.awg_profile import load_profile
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.scpi import InterruptedByOffError
@@ -24,8 +24,6 @@ from eschorty_ros.hardware.protocols import (
 
 FREQUENCY_DEFAULT_HZ = 70.0
 """Told before the first ``configure``."""
-OFF_LIMIT_S = 1.0
-"""Time after which switching off begins no further try: the state is unknown then."""
 
 
 class AwgLaser:
@@ -69,19 +67,18 @@ class AwgLaser:
         self._ready = False
         self._output = LaserOutput.UNKNOWN
         self._since_ns = clock_ns()
-        self._serial = ""
-        self._channel: AwgChannel | None = None
-        self._counts = {"opened": 0, "switch_off_failures": 0}
+        self._connection = AwgConnection(settings, self._profile, self._may_go_on)
+        self._failed_offs = 0
         self.identity = DeviceIdentity(self._profile.name, settings.serial)
         self._notes: list[str] = []
         with self._lock:
-            self._open()
+            self._connection.open()
             try:
                 self._darken()
-                self.identity = self._channel_open().introduce()
-                self._channel_open().unlock()
+                self.identity = self._connection.channel.introduce()
+                self._connection.channel.unlock()
             except DeviceError:
-                self._drop()
+                self._connection.drop()
                 raise
 
     def configure(self, modulation: Modulation) -> None:
@@ -101,7 +98,7 @@ class AwgLaser:
             with self._dark_on_failure():
                 self._ready = False
                 self._darken(keep_armed=True)
-                channel = self._channel_open()
+                channel = self._connection.channel
                 channel.apply(wanted)
                 channel.unlock()
                 self._modulation, self._ready = modulation, True
@@ -164,27 +161,21 @@ class AwgLaser:
         """
         with self._lock:
             self._refuse_closed()
-            channel = self._channel
-            if channel is not None and self._output is not LaserOutput.UNKNOWN:
+            if self._connection.is_open and self._output is not LaserOutput.UNKNOWN:
                 with self._dark_on_failure():
-                    self._look(channel)
+                    self._look(self._connection.channel)
             return LaserReadback(self._output, self._modulation, None, self._since_ns)
 
     def take_warnings(self) -> list[str]:
         """Hand out what was odd since the last call but is no failure, for the log."""
         with self._lock:
             taken, self._notes = self._notes, []
-            if self._channel is not None:
-                taken += self._channel.take_warnings()
-            return taken
+            return taken + self._connection.take_warnings()
 
     def statistics(self) -> dict[str, float]:
         """Counters for diagnostics."""
         with self._lock:
-            counts: dict[str, float] = dict(self._counts)
-            if self._channel is not None:
-                counts |= self._channel.statistics()
-            return counts
+            return {**self._connection.statistics(), "switch_off_failures": self._failed_offs}
 
     def close(self) -> None:
         """Switch off and release; idempotent.
@@ -199,7 +190,7 @@ class AwgLaser:
         finally:
             with self._lock:
                 self._closed = True
-                self._drop()
+                self._connection.drop()
 
     def _look(self, channel: AwgChannel) -> None:
         """Compare belief and generator."""
@@ -215,7 +206,7 @@ class AwgLaser:
         channel.unlock()
 
     def _light(self) -> None:
-        channel = self._channel_open()
+        channel = self._connection.channel
         channel.verify()
         channel.unlock()
         self._output = LaserOutput.UNKNOWN
@@ -243,65 +234,21 @@ class AwgLaser:
             raise
 
     def _darken(self, *, keep_armed: bool = False) -> None:
-        """Off by all means; the flag lets only this go on while others wait to switch off."""
+        """Off by all means, also while somebody else waits to switch off."""
         self._armed = self._armed and keep_armed
         before, self._darkening = self._darkening, True
-        ends = time.monotonic() + OFF_LIMIT_S
-        was_off = self._output is LaserOutput.OFF
-        failures: list[DeviceError] = []
+        openings = self._connection.openings
         try:
-            for remedy in (self._no_remedy, self._clear, self._open_again):
-                if time.monotonic() > ends:
-                    break
-                try:
-                    remedy()
-                    self._channel_open().darken()
-                except DeviceError as error:
-                    failures.append(error)
-                    continue
-                if not was_off:
-                    self._output = LaserOutput.UNKNOWN
-                self._believe(LaserOutput.OFF)
-                return
+            self._connection.darken()
+        except DeviceError:
+            self._failed_offs += 1
+            self._ready = False
+            self._believe(LaserOutput.UNKNOWN)
+            raise
         finally:
             self._darkening = before
-        self._counts["switch_off_failures"] += 1
-        self._ready = False
-        self._believe(LaserOutput.UNKNOWN)
-        first, last = str(failures[0]), str(failures[-1])
-        told = first if first == last else f"{first}; opened anew: {last}"
-        raise DeviceError(f"laser state unknown: {told}; {_BY_HAND}") from failures[0]
-
-    def _no_remedy(self) -> None:
-        if self._channel is None:
-            self._open()
-
-    def _clear(self) -> None:
-        self._channel_open().clear()
-
-    def _open_again(self) -> None:
-        if self._channel is not None:
-            with suppress(DeviceError):
-                self._channel.reset()
-        self._drop()
-        self._open()
-
-    def _open(self) -> None:
-        link = open_link(self._settings, self._profile, self._serial)
-        self._serial = link.serial
-        self._ready = False
-        self._counts["opened"] += 1
-        self._channel = AwgChannel(link, self._settings, self._profile, self._may_go_on)
-
-    def _drop(self) -> None:
-        channel, self._channel = self._channel, None
-        if channel is not None:
-            channel.close()
-
-    def _channel_open(self) -> AwgChannel:
-        if self._channel is None:
-            raise DeviceError(f"{NAME}: lost; check cable and power")
-        return self._channel
+            self._ready = self._ready and openings == self._connection.openings
+        self._believe(LaserOutput.OFF)
 
     def _may_go_on(self) -> None:
         if self._offs_waiting and not self._darkening:
@@ -310,9 +257,6 @@ class AwgLaser:
     def _refuse_closed(self) -> None:
         if self._closed:
             raise DeviceError(f"{NAME}: closed; open it again")
-
-
-_BY_HAND = "treat the laser as on and switch the generator off by hand"
 
 
 def open_laser(**settings: Any) -> LaserModulator:

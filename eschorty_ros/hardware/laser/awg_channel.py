@@ -93,6 +93,16 @@ class AwgChannel:
         """Whether replies are to be expected."""
         return self._settings.readback != "off" and not self._silent
 
+    @property
+    def faults(self) -> int:
+        """Transfers that failed."""
+        return self._scpi.faults
+
+    @property
+    def retries(self) -> int:
+        """Commands sent once more."""
+        return self._scpi.retries
+
     def introduce(self) -> DeviceIdentity:
         """Ask for maker, model, serial and firmware; empty the error queue if there is one."""
         reply = self._asked(lambda: self._scpi.ask(self._profile.identify))
@@ -187,14 +197,6 @@ class AwgChannel:
         """Hand out what was odd since the last call."""
         taken, self._new_warnings = self._new_warnings, []
         return taken
-
-    def statistics(self) -> dict[str, float]:
-        """Counters for diagnostics."""
-        return {
-            "faults": self._scpi.faults,
-            "retries": self._scpi.retries,
-            "write_only": float(not self.asks),
-        }
 
     def _set(self, name: str, value: Value) -> None:
         self._scpi.set(name, value, self._settings.channel)

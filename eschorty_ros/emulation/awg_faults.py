@@ -1,0 +1,52 @@
+"""What can go wrong with the generator model, as switches."""
+
+from __future__ import annotations
+
+
+class AwgFaults:
+    """Switches of what goes wrong; counts run down to 0 with each time it went wrong.
+
+    Attributes
+    ----------
+    lost_replies : int
+        Replies that never come.
+    late_replies : int
+        Replies that come one request late: the next request gets them, unless cleared before.
+    wrong_tags, wrong_kinds, short_headers, oversized, empty_packets : int
+        Reply transfers with a wrong bTag, a wrong MsgID, fewer than 12 bytes, a TransferSize
+        above what follows, an empty packet before them.
+    transfer_bytes : int
+        Cut replies into transfers of this size without EOM; 0 = whole.
+    newline : bool
+        End replies with a newline.
+    pending_clears : int
+        CHECK_CLEAR answers "pending" this often.
+    no_clear : bool
+        INITIATE_CLEAR stalls: the request is not known.
+    ignored : set of str
+        Paths (long form, such as ``BASE:FREQuency``) whose settings have no effect.
+    changed : dict
+        Path to the text that is set instead of what was asked.
+    """
+
+    def __init__(self) -> None:
+        self.lost_replies = 0
+        self.late_replies = 0
+        self.wrong_tags = 0
+        self.wrong_kinds = 0
+        self.short_headers = 0
+        self.oversized = 0
+        self.empty_packets = 0
+        self.transfer_bytes = 0
+        self.newline = False
+        self.pending_clears = 0
+        self.no_clear = False
+        self.ignored: set[str] = set()
+        self.changed: dict[str, str] = {}
+
+    def take(self, name: str) -> bool:
+        """Whether fault ``name`` strikes now; counts it."""
+        left = getattr(self, name)
+        if left > 0:
+            setattr(self, name, left - 1)
+        return bool(left > 0)
