@@ -43,6 +43,7 @@ setup(
     entry_points={
         "console_scripts": [
             "eschorty = eschorty_ros.cli:main",
+            "eschorty-bench = eschorty_ros.emulation.bench:main",
             *(f"eschorty-{node} = eschorty_ros.nodes.{node}:main" for node in NODES),
         ]
     },

@@ -112,6 +112,9 @@ class PtyPort:
                 if self._model.gone:
                     self._unplug()
                     self._ending.wait(_TICK_S)
+                    # Its time goes on: this may be the moment in which it is plugged in again.
+                    with self._lock:
+                        self._model.step()
                     continue
                 if self._ends[0] < 0:
                     self._ends = self._plug_in()

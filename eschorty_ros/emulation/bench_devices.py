@@ -1,0 +1,100 @@
+"""A whole bench in one process: camera, generator and stage models around one simulated world."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.emulation.apt_model import AptModel
+from eschorty_ros.emulation.awg_model import AwgModel
+from eschorty_ros.emulation.bench_physics import Imperfections, Physics
+from eschorty_ros.emulation.evk4_model import Evk4Model
+from eschorty_ros.emulation.usb_device import EmulatedUsbDevice
+from eschorty_ros.simulation.presets import preset
+from eschorty_ros.simulation.scene import named
+from eschorty_ros.simulation.warm_up import warm_up
+from eschorty_ros.simulation.world import BACKGROUND_HZ, World
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSettings:
+    """What stands on the bench and how it is wired.
+
+    Attributes
+    ----------
+    scene : str
+        A scene's name or a mesh file.
+    calibration : str
+        The optical build as it really is, a name or a file.
+    pixels : str
+        Preset of the event pixels.
+    seed : int
+    background_hz : float
+        Background events of one pixel.
+    trigger : {"none", "laser", "stage"}
+        What is wired to the camera's trigger input.
+    flaws : Imperfections
+    laser_log : str
+        File that gets one line per change of the generator's output; empty for none.
+    """
+
+    scene: str = "steps"
+    calibration: str = "config_3"
+    pixels: str = "paper"
+    seed: int = 1
+    background_hz: float = BACKGROUND_HZ
+    trigger: str = "stage"
+    flaws: Imperfections = field(default_factory=Imperfections)
+    laser_log: str = ""
+
+
+class Bench:
+    """Models of camera, generator and stage that act on each other as the real ones do.
+
+    Parameters
+    ----------
+    settings : BenchSettings
+    clock_ns : callable
+        The bench's clock.
+
+    Raises
+    ------
+    EschortyError
+        For a scene or calibration that cannot be used.
+    """
+
+    def __init__(
+        self, settings: BenchSettings, clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        scene = named(settings.scene)
+        calibration = load_calibration(settings.calibration)
+        pixels = preset(settings.pixels)
+        warm_up(calibration)
+
+        def world() -> World:
+            return World(scene, calibration, pixels, settings.seed, settings.background_hz)
+
+        self.physics = Physics(
+            world,
+            clock_ns,
+            settings.flaws,
+            settings.trigger,
+            lambda from_ns, until_ns: self.stage.trigger_pulses(from_ns, until_ns),
+        )
+        self.stage = AptModel(clock_ns, on_plan=self.physics.set_stage)
+        self.laser = AwgModel(clock_ns, log_path=settings.laser_log or None)
+        self.laser.on_change = self.physics.set_laser
+        # A command and the world's present exclude each other.
+        self.laser.mutex = self.physics.lock
+        self.camera = Evk4Model(self.physics)
+
+    def by_name(self) -> dict[str, Any]:
+        """Name the models as fault plans do."""
+        return {"camera": self.camera, "laser": self.laser, "stage": self.stage}
+
+    def usb_devices(self) -> list[EmulatedUsbDevice]:
+        """Give what is on the USB bus."""
+        return [self.camera, self.laser]
