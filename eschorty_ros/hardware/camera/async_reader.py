@@ -109,6 +109,15 @@ class AsyncReader:
         self.stop()
         self._synchronous.start()
         self._received.clear()
+        self._queue_all()
+
+    def resume(self) -> None:
+        """Cancel what is queued, clear the halt, queue anew; what has come can still be read."""
+        self.stop()
+        self._synchronous.resume()
+        self._queue_all()
+
+    def _queue_all(self) -> None:
         self._failure = None
         self._stopping = False
         for _ in range(TRANSFERS):

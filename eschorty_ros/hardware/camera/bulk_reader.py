@@ -24,6 +24,9 @@ class BulkReader(Protocol):
     def start(self) -> None:
         """Throw away what waits in the device, then be ready to receive."""
 
+    def resume(self) -> None:
+        """Be ready again after a failed transfer, keeping what the device still has."""
+
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """Bytes and their arrival time (ns); ``b""`` when none came.
 
@@ -50,11 +53,15 @@ class SyncReader:
 
     def start(self) -> None:
         """Clear a halt and empty the endpoint."""
+        self.resume()
+        drain(self._device, self._endpoint, self._buffer)
+
+    def resume(self) -> None:
+        """Clear a halt."""
         try:
             self._device.clear_halt(self._endpoint)
         except usb.core.USBError as error:
             raise translate(error, _NAME) from error
-        drain(self._device, self._endpoint, self._buffer)
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """Read one transfer."""

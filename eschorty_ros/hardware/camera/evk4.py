@@ -77,6 +77,7 @@ class Evk4:
             settings or CameraSettings(),
             reconnection or Reconnection(),
             self._pause,
+            sleep or time.sleep,
         )
         self._sleep = sleep
         self._queue = ChunkQueue(queue_bytes)
@@ -284,7 +285,7 @@ class Evk4:
             self._queue.mark_gap()
             if failed_before:
                 raise
-            session.reader.start()
+            session.reader.resume()
             return True
         if not data:
             return failed_before

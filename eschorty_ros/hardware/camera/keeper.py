@@ -56,6 +56,8 @@ class Keeper:
     reconnection : Reconnection
     pause : callable
         Waits some seconds; raises :class:`EndedError` to give up.
+    settle : callable
+        Waits milliseconds to the end.
 
     Attributes
     ----------
@@ -74,6 +76,7 @@ class Keeper:
         settings: CameraSettings,
         reconnection: Reconnection,
         pause: Sleep,
+        settle: Sleep,
     ) -> None:
         self.identity = DeviceIdentity("Prophesee EVK4", serial)
         self.settings = settings
@@ -83,6 +86,7 @@ class Keeper:
         self._clock_ns = clock_ns
         self._reconnection = reconnection
         self._pause = pause
+        self._settle = settle
         self._session: Session | None = None
         self._lock = threading.Lock()
         self._closed = False
@@ -116,7 +120,12 @@ class Keeper:
         if self._session is not None:
             return
         session = Session(
-            self._backend, self.identity.serial, self.settings, self._clock_ns, self._pause
+            self._backend,
+            self.identity.serial,
+            self.settings,
+            self._clock_ns,
+            self._pause,
+            self._settle,
         )
         with self._lock:
             if not self._closed:

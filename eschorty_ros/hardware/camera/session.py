@@ -42,6 +42,8 @@ class Session:
         Clock of the arrival times.
     sleep : callable
         Waits some seconds; may raise to give up.
+    settle : callable
+        Waits the milliseconds of the way down, to the end.
 
     Attributes
     ----------
@@ -69,8 +71,10 @@ class Session:
         settings: CameraSettings,
         clock_ns: ClockNs,
         sleep: Sleep,
+        settle: Sleep,
     ) -> None:
         self._sleep = sleep
+        self._settle = settle
         self._usb = open_camera(backend, serial)
         self.control = treuzell.Treuzell(self._usb)
         self.streaming = False
@@ -102,7 +106,7 @@ class Session:
         with self._sequence:
             if self.streaming:
                 self.streaming = False
-                run_sequence(self.control, imx636.STOP, _no_pause)
+                run_sequence(self.control, imx636.STOP, self._settle)
 
     def stop_reads(self) -> None:
         """Stop the reads, once nobody reads any more; idempotent."""
@@ -115,7 +119,7 @@ class Session:
     def temperature_c(self) -> float:
         """Temperature of the sensor (C)."""
         with self._sequence:
-            return monitors.read_temperature_c(self.control, _no_pause)
+            return monitors.read_temperature_c(self.control, self._settle)
 
     def set_bias(self, name: str, offset: int) -> int:
         """Set one bias; returns the offset the camera reads back."""
@@ -140,8 +144,8 @@ class Session:
             if not gone:
                 self.stop_sensor()
                 with self._sequence:
-                    monitors.end_monitors(self.control, _no_pause)
-                    run_sequence(self.control, imx636.DESTROY, _no_pause)
+                    monitors.end_monitors(self.control, self._settle)
+                    run_sequence(self.control, imx636.DESTROY, self._settle)
         self.reader.stop()
         self._usb.close()
 
@@ -177,7 +181,3 @@ class Session:
 
 def _version_text(version: int) -> str:
     return f"{version >> 16 & 0xFF}.{version >> 8 & 0xFF}.{version & 0xFF}"
-
-
-def _no_pause(_seconds: float) -> None:
-    """Skip waits of at most 1 ms on the way down: the transfers take longer."""

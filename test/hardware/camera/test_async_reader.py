@@ -1,0 +1,171 @@
+"""Queued transfers at libusb's C interface: its structures are real, the bus is not."""
+
+# ruff: noqa: E402 - without the packages the file skips before it imports what needs them
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import pytest
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceStallError
+from eschorty_ros.hardware.camera import async_reader
+from eschorty_ros.hardware.camera.async_reader import TRANSFERS, AsyncReader, make_reader
+from eschorty_ros.hardware.camera.bulk_reader import TRANSFER_BYTES, SyncReader
+
+libusb_package = pytest.importorskip("libusb_package", reason="libusb-package is not installed")
+pytest.importorskip("usb1", reason="libusb1 is not installed")
+
+from usb1 import libusb1
+
+BACKEND = libusb_package.get_libusb1_backend()
+assert async_reader._queueing_library(BACKEND) is libusb1
+
+
+def address(transfer: Any) -> int:
+    return ctypes.addressof(transfer.contents)
+
+
+class Bus:
+    """libusb whose transfers complete as a test says; the rest of its interface is the real one."""
+
+    def __init__(self) -> None:
+        self.queued: list[Any] = []
+        self.freed = 0
+        self.events: list[tuple[int, bytes]] = []
+        self.submit_code = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(libusb1, name)
+
+    def libusb_submit_transfer(self, transfer: Any) -> int:
+        if not self.submit_code:
+            self.queued.append(transfer)
+        return self.submit_code
+
+    def libusb_cancel_transfer(self, transfer: Any) -> int:
+        for index, queued in enumerate(self.queued):
+            if address(queued) == address(transfer):
+                self.queued.insert(0, self.queued.pop(index))
+                self.events.insert(0, (libusb1.LIBUSB_TRANSFER_CANCELLED, b""))
+                return 0
+        return int(libusb1.LIBUSB_ERROR_NOT_FOUND)
+
+    def libusb_free_transfer(self, transfer: Any) -> None:
+        assert address(transfer) not in map(address, self.queued)
+        self.freed += 1
+        libusb1.libusb_free_transfer(transfer)
+
+    def libusb_handle_events_timeout(self, _context: Any, _wait: Any) -> int:
+        while self.events and self.queued:
+            status, data = self.events.pop(0)
+            transfer = self.queued.pop(0)
+            done = transfer.contents
+            assert (done.endpoint, done.length) == (0x81, TRANSFER_BYTES)
+            ctypes.memmove(done.buffer, data, len(data))
+            done.actual_length, done.status = len(data), status
+            done.callback(transfer)
+        return 0
+
+
+class Silent:
+    """A device whose endpoint is empty."""
+
+    def __init__(self) -> None:
+        self.cleared: list[int] = []
+
+    def clear_halt(self, endpoint: int) -> None:
+        self.cleared.append(endpoint)
+
+    def read(self, *_: Any) -> int:
+        import usb.core
+
+        raise usb.core.USBTimeoutError("timed out", -7, 110)
+
+
+@pytest.fixture
+def bus() -> Bus:
+    return Bus()
+
+
+def reader_on(bus: Bus) -> AsyncReader:
+    handle, context = ctypes.c_void_p(8), ctypes.c_void_p(16)
+    clock = iter(range(10_000))
+    synchronous = SyncReader(Silent(), 0x81, lambda: 0)
+    return AsyncReader(bus, handle, context, synchronous, 0x81, lambda: next(clock))
+
+
+COMPLETED = libusb1.LIBUSB_TRANSFER_COMPLETED
+TIMED_OUT = libusb1.LIBUSB_TRANSFER_TIMED_OUT
+
+
+def test_transfers_are_queued_before_the_first_byte_and_again_after_each(bus: Bus) -> None:
+    reader = reader_on(bus)
+    reader.start()
+    assert len(bus.queued) == TRANSFERS
+    bus.events = [(COMPLETED, b"abcd"), (TIMED_OUT, b""), (TIMED_OUT, b"ef"), (COMPLETED, b"")]
+    assert reader.read(0.1) == (b"abcd", 0)
+    assert reader.read(0.1) == (b"ef", 1)
+    assert reader.read(0.1)[0] == b""
+    assert len(bus.queued) == TRANSFERS
+    reader.stop()
+    reader.stop()
+    assert (bus.queued, bus.freed) == ([], TRANSFERS)
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        (libusb1.LIBUSB_TRANSFER_STALL, DeviceStallError),
+        (libusb1.LIBUSB_TRANSFER_NO_DEVICE, DeviceGoneError),
+        (libusb1.LIBUSB_TRANSFER_OVERFLOW, DeviceError),
+        (libusb1.LIBUSB_TRANSFER_ERROR, DeviceError),
+    ],
+)
+def test_failed_transfer_comes_after_what_was_received(
+    bus: Bus, status: int, kind: type[DeviceError]
+) -> None:
+    reader = reader_on(bus)
+    reader.start()
+    bus.events = [(COMPLETED, b"abcd"), (status, b"")]
+    assert reader.read(0.1)[0] == b"abcd"
+    with pytest.raises(kind) as caught:
+        reader.read(0.1)
+    assert "\n" not in str(caught.value)
+    reader.resume()
+    assert len(bus.queued) == TRANSFERS
+    bus.events = [(COMPLETED, b"efgh")]
+    assert reader.read(0.1)[0] == b"efgh"
+    reader.stop()
+    assert bus.freed == 2 * TRANSFERS
+
+
+def test_transfer_that_cannot_be_queued_is_an_error(bus: Bus) -> None:
+    reader = reader_on(bus)
+    bus.submit_code = libusb1.LIBUSB_ERROR_NO_DEVICE
+    reader.start()
+    with pytest.raises(DeviceGoneError):
+        reader.read(0.1)
+    reader.stop()
+    assert bus.freed == TRANSFERS
+
+
+def test_emulated_backend_is_read_synchronously() -> None:
+    class Backend: ...
+
+    assert isinstance(make_reader(Backend(), Silent(), 0x81, lambda: 0), SyncReader)  # type: ignore[arg-type]
+
+
+def test_real_libusb_is_read_with_queued_transfers() -> None:
+    class Handle:
+        handle = ctypes.c_void_p(8)
+
+    class Context:
+        handle = Handle()
+
+    class Opened(Silent):
+        _ctx = Context()
+
+    reader = make_reader(BACKEND, Opened(), 0x81, lambda: 0)  # type: ignore[arg-type]
+    assert isinstance(reader, AsyncReader)
