@@ -128,7 +128,7 @@ class _Counter:
 
 
 class ObservedLine:
-    """A serial model whose bytes count for a plan; otherwise the model.
+    """A serial model whose bytes count for a plan.
 
     Its faults begin inside ``feed`` and ``step``, in the thread that serves the model.
     """
@@ -137,8 +137,16 @@ class ObservedLine:
         self._model = model
         self._script = script
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._model, name)
+    @property
+    def gone(self) -> bool:
+        """Whether the model is unplugged; nobody serves it then, and its return is decided here."""
+        if self._model.gone:
+            self._script.step("stage")
+        return bool(self._model.gone)
+
+    @gone.setter
+    def gone(self, value: bool) -> None:
+        self._model.gone = value
 
     def feed(self, data: bytes) -> None:
         """Hand bytes of the host to the model."""

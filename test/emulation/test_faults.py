@@ -10,6 +10,7 @@ import usb.core
 from usb_loop import IN, OUT, Loop
 
 from eschorty_ros.core.errors import FormatError
+from eschorty_ros.emulation.apt_model import AptModel
 from eschorty_ros.emulation.awg_model import AwgModel
 from eschorty_ros.emulation.evk4_model import Evk4Model
 from eschorty_ros.emulation.fault_catalogue import CATALOGUE, Dose
@@ -141,7 +142,7 @@ class Line:
     """A serial model that answers with what it got."""
 
     def __init__(self):
-        self.mute = False
+        self.mute = self.gone = False
         self.waiting = b""
 
     def feed(self, data):
@@ -172,6 +173,19 @@ def test_the_stage_is_served_through_the_script():
     assert not line.mute
 
 
+def test_a_stage_that_is_gone_comes_back_although_nobody_serves_it():
+    line, clock = Line(), Clock()
+    at = {"after_s": 0.0}
+    plan = FaultPlan.model_validate(
+        {"faults": [{"device": "stage", "fault": "unplug", "at": at, "for_s": 1.0}]}
+    )
+    served = FaultScript(plan, {"stage": line}, clock).line()
+    served.step()
+    assert served.gone
+    clock.ns = 1_000_000_000
+    assert not served.gone
+
+
 def test_the_catalogue_says_what_its_faults_do():
     for kinds in CATALOGUE.values():
         for name, kind in kinds.items():
@@ -200,9 +214,7 @@ def fresh(device):
     models = {
         "camera": lambda: Evk4Model(Silence()),
         "laser": lambda: AwgModel(lambda: 0),
-        "stage": lambda: pytest.importorskip("eschorty_ros.emulation.apt_model").AptModel(
-            lambda: 0
-        ),
+        "stage": lambda: AptModel(lambda: 0),
     }
     model = models[device]()
     return model, switches(model)
