@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
+from eschorty_ros.emulation.evk4_pixels import PixelMask
 from eschorty_ros.emulation.evk4_registers import SENSOR_RESET, Registers
 from eschorty_ros.emulation.evk4_sequences import Phase, SequenceWatch
 from eschorty_ros.emulation.evk4_settings import SETTING_ADDRESSES, SensorSettings, read_settings
@@ -111,6 +112,9 @@ class Evk4Model(EmulatedUsbDevice):
         self._source = source
         self._board = TreuzellBoard(board, self)
         self._packets = Packetiser()
+        self._mask = PixelMask((), (), ())
+        # Between the reader's thread and the one that starts and stops.
+        self._stream_lock = threading.Lock()
         self._run = 0
         self._settings = read_settings(self.registers)
 
@@ -166,17 +170,20 @@ class Evk4Model(EmulatedUsbDevice):
 
     def _change(self, was: Phase) -> None:
         if was is Phase.STREAMING:
-            self._run += 1
+            with self._stream_lock:
+                self._run += 1
+                self._send(self._packets.flush())
             self._source.stop()
-            self._send(self._packets.flush())
         elif self.watch.phase is Phase.STREAMING:
-            self._packets = Packetiser()
+            with self._stream_lock:
+                self._packets = Packetiser()
             self._source.start()
 
     def _configure(self) -> None:
         settings = read_settings(self.registers)
         if settings != self._settings:
             self._settings = settings
+            self._mask = PixelMask(settings.columns_off, settings.rows_off, settings.pixels_off)
             if self.configure:
                 self.configure(settings)
 
@@ -187,31 +194,36 @@ class Evk4Model(EmulatedUsbDevice):
             self._overflow(run)
         while not self.pending(DATA_IN):
             data = self._source.read(_PULL_BYTES, max(0.0, until_s - time.monotonic()))
-            if run != self._run:
+            if not self._take(data, run):
                 return
-            if not data:
-                # The sensor sends a packet every period, however little is in it.
-                self._send(self._packets.flush())
-                return
-            self._take(data)
 
     def _overflow(self, run: int) -> None:
         space, lost = self.buffer_bytes or 0, 0
         while data := self._source.read(_PULL_BYTES, 0.0):
-            if run != self._run:
-                return
             kept = data[: space - space % 2]
             space -= len(kept)
             lost += (len(data) - len(kept)) // 2
-            self._take(kept)
+            if kept and not self._take(kept, run):
+                return
         if lost:
-            self._take(dropped(lost))
+            self._take(dropped(lost), run)
 
-    def _take(self, data: bytes) -> None:
-        if not self._settings.trigger_in:
-            data = without_triggers(data)
-        for packet in self._packets.push(data, self._settings.packet_period_us):
-            self._send(packet)
+    def _take(self, data: bytes, run: int) -> bool:
+        """Packetise; False when there was nothing, or the stream it belongs to has ended."""
+        with self._stream_lock:
+            if run != self._run:
+                return False
+            if not data:
+                # The sensor sends a packet every period, however little is in it.
+                self._send(self._packets.flush())
+                return False
+            if not self._settings.trigger_in:
+                data = without_triggers(data)
+            if self._mask:
+                data = self._mask.apply(data)
+            for packet in self._packets.push(data, self._settings.packet_period_us):
+                self._send(packet)
+        return True
 
     def _send(self, packet: bytes) -> None:
         if self.cut_packets and packet:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from eschorty_ros.emulation.evk4_registers import BIAS_ADDRESSES, SENSOR_RESET, Registers
 
+_CONTROL, _MASKS_ON = 0x0004, 1 << 1
 _COLUMN_MASKS = range(0x2000, 0x20A0, 4)
 _ROW_MASKS = range(0x4000, 0x405C, 4)
 _PIXEL_MASKS = range(0x9100, 0x9200, 4)
@@ -16,6 +17,7 @@ _AFK, _AFK_BAND, _STC, _STC_CUT, _TRAIL = 0xC000, 0xC008, 0xD000, 0xD004, 0xD008
 SETTING_ADDRESSES = frozenset(
     [
         *BIAS_ADDRESSES.values(),
+        _CONTROL,
         *_COLUMN_MASKS,
         *_ROW_MASKS,
         *_PIXEL_MASKS,
@@ -80,6 +82,8 @@ def read_settings(registers: Registers) -> SensorSettings:
 
 
 def _lines(registers: Registers, addresses: range) -> frozenset[int]:
+    if not registers[_CONTROL] & _MASKS_ON:
+        return frozenset()
     return frozenset(
         32 * index + bit
         for index, address in enumerate(addresses)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import usb.core
 
+from eschorty_ros.core import evt3
 from eschorty_ros.emulation.evk4_model import CONTROL_IN, CONTROL_OUT, DATA_IN, Evk4Model
 from eschorty_ros.emulation.evk4_sequences import SEQUENCES, Phase
 from eschorty_ros.emulation.evk4_treuzell import BoardIdentity
@@ -286,6 +287,34 @@ def test_illumination_and_dead_time_are_read_as_the_reference_says():
     value = host.read(0x20)
     assert value >> 28 & 1
     assert (value & 0xFFFFFFF) / 200 == 8.0
+
+
+def test_masked_pixels_give_no_events_and_all_others_do():
+    rng = np.random.default_rng(8)
+    print("seed 8")
+    n = 30_000
+    t, p = rng.integers(0, 50, n) * 1000, rng.integers(0, 2, n, dtype=np.uint8)
+    x, y = rng.integers(0, 200, n, dtype=np.uint16), rng.integers(300, 340, n, dtype=np.uint16)
+    t, x, y, p = evt3.sort_readout(t, x, y, p)
+    stream = evt3.Encoder().encode(t, x, y, p)
+    cuts = np.sort(rng.integers(0, len(stream) // 2, 9))
+    host = Host(Words(*np.split(np.frombuffer(stream, "<u2"), cuts)))
+    host.run("init", "start")
+    host.write(0x2000, 0x0000FF00)
+    host.write(0x4000 + 4 * (310 // 32), 1 << 310 % 32)
+    host.write(0x9100, 1 << 31 | 320 << 16 | 100)
+    got = b""
+    while host.source.pieces or host.model.pending(DATA_IN):
+        got += host.data()
+    while True:
+        try:
+            got += host.data()
+        except usb.core.USBTimeoutError:
+            break
+    events = evt3.Decoder().decode(got)
+    on = ((x < 8) | (x > 15)) & (y != 310) & ~((x == 100) & (y == 320))
+    for field, expected in (("t", t), ("x", x), ("y", y), ("p", p)):
+        assert np.array_equal(getattr(events, field), expected[on])
 
 
 def test_settings_are_told_by_their_effect():
