@@ -118,6 +118,30 @@ def test_fault_u3_mute_generator(bench: AwgBench, log: Path) -> None:
     assert states(log) == ["OFF", "ON", "OFF"]
 
 
+@pytest.mark.parametrize("fault", ["mute", "lost_replies"])
+def test_fault_u3_switching_off_waits_two_seconds_at_most(fault: str) -> None:
+    """driver: the sum of all waits of a vain switching off is bounded. user reads: laser state unknown within 2 s."""  # noqa: E501
+    waits: list[float] = []
+
+    def wait(_: threading.Condition, seconds: float | None) -> bool:
+        assert seconds is not None
+        waits.append(seconds)
+        return False
+
+    bench = AwgBench()
+    bench.model = AwgModel(bench.clock, wait=wait)
+    bench.models[:] = [bench.model]
+    laser = bench.lit_laser()
+    waits.clear()
+    if fault == "mute":
+        bench.model.mute = True
+    else:
+        bench.model.faults.lost_replies = 10**9
+    with pytest.raises(DeviceError, match="laser state unknown"):
+        laser.disable()
+    assert sum(waits) < 2.0
+
+
 def test_fault_u3_replies_lost(bench: AwgBench) -> None:
     """driver: a setting asked for is not a setting made; dark when it cannot be read back. user reads: ... no answer in time."""  # noqa: E501
     laser = bench.ready_laser()
@@ -141,10 +165,10 @@ def test_fault_u4_bad_reply_header(bench: AwgBench, fault: str) -> None:
 
 
 def test_fault_u4_bad_reply_headers_without_end(bench: AwgBench) -> None:
-    """driver: never takes text that is out of step; dark. user reads: laser state unknown: ... a reply header reads message ..."""  # noqa: E501
+    """driver: never takes text that is out of step; dark. user reads: laser state unknown: ... a reply header has the wrong tag ..."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.faults.wrong_tags = 10**9
-    with pytest.raises(DeviceError, match=r"laser state unknown.*a reply header reads message"):
+    with pytest.raises(DeviceError, match=r"laser state unknown.*a reply header has the wrong tag"):
         laser.readback()
     assert not bench.model.output
     assert laser.readback().output is LaserOutput.UNKNOWN

@@ -101,8 +101,8 @@ def test_endless_reply_is_refused(link: UsbTmc, model: Echo) -> None:
 @pytest.mark.parametrize(
     ("fault", "kind", "text"),
     [
-        ("wrong_tags", DeviceError, "header reads message 2"),
-        ("wrong_kinds", DeviceError, "header reads message 3"),
+        ("wrong_tags", DeviceError, "wrong tag for its request"),
+        ("wrong_kinds", DeviceError, "wrong message id, 3,"),
         ("short_headers", DeviceError, "too short"),
         ("oversized", DeviceError, "announced 101 bytes and brought 1"),
         ("lost_replies", DeviceTimeoutError, "ETIMEDOUT"),

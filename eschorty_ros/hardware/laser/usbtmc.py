@@ -229,10 +229,8 @@ class UsbTmc:
             raise DeviceError(f"{self._name}: a reply of {len(data)} bytes is too short")
         kind, tag, inverse, _, size, attributes = _HEADER.unpack_from(data)
         if (kind, tag, inverse) != (_REPLY_IN, self._tag, self._tag ^ 0xFF):
-            raise DeviceError(
-                f"{self._name}: a reply header reads message {kind}, tag {tag}, {inverse}; "
-                f"{_REPLY_IN}, {self._tag}, {self._tag ^ 0xFF} was due"
-            )
+            wrong = "tag" if kind == _REPLY_IN else f"message id, {kind},"
+            raise DeviceError(f"{self._name}: a reply header has the wrong {wrong} for its request")
         if size > _ASKED_AT_ONCE:
             raise DeviceError(
                 f"{self._name}: a reply announced {size} bytes where {_ASKED_AT_ONCE} were asked"
