@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
@@ -88,8 +89,9 @@ class LaserReadback:
     """What the generator says it does.
 
     ``phase_epoch_ns`` is the time of one rising edge, ``None`` where nobody knows it: a
-    generator does not tell its phase. ``reason`` says why the output is off, when the driver
-    knows.
+    generator does not tell its phase. ``reason`` says why the output is off or
+    unknown, when the driver knows. ``warnings`` are all oddities since opening that are no
+    failure, ``counters`` go to diagnostics.
     """
 
     output: LaserOutput
@@ -97,6 +99,8 @@ class LaserReadback:
     phase_epoch_ns: int | None
     output_since_ns: int
     reason: str = ""
+    warnings: tuple[str, ...] = ()
+    counters: Mapping[str, float] = field(default_factory=dict)
 
 
 class LaserModulator(Protocol):

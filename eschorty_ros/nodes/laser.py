@@ -241,6 +241,8 @@ class LaserNode(DeviceNode):
             "reason": snapshot.reason if snapshot is not None else "",
             "switch_offs": keeper.switch_offs,
         }
+        if snapshot is not None:
+            values |= snapshot.told.counters
         for topic, gap_s in keeper.gate.gap_max_s.items():
             values[f"{topic} longest gap, s"] = gap_s
         if keeper.unknown:

@@ -79,6 +79,7 @@ class LaserKeeper:
         self._told: LaserReadback | None = None
         self._requested = LaserOutput.OFF
         self._reason = "off at start"
+        self._warned: set[str] = set()
         self._ending = threading.Event()
         self._threads: list[threading.Thread] = []
         self.switch_offs = 0
@@ -242,6 +243,10 @@ class LaserKeeper:
     def _hear(self, told: LaserReadback) -> None:
         """Note what the generator says."""
         self._told = told
+        for text in told.warnings:
+            if text not in self._warned:
+                self._warned.add(text)
+                self._log(text)
         self.unknown = ""
         if told.output is LaserOutput.UNKNOWN:
             self.unknown = told.reason or "the generator does not say"

@@ -76,7 +76,7 @@ def test_fault_u2_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None
     assert laser.readback().output is LaserOutput.ON
     assert not bench.model.stalled
     assert bench.model.lit
-    assert (laser.statistics()["faults"], laser.statistics()["retries"]) == (1, 1)
+    assert (laser.readback().counters["faults"], laser.readback().counters["retries"]) == (1, 1)
 
 
 def test_fault_u2_second_stall_is_an_error(
@@ -112,7 +112,7 @@ def test_fault_u3_mute_generator(bench: AwgBench, log: Path) -> None:
     with pytest.raises(DeviceError, match=r"laser state unknown: .*no answer in time"):
         laser.disable()
     assert laser.readback().output is LaserOutput.UNKNOWN
-    assert laser.statistics()["switch_off_failures"] == 1
+    assert laser.readback().counters["switch_off_failures"] == 1
     bench.model.mute = False
     laser.disable()
     assert states(log) == ["OFF", "ON", "OFF"]
@@ -161,7 +161,7 @@ def test_fault_u4_bad_reply_header(bench: AwgBench, fault: str) -> None:
     setattr(bench.model.faults, fault, 1)
     assert laser.readback().output is LaserOutput.ON
     assert bench.model.lit
-    assert laser.statistics()["faults"] == (0 if fault == "empty_packets" else 1)
+    assert laser.readback().counters["faults"] == (0 if fault == "empty_packets" else 1)
 
 
 def test_fault_u4_bad_reply_headers_without_end(bench: AwgBench) -> None:
@@ -182,7 +182,7 @@ def test_fault_u5_reply_in_pieces(bench: AwgBench, size: int, newline: bool) -> 
     bench.model.faults.newline = newline
     laser = bench.lit_laser()
     assert laser.readback().output is LaserOutput.ON
-    assert laser.statistics()["faults"] == 0
+    assert laser.readback().counters["faults"] == 0
 
 
 def test_fault_u6_stale_reply_after_a_time_out(bench: AwgBench) -> None:
@@ -190,7 +190,7 @@ def test_fault_u6_stale_reply_after_a_time_out(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     bench.model.faults.late_replies = 1
     assert laser.readback().output is LaserOutput.ON
-    assert laser.statistics()["faults"] == 1
+    assert laser.readback().counters["faults"] == 1
     assert not bench.model._replies
 
 
@@ -199,7 +199,7 @@ def test_fault_u6_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     bench.model._replies.append(b"SQUARE")
     assert laser.readback().output is LaserOutput.ON
-    assert laser.statistics()["faults"] == 1
+    assert laser.readback().counters["faults"] == 1
 
 
 @pytest.mark.parametrize("errors", [None, [], ['-222,"Data out of range"', '-113,"Undefined"']])
@@ -207,7 +207,7 @@ def test_fault_u7_error_queue(bench: AwgBench, errors: list[str] | None) -> None
     """driver: asks once at opening, takes silence for absent, empties what is there. user reads: a warning per entry."""  # noqa: E501
     bench.model.errors = None if errors is None else type(bench.model.commands)(errors)
     laser = bench.laser()
-    warnings = laser.take_warnings()
+    warnings = laser.readback().warnings
     assert len(warnings) == len(errors or [])
     assert all(error in text for error, text in zip(errors or [], warnings, strict=True))
     laser.configure(SQUARE)
@@ -296,7 +296,7 @@ def test_fault_u9_rebooted_while_lit(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     bench.model.reboot()
     assert laser.readback().output is LaserOutput.OFF
-    assert any("restarted" in text for text in laser.take_warnings())
+    assert "restarted" in laser.readback().reason
     laser.arm()
     with pytest.raises(DeviceError, match="not configured"):
         laser.enable()

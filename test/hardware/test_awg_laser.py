@@ -209,10 +209,10 @@ def test_warns_of_another_model_and_goes_on(bench: AwgBench, tmp_path: Path) -> 
     other = tmp_path / "awg_other.yaml"
     other.write_text(text)
     laser = bench.laser(profile=str(other))
-    (warning,) = laser.take_warnings()
+    (warning,) = laser.readback().warnings
     assert "UTG962E" in warning
     assert "check every setting" in warning
-    assert laser.take_warnings() == []
+    assert laser.readback().warnings == (warning,)
 
 
 @pytest.mark.parametrize("policy", ["best_effort", "off"])
@@ -223,10 +223,10 @@ def test_write_only_generator_works_without_read_back(bench: AwgBench, policy: s
     laser.disable()
     assert not bench.model.output
     assert laser.readback().output is LaserOutput.OFF
-    assert laser.statistics()["write_only"] == 1.0
+    assert laser.readback().counters["write_only"] == 1.0
     asked = [c for c in bench.model.commands if "?" in c]
     assert len(asked) == (0 if policy == "off" else 2)
-    assert any("not verified" in w for w in laser.take_warnings()) == (policy == "best_effort")
+    assert any("not verified" in w for w in laser.readback().warnings) == (policy == "best_effort")
 
 
 def test_best_effort_still_refuses_what_contradicts(bench: AwgBench) -> None:

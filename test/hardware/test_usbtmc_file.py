@@ -104,7 +104,7 @@ def test_lost_reply_is_asked_for_again(kernel: type[KernelFile]) -> None:
     opened = laser()
     kernel.model._replies.append(b"late")
     assert opened.readback().output is LaserOutput.OFF
-    assert opened.statistics()["faults"] == 1
+    assert opened.readback().counters["faults"] == 1
 
 
 @pytest.mark.parametrize(
@@ -145,6 +145,8 @@ def test_real_file_without_the_kernels_ioctls(pty: tuple[int, str]) -> None:
     link = UsbTmcFile(path, name="generator", timeout_s=0.1)
     answering = threading.Thread(target=lambda: (os.read(master, 100), os.write(master, b"70.5")))
     answering.start()
+    with pytest.raises(DeviceError, match="in use; close the other program"):
+        UsbTmcFile(path, name="generator", timeout_s=0.1)
     link.write(b":CHANnel1:BASE:FREQuency?\n")
     assert link.read() == b"70.5"
     answering.join()

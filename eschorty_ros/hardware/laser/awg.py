@@ -70,7 +70,7 @@ class AwgLaser:
         self._connection = AwgConnection(settings, self._profile, self._may_go_on)
         self._failed_offs = 0
         self.identity = DeviceIdentity(self._profile.name, settings.serial)
-        self._notes: list[str] = []
+        self._reason = ""
         with self._lock:
             self._connection.open()
             try:
@@ -147,6 +147,7 @@ class AwgLaser:
                 self._armed = False
                 if not self._closed:
                     self._darken()
+                    self._reason = ""
         finally:
             with self._counting:
                 self._offs_waiting -= 1
@@ -164,18 +165,15 @@ class AwgLaser:
             if self._connection.is_open and self._output is not LaserOutput.UNKNOWN:
                 with self._dark_on_failure():
                     self._look(self._connection.channel)
-            return LaserReadback(self._output, self._modulation, None, self._since_ns)
-
-    def take_warnings(self) -> list[str]:
-        """Hand out what was odd since the last call but is no failure, for the log."""
-        with self._lock:
-            taken, self._notes = self._notes, []
-            return taken + self._connection.take_warnings()
-
-    def statistics(self) -> dict[str, float]:
-        """Counters for diagnostics."""
-        with self._lock:
-            return {**self._connection.statistics(), "switch_off_failures": self._failed_offs}
+            return LaserReadback(
+                self._output,
+                self._modulation,
+                None,
+                self._since_ns,
+                self._reason,
+                tuple(self._connection.warnings),
+                {**self._connection.statistics(), "switch_off_failures": self._failed_offs},
+            )
 
     def close(self) -> None:
         """Switch off and release; idempotent.
@@ -200,7 +198,7 @@ class AwgLaser:
                 raise DeviceError(f"{NAME}: output found on; it was not switched on from here")
             self._believe(LaserOutput.OFF)
             self._ready = False
-            self._notes.append(f"{NAME}: output found off; restarted, or switched off by hand")
+            self._reason = f"{NAME}: output found off; restarted, or switched off by hand"
         elif self._output is LaserOutput.ON:
             channel.verify_waveform()
         channel.unlock()
@@ -212,6 +210,7 @@ class AwgLaser:
         self._output = LaserOutput.UNKNOWN
         channel.set_output(True)
         self._believe(LaserOutput.ON)
+        self._reason = ""
         if channel.output() is False:
             raise DeviceError(f"{NAME}: output stays off; check the generator's display")
         channel.unlock()
@@ -227,6 +226,7 @@ class AwgLaser:
         except BaseException as error:
             self._ready = False
             self._armed = False
+            self._reason = str(error)
             try:
                 self._darken()
             except DeviceError as second:
@@ -240,7 +240,8 @@ class AwgLaser:
         openings = self._connection.openings
         try:
             self._connection.darken()
-        except DeviceError:
+        except DeviceError as error:
+            self._reason = str(error).removeprefix("laser state unknown: ")
             self._failed_offs += 1
             self._ready = False
             self._believe(LaserOutput.UNKNOWN)

@@ -70,6 +70,8 @@ class AwgChannel:
     profile : AwgProfile
     may_go_on : callable
         Called before every transfer; raises to give up.
+    warn : callable
+        Called with one line for what is odd but no failure.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class AwgChannel:
         settings: AwgSettings,
         profile: AwgProfile,
         may_go_on: Callable[[], None],
+        warn: Callable[[str], None],
     ) -> None:
         self._link = link
         self._scpi = Scpi(link, profile, may_go_on)
@@ -85,8 +88,7 @@ class AwgChannel:
         self._profile = profile
         self._wanted: Wanted = {}
         self._silent = False
-        self._new_warnings: list[str] = []
-        self._told: set[str] = set()
+        self._warn = warn
 
     @property
     def asks(self) -> bool:
@@ -193,11 +195,6 @@ class AwgChannel:
         """Release the generator; never raises."""
         self._link.close()
 
-    def take_warnings(self) -> list[str]:
-        """Hand out what was odd since the last call."""
-        taken, self._new_warnings = self._new_warnings, []
-        return taken
-
     def _set(self, name: str, value: Value) -> None:
         self._scpi.set(name, value, self._settings.channel)
 
@@ -237,11 +234,6 @@ class AwgChannel:
             self._silent = True
             self._warn(f"{NAME}: reading back given up, settings are not verified ({error})")
             return None
-
-    def _warn(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
-            self._new_warnings.append(text)
 
 
 def _shown(value: Value) -> str:

@@ -14,6 +14,7 @@ from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 
 OFF_LIMIT_S = 1.0
 """Time after which switching off begins no further try: the state is unknown then."""
+_WARNINGS_KEPT = 32
 _BY_HAND = "treat the laser as on and switch the generator off by hand"
 
 
@@ -31,6 +32,8 @@ class AwgConnection:
     ----------
     openings : int
         How often the generator was opened; its settings are to be made anew after each.
+    warnings : list of str
+        What was odd but no failure, each once, 32 at most.
     """
 
     def __init__(
@@ -42,7 +45,7 @@ class AwgConnection:
         self._serial = ""
         self._channel: AwgChannel | None = None
         self._faults = self._retries = 0
-        self._warnings: list[str] = []
+        self.warnings: list[str] = []
         self.openings = 0
 
     @property
@@ -62,7 +65,7 @@ class AwgConnection:
         link = open_link(self._settings, self._profile, self._serial)
         self._serial = link.serial
         self.openings += 1
-        self._channel = AwgChannel(link, self._settings, self._profile, self._may_go_on)
+        self._channel = AwgChannel(link, self._settings, self._profile, self._may_go_on, self._warn)
 
     def drop(self) -> None:
         """Release the generator; idempotent, never raises."""
@@ -70,13 +73,7 @@ class AwgConnection:
         if channel is not None:
             self._faults += channel.faults
             self._retries += channel.retries
-            self._warnings += channel.take_warnings()
             channel.close()
-
-    def take_warnings(self) -> list[str]:
-        """Hand out what was odd since the last call."""
-        taken, self._warnings = self._warnings, []
-        return taken if self._channel is None else taken + self._channel.take_warnings()
 
     def statistics(self) -> dict[str, float]:
         """Counters over all openings, and whether replies are done without."""
@@ -111,6 +108,10 @@ class AwgConnection:
         first, last = str(failures[0]), str(failures[-1])
         told = first if first == last else f"{first}; opened anew: {last}"
         raise DeviceError(f"laser state unknown: {told}; {_BY_HAND}") from failures[0]
+
+    def _warn(self, text: str) -> None:
+        if text not in self.warnings and len(self.warnings) < _WARNINGS_KEPT:
+            self.warnings.append(text)
 
     def _open_lost(self) -> None:
         if self._channel is None:

@@ -46,18 +46,11 @@ class UsbIds(Schema):
 
 
 class Replies(Schema):
-    """What switches and numbers look like in replies; ``number`` has one group."""
+    """What switches look like in replies, and the units a number may carry."""
 
     on: Texts
     off: Texts
-    number: str
-
-    @field_validator("number")
-    @classmethod
-    def _compiles(cls, value: str) -> str:
-        if _pattern(value).groups != 1:
-            raise ValueError("write a regular expression with one group")
-        return value
+    units: dict[str, Annotated[float, Field(gt=0.0)]]
 
 
 class Setting(Schema):
@@ -125,7 +118,10 @@ class AwgProfile(Schema):
     @field_validator("model")
     @classmethod
     def _compiles(cls, value: str) -> str:
-        _pattern(value)
+        try:
+            re.compile(value)
+        except re.error as error:
+            raise ValueError(f"it is no regular expression ({error})") from None
         return value
 
     @model_validator(mode="after")
@@ -172,10 +168,3 @@ def _find(text: str) -> Path:
         f"profile is {text!r}, and there is no such profile; choose one of "
         f"{', '.join(sorted(names))} or give a path ending in .yaml"
     )
-
-
-def _pattern(text: str) -> re.Pattern[str]:
-    try:
-        return re.compile(text)
-    except re.error as error:
-        raise ValueError(f"it is no regular expression ({error})") from None

@@ -106,6 +106,8 @@ def readback_message(state: LaserReadback) -> Message:
         "phase_epoch_ns": state.phase_epoch_ns,
         "output_since_ns": state.output_since_ns,
         "reason": state.reason,
+        "warnings": state.warnings,
+        "counters": dict(state.counters),
     }
 
 
@@ -117,4 +119,6 @@ def readback_from(message: Message) -> LaserReadback:
         message["phase_epoch_ns"],
         message["output_since_ns"],
         message["reason"],
+        tuple(message["warnings"]),
+        message["counters"],
     )

@@ -13,6 +13,7 @@ from eschorty_ros.hardware.laser.usbtmc import MessageLink
 Result = TypeVar("Result")
 
 _ERRORS_DRAINED = 32
+_NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([A-Za-z%]*)", re.ASCII)
 
 
 class InterruptedByOffError(DeviceError):
@@ -150,9 +151,10 @@ class Scpi:
             if word in replies.off:
                 return False
         elif setting.kind == "number":
-            match = re.fullmatch(replies.number, reply)
-            if match is not None:
-                return float(match[1])
+            match = _NUMBER.fullmatch(reply)
+            scales = {"": 1.0, **replies.units}
+            if match is not None and match[2] in scales:
+                return float(match[1]) * scales[match[2]]
         elif re.fullmatch(r"[A-Z][A-Z0-9]*", word):
             return word
         raise DeviceError(

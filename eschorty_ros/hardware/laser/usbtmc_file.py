@@ -31,10 +31,15 @@ _REMEDIES = {
 
 
 class RawFile:
-    """The device file itself: what the operating system offers."""
+    """The device file itself, locked against a second program of this package."""
 
     def __init__(self, path: str) -> None:
         self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOCTTY)
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._fd)
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY)) from None
 
     def read(self, size: int) -> bytes:
         """Read at most ``size`` bytes."""
