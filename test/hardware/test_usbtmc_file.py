@@ -107,6 +107,24 @@ def test_lost_reply_is_asked_for_again(kernel: type[KernelFile]) -> None:
     assert opened.readback().counters["faults"] == 1
 
 
+def test_another_generator_behind_the_same_file_is_refused(kernel: type[KernelFile]) -> None:
+    wrong = AwgSettings(device="/dev/usbtmc0", serial="AWG0000000002")
+    with pytest.raises(DeviceError, match="its serial is AWG1234567890, AWG0000000002 was"):
+        AwgLaser(wrong)
+    opened = laser()
+    kernel.failing = errno.ENODEV
+    with pytest.raises(DeviceError, match="laser state unknown"):
+        opened.disable()
+    kernel.failing = 0
+    kernel.model = AwgModel(lambda: 0, serial="AWG0000000002", wait=lambda *_: False)
+    opened.disable()
+    with pytest.raises(DeviceError, match="its serial is AWG0000000002, AWG1234567890 was"):
+        opened.configure(SQUARE)
+    kernel.model = AwgModel(lambda: 0, wait=lambda *_: False)
+    opened.configure(SQUARE)
+    assert kernel.model.channels[0].frequency_hz == 70.0
+
+
 @pytest.mark.parametrize(
     ("code", "kind", "text"),
     [

@@ -68,6 +68,7 @@ class AwgLaser:
         self._output = LaserOutput.UNKNOWN
         self._since_ns = clock_ns()
         self._connection = AwgConnection(settings, self._profile, self._may_go_on)
+        self._introduced = 0
         self._failed_offs = 0
         self.identity = DeviceIdentity(self._profile.name, settings.serial)
         self._reason = ""
@@ -75,8 +76,7 @@ class AwgLaser:
             self._connection.open()
             try:
                 self._darken()
-                self.identity = self._connection.channel.introduce()
-                self._connection.channel.unlock()
+                self._introduce()
             except DeviceError:
                 self._connection.drop()
                 raise
@@ -98,6 +98,7 @@ class AwgLaser:
             with self._dark_on_failure():
                 self._ready = False
                 self._darken(keep_armed=True)
+                self._introduce()
                 channel = self._connection.channel
                 channel.apply(wanted)
                 channel.unlock()
@@ -189,6 +190,21 @@ class AwgLaser:
             with self._lock:
                 self._closed = True
                 self._connection.drop()
+
+    def _introduce(self) -> None:
+        """Ask who it is, once per opening; a kernel file may lead to another one than before."""
+        if self._introduced == self._connection.openings:
+            return
+        channel = self._connection.channel
+        identity = channel.introduce()
+        channel.unlock()
+        expected = self.identity.serial
+        if self._settings.device and expected and identity.serial not in ("", expected):
+            raise DeviceError(
+                f"{NAME} at {self._settings.device}: its serial is {identity.serial}, {expected} "
+                "was expected; give the right device or serial"
+            )
+        self.identity, self._introduced = identity, self._connection.openings
 
     def _look(self, channel: AwgChannel) -> None:
         """Compare belief and generator."""
