@@ -88,7 +88,7 @@ def serve(path: str, log: str) -> None:
     with UsbServer(path, lambda: models):
         print("done", flush=True)
         for line in sys.stdin:
-            command, *arguments = line.split(maxsplit=2)
+            command, *arguments = line.strip().split(maxsplit=2)
             match command:
                 case "gone" | "back":
                     switch("gone", command == "gone")

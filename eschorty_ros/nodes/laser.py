@@ -113,7 +113,7 @@ class LaserNode(DeviceNode):
     def stop_device(self) -> None:
         """Switch off; an output that nobody confirms is told as unknown."""
         try:
-            self._keeper.switch_off("not active")
+            self._keeper.switch_off(self.failure or "not active")
         except EschortyError as error:
             self._alarm(str(error))
 
@@ -121,8 +121,8 @@ class LaserNode(DeviceNode):
         """Switch off and release the generator; see ``stop_device``."""
         try:
             self._keeper.close()
-        except EschortyError as error:
-            self._alarm(f"laser state unknown: {error}")
+        except EschortyError:
+            self._alarm(self._keeper.unknown)
 
     def _new_gate(self) -> LaserGate:
         timeouts = {LEASE: self.parameters["heartbeat_timeout"]}
@@ -246,7 +246,7 @@ class LaserNode(DeviceNode):
         for topic, gap_s in keeper.gate.gap_max_s.items():
             values[f"{topic} longest gap, s"] = gap_s
         if keeper.unknown:
-            return diagnostics.ERROR, f"laser state unknown: {keeper.unknown}", values
+            return diagnostics.ERROR, keeper.unknown, values
         if self.failure:
             return diagnostics.ERROR, self.failure, values
         if snapshot is None:

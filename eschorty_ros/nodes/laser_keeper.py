@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -104,8 +105,11 @@ class LaserKeeper:
         self._hear(told)
         self._ending.clear()
         self._threads = [
-            threading.Thread(target=target, name=name, daemon=True)
-            for target, name in ((self._watch, "laser watchdog"), (self._read, "laser read-back"))
+            threading.Thread(target=self._look_after, args=(look, every_s), name=name, daemon=True)
+            for look, every_s, name in (
+                (self._watch, WATCH_PERIOD_S, "laser watchdog"),
+                (self._read, self._readback_period_s, "laser read-back"),
+            )
         ]
         for thread in self._threads:
             thread.start()
@@ -188,16 +192,15 @@ class LaserKeeper:
                 return
             try:
                 laser.disable()
-                told = laser.readback()
             except EschortyError as error:
                 self._note_unknown(error)
-                raise DeviceError(f"laser state unknown: {error}") from error
+                raise DeviceError(self.unknown) from error
             finally:
                 self._generation += 1
                 self.switch_offs += self._requested is LaserOutput.ON
                 self.gate.switched_off()
                 self._requested, self._reason = LaserOutput.OFF, reason
-            self._hear(told)
+            self._hear_off(laser)
 
     def darken(self, reason: str) -> bool:
         """Switch off for a reason of the keeper's own; alarm when it is not confirmed."""
@@ -249,11 +252,22 @@ class LaserKeeper:
                 self._log(text)
         self.unknown = ""
         if told.output is LaserOutput.UNKNOWN:
-            self.unknown = told.reason or "the generator does not say"
+            self.unknown = _unknown(told.reason or "the generator does not say")
         self.tell()
 
+    def _hear_off(self, laser: LaserModulator) -> None:
+        """Note what the generator says after it has confirmed that it is off."""
+        told = self._told
+        try:
+            told = laser.readback()
+        except EschortyError:
+            if told is not None:
+                told = replace(told, output=LaserOutput.OFF, output_since_ns=time.time_ns())
+        if told is not None:
+            self._hear(told)
+
     def _note_unknown(self, error: Exception) -> None:
-        self.unknown = str(error)
+        self.unknown = _unknown(str(error))
         if self._told is not None:
             self._told = replace(self._told, output=LaserOutput.UNKNOWN)
         self.tell()
@@ -282,8 +296,17 @@ class LaserKeeper:
             return f"waveform reads back {now.waveform}, asked {asked.waveform}"
         return ""
 
+    def _look_after(self, look: Callable[[], None], every_s: float) -> None:
+        try:
+            while not self._ending.wait(every_s):
+                look()
+        except Exception as error:
+            self.darken(f"watching it failed: {error!r}")
+            self._alarm(f"laser: watching it failed: {error!r}")
+
     def _watch(self) -> None:
-        while not self._ending.wait(WATCH_PERIOD_S):
+        # Under the lock: somebody may be switching off already.
+        with self._lock:
             reason = self.gate.must_end()
             if reason is None and not self._living() and self._requested is LaserOutput.ON:
                 reason = "the node is shutting down"
@@ -291,27 +314,26 @@ class LaserKeeper:
                 self.darken(reason)
 
     def _read(self) -> None:
-        while not self._ending.wait(self._readback_period_s):
-            with self._lock:
-                laser, generation = self._laser, self._generation
-                if laser is None or self._commanding:
-                    continue
-            try:
-                told = laser.readback()
-            except EschortyError as error:
-                self._lost(generation, error)
-                continue
-            with self._lock:
-                if generation != self._generation:
-                    continue
-                self._hear(told)
-                wrong = self._wrong_output(told)
-                if self._requested is LaserOutput.ON:
-                    wrong = wrong or self._wrong_waveform(told)
-                elif self.unknown:
-                    wrong = f"state unknown: {self.unknown}"
-            if wrong:
-                self.darken(wrong)
+        with self._lock:
+            laser, generation = self._laser, self._generation
+            if laser is None or self._commanding:
+                return
+        try:
+            told = laser.readback()
+        except EschortyError as error:
+            self._lost(generation, error)
+            return
+        with self._lock:
+            if generation != self._generation:
+                return
+            self._hear(told)
+            wrong = self._wrong_output(told)
+            if self._requested is LaserOutput.ON:
+                wrong = wrong or self._wrong_waveform(told)
+            else:
+                wrong = wrong or self.unknown
+        if wrong:
+            self.darken(wrong)
 
     def _lost(self, generation: int, error: EschortyError) -> None:
         """Give the laser up unless switching off is what interrupted the read-back."""
@@ -319,4 +341,9 @@ class LaserKeeper:
             if generation != self._generation:
                 return
         if self.darken(f"not read back: {error}"):
-            self._alarm(f"laser lost, output off: {error}")
+            self._alarm(f"laser off: {error}")
+
+
+def _unknown(text: str) -> str:
+    heading = "laser state unknown: "
+    return text if text.startswith(heading) else heading + text

@@ -340,3 +340,16 @@ def test_driver_starts_without_numpy_and_ros() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_switched_off_and_on_again_without_configuring() -> None:
+    bench = AwgBench()
+    laser = bench.lit_laser()
+    for _ in range(2):
+        laser.disable()
+        assert bench.model.channels[0].high_v < 0.1
+        laser.arm()
+        laser.enable()
+        assert bench.model.lit
+        assert bench.model.channels[0].high_v == 5.0
+    laser.close()

@@ -6,6 +6,7 @@ own; scanner, camera and stage are stand-ins that only beat.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -35,21 +36,38 @@ BEATING = ("laser", "camera", "stage")
 class Bench:
     """Generator, laser node and whoever has to be alive, each a process."""
 
-    def __init__(self, awg: AwgProcess, observer: Observer, **parameters: Any) -> None:
-        self.awg, self.observer = awg, observer
+    def __init__(self, folder: Path, **parameters: Any) -> None:
+        self._held = contextlib.ExitStack()
+        self.awg: AwgProcess = self._held.enter_context(awg_process(folder))
+        self.observer = self._held.enter_context(Observer(free_domain(), "safety_observer"))
         self.node = self._process(
-            "breakable_laser", {"driver": "awg", "backend": awg.backend, **parameters}
+            "breakable_laser", {"driver": "awg", "backend": self.awg.backend, **parameters}
         )
-        self.beating = {
-            name: self._process("beating", {"topic": f"{name}/heartbeat"}) for name in BEATING
-        }
-        self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
-        self.diagnostics = observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
-        self.breaking = observer.publisher(String, "test/break", qos.stream(10))
-        self.interlock = observer.publisher(Bool, "laser/interlock", qos.stream(10))
+        self.beating: dict[str, NodeProcess] = {}
+        self.revive()
+        self.states = self.observer.collect(
+            LaserState, "laser/state", qos.latched(qos.STATE_HISTORY)
+        )
+        self.diagnostics = self.observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
+        self.breaking = self.observer.publisher(String, "test/break", qos.stream(10))
+        self.interlock = self.observer.publisher(Bool, "laser/interlock", qos.stream(10))
 
     def _process(self, module: str, parameters: dict[str, Any]) -> NodeProcess:
         return NodeProcess(module, parameters, domain=self.observer.domain)
+
+    def revive(self) -> None:
+        """Start the stand-ins that do not run."""
+        for name in BEATING:
+            if name not in self.beating:
+                self.beating[name] = self._process("beating", {"topic": f"{name}/heartbeat"})
+
+    def lose(self, name: str, number: int = signal.SIGKILL) -> int:
+        """Send a stand-in a deadly signal; the time of it."""
+        process = self.beating.pop(name)
+        sent_ns = time.monotonic_ns()
+        process.send(number)
+        self._held.callback(process.kill)
+        return sent_ns
 
     def arm(self) -> Any:
         return self.observer.call(Trigger, "laser/arm")
@@ -58,16 +76,19 @@ class Bench:
         return self.observer.call(SetBool, "laser/enable", SetBool.Request(data=on))
 
     def light(self) -> None:
-        """Switch on, once everybody is there."""
+        """Switch on, with everybody there."""
+        self.revive()
+        if self.observer.lifecycle_state("laser") == "unconfigured":
+            self.observer.change_state("laser", "configure")
+            self.observer.change_state("laser", "activate")
         self.observer.wait_for_state("laser", "active")
 
         def lit() -> bool:
             answers = self.arm(), self.enable()
-            print(*(answer.message for answer in answers))
+            print("light:", *(answer.message for answer in answers))
             return all(answer.success for answer in answers)
 
-        wait_until(lit, "light", deadline_s=10.0, poll_s=0.2)
-        assert self.awg.lit()
+        wait_until(lit, "light", poll_s=0.2)
         time.sleep(0.3)
         assert self.awg.lit()
 
@@ -80,156 +101,156 @@ class Bench:
         for process in (*self.beating.values(), self.node):
             print(f"--- {process.module}\n{process.output}")
             process.kill()
+        self._held.close()
 
 
-@pytest.fixture
-def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", f"{TEST_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
+@pytest.fixture(scope="module", autouse=True)
+def importable() -> Iterator[None]:
+    """The processes import modules of the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", f"{TEST_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
+        yield
 
 
-@pytest.fixture
-def awg(tmp_path: Path) -> Iterator[AwgProcess]:
-    with awg_process(tmp_path) as made:
-        yield made
-
-
-@pytest.fixture
-def observer() -> Iterator[Observer]:
-    with Observer(free_domain(), "safety_observer") as made:
-        yield made
-
-
-@pytest.fixture
-def bench(importable: None, awg: AwgProcess, observer: Observer) -> Iterator[Bench]:
-    made = Bench(awg, observer)
+@contextlib.contextmanager
+def running(folder: Path, **parameters: Any) -> Iterator[Bench]:
+    made = Bench(folder, **parameters)
     try:
-        made.light()
         yield made
     finally:
         made.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM, signal.SIGINT])
-def test_signal_to_the_laser_node(bench: Bench, number: int) -> None:
+@pytest.fixture(scope="module")
+def shared(importable: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    with running(tmp_path_factory.mktemp("laser")) as made:
+        yield made
+
+
+@pytest.fixture
+def lit(shared: Bench) -> Bench:
+    """A bench whose laser is on, for tests that its node survives."""
+    shared.light()
+    return shared
+
+
+@pytest.fixture
+def doomed(tmp_path: Path) -> Iterator[Bench]:
+    """A bench whose laser is on, for tests that its node does not survive."""
+    with running(tmp_path) as made:
+        made.light()
+        yield made
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_laser_node_gets_a_signal(doomed: Bench, number: int) -> None:
     sent_ns = time.monotonic_ns()
-    bench.node.send(number)
-    bench.dark_after(signal.Signals(number).name, sent_ns)
-    if number == signal.SIGSTOP:
-        bench.node.send(signal.SIGCONT)
-        wait_until(lambda: "is stopped" in bench.states[-1].reason, "the reason in laser/state")
-        assert not bench.enable().success
+    doomed.node.send(number)
+    doomed.dark_after(signal.Signals(number).name, sent_ns)
+    assert doomed.node.wait() == (-number if number == signal.SIGKILL else 0)
 
 
 @pytest.mark.parametrize("way", ["exception", "abort", "segfault"])
-def test_laser_node_that_breaks_by_itself(bench: Bench, way: str) -> None:
+def test_laser_node_breaks_by_itself(doomed: Bench, way: str) -> None:
     sent_ns = time.monotonic_ns()
-    bench.breaking.publish(String(data=way))
-    bench.dark_after(way, sent_ns)
-    assert bench.node.wait() != 0
+    doomed.breaking.publish(String(data=way))
+    doomed.dark_after(way, sent_ns)
+    assert doomed.node.wait() != 0
+
+
+def test_laser_node_is_stopped(lit: Bench) -> None:
+    sent_ns = time.monotonic_ns()
+    lit.node.send(signal.SIGSTOP)
+    lit.dark_after("SIGSTOP", sent_ns)
+    lit.node.send(signal.SIGCONT)
+    wait_until(lambda: lit.states[-1].output == LaserState.OUTPUT_OFF, "off in laser/state")
+    assert "not armed" in lit.enable().message
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("name", BEATING)
-def test_whoever_light_depends_on_dies(bench: Bench, name: str, number: int) -> None:
-    sent_ns = time.monotonic_ns()
-    bench.beating[name].send(number)
-    bench.dark_after(f"{name} {signal.Signals(number).name}", sent_ns)
-    wait_until(lambda: f"{name}/heartbeat" in bench.states[-1].reason, "the reason")
-    assert bench.states[-1].output == LaserState.OUTPUT_OFF
+def test_whoever_light_depends_on_dies(lit: Bench, name: str, number: int) -> None:
+    sent_ns = lit.lose(name, number)
+    lit.dark_after(f"{name} {signal.Signals(number).name}", sent_ns)
+    wait_until(lambda: f"{name}/heartbeat" in lit.states[-1].reason, "the reason")
+    assert lit.states[-1].output == LaserState.OUTPUT_OFF
+    assert lit.arm().success
+    assert name in lit.enable().message
+    assert not lit.awg.lit()
 
 
-def test_guard_dies(bench: Bench) -> None:
-    guard = _child(bench.node.pid, "eschorty_ros.hardware.laser.guard")
+def test_guard_dies(lit: Bench) -> None:
+    guard = _child(lit.node.pid, "eschorty_ros.hardware.laser.guard")
     sent_ns = time.monotonic_ns()
     os.kill(guard, signal.SIGKILL)
-    bench.dark_after("guard SIGKILL", sent_ns)
-    bench.observer.wait_for_state("laser", "unconfigured")
-    assert bench.observer.change_state("laser", "configure")
-    assert bench.observer.change_state("laser", "activate")
-    bench.light()
+    lit.dark_after("guard SIGKILL", sent_ns)
+    lit.observer.wait_for_state("laser", "unconfigured")
+    lit.light()
 
 
-def test_interlock_opens(bench: Bench) -> None:
+def test_interlock(lit: Bench) -> None:
     sent_ns = time.monotonic_ns()
-    bench.interlock.publish(Bool(data=True))
-    bench.dark_after("interlock", sent_ns)
+    lit.interlock.publish(Bool(data=True))
+    lit.dark_after("interlock", sent_ns)
+    assert "interlock open" in lit.arm().message
+    lit.interlock.publish(Bool(data=False))
+    wait_until(lambda: not lit.states[-1].interlock_open, "the interlock closed")
+    lit.light()
 
 
-def test_fault_u1_unplug_of_the_generator(bench: Bench) -> None:
-    """driver: alarm, guard tries for 30 s, off at once on replug; user reads: laser state unknown"""
-    bench.awg.do("gone")
-    wait_until(lambda: bench.states[-1].output == LaserState.OUTPUT_UNKNOWN, "unknown")
-    assert bench.awg.lit()
+def test_fault_u1_unplug_of_the_generator(lit: Bench) -> None:
+    """driver: alarm, tries again for 30 s, off on replug; user reads: laser state unknown"""
+    lit.awg.do("gone")
+    wait_until(lambda: lit.states[-1].output == LaserState.OUTPUT_UNKNOWN, "unknown")
+    assert lit.awg.lit()
 
     def alarm() -> bool:
-        status = [s for a in bench.diagnostics for s in a.status if s.name.endswith("laser")]
+        status = [s for a in lit.diagnostics for s in a.status if s.name.endswith("laser")]
         return status[-1].level == DiagnosticStatus.ERROR and "unknown" in status[-1].message
 
     wait_until(alarm, "the alarm in /diagnostics")
-    bench.observer.wait_for_state("laser", "unconfigured")
+    lit.observer.wait_for_state("laser", "unconfigured")
     plugged_ns = time.monotonic_ns()
-    bench.awg.do("back")
-    took_s = bench.awg.off_after_s(plugged_ns)
+    lit.awg.do("back")
+    took_s = lit.awg.off_after_s(plugged_ns)
     print(f"dark {took_s:.2f} s after it was plugged in")
     assert took_s < 2.0
+    lit.light()
 
 
-def test_fault_u8_panel_touched_while_lit(bench: Bench) -> None:
-    """driver: reads back twice a second or more and switches off; user reads: what differs"""
-    bench.awg.do("touch BASE:FREQuency 90")
-    wait_until(lambda: not bench.awg.lit(), "dark")
-    wait_until(lambda: "90" in bench.states[-1].reason, "the reason in laser/state")
+def test_fault_u8_panel_touched_while_lit(lit: Bench) -> None:
+    """driver: reads back five times a second, switches off; user reads: what differs"""
+    lit.awg.do("touch BASE:FREQuency 90")
+    wait_until(lambda: not lit.awg.lit(), "dark")
+    wait_until(lambda: "90" in lit.states[-1].reason, "the reason in laser/state")
 
 
-def test_fault_u9_generator_restarted(bench: Bench) -> None:
-    """driver: takes note that it is dark, refuses light until configured; user reads: found off"""
-    bench.awg.do("reboot")
-    assert not bench.awg.lit()
-    wait_until(lambda: bench.states[-1].output == LaserState.OUTPUT_OFF, "off in laser/state")
-    wait_until(lambda: bench.states[-1].requested == LaserState.OUTPUT_OFF, "no longer asked for")
+def test_fault_u9_generator_restarted(lit: Bench) -> None:
+    """driver: dark, refuses light until configured; user reads: output reads back OFF"""
+    lit.awg.do("reboot")
+    assert not lit.awg.lit()
+    wait_until(lambda: lit.states[-1].requested == LaserState.OUTPUT_OFF, "no longer asked for")
+    assert "reads back OFF" in lit.states[-1].reason
+    lit.arm()
+    assert "configure it again" in lit.enable().message
+    assert lit.observer.set_parameter("laser", "frequency", 80.0)[0]
+    lit.light()
 
 
-def test_interlock_that_is_required_is_open_until_it_says_closed(
-    importable: None, awg: AwgProcess, observer: Observer
-) -> None:
-    bench = Bench(awg, observer, interlock_required=True)
-    try:
-        observer.wait_for_state("laser", "active")
+def test_interlock_that_is_required_is_open_until_it_says_closed(tmp_path: Path) -> None:
+    with running(tmp_path, interlock_required=True) as bench:
+        bench.observer.wait_for_state("laser", "active")
         wait_until(lambda: bench.states and bench.states[-1].interlock_open, "the interlock open")
         assert "interlock open" in bench.arm().message
         bench.interlock.publish(Bool(data=False))
         wait_until(lambda: not bench.states[-1].interlock_open, "the interlock closed")
         bench.light()
-    finally:
-        bench.close()
-
-
-def test_watched_node_that_never_came_is_named(
-    importable: None, awg: AwgProcess, observer: Observer
-) -> None:
-    bench = Bench(awg, observer)
-    try:
-        observer.wait_for_state("laser", "active")
-        bench.beating["camera"].kill()
-        time.sleep(0.3)
-        assert bench.arm().success
-        refused = bench.enable()
-        assert not refused.success
-        assert "camera" in refused.message
-        assert "ON" not in awg.outputs()
-    finally:
-        bench.close()
 
 
 def _child(pid: int, module: str) -> int:
-    """Process started by ``pid`` that runs ``module``."""
-    for number in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        if module in Path(f"/proc/{number}/cmdline").read_text():
-            return int(number)
-    for path in Path("/proc").glob("[0-9]*"):
-        with_parent = f"\nPPid:\t{pid}\n"
-        if with_parent in (path / "status").read_text() and module in (
-            path / "cmdline"
-        ).read_text():
-            return int(path.name)
-    raise AssertionError("no guard")
+    """Process started by any thread of ``pid`` that runs ``module``."""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for number in (task / "children").read_text().split():
+            if module in Path(f"/proc/{number}/cmdline").read_text():
+                return int(number)
+    raise AssertionError(f"no process of {module}")

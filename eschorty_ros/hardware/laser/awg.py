@@ -221,6 +221,7 @@ class AwgLaser:
 
     def _light(self) -> None:
         channel = self._connection.channel
+        channel.raise_levels()
         channel.verify()
         channel.unlock()
         self._output = LaserOutput.UNKNOWN

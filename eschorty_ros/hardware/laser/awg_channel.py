@@ -87,6 +87,7 @@ class AwgChannel:
         self._settings = settings
         self._profile = profile
         self._wanted: Wanted = {}
+        self._lowered = False
         self._silent = False
         self._warn = warn
 
@@ -138,6 +139,11 @@ class AwgChannel:
                 self._set(name, value)
         self.verify()
 
+    def raise_levels(self) -> None:
+        """Set the levels that ``darken`` lowered as they were applied; raises ``DeviceError``."""
+        if self._lowered and "high" in self._wanted:
+            self._set_levels(float(self._wanted["high"]), float(self._wanted["low"]))
+
     def verify(self) -> None:
         """Read every setting back and compare; raises ``DeviceError`` naming what differs."""
         self._compare(self._wanted)
@@ -168,6 +174,7 @@ class AwgChannel:
         others = [n for n in range(1, self._profile.channels + 1) if n != own]
         for channel in (own, *others):
             self._scpi.set_at_once("output", False, channel)
+        self._lowered = True
         self._scpi.set_at_once("low", 0.0, own)
         self._scpi.set_at_once("high", self._profile.dark_high_v, own)
         for channel in (own, *others):
@@ -205,6 +212,7 @@ class AwgChannel:
         levels: list[tuple[str, Value]] = [("high", high), ("low", low)]
         for name, value in levels if high >= present else reversed(levels):
             self._set(name, value)
+        self._lowered = False
 
     def _compare(self, wanted: Wanted) -> None:
         wrong = []

@@ -74,7 +74,6 @@ class GuardedLaser:
         silence_s: float = 0.5,
         answer_s: float = 5.0,
     ) -> None:
-        self._make, self._settings = make, dict(settings)
         self._beat_s = silence_s / BEATS_PER_SILENCE
         self._answer_s = answer_s
         self._numbers = itertools.count()
@@ -96,13 +95,15 @@ class GuardedLaser:
         self._thread = threading.Thread(target=self._serve, name="laser guard", daemon=True)
         self._thread.start()
         try:
-            identity = self._call("open", OPEN_S, make=make, settings=self._settings,
+            identity = self._call("open", OPEN_S, make=make, settings=dict(settings),
                                   silence_s=silence_s)  # fmt: skip
         except BaseException:
             with contextlib.suppress(EschortyError):
                 self.close()
             raise
         self.identity = DeviceIdentity(**identity)
+        # Loaded now: should the guard die, there is no time for it.
+        self._open_directly = maker(make, settings)
         self._opened = True
 
     @property
@@ -178,6 +179,8 @@ class GuardedLaser:
         try:
             # Asked after being entered: whoever sets it tells all that are.
             if self._lost:
+                # Until it is known whether the output is off.
+                self._thread.join(EXIT_S)
                 raise DeviceGoneError(self._lost)
             self._wire.send({"id": number, "do": command, **arguments})
             answer = answers.get(timeout=patience_s)
@@ -236,11 +239,10 @@ class GuardedLaser:
         with self._direct:
             if self._off_confirmed:
                 return
-            make = maker(self._make, self._settings)
             end_s = time.monotonic() + _DIRECT_S
             while not self._off_confirmed:
                 try:
-                    make().close()
+                    self._open_directly().close()
                     self._off_confirmed = True
                 except EschortyError as error:
                     if time.monotonic() > end_s:
