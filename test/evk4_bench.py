@@ -77,6 +77,19 @@ def until(condition: Callable[[], Any], what: str) -> None:
         time.sleep(0.002)
 
 
+_BUSES: dict[str, list[Evk4Model]] = {}
+
+
+def backend(name: str) -> EmulatedBackend:
+    """Backend ``evk4_bench:backend?name`` of the driver's parameter: the bus of that name."""
+    return EmulatedBackend(lambda: _BUSES.get(name, []))
+
+
+def plug(name: str, *models: Evk4Model) -> None:
+    """Put these on the bus of that name."""
+    _BUSES[name] = list(models)
+
+
 class Rig:
     """A model, a driver on it, what was read."""
 

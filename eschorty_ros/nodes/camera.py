@@ -107,7 +107,8 @@ class CameraNode(DeviceNode):
         self._source = drivers.make(drivers.CAMERAS, self.parameters, self.now_ns)
         if isinstance(self._source, Evk4):
             self._source.on_loss = self._on_loss
-            self.get_logger().info("initialising the camera, 3 s")
+            if not self.waiting:
+                self.get_logger().info("looking for the camera; its initialisation takes 3 s")
         self._source.open()
         identity = self._source.identity
         self.get_logger().info(
