@@ -32,12 +32,14 @@ class StagePulses:
         odometry_mm=0.0,
         seed=SEED,
         width_us=500,
+        lead_s=1.0,
+        drift=DRIFT,
     ):
         rng = np.random.default_rng(seed)
         self.track = StageTrack(max_gap_us=500_000)
-        self.true = ClockLine(0, EPOCH_NS, round(DRIFT * 1e9))
+        self.true = ClockLine(0, EPOCH_NS, round(drift * 1e9))
         crossings = []
-        now = EPOCH_NS + 1_000_000_000
+        now = EPOCH_NS + round(lead_s * 1e9)
         plans = []
         for start, stop in pairwise(targets):
             plan = plan_move(now, start, stop, speed, acceleration)
@@ -58,7 +60,7 @@ class StagePulses:
         self.missing = int((~kept).sum())
         at = at[kept].astype(np.int64)
         if spurious:
-            at = np.sort(np.concatenate([at, rng.integers(EPOCH_NS + 10**9, now, spurious)]))
+            at = np.sort(np.concatenate([at, rng.integers(plans[0].start_ns, now, spurious)]))
         self.edges = np.asarray(self.true.to_us(at))
         self.falls = self.edges + width_us
 

@@ -235,12 +235,18 @@ class SensorClock:
         """Sensor time since the newest packet that arrived without delay."""
         return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
 
+    def goes_on(self, t_us: int, arrival_ns: int) -> bool:
+        """Whether neither time lies before the last observed."""
+        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])
+
     def observe(self, t_us: int, arrival_ns: int) -> None:
         """Take note that the event of sensor time ``t_us`` arrived at ROS time ``arrival_ns``."""
         t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         if self._fixed is None:
-            if self._last is not None and (t_us < self._last[0] or arrival_ns < self._last[1]):
+            if not self.goes_on(t_us, arrival_ns):
                 self._envelope = LowerEnvelope(self._window_ns)
                 self._adopted = None
                 self.restarts += 1

@@ -11,7 +11,7 @@ from eschorty_ros.core._checks import octets
 from eschorty_ros.core._window_kernels import TIME_LIMIT_US
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.evt3 import Decoder, Events
+from eschorty_ros.core.evt3 import Decoder, Events, Triggers
 from eschorty_ros.core.finishing import Finisher
 from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
@@ -23,6 +23,8 @@ from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.core.settings import Settings
 
 PIECE_BYTES = 1 << 17
+# Pieces with edges that nobody has taken; who reconstructs a file does not need them.
+_STAGE_EDGES_MAX = 1024
 
 
 class Reconstructor:
@@ -61,6 +63,7 @@ class Reconstructor:
             ("events", "events_filtered", "events_outside_phase"), 0
         )
         self._schedule_counts: dict[str, int] = {}
+        self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         self.first_t_us: int | None = None
         self.newest_t_us: int | None = None
         self._begin(modulation)
@@ -166,20 +169,45 @@ class Reconstructor:
 
     def set_modulation(self, modulation: Modulation) -> None:
         """Use ``modulation`` for data pushed afterwards; the open period is closed first."""
-        if modulation == self._modulation:
-            return
+        if modulation != self._modulation:
+            self._restart(modulation)
+
+    def _restart(self, modulation: Modulation) -> None:
         self._drain()
+        self._counts["events_outside_phase"] += self._lock.refused
         counts = self._lock.counters
         counts["periods_jumped"] = self._lock.schedule.periods_jumped
         self._begin(modulation)
         for name, value in counts.items():
             self._schedule_counts[name] = self._schedule_counts.get(name, 0) + value
 
+    def take_stage_edges(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Trigger edges since the last call, if they are the stage's: times (us), 1 for rising."""
+        edges, self._stage_edges = self._stage_edges, []
+        if not edges:
+            return np.empty(0, np.int64), np.empty(0, np.uint8)
+        return np.concatenate([t for t, _ in edges]), np.concatenate([kind for _, kind in edges])
+
+    def _take_triggers(self, triggers: Triggers) -> None:
+        source = self.settings.trigger_source
+        if source == "laser":
+            self._lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
+        elif source == "stage" and len(self._stage_edges) < _STAGE_EDGES_MAX:
+            self._stage_edges.append((triggers.t.copy(), triggers.edge.copy()))
+
+    def restart_phase(self) -> None:
+        """Estimate the phase anew from the next data on: the laser has been switched on.
+
+        Nothing happens where the phase is known, or still looked for.
+        """
+        if self._modulation.on_edge_us is None and self._lock.schedule.anchored:
+            self._restart(self._modulation)
+
     def _absorb(self, events: Events, now_us: int) -> None:
         self._counts["events"] += len(events)
         triggers = events.triggers
         if len(triggers):
-            self._lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
+            self._take_triggers(triggers)
         if len(events):
             if self.first_t_us is None:
                 self.first_t_us = int(events.t[0])

@@ -13,6 +13,7 @@ from eschorty_ros.core.row_sigma import SIGMA_COMMON_PX, SIGMA_FACTOR, SIGMA_FLO
 
 NOISE_FILTERS = ("none", "activity")
 SWITCH = ("off", "on")
+TRIGGER_SOURCES = ("laser", "stage", "none")
 
 
 def _number(
@@ -67,6 +68,11 @@ class Settings:
     phase_gate_us: int = _number(
         0, 0, GATE_MAX_US, "us", "keep only events this soon after their laser edge; 0 is off"
     )
+    trigger_source: str = _choice(
+        "laser", TRIGGER_SOURCES,
+        "what is wired to the camera's trigger input: the laser cuts the periods, the stage's "
+        "pulses set the clock (live only), none ignores the edges",
+    )  # fmt: skip
     line_width_px: float = _number(
         20.0, 1.0, 200.0, "px", "largest full width at half maximum of the line, in rows"
     )

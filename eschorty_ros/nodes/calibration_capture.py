@@ -16,8 +16,8 @@ from eschorty_ros.core.posts import AggregateFrame, find_posts, match_posts, mov
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.targets import Targets
 from eschorty_ros.nodes.calibration_sequence import CaptureRequest, Sweep
-from eschorty_ros.nodes.packet_stream import Packet
-from eschorty_ros.nodes.stage_placer import TimedProfiles
+from eschorty_ros.nodes.packet_times import Packet
+from eschorty_ros.nodes.sensor_epoch import TimedProfiles
 
 _TARGETS_LEAST = 3
 _REASONS_SHOWN = 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 from builtin_interfaces.msg import Time
 
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.pulses import PulseGrid
 
 _NS_PER_S = 1_000_000_000
 
@@ -52,3 +53,26 @@ def modulation_from_laser_state(state: object) -> tuple[Modulation, int | None]:
     )
     epoch_ns = ns_from_stamp(state.phase_epoch)  # type: ignore[attr-defined]
     return modulation, epoch_ns or None
+
+
+def laser_settings(state: object) -> tuple[Modulation, int | None, int | None]:
+    """Add to ``modulation_from_laser_state`` since when the laser is on, ``None`` when off."""
+    modulation, epoch_ns = modulation_from_laser_state(state)
+    lit = state.output == state.OUTPUT_ON  # type: ignore[attr-defined]
+    since_ns = ns_from_stamp(state.output_since) if lit else None  # type: ignore[attr-defined]
+    return modulation, epoch_ns, since_ns
+
+
+def pulse_grid(trigger: object) -> tuple[PulseGrid | None]:
+    """Where a ``PositionTrigger`` says that the stage gives pulses, ``None`` when nowhere.
+
+    Raises
+    ------
+    ArgumentError
+        When the message holds a position that is not finite or a negative interval.
+    """
+    interval_mm = mm_from_m(float(trigger.interval))  # type: ignore[attr-defined]
+    count = int(trigger.count)  # type: ignore[attr-defined]
+    if interval_mm == 0.0 or count == 0:
+        return (None,)
+    return (PulseGrid(mm_from_m(float(trigger.first)), interval_mm, count),)  # type: ignore[attr-defined]

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from eschorty_ros.core.calibration import Calibration
+from eschorty_ros.core.clock import NS_PER_US
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.reconstruction import Settings, place
 from eschorty_ros.nodes.calibration_capture import Capture
-from eschorty_ros.nodes.packet_stream import Packet, PacketStream
+from eschorty_ros.nodes.packet_stream import PacketStream
+from eschorty_ros.nodes.packet_times import Packet
 from eschorty_ros.nodes.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
-from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
+from eschorty_ros.nodes.sensor_epoch import TimedProfiles
+from eschorty_ros.nodes.stage_placer import StagePlacer
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +39,7 @@ class Pipeline:
     ----------
     calibration : Calibration
     settings : Settings
-    clock_timeout_s, stage_gap_s, stage_timeout_s : float
+    clock_timeout_s, stage_gap_s, stage_timeout_s, packet_period_s : float
         See ``PacketStream`` and ``StagePlacer``.
 
     Attributes
@@ -52,10 +55,11 @@ class Pipeline:
         clock_timeout_s: float,
         stage_gap_s: float,
         stage_timeout_s: float,
+        packet_period_s: float = 0.0,
     ) -> None:
         self.calibration = calibration
         self.model = calibration.model()
-        self.stream = PacketStream(calibration, settings, clock_timeout_s)
+        self.stream = PacketStream(calibration, settings, clock_timeout_s, packet_period_s)
         self.placer = StagePlacer(stage_gap_s, stage_timeout_s)
         self.profiles = 0
         self.points = 0
@@ -84,6 +88,7 @@ class Pipeline:
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
         """Advance whatever waited: profiles completed and points placed since the last call."""
         self._receive(self.stream.process(now_s), now_s)
+        self.stream.follow_edges(self.placer.track)
         ready = self.placer.ready(now_s)
         if self.capture is not None:
             for timed, stage_mm in ready:
@@ -164,13 +169,16 @@ class Pipeline:
         self._receive(self.stream.flush(), now_s)
 
     def end_scan(self) -> ScanReport:
-        """Second half: what was collected, in order."""
+        """Second half: what was collected, in order.
+
+        Points are placed again, by the clock as the whole sweep shows it.
+        """
         assert self._buffer is not None
         buffer, self._buffer = self._buffer, None
+        self.stream.follow_edges(self.placer.track, now=True)
+        scan = buffer.assemble(self._placed_again)
         events, lost, dropped, without = np.subtract(self._losses(), self._at_begin).tolist()
-        return ScanReport(
-            buffer.assemble(), events, lost, dropped, without, buffer.points_over_limit
-        )
+        return ScanReport(scan, events, lost, dropped, without, buffer.points_over_limit)
 
     def _receive(self, timed: list[TimedProfiles], now_s: float) -> None:
         for part in timed:
@@ -180,7 +188,27 @@ class Pipeline:
 
     def _place(self, timed: TimedProfiles, stage_mm: np.ndarray) -> PlacedPoints:
         points = place(timed.profiles, self.model, stage_mm, self.calibration.stage_direction)
-        return PlacedPoints(points, timed.t_ns, timed.edge_ns, stage_mm)
+        return PlacedPoints(points, timed.t_ns, timed.edge_ns, stage_mm, timed.sensor)
+
+    def _placed_again(self, part: PlacedPoints) -> PlacedPoints:
+        if part.sensor is None:
+            return part
+        t_ns, edge_ns = part.sensor.to_ns()
+        stage_mm = self.placer.track.position_mm(t_ns // NS_PER_US)
+        # The odometry is not kept for ever: what it has forgotten stays where it was.
+        known = np.isfinite(stage_mm)
+        stage_mm = np.where(known, stage_mm, part.stage_mm)
+        moved_mm = stage_mm - part.stage_mm
+        points = part.points.copy()
+        for name, share in zip("xyz", self.calibration.stage_direction, strict=True):
+            points[name] += moved_mm * (share * 1e-3)
+        return PlacedPoints(
+            points,
+            np.where(known, t_ns, part.t_ns),
+            np.where(known, edge_ns, part.edge_ns),
+            stage_mm,
+            part.sensor,
+        )
 
     def _losses(self) -> tuple[int, int, int, int]:
         counters = self.stream.counters

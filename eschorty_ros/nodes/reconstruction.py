@@ -23,18 +23,14 @@ from eschorty_ros.core.calibration import Calibration, load_calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.warm_up import warm_up
-from eschorty_ros.msg import LaserState
+from eschorty_ros.msg import LaserState, PositionTrigger
 from eschorty_ros.nodes import diagnostics, qos, transforms
 from eschorty_ros.nodes.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.auto_calibration import AutoCalibration
 from eschorty_ros.nodes.calibrator import Calibrator
-from eschorty_ros.nodes.conversions import (
-    mm_from_m,
-    modulation_from_laser_state,
-    ns_from_stamp,
-)
+from eschorty_ros.nodes.conversions import laser_settings, mm_from_m, ns_from_stamp, pulse_grid
 from eschorty_ros.nodes.mailbox import Mailbox
-from eschorty_ros.nodes.packet_stream import Packet
+from eschorty_ros.nodes.packet_times import Packet
 from eschorty_ros.nodes.parameters import Parameters, from_settings
 from eschorty_ros.nodes.pipeline import Pipeline, ScanReport
 from eschorty_ros.nodes.reconstruction_outputs import Outputs
@@ -69,6 +65,7 @@ class ReconstructionNode(Node):
             self.parameters["clock_timeout"],
             self.parameters["stage_gap"],
             self.parameters["stage_timeout"],
+            self.parameters["packet_period"],
         )
         if self._override is not None:
             self._pipeline.stream.set_laser(self._override, None)
@@ -104,7 +101,11 @@ class ReconstructionNode(Node):
         packets = self.create_subscription(EventPacket, "camera/events", self._on_packet,
                                            qos.events(), callback_group=bulk,
                                            **override)  # fmt: skip
-        self.create_subscription(TimeReference, "camera/clock", self._on_clock, qos.latched())
+        latched = qos.latched()
+        self._clock_source = self.create_subscription(
+            TimeReference, "camera/clock", self._on_clock, latched
+        )
+        self.create_subscription(PositionTrigger, "stage/trigger", self._on_trigger, latched)
         self.create_subscription(
             LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )
@@ -154,14 +155,22 @@ class ReconstructionNode(Node):
         self._mailbox.post(partial(self._pipeline.stream.announce_zero, zero_ns))
 
     def _on_laser(self, message: LaserState) -> None:
-        if self._override is not None:
-            return
+        read = None if self._override else self._read("laser/state", laser_settings, message)
+        if read is not None:
+            self._mailbox.post(partial(self._pipeline.stream.set_laser, *read))
+
+    def _on_trigger(self, message: PositionTrigger) -> None:
+        read = self._read("stage/trigger", pulse_grid, message)
+        if read is not None:
+            self._mailbox.post(partial(self._pipeline.stream.set_grid, *read))
+
+    def _read(self, topic: str, convert: Callable[[Any], tuple[Any, ...]], message: Any) -> Any:
+        """Convert a message; ``None`` and a line in the log when it is bad."""
         try:
-            modulation, epoch_ns = modulation_from_laser_state(message)
+            return convert(message)
         except ArgumentError as error:
-            self.get_logger().error(f"laser/state: {error}", throttle_duration_sec=5.0)
-            return
-        self._mailbox.post(partial(self._pipeline.stream.set_laser, modulation, epoch_ns))
+            self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=5.0)
+            return None
 
     def _on_stage(self, message: Odometry) -> None:
         t_ns = ns_from_stamp(message.header.stamp)
@@ -252,6 +261,9 @@ class ReconstructionNode(Node):
 
     def _take_packet(self, packet: Packet) -> None:
         self._outputs.packet(packet.data)
+        stream = self._pipeline.stream
+        if stream.epoch is None:
+            stream.announcement_expected = self._clock_source.get_publisher_count() > 0
         self._pipeline.add_packet(packet, time.monotonic())
 
     def _step(self) -> None:

@@ -21,7 +21,7 @@ from eschorty_ros.nodes.cloud_messages import (
 )
 from eschorty_ros.nodes.event_frame import EventFrame
 from eschorty_ros.nodes.scan_buffer import AssembledScan, PlacedPoints
-from eschorty_ros.nodes.stage_placer import TimedProfiles
+from eschorty_ros.nodes.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.transforms import BASE, LINK, OPTICAL
 
 _POINTS_INTERVAL_S = 0.05

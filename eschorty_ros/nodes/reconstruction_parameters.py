@@ -17,8 +17,10 @@ TABLE = (
     Param("duty", 0.5, "duty where frequency is given", "", 0.001, 0.999, dynamic=True),
     Param("waveform", "square", "waveform where frequency is given",
           choices=WAVEFORMS, dynamic=True),
-    Param("clock_timeout", 2.0, "wait for camera/clock before the packets' stamps serve instead",
-          "s", 0.0, 60.0),
+    Param("clock_timeout", 2.0, "wait for camera/clock, where somebody publishes it, before the "
+          "packets' stamps serve", "s", 0.0, 60.0),
+    Param("packet_period", 1008e-6, "time over which the camera collects events before it sends "
+          "them; metavision_driver's default is 0.004", "s", 0.0, 0.1),
     Param("stage_gap", 0.5, "longest distance of two stage samples that is bridged; 0 bridges any",
           "s", 0.0, 1e6, dynamic=True),
     # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.

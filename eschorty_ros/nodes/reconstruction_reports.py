@@ -10,6 +10,7 @@ from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.nodes import diagnostics
 from eschorty_ros.nodes.conversions import stamp_from_ns
 from eschorty_ros.nodes.mailbox import Mailbox
+from eschorty_ros.nodes.packet_stream import PacketStream
 from eschorty_ros.nodes.pipeline import Pipeline, ScanReport
 
 
@@ -56,7 +57,6 @@ class Reports:
         """Level, line and values for ``/diagnostics``."""
         stream, placer = self._pipeline.stream, self._pipeline.placer
         counters = stream.counters
-        residual_ns = stream.clock_residual_ns
         values: dict[str, Any] = {
             "packets": stream.packets,
             "packets_lost": stream.packets_lost,
@@ -65,8 +65,7 @@ class Reports:
             "stream_restarts": stream.restarts,
             "queue": len(self._mailbox),
             "events_per_second": self._diagnostics_rate.read(counters["events"]),
-            "clock": "announced" if stream.clock_announced else "from packet stamps",
-            "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
+            **_clock_values(stream),
             "profiles": self._pipeline.profiles,
             "points": self._pipeline.points,
             "points_waiting_for_stage": placer.waiting,
@@ -79,9 +78,38 @@ class Reports:
             return diagnostics.ERROR, "internal errors; see the log", values
         if stream.held:
             return diagnostics.WARN, f"packets wait for the {stream.waits_for}", values
+        if stream.epoch is not None and stream.epoch.edges_missing:
+            return diagnostics.WARN, "no edges of the stage; check its wire to the camera", values
         if stream.packets_lost or placer.points_without_stage:
             return diagnostics.WARN, "packets or points were lost", values
         return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
+
+
+def _clock_values(stream: PacketStream) -> dict[str, Any]:
+    """Offset, drift and residual of the sensor's clock, and what the stage's edges say of it."""
+    epoch = stream.epoch
+    if epoch is None:
+        return {"clock": "unknown", "clock_restarts": stream.clock_restarts}
+    clock, fit = epoch.clock, epoch.edges.fit
+    source = "stage edges" if clock.from_edges else "packet stamps"
+    residual_ns = clock.residual_ns
+    values: dict[str, Any] = {
+        "clock": "announced" if clock.exact else f"from {source}",
+        "clock_drift_ppm": clock.drift_ppm,
+        "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
+        "clock_offset_age_s": clock.offset_age_us * 1e-6,
+        "clock_restarts": stream.clock_restarts,
+    }
+    if epoch.expects_edges:
+        values |= {
+            "stage_edges_kept": len(epoch.edges),
+            "stage_edges_dropped": epoch.edges.edges_dropped,
+            "stage_edges_used": fit.used if fit is not None else 0,
+            "stage_edges_missing": fit.missing if fit is not None else 0,
+            "stage_edges_spurious": fit.spurious if fit is not None else 0,
+            "stage_edges_residual_um": fit.residual_mm * 1e3 if fit is not None else float("nan"),
+        }
+    return values
 
 
 def fill_end_scan(response: Any, report: ScanReport) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.cloud import join_points
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
+from eschorty_ros.nodes.sensor_epoch import SensorTimes
 
 _HALF_NM = 0.5e-6
 
@@ -21,12 +23,14 @@ class PlacedPoints:
 
     ``points`` is as ``place`` gives it (its ``t`` is not used), ``t_ns`` and ``edge_ns`` are int64
     ROS nanoseconds of the point and of the rising edge of its period, ``stage_mm`` is float64.
+    ``sensor`` holds the sensor times where the clock may still get better.
     """
 
     points: NDArray[Any]
     t_ns: NDArray[np.int64]
     edge_ns: NDArray[np.int64]
     stage_mm: NDArray[np.float64]
+    sensor: SensorTimes | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -34,7 +38,11 @@ class PlacedPoints:
     def select(self, mask: NDArray[Any]) -> PlacedPoints:
         """Points where ``mask`` (boolean, indices or slice-like index array) says."""
         return PlacedPoints(
-            self.points[mask], self.t_ns[mask], self.edge_ns[mask], self.stage_mm[mask]
+            self.points[mask],
+            self.t_ns[mask],
+            self.edge_ns[mask],
+            self.stage_mm[mask],
+            None if self.sensor is None else self.sensor.select(mask),
         )
 
 
@@ -50,6 +58,8 @@ class AssembledScan:
 
 class ScanBuffer:
     """Points whose stage position lies between two limits.
+
+    Points whose place is not final are kept wherever they are until the end.
 
     Parameters
     ----------
@@ -87,8 +97,7 @@ class ScanBuffer:
 
     def add(self, placed: PlacedPoints) -> None:
         """Keep the points between the limits."""
-        inside = (placed.stage_mm >= self._low_mm) & (placed.stage_mm <= self._high_mm)
-        kept = placed if inside.all() else placed.select(inside)
+        kept = placed if placed.sensor is not None else self._inside(placed)
         room = self._points_max - self._count
         if len(kept) > room:
             self.points_over_limit += len(kept) - room
@@ -97,8 +106,20 @@ class ScanBuffer:
             self._parts.append(kept)
             self._count += len(kept)
 
-    def assemble(self) -> AssembledScan:
-        """Everything kept so far as one cloud; an empty one when nothing was kept."""
+    def _inside(self, placed: PlacedPoints) -> PlacedPoints:
+        inside = (placed.stage_mm >= self._low_mm) & (placed.stage_mm <= self._high_mm)
+        return placed if inside.all() else placed.select(inside)
+
+    def assemble(
+        self, placed_again: Callable[[PlacedPoints], PlacedPoints] | None = None
+    ) -> AssembledScan:
+        """Everything kept so far as one cloud; an empty one when nothing was kept.
+
+        ``placed_again`` gives points their final place.
+        """
+        if placed_again is not None:
+            self._parts = [self._inside(placed_again(part)) for part in self._parts]
+        self._parts = [part for part in self._parts if len(part)]
         if not self._parts:
             return AssembledScan(np.empty(0, SCAN_DTYPE), 0, 0, float("nan"))
         points = join_points([part.points for part in self._parts])

@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.clock import NS_PER_US, StageTrack
-from eschorty_ros.core.reconstruction import Profiles
+from eschorty_ros.nodes.sensor_epoch import TimedProfiles
+
+__all__ = ["StagePlacer", "TimedProfiles"]
 
 _HISTORY_US = 600_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class TimedProfiles:
-    """Profiles with int64 ROS nanoseconds of each point and of its period's rising edge."""
-
-    profiles: Profiles
-    t_ns: NDArray[np.int64]
-    edge_ns: NDArray[np.int64]
-
-    def select(self, mask: NDArray[np.bool_]) -> TimedProfiles:
-        """Points where ``mask`` is set."""
-        return TimedProfiles(self.profiles.select(mask), self.t_ns[mask], self.edge_ns[mask])
+# A stage that rests gives no pulses, and a wire may be off: nobody waits longer for an edge.
+_EDGE_WAIT_S = 0.3
 
 
 class StagePlacer:
     """Joins profiles and stage positions by time; interpolates, never extrapolates.
+
+    Profiles have sensor times until then: they are placed by the clock as it is known when their
+    position is, and where edges of the stage are expected, when edges cover their time.
 
     Parameters
     ----------
@@ -43,29 +36,31 @@ class StagePlacer:
         Points discarded because no position covers their time.
     waiting : int
         Points that wait for a stage position.
+    track : StageTrack
+        The odometry over ROS time, us.
     """
 
     def __init__(self, gap_s: float, timeout_s: float) -> None:
         self.timeout_s = timeout_s
         self.points_without_stage = 0
         self.waiting = 0
-        self._track = StageTrack(max_gap_us=round(gap_s * 1e6) or None)
+        self.track = StageTrack(max_gap_us=round(gap_s * 1e6) or None)
         self._waiting: deque[tuple[float, TimedProfiles]] = deque()
 
     @property
     def late_samples(self) -> int:
         """Stage samples that were not later than the one before, and so were not used."""
-        return self._track.dropped
+        return self.track.dropped
 
     def set_gap(self, gap_s: float) -> None:
         """Change the longest bridged distance of two samples."""
-        self._track.max_gap_us = round(gap_s * 1e6) or None
+        self.track.max_gap_us = round(gap_s * 1e6) or None
 
     def add_stage(self, t_ns: int, position_mm: float) -> None:
         """Add one stage sample at ROS time ``t_ns``."""
-        self._track.append(t_ns // NS_PER_US, position_mm)
-        assert self._track.last_us is not None
-        self._track.forget_before(self._track.last_us - _HISTORY_US)
+        self.track.append(t_ns // NS_PER_US, position_mm)
+        assert self.track.last_us is not None
+        self.track.forget_before(self.track.last_us - _HISTORY_US)
 
     def add_profiles(self, timed: TimedProfiles, now_s: float) -> None:
         """Queue profiles that arrived at steady time ``now_s``."""
@@ -77,17 +72,20 @@ class StagePlacer:
         """Profiles whose position is known, each with its positions (mm, float64), oldest first."""
         placed = []
         still: deque[tuple[float, TimedProfiles]] = deque()
-        for arrived_s, timed in self._waiting:
+        for arrived_s, waiting in self._waiting:
+            timed = waiting.retimed()
             t_us = timed.t_ns // NS_PER_US
-            last_us = self._track.last_us
+            last_us = self.track.last_us
             early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
+            if now_s - arrived_s <= min(_EDGE_WAIT_S, self.timeout_s):
+                early |= ~timed.settled()
             if now_s - arrived_s > self.timeout_s:
                 self.points_without_stage += int(np.count_nonzero(early))
             elif early.any():
                 still.append((arrived_s, timed.select(early)))
             if early.all():
                 continue
-            position_mm = self._track.position_mm(t_us)
+            position_mm = self.track.position_mm(t_us)
             known = ~early & ~np.isnan(position_mm)
             self.points_without_stage += int(np.count_nonzero(~early & ~known))
             if known.any():

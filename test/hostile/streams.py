@@ -150,6 +150,12 @@ CALLS: dict[str, Call] = {
     "reconstructor.Reconstructor.flush": Call(
         method(partial(reconstructor.Reconstructor, CALIBRATION, LASER), "flush"), {}
     ),
+    "reconstructor.Reconstructor.take_stage_edges": Call(
+        method(partial(reconstructor.Reconstructor, CALIBRATION, LASER), "take_stage_edges"), {}
+    ),
+    "reconstructor.Reconstructor.restart_phase": Call(
+        method(partial(reconstructor.Reconstructor, CALIBRATION, LASER), "restart_phase"), {}
+    ),
     "reconstructor.Reconstructor.note_gap": Call(
         method(partial(reconstructor.Reconstructor, CALIBRATION, LASER), "note_gap"), {}
     ),

@@ -103,6 +103,11 @@ CALLS: dict[str, Call] = {
         {"t_us": 5, "arrival_ns": 10},
         {"t_us": whole(), "arrival_ns": whole()},
     ),
+    "clock.SensorClock.goes_on": Call(
+        method(clock.SensorClock, "goes_on"),
+        {"t_us": 5, "arrival_ns": 10},
+        {"t_us": whole(), "arrival_ns": whole()},
+    ),
     "clock.SensorClock.to_ns": Call(
         method(partial(clock.SensorClock, 7), "to_ns"), {"t_us": 3}, {"t_us": whole()}
     ),

@@ -10,7 +10,8 @@ from line_events import encoded, line_events
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
-from eschorty_ros.nodes.packet_stream import WRAP_US, Packet, PacketStream, first_time_high_us
+from eschorty_ros.nodes.packet_stream import PacketStream
+from eschorty_ros.nodes.packet_times import WRAP_US, Packet, first_time_high_us
 
 ZERO_NS = 1_700_000_000_123_456_789
 EDGE_US = 1000

@@ -1,0 +1,72 @@
+"""Event packets and the sensor time they begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+WRAP_US = 1 << 24
+_TIME_LOW, _TIME_HIGH = 0x6, 0x8
+# A stream repeats its time far more often than this.
+_WORDS_SEARCHED = 8192
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One ``EventPacket``: ``data`` is a buffer of EVT3 words, ``stamp_ns`` its arrival time."""
+
+    seq: int
+    stamp_ns: int
+    data: Any
+
+
+def first_time_high_us(data: Any) -> int | None:
+    """Sensor time (us, modulo 2^24) of the first TIME_HIGH word, ``None`` when there is none."""
+    words = _words(data)
+    found = np.flatnonzero(words >> 12 == _TIME_HIGH)
+    return int(words[found[0]] & 0xFFF) << 12 if found.size else None
+
+
+def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int | None:
+    """Sensor time at which a packet's first bytes were sent, not later than that.
+
+    Parameters
+    ----------
+    data : buffer of EVT3 words
+    before_us, after_us : int, optional
+        Times the decoder had reached before and after it; what lies outside is a broken word.
+
+    Returns
+    -------
+    int or None
+        us; ``None`` without any time.
+    """
+    t_us = _first_word_us(data, before_us)
+    if after_us is None or (t_us is not None and (before_us or 0) <= t_us <= after_us):
+        return t_us
+    return before_us
+
+
+def _first_word_us(data: Any, before_us: int | None) -> int | None:
+    words = _words(data)[:_WORDS_SEARCHED]
+    low = np.flatnonzero(words >> 12 == _TIME_LOW)
+    high = np.flatnonzero(words >> 12 == _TIME_HIGH)
+    if high.size and (low.size == 0 or high[0] < low[0]):
+        until = low[0] if low.size else words.size
+        t_us = int(words[high[high < until][-1]] & 0xFFF) << 12
+    elif low.size and before_us is not None:
+        t_us = before_us & ~0xFFF
+    else:
+        return None
+    if low.size:
+        t_us |= int(words[low[0]] & 0xFFF)
+    if before_us is None:
+        return t_us
+    return t_us + round((before_us - t_us) / WRAP_US) * WRAP_US
+
+
+def _words(data: Any) -> np.ndarray:
+    view = memoryview(data).cast("B")
+    return np.frombuffer(view[: len(view) & ~1], dtype="<u2")
