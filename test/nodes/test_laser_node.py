@@ -1,4 +1,4 @@
-"""The laser node as a process: its emulator's own log says when there was light."""
+"""The laser node as a process: the emulated generator's own log says when there was light."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
+from awg_process import AwgProcess
 from eschorty_ros.msg import LaserState
 from ros_process import NodeProcess, Observer, wait_until
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
+from eschorty_ros.emulation.awg_model import truth
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.domain import free_domain
 
@@ -27,12 +29,14 @@ PARAMETERS = {"arm_timeout": 1.0, "max_on_time": 3.0, "watch": "none"}
 class Bench:
     """A laser node with its log, its state and a heartbeat that can be switched."""
 
-    def __init__(self, log: Path, domain: int, observer: Observer, **parameters: Any) -> None:
-        self.log = log
+    def __init__(self, folder: Path, domain: int, observer: Observer, **parameters: Any) -> None:
+        self.awg = AwgProcess(folder)
         self.observer = observer
         self.beating = False
         self.process = NodeProcess(
-            MODULE, {**PARAMETERS, "fake_log": log, **parameters}, domain=domain
+            MODULE,
+            {**PARAMETERS, "driver": "awg", "backend": self.awg.backend, **parameters},
+            domain=domain,
         )
         self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
         self._heart = observer.node.create_publisher(Header, "laser/heartbeat", qos.stream(10))
@@ -48,13 +52,12 @@ class Bench:
             self._heart.publish(Header())
 
     def light(self) -> list[str]:
-        """ON and OFF as the emulator logged them."""
-        return [line.split()[1] for line in self.log.read_text().splitlines()]
+        """ON and OFF as the generator logged them."""
+        return self.awg.outputs()
 
-    def lit_for_s(self) -> float:
-        """Length of the last light."""
-        on, off = (int(line.split()[0]) for line in self.log.read_text().splitlines()[-2:])
-        return (off - on) * 1e-9
+    def switched_ns(self) -> list[int]:
+        """Times of the last light's begin and end, CLOCK_MONOTONIC."""
+        return [t_ns for t_ns, _ in truth(self.awg.log)[-2:]]
 
     def arm(self) -> Any:
         return self.observer.call(Trigger, "laser/arm")
@@ -78,6 +81,7 @@ class Bench:
         self.beating = False
         self.observer.node.destroy_timer(self._timer)
         self.process.kill()
+        self.awg.close()
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +99,7 @@ def observer(domain: int) -> Iterator[Observer]:
 def shared(
     domain: int, observer: Observer, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Bench]:
-    bench = Bench(tmp_path_factory.mktemp("laser") / "laser.log", domain, observer)
+    bench = Bench(tmp_path_factory.mktemp("laser"), domain, observer)
     yield bench
     bench.close()
 
@@ -153,7 +157,8 @@ def test_lost_heartbeat_switches_off(bench: Bench) -> None:
 def test_light_ends_after_the_longest_time_on(bench: Bench) -> None:
     bench.switch_on()
     bench.wait_dark()
-    assert bench.lit_for_s() >= 3.0
+    on_ns, off_ns = bench.switched_ns()
+    assert (off_ns - on_ns) * 1e-9 >= 3.0
     wait_until(lambda: "max_on_time" in bench.states[-1].reason, "the reason in laser/state")
 
 
@@ -183,9 +188,13 @@ def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
     bench.switch_on()
     assert bench.enable(False).success
     wait_until(lambda: bench.states[-1].output == LaserState.OUTPUT_OFF, "off in laser/state")
-    logged = [int(line.split()[0]) for line in bench.log.read_text().splitlines()[-2:]]
-    told = {s.output_since.sec * 10**9 + s.output_since.nanosec for s in bench.states}
-    assert set(logged) <= told
+    to_ros_ns = time.time_ns() - time.monotonic_ns()
+    switched_ns = [t_ns + to_ros_ns for t_ns in bench.switched_ns()]
+    told_ns = sorted({s.output_since.sec * 10**9 + s.output_since.nanosec for s in bench.states})
+    # Each was told, when it had been read back.
+    for switch_ns, since_ns in zip(switched_ns, told_ns[-2:], strict=True):
+        assert since_ns > switch_ns - 1_000_000
+    assert told_ns[-2] < switched_ns[1]
 
 
 @pytest.mark.parametrize("pause_s", [None, 0.003, 0.02], ids=["once", "rapidly", "again"])
@@ -194,7 +203,7 @@ def test_signal_switches_off_and_exits_clean(
     number: int, pause_s: float | None, tmp_path: Path
 ) -> None:
     with Observer(free_domain(), "signal_observer") as own:
-        bench = Bench(tmp_path / "laser.log", own.domain, own)
+        bench = Bench(tmp_path, own.domain, own)
         try:
             bench.switch_on()
             bench.process.send(number)
@@ -213,7 +222,7 @@ def test_unknown_driver_is_one_clear_line() -> None:
         process = NodeProcess(MODULE, {"driver": "quantum"}, domain=own.domain)
         try:
             wait_until(lambda: "quantum" in process.output, "the refusal")
-            assert "choose one of fake" in process.output
+            assert "choose one of" in process.output
             assert "Traceback" not in process.output
             assert own.lifecycle_state("laser") == "unconfigured"
             assert process.interrupt() == 0
