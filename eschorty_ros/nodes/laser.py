@@ -24,7 +24,8 @@ from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import stamp_from_ns
 from eschorty_ros.nodes.laser_gate import LEASE, LaserGate
-from eschorty_ros.nodes.laser_keeper import LaserKeeper, LaserSnapshot
+from eschorty_ros.nodes.laser_keeper import LaserKeeper
+from eschorty_ros.nodes.laser_readback import LaserSnapshot
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run

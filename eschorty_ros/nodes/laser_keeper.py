@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput, LaserReadback
 from eschorty_ros.nodes.laser_gate import LaserGate
+from eschorty_ros.nodes.laser_readback import (
+    LaserSnapshot,
+    unknown_text,
+    wrong_output,
+    wrong_waveform,
+)
 
 WATCH_PERIOD_S = 0.01
-FREQUENCY_TOLERANCE = 1e-4
-DUTY_TOLERANCE = 2e-3
-
-
-@dataclass(frozen=True, slots=True)
-class LaserSnapshot:
-    """What was asked, what was read back, and why."""
-
-    requested: LaserOutput
-    told: LaserReadback
-    reason: str
 
 
 class LaserKeeper:
@@ -215,10 +209,10 @@ class LaserKeeper:
     def tell(self) -> None:
         """Tell the state as it is now."""
         with self._lock:
-            told = self._told
+            snapshot = self.snapshot()
             # While a command is under way nobody knows; what comes of it is told at its end.
-            if told is not None and not self._commanding:
-                self._changed(LaserSnapshot(self._requested, told, self._reason))
+            if snapshot is not None and not self._commanding:
+                self._changed(snapshot)
 
     def snapshot(self) -> LaserSnapshot | None:
         """Return what is known now, ``None`` before the generator has been opened."""
@@ -252,7 +246,7 @@ class LaserKeeper:
                 self._log(text)
         self.unknown = ""
         if told.output is LaserOutput.UNKNOWN:
-            self.unknown = _unknown(told.reason or "the generator does not say")
+            self.unknown = unknown_text(told.reason or "the generator does not say")
         self.tell()
 
     def _hear_off(self, laser: LaserModulator) -> None:
@@ -267,34 +261,15 @@ class LaserKeeper:
             self._hear(told)
 
     def _note_unknown(self, error: Exception) -> None:
-        self.unknown = _unknown(str(error))
+        self.unknown = unknown_text(str(error))
         if self._told is not None:
             self._told = replace(self._told, output=LaserOutput.UNKNOWN)
         self.tell()
 
     def _refuse_difference(self, told: LaserReadback) -> None:
-        difference = self._wrong_output(told) or self._wrong_waveform(told)
+        difference = wrong_output(told, self._requested) or wrong_waveform(told, self._asked)
         if difference:
             raise DeviceError(f"laser: {difference}; look at the generator")
-
-    def _wrong_output(self, told: LaserReadback) -> str:
-        """How the output differs from what was asked, ``""`` when it does not or is unknown."""
-        if told.output in (self._requested, LaserOutput.UNKNOWN):
-            return ""
-        why = f" ({told.reason})" if told.reason else ""
-        return f"output reads back {told.output.name}, asked {self._requested.name}{why}"
-
-    def _wrong_waveform(self, told: LaserReadback) -> str:
-        asked, now = self._asked, told.modulation
-        if asked is None:
-            return ""
-        if not math.isclose(now.frequency_hz, asked.frequency_hz, rel_tol=FREQUENCY_TOLERANCE):
-            return f"frequency reads back {now.frequency_hz:g} Hz, asked {asked.frequency_hz:g} Hz"
-        if abs(now.duty - asked.duty) > DUTY_TOLERANCE:
-            return f"duty reads back {now.duty:g}, asked {asked.duty:g}"
-        if now.waveform != asked.waveform:
-            return f"waveform reads back {now.waveform}, asked {asked.waveform}"
-        return ""
 
     def _look_after(self, look: Callable[[], None], every_s: float) -> None:
         try:
@@ -327,9 +302,9 @@ class LaserKeeper:
             if generation != self._generation:
                 return
             self._hear(told)
-            wrong = self._wrong_output(told)
+            wrong = wrong_output(told, self._requested)
             if self._requested is LaserOutput.ON:
-                wrong = wrong or self._wrong_waveform(told)
+                wrong = wrong or wrong_waveform(told, self._asked)
             else:
                 wrong = wrong or self.unknown
         if wrong:
@@ -342,8 +317,3 @@ class LaserKeeper:
                 return
         if self.darken(f"not read back: {error}"):
             self._alarm(f"laser off: {error}")
-
-
-def _unknown(text: str) -> str:
-    heading = "laser state unknown: "
-    return text if text.startswith(heading) else heading + text
