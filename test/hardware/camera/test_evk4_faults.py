@@ -288,6 +288,26 @@ def test_fault_u10_a_kernel_driver_holds_it() -> None:
         assert rig.model.kernel_driver == "uvcvideo"
 
 
+def test_fault_x1_host_stalls() -> None:
+    """driver: receives on in its own thread: stamps are those of the receipt, nothing is lost; user reads: queue_bytes in the diagnostics."""
+    with Rig() as rig:
+        rig.streaming()
+        given, received_ns = b"", []
+        for round_ in range(1, 6):
+            given += rig.source.give(10)
+            until(lambda bytes_=80 * round_: rig.count("bytes") == bytes_, "the receipt")
+            received_ns.append(time.monotonic_ns())
+        time.sleep(0.3)
+        assert rig.count("queue_bytes") == len(given)
+        assert rig.read(len(given)) == given
+        last_ns, done = {}, 0
+        for chunk in rig.chunks:
+            done += len(chunk.data)
+            last_ns[-(-done // 80) - 1] = chunk.arrival_ns
+        assert all(last_ns[i] <= received_ns[i] for i in range(5))
+        assert rig.count("drops") == 0
+
+
 def test_fault_x2_two_clients() -> None:
     """driver: the second program fails in one line, the first streams on; user reads: 'in use; close the other program, or unload the kernel driver that holds it'."""
     with Rig() as rig:

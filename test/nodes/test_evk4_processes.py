@@ -1,0 +1,61 @@
+"""The camera node as a process on the emulated bus of another: it ends well in every phase."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+
+from event_camera_msgs.msg import EventPacket
+from evk4_bench import OnDemand
+from ros_process import Observer, processes, wait_until
+
+from eschorty_ros.emulation.evk4_model import Evk4Model
+from eschorty_ros.emulation.evk4_sequences import Phase
+from eschorty_ros.emulation.usb_server import UsbServer
+from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.domain import free_domain
+
+CAMERA = "eschorty_ros.nodes.camera"
+
+
+def test_fault_x3_ctrl_c_in_the_initialisation_and_while_streaming(tmp_path: Path) -> None:
+    """driver: ends within 2 s, camera released or powered down, exit 0; user reads: nothing."""
+    model, domain = Evk4Model(source := OnDemand()), free_domain()
+    backend = f"eschorty_ros.emulation.usb_remote:backend?{tmp_path / 'usb.sock'}"
+    nodes = {CAMERA: {"driver": "evk4", "backend": backend}}
+    with UsbServer(tmp_path / "usb.sock", lambda: [model]):
+        with processes(nodes, domain) as running:
+            wait_until(lambda: model.claims, "the claim")
+            time.sleep(0.5)
+            begun_s = time.monotonic()
+            assert running["camera"].interrupt() == 0
+            assert time.monotonic() - begun_s < 2.0
+            assert "Traceback" not in running["camera"].output
+        assert not model.claims
+        with processes(nodes, domain) as running, Observer(domain, "evk4_processes") as observer:
+            packets = observer.collect(EventPacket, "camera/events", qos.events())
+
+            def arrived() -> bool:
+                source.give(5)
+                return len(packets) > 3
+
+            wait_until(arrived, "packets")
+            begun_s = time.monotonic()
+            assert running["camera"].interrupt() == 0
+            assert time.monotonic() - begun_s < 2.0
+            assert "Traceback" not in running["camera"].output
+        assert model.watch.phase is Phase.OFF
+        assert not model.claims
+
+
+def test_process_without_a_camera_waits_and_ends_well() -> None:
+    domain = free_domain()
+    with processes({CAMERA: {"driver": "evk4"}}, domain) as running:
+        camera = running["camera"]
+        wait_until(lambda: "waiting: EVK4 camera: no such device" in camera.output, "the line")
+        assert camera.interrupt() == 0
+        assert "Traceback" not in camera.output
