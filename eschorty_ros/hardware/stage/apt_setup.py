@@ -1,0 +1,292 @@
+"""What a stage controller is asked and told when it is connected: all that later use relies on.
+
+Settings of these controllers are volatile and other programs rewrite them, so every one is written
+at every connection, and read back where the controller answers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceTimeoutError
+from eschorty_ros.hardware.protocols import DeviceIdentity, PulseTrain
+from eschorty_ros.hardware.stage import apt_messages as apt
+from eschorty_ros.hardware.stage.apt_link import AptLink
+
+CONTROLLERS = ("kbd101", "bbd30x")
+_ANSWER_S = 0.3
+_ATTEMPTS = 3
+_PULSE_US = 500
+# As many passes as anybody will make in one session.
+_CYCLES = 1_000_000
+_STEPS_BOTH = 0x0F
+_OUTPUT = 1
+_ARM, _DISARM = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class AptSettings:
+    """How the stage is connected and what it may do.
+
+    Parameters
+    ----------
+    controller : {"kbd101", "bbd30x"}
+    bay : int
+        Bay of a rack, from 1.
+    speed_max_mm_s, acceleration_mm_s2 : float
+        Caps on what the controller reports.
+    travel_mm : tuple of float
+        Cap on the travel it reports.
+    homing_mm_s : float
+    poll_hz : float
+        Rate of status requests.
+    trigger_interval_mm : float
+        Distance of the pulses for the camera; 0 for none.
+    trigger_port : int
+        Output that gives the pulses: 1 or 2 of a KBD101, 1 to 3 of a BBD30x.
+    """
+
+    controller: str = "kbd101"
+    bay: int = 1
+    speed_max_mm_s: float = 250.0
+    acceleration_mm_s2: float = 2000.0
+    travel_mm: tuple[float, float] = (0.0, 220.0)
+    homing_mm_s: float = 25.0
+    poll_hz: float = 50.0
+    trigger_interval_mm: float = 2.0
+    trigger_port: int = 1
+
+    def __post_init__(self) -> None:
+        if self.controller not in CONTROLLERS:
+            raise ArgumentError(
+                f"controller is {self.controller!r}; choose one of {', '.join(CONTROLLERS)}"
+            )
+        apt.bay_address(self.bay)
+        for name in ("speed_max_mm_s", "acceleration_mm_s2", "homing_mm_s", "poll_hz"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ArgumentError(f"{name} is {getattr(self, name)!r}; choose a positive number")
+        ports = 2 if self.controller == "kbd101" else 3
+        if not 1 <= self.trigger_port <= ports:
+            raise ArgumentError(f"trigger_port is {self.trigger_port}; choose 1 to {ports}")
+        if not (self.trigger_interval_mm == 0.0 or 0.01 <= self.trigger_interval_mm < math.inf):
+            raise ArgumentError(
+                f"trigger_interval_mm is {self.trigger_interval_mm!r}; choose 0 or 0.01 mm at least"
+            )
+
+    @property
+    def address(self) -> int:
+        """Where motion commands go."""
+        return apt.SINGLE_UNIT if self.controller == "kbd101" else apt.bay_address(self.bay)
+
+
+@dataclass(frozen=True, slots=True)
+class AxisData:
+    """What the controller says of itself and its stage, within the settings' caps."""
+
+    identity: DeviceIdentity
+    scale: apt.Scale
+    travel_mm: tuple[float, float]
+    speed_max_mm_s: float
+    acceleration_mm_s2: float
+
+
+class AptSetup:
+    """Questions and settings over a link.
+
+    Parameters
+    ----------
+    link : AptLink
+    settings : AptSettings
+    """
+
+    def __init__(self, link: AptLink, settings: AptSettings) -> None:
+        self._link = link
+        self._settings = settings
+
+    def ask(self, request: str, answer: str, **values: int) -> apt.Frame:
+        """Ask the axis, again when no answer comes; only for what may be asked twice."""
+        return self._ask(self._settings.address, request, answer, **values)
+
+    def tell(self, name: str, **values: int) -> None:
+        """Send the axis a setting."""
+        self._link.send(apt.pack(name, self._settings.address, **values))
+
+    def read_axis(self) -> AxisData:
+        """Identify controller and stage.
+
+        Raises
+        ------
+        DeviceError
+            When the bay is empty or the stage's data make no sense.
+        """
+        settings = self._settings
+        rack = settings.controller == "bbd30x"
+        if rack:
+            bay = self._ask(apt.RACK, "request_bay", "bay", bay=settings.bay - 1)
+            if bay.whole("state") != 1:
+                raise DeviceError(f"stage: bay {settings.bay} of the rack is empty; check bay")
+        info = self._ask(apt.RACK if rack else settings.address, "request_info", "info")
+        axis = self.ask("request_axis", "axis", channel=apt.CHANNEL)
+        counts = axis.whole("counts_per_unit")
+        if not 100 <= counts <= 1_000_000:
+            raise DeviceError(
+                f"stage: the controller reports {counts} counts per mm; check that a DDS stage is "
+                "connected and its memory readable"
+            )
+        scale = apt.Scale(float(counts))
+        low = max(settings.travel_mm[0], scale.mm(axis.whole("minimum")))
+        high = min(settings.travel_mm[1], scale.mm(axis.whole("maximum")))
+        if not low < high:
+            raise DeviceError(
+                f"stage: no travel is left between {low:g} and {high:g} mm; check travel"
+            )
+        firmware = ".".join(str(info.whole(part)) for part in ("major", "interim", "minor"))
+        name = f"{info.text('model')} with {axis.text('part') or 'unknown stage'}"
+        return AxisData(
+            DeviceIdentity(name, str(info.whole("serial")), firmware),
+            scale,
+            (low, high),
+            _least(settings.speed_max_mm_s, axis.whole("velocity") / scale.velocity_unit),
+            _least(
+                settings.acceleration_mm_s2, axis.whole("acceleration") / scale.acceleration_unit
+            ),
+        )
+
+    def write(self, axis: AxisData) -> None:
+        """Write all settings but the trigger."""
+        scale = axis.scale
+        self.tell("set_profile_mode", channel=apt.CHANNEL, mode=0, jerk=0)
+        self.write_velocity(axis, axis.speed_max_mm_s)
+        # Reverse, to the reverse limit switch, as the manufacturer's own software sets it.
+        self.tell(
+            "set_home",
+            channel=apt.CHANNEL,
+            direction=2,
+            limit=1,
+            velocity=scale.velocity(min(self._settings.homing_mm_s, axis.speed_max_mm_s)),
+            offset=0,
+        )
+        self.tell("resume_end_of_move")
+
+    def write_velocity(self, axis: AxisData, speed_mm_s: float) -> tuple[float, float]:
+        """Set speed and acceleration; both as the controller has them (mm/s, mm/s2).
+
+        Raises
+        ------
+        DeviceError
+            When the controller does not take them.
+        """
+        wanted = {
+            "acceleration": axis.scale.acceleration(axis.acceleration_mm_s2),
+            "velocity": axis.scale.velocity(speed_mm_s),
+        }
+        self.tell("set_velocity", channel=apt.CHANNEL, minimum=0, **wanted)
+        answer = self.ask("request_velocity", "velocity", channel=apt.CHANNEL)
+        for name, value in wanted.items():
+            if answer.whole(name) != value:
+                raise DeviceError(
+                    f"stage: the controller keeps {name} {answer.whole(name)} instead of {value}; "
+                    "lower speed or acceleration, and close other programs that use it"
+                )
+        return (
+            wanted["velocity"] / axis.scale.velocity_unit,
+            wanted["acceleration"] / axis.scale.acceleration_unit,
+        )
+
+    def write_trigger(self, axis: AxisData) -> PulseTrain | None:
+        """Program the pulses for the camera over the travel; ``None`` when there are none.
+
+        Raises
+        ------
+        DeviceError
+            When the controller does not take the pattern.
+        """
+        scale, (low, high) = axis.scale, axis.travel_mm
+        interval = scale.position(self._settings.trigger_interval_mm)
+        if interval == 0:
+            self._write_pulses({}, 0)
+            return None
+        first = scale.position(low) + interval
+        count = (scale.position(high) - 1 - first) // interval + 1
+        if count < 1:
+            raise DeviceError(
+                f"stage: trigger interval {scale.mm(interval):g} mm does not fit into the travel; "
+                "choose a shorter one"
+            )
+        pulses = {
+            "start_forward": first,
+            "interval_forward": interval,
+            "count_forward": count,
+            "start_reverse": first + (count - 1) * interval,
+            "interval_reverse": interval,
+            "count_reverse": count,
+            "width_us": _PULSE_US,
+            "cycles": _CYCLES,
+        }
+        self._write_pulses(pulses, _STEPS_BOTH)
+        kind = "pulses" if self._settings.controller == "kbd101" else "rack_trigger"
+        answer = self.ask(f"request_{kind}", kind, channel=apt.CHANNEL)
+        for name, value in pulses.items():
+            if answer.whole(name) != value:
+                raise DeviceError(
+                    f"stage: the controller keeps trigger {name} {answer.whole(name)} instead of "
+                    f"{value}; set trigger_interval to 0 to go without"
+                )
+        return PulseTrain(scale.mm(first), scale.mm(interval), count)
+
+    def _write_pulses(self, pulses: dict[str, int], mode: int) -> None:
+        port = self._settings.trigger_port
+        if self._settings.controller == "kbd101":
+            if pulses:
+                self.tell("set_pulses", channel=apt.CHANNEL, **pulses)
+            modes = [mode if number == port else 0 for number in (1, 2)]
+            self.tell(
+                "set_ports",
+                channel=apt.CHANNEL,
+                mode_1=modes[0],
+                polarity_1=1,
+                mode_2=modes[1],
+                polarity_2=1,
+                reserved=0,
+            )
+            return
+        self.tell("set_rack_trigger_state", channel=apt.CHANNEL, state=_DISARM)
+        if not pulses:
+            return
+        self._link.send(
+            apt.pack(
+                "set_rack_port",
+                apt.SINGLE_UNIT,
+                port=port,
+                mode=_OUTPUT,
+                source=self._settings.bay,
+            )
+        )
+        self.tell(
+            "set_rack_trigger",
+            channel=apt.CHANNEL,
+            in_mode=0,
+            in_polarity=1,
+            in_source=0,
+            out_mode=mode,
+            out_polarity=1,
+            reserved=0,
+            **pulses,
+        )
+        self.tell("set_rack_trigger_state", channel=apt.CHANNEL, state=_ARM)
+
+    def _ask(self, address: int, request: str, answer: str, **values: int) -> apt.Frame:
+        frame = apt.pack(request, address, **values)
+        for attempt in range(_ATTEMPTS):
+            try:
+                return self._link.request(frame, answer, address, _ANSWER_S)
+            except DeviceTimeoutError:
+                if attempt == _ATTEMPTS - 1:
+                    raise
+        raise AssertionError
+
+
+def _least(cap: float, reported: float) -> float:
+    """Cap, or what is reported when that is less; 0 and below tell nothing."""
+    return min(cap, reported) if reported > 0.0 else cap
