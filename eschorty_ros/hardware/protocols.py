@@ -163,6 +163,10 @@ class LinearStage(Protocol):
     speed_max_mm_s: float
     acceleration_mm_s2: float
 
+    @property
+    def healthy(self) -> bool:
+        """Whether the stage answers and nothing has failed; never waits."""
+
     def home(self) -> None:
         """Start homing; ``state().homed`` tells when it is done."""
 
@@ -172,8 +176,14 @@ class LinearStage(Protocol):
     def stop(self) -> None:
         """Profiled stop; idempotent."""
 
-    def state(self) -> StageState:
-        """Position, velocity, time and flags now."""
+    def state(self, t_ns: int | None = None) -> StageState:
+        """Position, velocity, time and flags; by default at the newest time that is known.
+
+        Raises ``DeviceError`` when the stage has failed.
+        """
+
+    def statistics(self) -> dict[str, float]:
+        """Counters for diagnostics, by name with unit."""
 
     def plan(self) -> MotionPlan | None:
         """Tell the motion under way in host time, ``None`` when the device does not know it."""

@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.protocols import EventSource, LaserModulator, LinearStage
+from eschorty_ros.hardware.stage.apt_setup import CONTROLLERS, AptSettings
+from eschorty_ros.nodes.conversions import mm_from_m
 from eschorty_ros.nodes.parameters import Param, from_settings
 
 ClockNs = Callable[[], int]
@@ -23,6 +25,20 @@ LASER_AWG = from_settings(AwgSettings)
 LASER_TABLE = (
     Param("fake_log", "", "fake laser: file that gets one line per change of the output"),
     *LASER_AWG,
+)
+STAGE_TABLE = (
+    Param("port", "", "serial port or pyserial URL of the stage controller; empty finds it"),
+    Param("serial", "", "USB serial number of the stage controller; empty takes the only one"),
+    Param("controller", "kbd101", "stage controller", choices=CONTROLLERS),
+    Param("bay", 1, "bay of the rack, from 1", "", 1, 10),
+    Param("speed_max", 0.25, "cap on the speed the controller reports", "m/s", 0.001, 1.0),
+    Param("acceleration", 2.0, "cap on the acceleration it reports", "m/s^2", 0.01, 20.0),
+    Param("travel_low", 0.0, "lower end of the travel to use", "m", -1.0, 1.0),
+    Param("travel_high", 0.22, "upper end of the travel to use", "m", -1.0, 1.0),
+    Param("homing_speed", 0.025, "speed of homing", "m/s", 0.001, 0.1),
+    Param("poll_rate", 50.0, "rate of status requests", "Hz", 5.0, 200.0),
+    Param("trigger_interval", 0.002, "distance of pulses for the camera; 0 = none", "m", 0.0, 0.1),
+    Param("trigger_port", 1, "output of the controller that gives the pulses", "", 1, 3),
 )
 
 
@@ -90,13 +106,30 @@ def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage
     return FakeStage(clock_ns)
 
 
+def _apt(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
+    from eschorty_ros.hardware.stage.apt_stage import open_stage
+
+    settings = AptSettings(
+        controller=parameters["controller"],
+        bay=parameters["bay"],
+        speed_max_mm_s=mm_from_m(parameters["speed_max"]),
+        acceleration_mm_s2=mm_from_m(parameters["acceleration"]),
+        travel_mm=(mm_from_m(parameters["travel_low"]), mm_from_m(parameters["travel_high"])),
+        homing_mm_s=mm_from_m(parameters["homing_speed"]),
+        poll_hz=parameters["poll_rate"],
+        trigger_interval_mm=mm_from_m(parameters["trigger_interval"]),
+        trigger_port=parameters["trigger_port"],
+    )
+    return open_stage(settings, clock_ns, parameters["port"], parameters["serial"])
+
+
 CAMERAS: Registry[EventSource] = {
     "fake": _fake_camera,
     "evk4": _evk4,
     "neuromorphic": _neuromorphic,
 }
 LASERS: Registry[LaserModulator] = {"fake": _fake_laser, "awg": _awg}
-STAGES: Registry[LinearStage] = {"fake": _fake_stage}
+STAGES: Registry[LinearStage] = {"fake": _fake_stage, "apt": _apt}
 
 
 def make(registry: Registry[Device], parameters: Mapping[str, Any], clock_ns: ClockNs) -> Device:

@@ -27,11 +27,14 @@ from eschorty_ros.nodes.spin import run
 MOTION_RATE_HZ = 20.0
 FEEDBACK_PERIOD_S = 0.05
 POLL_S = 0.01
+# Odometry of so many periods is made up for.
+FILL_MAX = 200
 # More than DDS's heartbeat of 3 s holds: what got lost can still be repeated.
 ODOM_DEPTH = 2000
 
 TABLE = (
     drivers.DRIVER,
+    *drivers.STAGE_TABLE,
     Param("odom_rate", 100.0, "rate of stage/odom", "Hz", 1.0, 500.0),
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
     Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
@@ -56,6 +59,7 @@ class StageNode(DeviceNode):
         self._stage: LinearStage | None = None
         super().__init__("stage", TABLE, **kwargs)
         self.moves = 0
+        self._told_ns = 0
         self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(ODOM_DEPTH))
         self._motion = self.create_publisher(StageMotion, "stage/motion", qos.stream())
         self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
@@ -124,7 +128,8 @@ class StageNode(DeviceNode):
 
     def _healthy(self) -> bool:
         """Whether light is of use: the stage can be moved."""
-        return self._stage is not None and self.active and not self.failure
+        stage = self._stage
+        return stage is not None and stage.healthy and self.active and not self.failure
 
     def _opened(self) -> LinearStage:
         stage = self._stage
@@ -210,7 +215,10 @@ class StageNode(DeviceNode):
             return MoveStage.Result(success=False, message=reason)
         self.get_logger().warning(reason)
         goal.abort()
-        return self._result(False, reason, self._stage.state() if self._stage else None)
+        stage, state = self._stage, None
+        with contextlib.suppress(EschortyError):
+            state = stage.state() if stage is not None else None
+        return self._result(False, reason, state)
 
     @staticmethod
     def _result(success: bool, message: str, state: StageState | None) -> MoveStage.Result:
@@ -222,10 +230,26 @@ class StageNode(DeviceNode):
         if stage is None:
             return
         try:
-            state = stage.state()
+            states = self._new_states(stage)
         except EschortyError as error:
             self.fault(f"stage lost: {error}")
             return
+        for state in states:
+            self._odom.publish(self._odometry(state))
+
+    def _new_states(self, stage: LinearStage) -> list[StageState]:
+        """Tell what has become known since the last odometry; a pause leaves no gap."""
+        newest = stage.state()
+        if newest.t_ns <= self._told_ns:
+            return []
+        period_ns = round(1e9 / self.parameters["odom_rate"])
+        missed = range(self._told_ns + period_ns, newest.t_ns - period_ns // 2, period_ns)
+        # After a longer silence the past is over.
+        fill = missed if len(missed) <= FILL_MAX else ()
+        self._told_ns = newest.t_ns
+        return [*(stage.state(t_ns) for t_ns in fill), newest]
+
+    def _odometry(self, state: StageState) -> Odometry:
         message = Odometry(child_frame_id=self.parameters["stage_frame"])
         message.header.frame_id = self.parameters["base_frame"]
         message.header.stamp = stamp_from_ns(state.t_ns)
@@ -234,7 +258,7 @@ class StageNode(DeviceNode):
         message.twist.twist.linear.y = m_from_mm(state.velocity_mm_s)
         message.pose.covariance[7] = self.parameters["position_sigma"] ** 2
         message.twist.covariance[7] = self.parameters["velocity_sigma"] ** 2
-        self._odom.publish(message)
+        return message
 
     def _publish_motion(self) -> None:
         """Under the lock, so that stamp and plan agree and every change is told."""
@@ -257,7 +281,10 @@ class StageNode(DeviceNode):
         if stage is None or self.failure:
             level = diagnostics.ERROR if self.failure else diagnostics.OK
             return level, self.failure or self.state_label, {"state": self.state_label}
-        state = stage.state()
+        try:
+            state = stage.state()
+        except EschortyError as error:
+            return diagnostics.ERROR, str(error), {"state": self.state_label}
         values = {
             "device": stage.identity.model,
             "state": self.state_label,
@@ -267,6 +294,7 @@ class StageNode(DeviceNode):
             "moving": state.moving,
             "flags": " ".join(state.flags),
             "moves": self.moves,
+            **stage.statistics(),
         }
         if self.active and not state.homed:
             return diagnostics.WARN, "not homed", values

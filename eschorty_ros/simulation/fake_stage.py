@@ -82,10 +82,16 @@ class FakeStage:
                 self._home_ns = None
             self._plan = plan_stop(self._plan, now_ns, self.acceleration_mm_s2)
 
-    def state(self) -> StageState:
-        """Position, velocity, time and flags now."""
+    healthy = True
+
+    def statistics(self) -> dict[str, float]:
+        """Nothing is counted."""
+        return {}
+
+    def state(self, t_ns: int | None = None) -> StageState:
+        """Position, velocity and flags at ``t_ns``, by default now."""
         with self._lock:
-            now_ns = self._clock_ns()
+            now_ns = self._clock_ns() if t_ns is None else t_ns
             position, velocity = (float(value) for value in self._plan.state(now_ns))
             moving = now_ns < self._plan.end_ns
             low, high = self.travel_mm

@@ -188,6 +188,10 @@ class AptStage:
             homed = bool(status.bits & apt.HOMED) and not self._homing()
             return StageState(position, velocity, t_ns, homed, moving, flags)
 
+    def plan(self) -> None:
+        """Tell nothing: only the controller knows when a motion began."""
+        return
+
     @property
     def healthy(self) -> bool:
         """Whether status messages come and nothing has failed."""
@@ -285,8 +289,8 @@ class AptStage:
             if self._status is not None and self._age_ns() > FAULT_AGE_NS:
                 self._fail(
                     DeviceGoneError(
-                        f"the stage controller is silent for {self._age_ns() * 1e-9:.1f} s; check "
-                        "its power and cable"
+                        f"the stage controller is silent for {FAULT_AGE_NS * 1e-9:g} s; check its "
+                        "power and cable"
                     )
                 )
             elif motion is not None and now_ns > motion.deadline_ns:
