@@ -39,6 +39,8 @@ READ_TIMEOUT_S = 0.02
 STOP_TIMEOUT_S = 3.0
 REPORT_DEPTH = 1000
 
+_LOSSES = ("drops", "gaps", "sensor_drop_words")
+
 TABLE = (
     drivers.DRIVER,
     *FAKE_TABLE,
@@ -72,6 +74,7 @@ class CameraNode(DeviceNode):
         self._laser_hz: float | None = None
         self._rates = {name: diagnostics.Rate() for name in ("packets", "bytes", "on", "off")}
         self._kept: dict[str, int] = {}
+        self._lost_told = 0.0
         super().__init__("camera", TABLE, self._on_change, **kwargs)
         events = self.create_lifecycle_publisher(
             EventPacket,
@@ -273,6 +276,8 @@ class CameraNode(DeviceNode):
         }
         if source is not None:
             values |= source.statistics()
+        lost = sum(values.get(name, 0) for name in _LOSSES)
+        lost, self._lost_told = lost - self._lost_told, lost
         if self.failure:
             return diagnostics.ERROR, self.failure, values
         trouble = getattr(source, "trouble", "")
@@ -284,6 +289,9 @@ class CameraNode(DeviceNode):
                 f"the anti-flicker filter erases the laser's {self._laser_hz:g} Hz; switch it off"
             )
             return diagnostics.WARN, line, values
+        if lost > 0:
+            which = ", ".join(f"{name} {values[name]:g}" for name in _LOSSES if values.get(name))
+            return diagnostics.WARN, f"events were lost in the last second; so far {which}", values
         return diagnostics.OK, "streaming" if self.active else self.state_label, values
 
 

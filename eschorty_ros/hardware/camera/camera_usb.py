@@ -94,7 +94,11 @@ class CameraUsb:
         self.slow = device.speed is not None and device.speed < usb.util.SPEED_SUPER
         self._timeout_ms = _TIMEOUT_MS
         self._answer = array.array("B", bytes(_ANSWER_BYTES))
-        self._reattach = bus.claim(device, _INTERFACE, NAME)
+        try:
+            self._reattach = bus.claim(device, _INTERFACE, NAME)
+        except DeviceError:
+            usb.util.dispose_resources(device)
+            raise
         try:
             if device.bcdDevice >= _ALTSETTING_SINCE:
                 device.set_interface_altsetting(_INTERFACE, 0)

@@ -25,6 +25,7 @@ from eschorty_ros.hardware.camera.settings import CameraSettings
 from eschorty_ros.hardware.protocols import DeviceIdentity, EventChunk
 
 _READ_S = 0.05
+_STUCK_S = 1.0
 _JOIN_S = 1.0
 
 
@@ -118,7 +119,7 @@ class Evk4:
             and thread.is_alive()
             and not self._ending.is_set()
             and self._keeper.session is not None
-            and time.monotonic() - self._turned_s < 4.0 * _READ_S
+            and time.monotonic() - self._turned_s < _STUCK_S
             and self._health.alive
         )
 
@@ -210,13 +211,7 @@ class Evk4:
         return kept
 
     def read_biases(self) -> dict[str, int]:
-        """Offsets the camera has now.
-
-        Raises
-        ------
-        DeviceError
-            When it is not there.
-        """
+        """Offsets the camera has now; raises ``DeviceError`` when it is not there."""
         return self._keeper.require("biases").read_biases()
 
     def statistics(self) -> dict[str, float]:
@@ -278,12 +273,10 @@ class Evk4:
         self._health.check()
         try:
             data, arrival_ns = session.reader.read(_READ_S)
-        except DeviceGoneError:
-            raise
-        except DeviceError:
+        except DeviceError as error:
             self._failed_transfers += 1
             self._queue.mark_gap()
-            if failed_before:
+            if failed_before or isinstance(error, DeviceGoneError):
                 raise
             session.reader.resume()
             return True

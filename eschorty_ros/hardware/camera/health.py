@@ -11,7 +11,7 @@ from typing import Protocol
 from eschorty_ros.core.errors import DeviceError
 
 SILENCE_S = 0.1
-ALIVE_S = 0.2
+PATIENCE_S = 0.5
 TEMPERATURE_EVERY_S = 5.0
 _TURN_S = 0.03
 _JOIN_S = 0.5
@@ -50,6 +50,7 @@ class Health:
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._heard_s = time.monotonic()
+        self._asked_s: float | None = None
         self._finding: DeviceError | None = None
 
     def start(self) -> None:
@@ -68,8 +69,12 @@ class Health:
 
     @property
     def alive(self) -> bool:
-        """Whether the camera gave a sign of life within the last 0.2 s."""
-        return time.monotonic() - self._heard_s < ALIVE_S
+        """Whether no question has been waiting for its answer for 0.5 s.
+
+        A busy host that asks late is no dead camera; one that does not answer is.
+        """
+        asked_s = self._asked_s
+        return asked_s is None or time.monotonic() - asked_s < PATIENCE_S
 
     def heard(self) -> None:
         """Take note that events came: the camera lives."""
@@ -87,6 +92,7 @@ class Health:
         patient = self._patient()
         if patient is None:
             return
+        self._asked_s = time.monotonic()
         try:
             if patient.is_streaming():
                 self._heard_s = time.monotonic()
@@ -97,6 +103,8 @@ class Health:
         except DeviceError as error:
             self.failures += 1
             finding = error
+        finally:
+            self._asked_s = None
         # Not about a camera that was replaced while it was asked.
         if self._patient() is patient:
             self._finding = finding

@@ -6,6 +6,8 @@ import struct
 from collections.abc import Callable
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from eschorty_ros.core.errors import DeviceError, DeviceStallError, DeviceTimeoutError
 from eschorty_ros.hardware.camera import treuzell
@@ -108,6 +110,26 @@ def test_refusal_is_an_error_at_once() -> None:
     with pytest.raises(DeviceError, match="request 10102 failed with errno 22"):
         control.read(0x14)
     assert board.recoveries == 0
+
+
+ASKED = (treuzell.SERIAL, treuzell.REGISTERS, treuzell.REGISTERS | treuzell.WRITE)
+FRAMES = st.builds(
+    treuzell.request_frame,
+    st.sampled_from([*ASKED, *(a | treuzell.FAILED for a in ASKED), treuzell.FAILED]),
+    st.binary(max_size=40),
+)
+
+
+@given(st.binary(max_size=64) | FRAMES, st.sampled_from(ASKED))
+def test_any_bytes_are_an_answer_or_one_line(frame: bytes, asked: int) -> None:
+    if frame[:4] == asked.to_bytes(4, "little") and frame[4:8] == (len(frame) - 8).to_bytes(
+        4, "little", signed=True
+    ):
+        assert treuzell.answer_payload(asked, frame) == frame[8:]
+        return
+    with pytest.raises(DeviceError) as caught:
+        treuzell.answer_payload(asked, frame)
+    assert "\n" not in str(caught.value)
 
 
 def test_answer_payload_is_what_follows_the_header() -> None:
