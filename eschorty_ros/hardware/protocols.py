@@ -99,8 +99,8 @@ class LaserReadback:
     phase_epoch_ns: int | None
     output_since_ns: int
     reason: str = ""
-    warnings: tuple[str, ...] = ()
-    counters: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = field(default=(), compare=False)
+    counters: Mapping[str, float] = field(default_factory=dict, compare=False)
 
 
 class LaserModulator(Protocol):
