@@ -8,10 +8,12 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from line_events import encoded, line_events
 
 from eschorty_ros.core.calibration import load_calibration
+from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.pulses import PulseGrid
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.nodes.packet_stream import PacketStream
-from eschorty_ros.nodes.packet_times import WRAP_US, Packet, first_time_high_us
+from eschorty_ros.nodes.packet_times import WRAP_US, Packet, first_time_high_us, first_time_us
 
 ZERO_NS = 1_700_000_000_123_456_789
 EDGE_US = 1000
@@ -184,6 +186,129 @@ def test_new_settings_apply_from_the_next_packet_on_and_keep_the_time():
     after = run(subject, items[half:])
     edges = np.unique(joined(before + after).edge_us)
     np.testing.assert_array_equal(edges, np.unique(plain(data).edge_us))
+
+
+def unannounced(**settings):
+    subject = stream(Settings(**settings))
+    subject.announcement_expected = False
+    subject.set_laser(MODULATION, None)
+    return subject
+
+
+def sent(data, shift_us=0, seq=0):
+    """Packets stamped when their last event had happened."""
+    decoder = Decoder()
+    out = []
+    for packet in packets(data, size=6000, seq=seq):
+        decoder.decode(packet.data)
+        stamp_ns = ZERO_NS + (decoder.time_us + shift_us) * 1000
+        out.append(Packet(packet.seq, stamp_ns, packet.data))
+    return out
+
+
+def test_nobody_waits_for_an_announcement_that_nobody_makes():
+    subject = unannounced()
+    subject.add(packets(line())[0], 0.0)
+    subject.process(0.0)
+    assert (subject.held, subject.packets, subject.clock_announced) == (0, 1, False)
+
+
+@pytest.mark.parametrize("gap_us", [1_000_000, 12_000_000, 40_000_000])
+def test_time_goes_on_over_a_gap_of_any_length(gap_us):
+    """More than half a wrap of the stream's time without packets: the stamps count the wraps."""
+    subject = unannounced()
+    first = run(subject, sent(line()))
+    later = sent(line(offset_us=gap_us % WRAP_US), gap_us - gap_us % WRAP_US, seq=1000)
+    second = run(subject, later)
+    assert subject.packets_lost > 800
+    assert subject.clock_restarts == 0
+    for parts, shift_us in ((first, 0), (second, gap_us)):
+        part = parts[len(parts) // 2].retimed()
+        expected_ns = ZERO_NS + part.sensor.t_us * 1000
+        assert np.abs(part.t_ns - expected_ns).max() < 5_000_000
+        assert part.t_ns.min() > ZERO_NS + shift_us * 1000 - 5_000_000
+
+
+def test_points_move_with_the_clock_until_they_are_placed():
+    subject = unannounced()
+    data = line()
+    late = [Packet(p.seq, p.stamp_ns + 3_000_000_000, p.data) for p in sent(data)]
+    parts = run(subject, late)
+    before_ns = parts[0].t_ns.copy()
+    prompt = sent(line(offset_us=3_000_000), seq=len(late))
+    run(subject, [Packet(p.seq, max(p.stamp_ns, late[-1].stamp_ns), p.data) for p in prompt])
+    moved_ns = parts[0].retimed().t_ns - before_ns
+    assert np.ptp(moved_ns) <= 1000
+    assert -3_050_000_000 < moved_ns[0] < -2_800_000_000
+
+
+def test_a_clock_set_back_begins_anew_and_leaves_old_points_alone():
+    subject = unannounced()
+    items = sent(line())
+    half = len(items) // 2
+    parts = run(subject, items[:half])
+    before_ns = parts[0].t_ns
+    for packet in items[half:]:
+        subject.add(Packet(packet.seq, packet.stamp_ns - 10**12, packet.data), 0.0)
+    parts_after = subject.process(0.0) + subject.flush()
+    assert subject.clock_restarts == 1
+    np.testing.assert_allclose(parts[0].retimed().t_ns, before_ns, atol=5_000_000)
+    assert parts_after[-1].t_ns.max() < ZERO_NS - 9 * 10**11
+
+
+@pytest.mark.parametrize("source", ["laser", "stage", "none"])
+def test_edges_at_the_trigger_input_go_where_they_are_wired_to(source):
+    """Edges every 7 ms are no laser of 70 Hz."""
+    t, x, y, p = line_events(
+        np.random.default_rng(3),
+        lambda k, c: np.full(len(c), 300.0),
+        periods=PERIODS,
+        edge_us=EDGE_US,
+    )
+    edges = np.arange(2000, 110_000, 7000)
+    data = encoded((t, x, y, p), edges)
+    subject = unannounced(trigger_source=source)
+    subject.set_grid(PulseGrid(0.0, 2.0, 100))
+    run(subject, packets(data))
+    triggered = subject.counters["triggers_used"] + subject.counters["triggers_spurious"]
+    assert (triggered > 0) == (source == "laser")
+    assert len(subject.epoch.edges) == (edges.size if source == "stage" else 0)
+
+
+def test_the_phase_is_found_again_when_the_laser_is_switched_on():
+    period_us = 1e6 / 70
+    later_us = round(EDGE_US + 40.37 * period_us)
+    rng = np.random.default_rng(3)
+    both = [
+        line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=PERIODS, edge_us=edge)
+        for edge in (EDGE_US, later_us)
+    ]
+    first, second = (encoded(events) for events in both)
+    subject = unannounced()
+    subject.set_laser(MODULATION, None, 1)
+    run(subject, sent(first))
+    subject.set_laser(MODULATION, None, None)
+    subject.set_laser(MODULATION, None, 2)
+    edges = np.unique(joined(run(subject, sent(second, seq=100))).edge_us)
+    off = (edges - later_us) / period_us
+    assert np.abs(off - np.rint(off)).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("words", "before_us", "after_us", "found"),
+    [
+        ([0x8003, 0x6010], None, 0x3010, 0x3010),
+        ([0x0001, 0x6010, 0x8004, 0x6001], 0x3001, 0x4001, 0x3010),
+        ([0x0001, 0x8004], 0x3001, 0x4000, 0x4000),
+        ([0x0001, 0x2001], 0x3001, 0x3001, None),
+        # Across the wrap, and a broken word that the decoder left out.
+        ([0x8000, 0x6010], WRAP_US - 5, WRAP_US + 0x10, WRAP_US + 0x10),
+        ([0x8800, 0x6010], 0x3001, 0x3020, 0x3001),
+    ],
+)
+def test_time_of_a_packets_first_bytes(words, before_us, after_us, found):
+    data = np.array(words, "<u2").tobytes()
+    assert first_time_us(data, before_us, after_us) == (before_us if found is None else found)
 
 
 def test_first_time_high():

@@ -9,16 +9,19 @@ import mpmath
 import numpy as np
 import pytest
 from line_events import blank_profiles, encoded, line_events
+from stage_pulses import GRID, StagePulses
 
 from eschorty_ros.core import reconstructor as reconstructor_module
 from eschorty_ros.core import reference
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.clock import SensorClock, StageTrack
+from eschorty_ros.core.clock_line import ClockLine
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Encoder, Events, Triggers, sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.noise import ActivityFilter
 from eschorty_ros.core.phase import EdgeSchedule, estimate_phase
+from eschorty_ros.core.position_edges import fit_edges
 from eschorty_ros.core.profiles import Profiles, place
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
 
@@ -82,6 +85,20 @@ def test_case_07_conversion_to_ros_time_is_exact_at_1e18_ns(measured):
     np.testing.assert_array_equal(clock.to_us(clock.to_ns(t_us)), t_us)
     with pytest.raises(ArgumentError, match="float64"):
         clock.to_ns(t_us.astype(np.float64))
+
+
+@pytest.mark.parametrize("uptime_us", [WRAP_EVT3_US, WRAP_INT32_US, WRAP_EVT2_US, EPOCH_US])
+def test_case_07_a_clock_from_edges_is_the_same_after_any_uptime(uptime_us, measured):
+    """ROS time of 54 years, sensor time up to as much: floats would round both."""
+    bench = StagePulses((10.0, 210.0, 10.0))
+    near = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(3.0))
+    arrivals = bench.arrivals(3.0)
+    late = ClockLine(arrivals.origin_us + uptime_us, arrivals.origin_ns, arrivals.drift_ppb)
+    far = fit_edges(bench.edges + uptime_us, bench.track, GRID, late)
+    t_us = bench.edges[0] + np.arange(0, 2_000_000, 997)
+    worst_ns = np.abs(far.line.to_ns(t_us + uptime_us) - near.line.to_ns(t_us)).max()
+    measured("clock from edges after a long uptime, ns", worst_ns, 1)
+    measured("position by that clock at 300 mm/s, um", bench.error_um(near), 10.0)
 
 
 def test_case_07_points_count_time_from_their_origin(measured):
