@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.emulation.awg_faults import AwgFaults
 from eschorty_ros.emulation.awg_model import ENDPOINT_IN, ENDPOINT_OUT
 from eschorty_ros.hardware.laser.awg import AwgLaser
 from eschorty_ros.hardware.protocols import LaserOutput
@@ -62,7 +63,9 @@ def test_light_is_never_denied(steps: list[str]) -> None:
         if bench.model.output:
             assert laser._output is not LaserOutput.OFF
         assert not bench.model.locked or bench.model.mute
+    # All is well again.
     bench.model.mute = False
+    bench.model.faults = AwgFaults()
     laser.disable()
     assert not bench.model.output
     for step in ("configure 70", "arm", "enable"):

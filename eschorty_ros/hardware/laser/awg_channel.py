@@ -190,6 +190,11 @@ class AwgChannel:
         if self._profile.unlock is not None:
             self._scpi.command(self._profile.unlock)
 
+    def unlock_at_once(self) -> None:
+        """Free the front panel without a retry; raises ``DeviceError``."""
+        if self._profile.unlock is not None:
+            self._scpi.command_at_once(self._profile.unlock)
+
     def clear(self) -> None:
         """Make both sides of the link forget what is under way; raises ``DeviceError``."""
         self._link.clear()

@@ -105,6 +105,12 @@ class AwgConnection:
                 failures.append(error)
             else:
                 return
+        if self._channel is not None:
+            # Whoever is sent to the panel must not find it locked.
+            with suppress(DeviceError):
+                self._channel.clear()
+            with suppress(DeviceError):
+                self._channel.unlock_at_once()
         first, last = str(failures[0]), str(failures[-1])
         told = first if first == last else f"{first}; opened anew: {last}"
         raise DeviceError(f"laser state unknown: {told}; {_BY_HAND}") from failures[0]

@@ -56,6 +56,10 @@ class Scpi:
         """Set without asking whether to go on and without a retry: for switching off."""
         self._write(self._spelt(name, value, channel))
 
+    def command_at_once(self, text: str) -> None:
+        """Send a command as ``set_at_once`` does."""
+        self._write(text)
+
     def get(self, name: str, channel: int) -> Value:
         """Read ``name`` back: bool, float or keyword, as its kind says.
 
