@@ -107,8 +107,8 @@ class Evk4:
 
     @property
     def trouble(self) -> str:
-        """Why the camera is being looked for; empty while it is there."""
-        return self._keeper.loss
+        """Why the camera is being looked for; empty while it is there or nobody streams."""
+        return self._keeper.loss if self._thread is not None else ""
 
     @property
     def healthy(self) -> bool:
