@@ -12,8 +12,10 @@ from eschorty_ros.core._motion_timing import Delays, Timing, refined_shape, star
 from eschorty_ros.core.motion import MotionPlan, plan_stop
 
 _READINGS_MAX = 512
+_SETTLED_MM = 1e-4
 _LEAST_TO_JUDGE = 6
 _AGREEING_SHARE = 0.8
+_LEAST_SHARE = 0.6
 # A shape that readings have changed is looked at again with so many times the readings.
 _AGAIN = 1.2
 # A motion that does not begin by then after it was ordered is not the one expected.
@@ -133,7 +135,9 @@ class Move:
             starts = self._not_before_s, self._not_before_s + LATEST_START_S
         else:
             margin_s = 1e-3 + 5.0 * self._timing.sigma_s
-            starts = self._timing.start_s - margin_s, self._timing.start_s + margin_s
+            early_s, late_s = self._timing.start_s - margin_s, self._timing.start_s + margin_s
+            # Arrivals alone say how late it began at most.
+            starts = early_s if self._timing.bounded_below else self._not_before_s, late_s
         early_ns, late_ns = (self.from_ns + round(start_s * 1e9) for start_s in starts)
         first = float(replace(self._shape, start_ns=late_ns).state(earliest_ns)[0])
         last = float(replace(self._shape, start_ns=early_ns).state(latest_ns)[0])
@@ -170,10 +174,15 @@ class Move:
         positions = np.array([reading.position_mm for reading in self._readings])
         shape = refined_shape(self._shape, positions, earliest_s, latest_s)
         if shape is not None:
+            before = self._shape, self._passing_s, self._speed
             self._shape, self._passing_s, self._speed = shape, [], []
             self._time(self._readings)
-            agreeing = self._estimate(earliest_s, latest_s)
-        self._fits = agreeing >= _AGREEING_SHARE
+            better = self._estimate(earliest_s, latest_s)
+            if better < agreeing:
+                self._shape, self._passing_s, self._speed = before
+                self._estimate(earliest_s, latest_s)
+            agreeing = max(agreeing, better)
+        self._fits = agreeing >= _LEAST_SHARE
 
     def _estimate(self, earliest_s: NDArray[np.float64], latest_s: NDArray[np.float64]) -> float:
         """Estimate the start; the share of readings that agree with it."""
@@ -234,7 +243,6 @@ class Stop:
         self._plan = plan_stop(before, at_ns, deceleration_mm_s2)
         self._ordered_ns = at_ns
         self._last: Reading | None = None
-        self._settled = False
 
     @property
     def from_ns(self) -> int:
@@ -248,11 +256,10 @@ class Stop:
     def add(self, reading: Reading) -> None:
         """Learn from the place of rest."""
         last, self._last = self._last, reading
-        if self._settled or last is None:
+        if last is None or abs(last.position_mm - reading.position_mm) > self._tolerance_mm:
             return
-        if abs(last.position_mm - reading.position_mm) > self._tolerance_mm:
+        if abs(self._plan.end_mm - reading.position_mm) < _SETTLED_MM:
             return
-        self._settled = True
         low_ns = self._ordered_ns
         high_ns = max(reading.latest_ns, low_ns)
         forward = self._before.end_mm >= self._before.position_mm

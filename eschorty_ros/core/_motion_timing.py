@@ -38,6 +38,7 @@ class Timing:
     sigma_s: float
     agreeing: NDArray[np.bool_]
     delays: Delays
+    bounded_below: bool = False
 
 
 def widest_agreement(low: Array, high: Array) -> tuple[float, float]:
@@ -85,7 +86,8 @@ def start_of(
     joined = float(weights @ np.array([after, -before]) / weights.sum())
     low, high = sorted((float(latest_s[use].min()), float(earliest_s[known].max())))
     sigma_s = float(weights.sum() ** -0.5)
-    return Timing(min(max(joined, low), high), sigma_s, agreeing, Delays(before_s, after_s))
+    start_s = min(max(joined, low), high)
+    return Timing(start_s, sigma_s, agreeing, Delays(before_s, after_s), bounded_below=True)
 
 
 def _extreme(values: Array, usual_s: float, floor_s: float) -> tuple[float, float, float]:

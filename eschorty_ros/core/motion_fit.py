@@ -119,6 +119,10 @@ class MotionFit:
         """Expect nothing from ``at_ns`` on."""
         self._begin(Unknown(whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)))
 
+    def doubt(self) -> None:
+        """Believe the readings alone for the motion under way."""
+        self._legs[-1] = Unknown(self._legs[-1].from_ns)
+
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
         """Lowest and highest position of a reading between two times; ``None`` if unknown."""
         for name, value in (("earliest_ns", earliest_ns), ("latest_ns", latest_ns)):

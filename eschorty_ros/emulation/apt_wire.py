@@ -96,6 +96,6 @@ class Disturbance:
             del sent[self._chance.randrange(len(sent))]
         if self.repeats:
             self.repeats -= 1
-            sent += sent
+            sent += bytes(sent)
         before, self.garbage = self.garbage, b""
         return before + bytes(sent)

@@ -240,6 +240,7 @@ CALLS: dict[str, Call] = {
     "motion_fit.MotionFit.wander": Call(
         method(a_fit, "wander"), {"at_ns": 10**9}, {"at_ns": whole()}
     ),
+    "motion_fit.MotionFit.doubt": Call(method(a_fit, "doubt"), {}, {}),
     "motion_fit.MotionFit.expected_mm": Call(
         method(a_fit, "expected_mm"),
         {"earliest_ns": 10**9, "latest_ns": 2 * 10**9},

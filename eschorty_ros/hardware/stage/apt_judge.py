@@ -12,6 +12,8 @@ from enum import Enum, auto
 
 from eschorty_ros.hardware.stage import apt_messages as apt
 
+# An answer that belongs to no known request may be so late.
+LATE_NS = 500_000_000
 REST_MARGIN_MM = 0.02
 MOVE_MARGIN_MM = 1.0
 _CRITICAL = apt.HOMED | apt.ENABLED | apt.FAULTS | apt.LIMITS
@@ -106,5 +108,5 @@ class Judge:
 
 def _reach_mm(first: Status, second: Status, speed_mm_s: float) -> float:
     """How far the carriage gets between two messages."""
-    begin_ns = first.latest_ns if first.earliest_ns is None else first.earliest_ns
+    begin_ns = first.latest_ns - LATE_NS if first.earliest_ns is None else first.earliest_ns
     return 1.2 * speed_mm_s * max(second.latest_ns - begin_ns, 0) * 1e-9

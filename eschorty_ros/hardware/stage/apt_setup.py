@@ -147,9 +147,9 @@ class AptSetup:
             DeviceIdentity(name, str(info.whole("serial")), firmware),
             scale,
             (low, high),
-            _least(settings.speed_max_mm_s, axis.whole("velocity") / scale.velocity_unit),
+            _least(settings.speed_max_mm_s, axis.whole("velocity"), scale.velocity_unit),
             _least(
-                settings.acceleration_mm_s2, axis.whole("acceleration") / scale.acceleration_unit
+                settings.acceleration_mm_s2, axis.whole("acceleration"), scale.acceleration_unit
             ),
         )
 
@@ -287,6 +287,9 @@ class AptSetup:
         raise AssertionError
 
 
-def _least(cap: float, reported: float) -> float:
-    """Cap, or what is reported when that is less; 0 and below tell nothing."""
-    return min(cap, reported) if reported > 0.0 else cap
+def _least(cap: float, counts: int, unit: float) -> float:
+    """Cap, or what is reported when that is less; 0 and below tell nothing.
+
+    What rounds to the reported counts is still within them.
+    """
+    return min(cap, (counts + 0.49) / unit) if counts > 0 else cap

@@ -16,7 +16,7 @@ from eschorty_ros.core.motion_fit import MotionFit
 from eschorty_ros.hardware.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_follow import BEGIN_NS, TOLERANCE_MM, Kind, Motion, Outcome
-from eschorty_ros.hardware.stage.apt_judge import Judge, Status, Verdict
+from eschorty_ros.hardware.stage.apt_judge import LATE_NS, Judge, Status, Verdict
 from eschorty_ros.hardware.stage.apt_link import AptLink
 from eschorty_ros.hardware.stage.apt_port import find_port, open_port
 from eschorty_ros.hardware.stage.apt_setup import AptSettings, AptSetup
@@ -59,7 +59,7 @@ class AptStage:
     def __init__(
         self, make_link: MakeLink, clock_ns: Callable[[], int], settings: AptSettings
     ) -> None:
-        self.lag_s = max(0.1, 2.5 / settings.poll_hz + 0.02)
+        self.lag_s = max(0.1, 3.5 / settings.poll_hz + 0.02)
         self._clock_ns = clock_ns
         self._settings = settings
         self._lock = threading.RLock()
@@ -71,6 +71,7 @@ class AptStage:
         self._status: Status | None = None
         self._status_ns: int | None = None
         self._poll: tuple[int, int] | None = None
+        self._unmatched_until_ns = 0
         self._rest_ns = 0
         self._blocked_sense = 0
         self._stopping: list[tuple[int, bytes]] = []
@@ -273,8 +274,11 @@ class AptStage:
     def _ask_status(self) -> None:
         now_ns = self._link.now_ns()
         # One at a time: so an answer belongs to its request.
-        if self._poll is not None and now_ns - self._poll[1] < _POLL_LOST_NS:
-            return
+        if self._poll is not None:
+            if now_ns - self._poll[1] < _POLL_LOST_NS:
+                return
+            # Its answer may still come, and must not be taken for the next one's.
+            self._unmatched_until_ns = now_ns + LATE_NS
         self._poll = self._clock_ns(), now_ns
         self._link.write_at_once(
             apt.pack("request_status", self._settings.address, channel=apt.CHANNEL)
@@ -332,9 +336,9 @@ class AptStage:
     def _on_status(self, frame: apt.Frame, received_ns: int, clock_ns: int) -> None:
         latest_ns = clock_ns - ANSWER_NS
         earliest_ns = None
-        if self._poll is not None:
+        if self._poll is not None and received_ns >= self._unmatched_until_ns:
             earliest_ns = min(self._poll[0] + REQUEST_NS, latest_ns)
-            self._poll = None
+        self._poll = None
         position_mm = self._scale.mm(frame.whole("position"))
         status = Status(position_mm, frame.whole("bits"), earliest_ns, latest_ns)
         self._status_ns = received_ns
@@ -344,17 +348,14 @@ class AptStage:
             expected = (self._status.position_mm, self._status.position_mm)
         elif motion is not None and motion.kind is not Kind.HOME:
             expected = self._fit.expected_mm(
-                latest_ns if earliest_ns is None else earliest_ns, latest_ns
+                latest_ns - LATE_NS if earliest_ns is None else earliest_ns, latest_ns
             )
         speed = 0.0 if motion is None else motion.speed_mm_s
         if self._status is None or self._failure is not None:
             self._judge.forget()
         match self._judge.judge(status, expected, speed):
             case Verdict.ASK_AGAIN:
-                with contextlib.suppress(DeviceError):
-                    self._link.send(
-                        apt.pack("request_status", self._settings.address, channel=apt.CHANNEL)
-                    )
+                self._ask_status()
             case Verdict.CONTRADICTORY:
                 self._fail(
                     DeviceError(
@@ -437,7 +438,7 @@ class AptStage:
             return
         planned_mm = float(self._fit.state(status.latest_ns)[0])
         if abs(planned_mm - status.position_mm) > TOLERANCE_MM:
-            self._fit.wander(status.latest_ns - 1)
+            self._fit.doubt()
         if self._blocked_sense and motion.sense == -self._blocked_sense:
             self._blocked_sense = 0
 

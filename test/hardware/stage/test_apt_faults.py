@@ -1,0 +1,300 @@
+"""Every fault a stage on a serial line can have: what the driver does, what the user reads."""
+
+from __future__ import annotations
+
+import itertools
+import random
+
+import pytest
+from apt_bench import AptBench
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.hardware.stage.apt_setup import AptSettings
+
+STOP, ENABLE, STATUS_REQUEST, KEEP_ALIVE = 0x0465, 0x0210, 0x0490, 0x0492
+
+
+def moving(speed_mm_s: float = 100.0, **model: object) -> AptBench:
+    """A bench half a second into a move to 200 mm."""
+    bench = AptBench(**model)
+    bench.stage.move_to(200.0, speed_mm_s)
+    bench.advance(0.5)
+    return bench
+
+
+def at_rest(bench: AptBench) -> bool:
+    bench.advance(0.5)
+    return not bench.model.axis.moving(bench.clock_ns())
+
+
+def test_fault_s1_garbage_in_a_move() -> None:
+    """driver: skips it and goes on. user reads: skipped_bytes in the diagnostics."""
+    chance = random.Random(1)
+    bench = AptBench()
+    bench.stage.move_to(200.0, 100.0)
+    while bench.stage.state().moving:
+        bench.model.disturbance.garbage = chance.randbytes(chance.randrange(1, 12))
+        bench.advance(0.2)
+    assert bench.stage.state().position_mm == pytest.approx(200.0, abs=1e-4)
+    assert bench.stage.statistics()["skipped_bytes"] > 20
+
+
+def test_fault_s2_lost_bytes_in_a_move() -> None:
+    """driver: asks again for what got lost. user reads: broken_frames and skipped_bytes."""
+    bench = AptBench(seed=3)
+    bench.model.disturbance.loss_share = 0.05
+    bench.move(200.0, 50.0)
+    assert bench.stage.state().position_mm == pytest.approx(200.0, abs=1e-4)
+    statistics = bench.stage.statistics()
+    assert statistics["skipped_bytes"] + statistics["broken_frames"] > 0
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_fault_s3_flipped_bits(rests: bool) -> None:
+    """driver: believes no single odd message, asks again. user reads: statuses_rejected."""
+    bench = AptBench()
+    bench.move(100.0)
+    if not rests:
+        bench.stage.move_to(200.0, 10.0)
+    for bit in (*range(16, 48), *range(80, 112)):
+        bench.model.disturbance.flips, bench.model.disturbance.flip_bit = 1, bit
+        bench.advance(0.12)
+        state = bench.stage.state()
+        true_mm = bench.model.axis.position_mm(state.t_ns)
+        assert state.position_mm == pytest.approx(true_mm, abs=0.02), bit
+    assert bench.stage.statistics()["statuses_rejected"] > 10
+    assert bench.stage.healthy
+
+
+def test_fault_s3_two_running() -> None:
+    """driver: stops. user reads: two status messages running make no sense; check the cable."""
+    bench = moving()
+    bench.model.disturbance.flips = 2
+    bench.model.disturbance.flip_bit = 16 + 21
+
+    def next_bit() -> None:
+        if bench.model.disturbance.flips == 1:
+            bench.model.disturbance.flip_bit = 16 + 19
+
+    bench.on_tick = next_bit
+    assert "make no sense" in bench.failure()
+    assert at_rest(bench)
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_fault_s4_encoder_jump(rests: bool) -> None:
+    """driver: two readings stop it. user reads: the encoder jumped by ... mm; home again."""
+    bench = AptBench()
+    if not rests:
+        bench.stage.move_to(200.0, 100.0)
+        bench.advance(0.5)
+    bench.model.axis.encoder_offset_mm -= 20.0
+    text = bench.failure()
+    assert "encoder jumped by" in text
+    assert "home again" in text
+    assert not bench.stage.healthy
+    assert at_rest(bench)
+    assert bench.sent(STOP)
+
+
+def test_fault_s5_stall() -> None:
+    """driver: profiled stop, immediate stop, disable. user reads: stuck at ... on its move."""
+    bench = moving()
+    bench.model.axis.freeze(bench.clock_ns())
+    begun_ns = bench.now_ns
+    text = bench.failure()
+    assert "stuck at" in text
+    assert bench.now_ns - begun_ns < 400_000_000
+    bench.advance(0.6)
+    late = [data for at, data in bench.port.written if at > begun_ns]
+    modes = [data[3] for data in late if data[:2] == b"\x65\x04"]
+    assert modes == [2, 1]
+    assert not bench.model.enabled
+
+
+def test_fault_s5_position_error() -> None:
+    """driver: the same as for a stall. user reads: the stage is stuck at ..."""
+    bench = moving()
+    bench.model.extra_bits = 0x4000
+    assert "stuck at" in bench.failure()
+    assert at_rest(bench)
+
+
+def test_fault_s6_unplug() -> None:
+    """driver: fails at once, every order after it, too. user reads: the stage's port failed: ..."""
+    bench = moving()
+    bench.model.gone = True
+    assert "port failed" in bench.failure()
+    with pytest.raises(DeviceGoneError):
+        bench.stage.move_to(10.0, 10.0)
+    bench.stage.stop()
+    bench.stage.close()
+
+
+def test_fault_s6_silent_link() -> None:
+    """driver: warns after 0.5 s, fails after 1.5 s. user reads: silent for 1.5 s; check power."""
+    bench = AptBench()
+    bench.model.mute = True
+    bench.advance(0.7)
+    assert "status_late" in bench.stage.state().flags
+    assert not bench.stage.healthy
+    text = bench.failure()
+    assert "silent for 1.5 s" in text
+    assert 1.4e9 < bench.stage._age_ns() < 1.7e9
+
+
+def test_fault_s7_limit_in_a_move() -> None:
+    """driver: stops, lets only back. user reads: met a limit at ... mm; move it back first."""
+    bench = AptBench()
+    bench.model.axis.obstacle_mm = 80.0
+    bench.move(200.0, 100.0)
+    state = bench.stage.state()
+    assert state.position_mm == pytest.approx(80.0, abs=0.01)
+    assert "forward_hard_limit" in state.flags
+    with pytest.raises(DeviceError, match=r"met a limit at 80\.000 mm"):
+        bench.stage.move_to(150.0, 100.0)
+    bench.model.axis.obstacle_mm = None
+    bench.move(40.0)
+    bench.move(150.0)
+    assert bench.stage.state().position_mm == pytest.approx(150.0, abs=1e-4)
+
+
+def test_fault_s8_end_messages_missing() -> None:
+    """driver: finds the end of homing, move and stop in the status. user reads: nothing."""
+    bench = AptBench(home=False)
+    bench.model.withheld = {"moved", "stopped", "homed"}
+    bench.stage.home()
+    bench.until(lambda: bench.stage.state().homed, 20.0)
+    bench.move(50.0)
+    assert bench.stage.state().position_mm == pytest.approx(50.0, abs=1e-4)
+    bench.stage.move_to(200.0, 100.0)
+    bench.advance(0.5)
+    bench.stage.stop()
+    bench.until(lambda: not bench.stage.state().moving)
+
+
+def test_fault_s9_keep_alive() -> None:
+    """driver: keeps alive from the writer's thread twice a second. user reads: nothing."""
+    bench = AptBench()
+    bench.advance(5.0)
+    sent = bench.sent(KEEP_ALIVE)
+    assert max(b - a for a, b in itertools.pairwise(sent)) < 700_000_000
+    assert bench.stage.healthy
+
+
+def test_fault_s9_keep_alive_lost() -> None:
+    """driver: takes the silence for a dead link. user reads: silent for 1.5 s; check its power."""
+    bench = AptBench()
+    bench.stage._keep_alive = lambda: None
+    for timer in bench.link._timers:
+        if timer.period_ns == 500_000_000:
+            timer.action = lambda: None
+    assert "silent for 1.5 s" in bench.failure(10.0)
+
+
+def test_fault_s10_not_enabled() -> None:
+    """driver: does not come up. user reads: does not enable the axis; check its front panel."""
+    bench = AptBench(home=False)
+    bench.model.panel_disabled, bench.model.enabled = True, False
+    with pytest.raises(DeviceError, match=r"does not enable the axis; check its front panel"):
+        bench.open()
+
+
+def test_fault_s10_disabled_later() -> None:
+    """driver: stops. user reads: does not have the axis enabled any more; configure and home."""
+    bench = moving()
+    bench.model.enabled = False
+    assert "axis enabled any more" in bench.failure()
+
+
+def test_fault_s10_ignored_move() -> None:
+    """driver: sees no motion within 0.3 s. user reads: does not begin its move within 0.3 s."""
+    bench = AptBench()
+    bench.model.ignores_moves = True
+    bench.stage.move_to(100.0, 100.0)
+    begun_ns = bench.now_ns
+    assert "does not begin its move within 0.3 s" in bench.failure()
+    assert bench.now_ns - begun_ns < 500_000_000
+
+
+@pytest.mark.parametrize("text", ["", "Motor over temperature"])
+def test_fault_s11_error_message(text: str) -> None:
+    """driver: stops. user reads: the controller's code and words, or to look at its display."""
+    bench = moving()
+    bench.model.complain(17, text)
+    read = bench.failure()
+    assert (f"error 17: {text}" if text else "look at its display") in read
+    assert at_rest(bench)
+
+
+def test_fault_s11_fault_bits() -> None:
+    """driver: stops when two messages say so. user reads: controller reports over_temperature."""
+    bench = moving()
+    bench.model.extra_bits = 0x20000
+    assert "reports over_temperature" in bench.failure()
+    assert at_rest(bench)
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_fault_s12_controller_restarts(rests: bool) -> None:
+    """driver: stops. user reads: does not have its reference any more; configure and home."""
+    bench = AptBench()
+    bench.move(60.0)
+    if not rests:
+        bench.stage.move_to(200.0, 100.0)
+        bench.advance(0.4)
+    bench.model.reboot()
+    assert "does not have its reference any more" in bench.failure()
+    bench.stage.close()
+    bench.stage = bench.open()
+    assert not bench.stage.state().homed
+    with pytest.raises(DeviceError, match="not homed"):
+        bench.stage.move_to(10.0, 10.0)
+
+
+def test_fault_s13_double_replies() -> None:
+    """driver: takes each answer once, by message and source. user reads: nothing."""
+    bench = AptBench()
+    bench.model.disturbance.repeats = 10_000
+    bench.move(100.0)
+    bench.move(20.0)
+    assert bench.stage.state().position_mm == pytest.approx(20.0, abs=1e-4)
+
+
+def test_fault_s13_late_reply() -> None:
+    """driver: asks again, and the late answer harms nobody. user reads: nothing."""
+    late = {"ns": 0}
+    bench = AptBench(late_ns=lambda: late["ns"])
+    late["ns"] = 350_000_000
+    bench.stage.move_to(100.0, 100.0)
+    late["ns"] = 0
+    bench.until(lambda: not bench.stage.state().moving, 20.0)
+    assert bench.stage.state().position_mm == pytest.approx(100.0, abs=1e-4)
+
+
+def test_fault_x1_host_stalls_in_a_move() -> None:
+    """driver: positions stay interpolated, the pause is filled in later. user reads: nothing."""
+    bench = AptBench()
+    bench.stage.move_to(200.0, 100.0)
+    bench.advance(0.5)
+    link, bench.link = bench.link, None
+    bench.advance(0.3)
+    bench.link = link
+    before = bench.stage.state()
+    assert before.t_ns <= bench.clock_ns() - 300_000_000
+    bench.until(lambda: not bench.stage.state().moving, 20.0)
+    for t_ns in range(before.t_ns, before.t_ns + 400_000_000, 10_000_000):
+        true_mm = bench.model.axis.position_mm(t_ns)
+        assert bench.stage.state(t_ns).position_mm == pytest.approx(true_mm, abs=0.02)
+
+
+def test_fault_x3_close_while_homing() -> None:
+    """driver: stops and closes within 2 s, twice if need be. user reads: nothing."""
+    bench = AptBench(AptSettings(homing_mm_s=10.0), home=False, power_up_mm=150.0)
+    bench.stage.home()
+    bench.advance(1.0)
+    begun_ns = bench.now_ns
+    bench.stage.close()
+    bench.stage.close()
+    assert bench.now_ns - begun_ns < 2_000_000_000
+    assert not bench.model.axis.moving(bench.clock_ns())

@@ -1,0 +1,202 @@
+"""The stage driver on the emulated controller, in virtual time."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from apt_bench import EPOCH_NS, AptBench
+
+from eschorty_ros.core.errors import ArgumentError, DeviceError
+from eschorty_ros.hardware.stage.apt_setup import AptSettings
+
+BAY_2 = AptSettings(controller="bbd30x", bay=2, trigger_port=3)
+
+
+@pytest.mark.parametrize("settings", [AptSettings(), BAY_2], ids=["kbd101", "bbd30x"])
+def test_connect_home_and_move(settings: AptSettings) -> None:
+    bench = AptBench(settings)
+    stage = bench.stage
+    assert stage.identity.model.endswith("with DDS220")
+    assert stage.travel_mm == (0.0, 220.0)
+    assert stage.speed_max_mm_s == pytest.approx(250.0, abs=1e-3)
+    assert stage.acceleration_mm_s2 == pytest.approx(2000.0, abs=0.1)
+    for target_mm in (100.0, 220.0, 0.0, 33.33335):
+        bench.move(target_mm)
+        state = stage.state()
+        assert state.position_mm == pytest.approx(target_mm, abs=5e-5)
+        assert bench.true_mm == pytest.approx(target_mm, abs=5e-5)
+        assert state.velocity_mm_s == 0.0
+        assert {"homed", "enabled", "settled"} <= set(state.flags)
+    assert stage.healthy
+
+
+def test_caps_are_the_least_of_settings_and_report() -> None:
+    slow = AptBench(speed_max_mm_s=120.0, acceleration_max_mm_s2=900.0, home=False).stage
+    assert slow.speed_max_mm_s == pytest.approx(120.0, abs=1e-3)
+    assert slow.acceleration_mm_s2 == pytest.approx(900.0, abs=0.1)
+    settings = AptSettings(speed_max_mm_s=300.0, travel_mm=(10.0, 90.0))
+    fast = AptBench(settings, speed_max_mm_s=400.0, acceleration_max_mm_s2=5000.0, home=False).stage
+    assert fast.speed_max_mm_s == 300.0
+    assert fast.acceleration_mm_s2 == 2000.0
+    assert fast.travel_mm == (10.0, 90.0)
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+def test_odometry_within_20_um_at_300_mm_s(rate_hz: float) -> None:
+    """Through the driver: jitter of the answers, the line's own time, polling, ramps and all."""
+    chance = random.Random(5)
+    bench = AptBench(
+        AptSettings(speed_max_mm_s=300.0, poll_hz=rate_hz),
+        speed_max_mm_s=300.0,
+        late_ns=lambda: round(chance.uniform(0.0, 3e6)),
+    )
+    bench.move(5.0, 300.0)
+    told: dict[int, float] = {}
+    for target_mm in (215.0, 5.0):
+        stage = bench.stage
+        stage.move_to(target_mm, 300.0)
+        while stage.state().moving:
+            bench.advance(0.01)
+            state = stage.state()
+            told[state.t_ns] = state.position_mm
+    t_ns = np.array(sorted(told))
+    places = np.array([told[int(t)] for t in t_ns])
+    true = np.array([bench.model.axis.position_mm(int(t)) for t in t_ns])
+    worst_um = np.abs(places - true).max() * 1e3
+    print(f"{rate_hz:g} Hz: {worst_um:.1f} um at most, {len(t_ns)} positions")
+    assert np.ptp(true) > 205.0
+    assert worst_um < 20.0
+    assert bench.stage.statistics()["fit_residual_um"] < 5.0
+
+
+def test_moves_are_refused_with_a_reason() -> None:
+    bench = AptBench(home=False)
+    with pytest.raises(DeviceError, match="not homed"):
+        bench.stage.move_to(10.0, 100.0)
+    bench = AptBench()
+    for position_mm, speed_mm_s, reason in (
+        (221.0, 100.0, "travel is 0 to 220"),
+        (-1.0, 100.0, "travel is 0 to 220"),
+        (10.0, 260.0, "choose above 0 to 250"),
+        (10.0, 0.0, "choose above 0"),
+    ):
+        with pytest.raises(DeviceError, match=reason):
+            bench.stage.move_to(position_mm, speed_mm_s)
+    bench.stage.move_to(200.0, 50.0)
+    with pytest.raises(DeviceError, match="is moving"):
+        bench.stage.move_to(10.0, 100.0)
+    with pytest.raises(DeviceError, match="is moving"):
+        bench.stage.home()
+
+
+def test_profiled_stop_is_on_the_wire_at_once() -> None:
+    """The line is busy with polling at 200 Hz and a queue of requests."""
+    bench = AptBench(AptSettings(poll_hz=200.0))
+    bench.stage.move_to(200.0, 100.0)
+    bench.advance(0.5)
+    for _ in range(50):
+        bench.stage._setup.tell("request_velocity", channel=1)
+    asked_ns = bench.now_ns
+    bench.stage.stop()
+    assert bench.sent(0x0465)[-1] - asked_ns < 20_000_000
+    bench.until(lambda: not bench.stage.state().moving)
+    assert 45.0 < bench.stage.state().position_mm < 60.0
+    assert bench.stage.state().position_mm == pytest.approx(bench.true_mm, abs=1e-4)
+    bench.move(10.0)
+
+
+def test_a_stage_left_moving_is_stopped_at_connect() -> None:
+    bench = AptBench()
+    bench.stage.move_to(200.0, 50.0)
+    bench.advance(0.5)
+    bench.stage = bench.open()
+    assert not bench.stage.state(bench.clock_ns()).moving or bench.true_mm < 60.0
+    bench.advance(0.3)
+    assert not bench.stage.state().moving
+    bench.move(20.0)
+
+
+def test_close_stops_and_is_idempotent() -> None:
+    bench = AptBench()
+    bench.stage.move_to(200.0, 50.0)
+    bench.advance(0.5)
+    begun_ns = bench.now_ns
+    bench.stage.close()
+    bench.stage.close()
+    assert bench.now_ns - begun_ns < 2_000_000_000
+    assert not bench.model.axis.moving(bench.clock_ns())
+    assert bench.sent(0x0002)
+    with pytest.raises(DeviceError, match="closed"):
+        bench.stage.move_to(10.0, 10.0)
+
+
+@pytest.mark.parametrize("settings", [AptSettings(), BAY_2], ids=["kbd101", "bbd30x"])
+def test_pulses_every_2_mm_in_both_directions(settings: AptSettings) -> None:
+    bench = AptBench(settings)
+    train = bench.stage.trigger
+    assert train is not None
+    assert (train.first_mm, train.interval_mm, train.count) == (2.0, 2.0, 109)
+    expected = [train.first_mm + k * train.interval_mm for k in range(train.count)]
+    for target_mm, places in ((220.0, expected), (0.0, expected[::-1])):
+        begun_ns = bench.clock_ns()
+        bench.move(target_mm)
+        edges = bench.model.trigger_pulses(begun_ns, bench.clock_ns())
+        rises = [t_ns for t_ns, rising in edges if rising]
+        assert len(edges) == 2 * len(rises)
+        passed = [bench.model.axis.position_mm(t_ns) for t_ns in rises]
+        assert passed == pytest.approx(places, abs=1e-3)
+
+
+def test_sampled_pulses_are_late_by_one_cycle_at_most() -> None:
+    bench = AptBench(sampled_pulses=True)
+    begun_ns = bench.clock_ns()
+    bench.move(100.0, 100.0)
+    rises = [t for t, up in bench.model.trigger_pulses(begun_ns, bench.clock_ns()) if up]
+    late_mm = [bench.model.axis.position_mm(t) - 2.0 * (k + 1) for k, t in enumerate(rises)]
+    assert min(late_mm) >= -1e-6
+    assert max(late_mm) <= 100.0 * 102.4e-6
+    assert max(late_mm) > 1e-3
+
+
+def test_no_pulses_when_the_interval_is_0() -> None:
+    bench = AptBench(AptSettings(trigger_interval_mm=0.0))
+    assert bench.stage.trigger is None
+    bench.move(50.0)
+    assert bench.model.trigger_pulses(EPOCH_NS, bench.clock_ns()) == []
+
+
+def test_everything_is_written_again_at_connect() -> None:
+    bench = AptBench()
+    bench.model.reboot()
+    bench.port.written.clear()
+    bench.stage = bench.open()
+    for id in (0x0210, 0x0413, 0x0440, 0x04E3, 0x0523, 0x0526):
+        assert bench.sent(id), hex(id)
+
+
+def test_a_silent_controller_and_an_empty_bay_are_named() -> None:
+    bench = AptBench(home=False)
+    bench.model.mute = True
+    with pytest.raises(DeviceError, match=r"sent no 'info'.*check its power"):
+        bench.open()
+    bench = AptBench(BAY_2, home=False)
+    bench.settings = AptSettings(controller="bbd30x", bay=3)
+    with pytest.raises(DeviceError, match="bay 3 of the rack is empty"):
+        bench.open()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"controller": "tdc001"}, "controller is 'tdc001'"),
+        ({"bay": 11}, "bay is 11"),
+        ({"poll_hz": 0.0}, "poll_hz is 0.0"),
+        ({"trigger_port": 3}, "trigger_port is 3"),
+        ({"trigger_interval_mm": -1.0}, "trigger_interval_mm is -1.0"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong: dict, text: str) -> None:
+    with pytest.raises(ArgumentError, match=text):
+        AptSettings(**wrong)
