@@ -24,7 +24,8 @@ EDGES_MIN = 8
 SAMPLING_US = 102
 _SPEED_MIN_MM_S = 5.0
 # On ramps the odometry's straight lines cut the corners, and edges tell less anyway.
-_CRUISE_SHARE = 0.8
+_STEADY_US = 20_000
+_STEADY_SHARE = 0.1
 _SHARE_MIN = 0.6
 _SHARE_GOOD = 0.97
 # Where the edges are looked for, as the time by which packets' arrivals show them late: first near,
@@ -173,11 +174,19 @@ class _Match:
         behind = self._track.position_mm(at_us - 1000)
         return self._grid.off_mm(position), (ahead - behind) / 2e-3
 
+    def _steady(self, at_us: NDArray[np.int64], speed: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell where the speed hardly changes."""
+        position = self._track.position_mm(at_us)
+        ahead = self._track.position_mm(at_us + _STEADY_US) - position
+        behind = position - self._track.position_mm(at_us - _STEADY_US)
+        change = np.abs(ahead - behind) * (1e6 / _STEADY_US)
+        return change < np.maximum(_STEADY_SHARE * np.abs(speed), _SPEED_MIN_MM_S)
+
     def _fit(self, late_ms: float) -> EdgeFit | None:
         """Refine offset and drift by least squares over the edges that fit."""
         late_ns, slope = late_ms * 1e6, 0.0
         middle_us = int(self._t_us[self._t_us.size // 2])
-        since_s = (self._t_us - middle_us) * 1e-6
+        since_s: NDArray[np.float64] = (self._t_us - middle_us) / 1e6
         limit_mm, noise_mm = 0.25 * self._grid.interval_mm, _NOISE_MM
         for _ in range(_TURNS):
             late_us = np.rint((late_ns + slope * since_s * 1e9) * 1e-3).astype(np.int64)
@@ -185,9 +194,11 @@ class _Match:
             near = (np.abs(off_mm) < limit_mm) & (np.abs(speed) > _SPEED_MIN_MM_S)
             if np.count_nonzero(near) < EDGES_MIN:
                 return None
-            cruise = near & (np.abs(speed) >= _CRUISE_SHARE * np.median(np.abs(speed[near])))
+            steady = near & self._steady(self._all_us - late_us, speed)
+            if np.count_nonzero(steady) < EDGES_MIN // 2:
+                steady = near
             by_ns, by_slope = _correction(
-                off_mm[cruise], speed[cruise], since_s[cruise], slope, noise_mm
+                off_mm[steady], speed[steady], since_s[steady], slope, noise_mm
             )
             late_ns += by_ns
             slope += by_slope

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stage_pulses import GRID, SEED, StagePulses
+from stage_pulses import EPOCH_NS, GRID, SEED, StagePulses
 
 from eschorty_ros.core.clock import StageTrack
 from eschorty_ros.core.position_edges import fit_edges
@@ -52,6 +52,20 @@ def test_other_intervals_and_speeds(interval, speed):
     fit = fit_edges(bench.edges, bench.track, grid, bench.arrivals(1.5))
     # Positions are wrong by the error in time times the speed there is.
     assert bench.error_um(fit) * speed / 300.0 < 10.0
+
+
+def test_a_slow_sweep_after_a_fast_way_to_its_start():
+    """The edges of the sweep count, too, however fast others were."""
+    fast = StagePulses((200.0, 10.0))
+    slow = StagePulses((10.0, 40.0), 50.0, lead_s=fast.until_ns * 1e-9 - EPOCH_NS * 1e-9 + 20.0)
+    track = StageTrack()
+    for part in (fast, slow):
+        t_ns = np.arange(part.plans[0].start_ns - 10**8, part.until_ns, 10**7)
+        track.append(t_ns // 1000, part.position(t_ns))
+    edges = np.concatenate([fast.edges, slow.edges])
+    fit = fit_edges(edges, track, GRID, slow.arrivals(3.0, 0.0))
+    assert fit.used >= edges.size - 1
+    assert slow.error_um(fit) * 50.0 / 300.0 < 5.0
 
 
 def test_direction_back():
