@@ -129,6 +129,12 @@ class TimedProfiles:
         t_ns, edge_ns = self.sensor.to_ns()
         return replace(self, t_ns=t_ns, edge_ns=edge_ns)
 
+    def earliest_ns(self) -> int:
+        """ROS time of the first point as the clock has it now."""
+        if self.sensor is None:
+            return int(self.t_ns.min())
+        return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.min()))
+
     def settled(self) -> NDArray[np.bool_]:
         """Tell which points' times are as good as they will be while the stage moves."""
         if self.sensor is None:

@@ -72,14 +72,18 @@ class StagePlacer:
         """Profiles whose position is known, each with its positions (mm, float64), oldest first."""
         placed = []
         still: deque[tuple[float, TimedProfiles]] = deque()
+        last_us = self.track.last_us
         for arrived_s, waiting in self._waiting:
+            expired = now_s - arrived_s > self.timeout_s
+            if not expired and (last_us is None or waiting.earliest_ns() // NS_PER_US > last_us):
+                still.append((arrived_s, waiting))
+                continue
             timed = waiting.retimed()
             t_us = timed.t_ns // NS_PER_US
-            last_us = self.track.last_us
             early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
             if now_s - arrived_s <= min(_EDGE_WAIT_S, self.timeout_s):
                 early |= ~timed.settled()
-            if now_s - arrived_s > self.timeout_s:
+            if expired:
                 self.points_without_stage += int(np.count_nonzero(early))
             elif early.any():
                 still.append((arrived_s, timed.select(early)))
