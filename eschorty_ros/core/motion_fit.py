@@ -8,8 +8,7 @@ spread. Where the motion is not known, or does not fit, positions lie on lines b
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections import deque
+from bisect import bisect_left, bisect_right
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +20,8 @@ from eschorty_ros.core.clock import POSITION_LIMIT_MM
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.motion import MotionPlan
 
-_HISTORY_NS = 60_000_000_000
 _LEGS_MAX = 64
-_READINGS_MAX = 20_000
+_READINGS_MAX = 10_000
 
 
 class MotionFit:
@@ -45,14 +43,15 @@ class MotionFit:
     def __init__(self, tolerance_mm: float = 1e-3) -> None:
         self._tolerance_mm = positive("tolerance_mm", tolerance_mm)
         self.late_readings = 0
-        self._readings: deque[Reading] = deque(maxlen=_READINGS_MAX)
+        self._at_ns: list[int] = []
+        self._places: list[float] = []
         self._legs: list[Leg] = [Unknown(-TIME_LIMIT)]
         self._delays = Delays()
 
     @property
     def until_ns(self) -> int | None:
         """Time up to which positions are known; ``None`` before the first reading."""
-        return self._readings[-1].middle_ns if self._readings else None
+        return self._at_ns[-1] if self._at_ns else None
 
     @property
     def residual_mm(self) -> float:
@@ -93,12 +92,13 @@ class MotionFit:
                     f"earliest_ns is {earliest_ns}, after latest_ns {latest_ns}; swap them"
                 )
         reading = Reading(float(position_mm), earliest_ns, latest_ns)
-        if self._readings and reading.middle_ns <= self._readings[-1].middle_ns:
+        if self._at_ns and reading.middle_ns <= self._at_ns[-1]:
             self.late_readings += 1
             return
-        self._readings.append(reading)
-        while self._readings[0].latest_ns < latest_ns - _HISTORY_NS:
-            self._readings.popleft()
+        self._at_ns.append(reading.middle_ns)
+        self._places.append(reading.position_mm)
+        if len(self._at_ns) > 2 * _READINGS_MAX:
+            del self._at_ns[:_READINGS_MAX], self._places[:_READINGS_MAX]
         self._legs[-1].add(reading)
 
     def follow(self, plan: MotionPlan) -> None:
@@ -140,7 +140,7 @@ class MotionFit:
             Before the first reading.
         """
         wanted = times("t_ns", t_ns)
-        if not self._readings:
+        if not self._at_ns:
             raise ArgumentError("the position is unknown; observe a reading first")
         flat = wanted.reshape(-1)
         position, velocity = np.empty(flat.shape), np.empty(flat.shape)
@@ -164,16 +164,16 @@ class MotionFit:
         before = self._legs[index - 1].plan() if index else None
         after = self._legs[index + 1].plan() if index + 1 < len(self._legs) else None
         # Beside another unknown leg its readings count, too.
-        low_ns = begin_ns if before is not None else -TIME_LIMIT
-        high_ns = end_ns if after is not None else TIME_LIMIT
-        knots = [
-            (reading.middle_ns, reading.position_mm)
-            for reading in self._readings
-            if low_ns < reading.middle_ns < high_ns
-        ]
-        if before is not None:
+        low = bisect_right(self._at_ns, begin_ns) if before is not None else 0
+        high = bisect_left(self._at_ns, end_ns) if after is not None else len(self._at_ns)
+        # No more of them than the times asked for need.
+        first = max(bisect_right(self._at_ns, int(t_ns.min()), low, max(low, high)) - 1, low)
+        last = bisect_left(self._at_ns, int(t_ns.max()), first, max(first, high)) + 1
+        chosen = slice(first, min(last, high))
+        knots = list(zip(self._at_ns[chosen], self._places[chosen], strict=True))
+        if before is not None and first == low:
             knots.insert(0, (begin_ns, float(before.state(begin_ns)[0])))
-        if after is not None:
+        if after is not None and last >= high:
             knots.append((end_ns, float(after.state(end_ns)[0])))
         at_s = np.array([at_ns - knots[0][0] for at_ns, _ in knots]) * 1e-9
         places = np.array([place for _, place in knots])
