@@ -1,0 +1,121 @@
+"""The stage node on its real driver, a pseudo-terminal between it and the emulated controller."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from eschorty_ros.action import MoveStage
+from eschorty_ros.msg import PositionTrigger
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionClient
+from ros_process import NodeProcess, Observer, wait_until
+
+from eschorty_ros.emulation.apt_model import AptModel
+from eschorty_ros.emulation.pty_port import PtyPort
+from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.conversions import ns_from_stamp
+from eschorty_ros.nodes.domain import free_domain
+
+SETTINGS = {"driver": "apt", "homing_speed": 0.1, "trigger_interval": 0.005}
+
+
+@pytest.fixture
+def model() -> AptModel:
+    return AptModel(time.time_ns, power_up_mm=2.0)
+
+
+@pytest.fixture
+def port(model: AptModel, tmp_path: Path) -> Iterator[str]:
+    with PtyPort(model, tmp_path / "stage"):
+        yield str(tmp_path / "stage")
+
+
+@pytest.fixture
+def observer() -> Iterator[Observer]:
+    with Observer(free_domain(), "stage_observer") as observer:
+        yield observer
+
+
+def test_moves_with_odometry_on_the_true_motion(
+    port: str, model: AptModel, observer: Observer
+) -> None:
+    process = NodeProcess(
+        "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
+    )
+    odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
+    triggers = observer.collect(PositionTrigger, "stage/trigger", qos.latched())
+    client = ActionClient(observer.node, MoveStage, "stage/move")
+    try:
+        observer.wait_for_state("stage", "active")
+        wait_until(client.server_is_ready, "stage/move")
+        wait_until(lambda: triggers, "the trigger")
+        assert (triggers[0].first, triggers[0].interval, triggers[0].count) == (0.005, 0.005, 43)
+        for position in (0.01, 0.21):
+            begun = len(odometry)
+            sent = client.send_goal_async(MoveStage.Goal(position=position, speed=0.2))
+            wait_until(sent.done, "acceptance")
+            ended = sent.result().get_result_async()
+            wait_until(ended.done, "the end")
+            assert ended.result().status == GoalStatus.STATUS_SUCCEEDED
+        seen = odometry[begun:]
+        stamps = [ns_from_stamp(message.header.stamp) for message in seen]
+        assert max(b - a for a, b in itertools.pairwise(stamps)) < 25_000_000
+        errors = [
+            message.pose.pose.position.y * 1e3 - model.axis.position_mm(stamp)
+            for message, stamp in zip(seen, stamps, strict=True)
+        ]
+        worst_mm = max(map(abs, errors))
+        print(f"odometry of a real process: {worst_mm:.3f} mm off at most at 200 mm/s")
+        assert worst_mm < 1.0
+        assert process.interrupt() == 0
+        assert "Traceback" not in process.output
+    finally:
+        client.destroy()
+        process.kill()
+
+
+def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Observer) -> None:
+    """driver: the node leaves the active state. user reads: stage lost: the stage's port failed."""
+    process = NodeProcess(
+        "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
+    )
+    told = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+    try:
+        observer.wait_for_state("stage", "active")
+        model.gone = True
+        wait_until(lambda: "stage lost: the stage's port failed" in process.output, "the log")
+        wait_until(
+            lambda: any("port failed" in s.message for m in told for s in m.status), "diagnostics"
+        )
+        assert process.interrupt() == 0
+        assert "Traceback" not in process.output
+    finally:
+        process.kill()
+
+
+def test_fault_x3_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
+    """driver: stops the carriage, closes the port, within 2 s. user reads: nothing; exit code 0."""
+    model = AptModel(time.time_ns, power_up_mm=150.0)
+    with PtyPort(model, tmp_path / "stage") as _:
+        process = NodeProcess(
+            "eschorty_ros.nodes.stage",
+            {**SETTINGS, "homing_speed": 0.01, "port": str(tmp_path / "stage")},
+            domain=observer.domain,
+        )
+        try:
+            wait_until(lambda: model.axis.moving(time.time_ns()), "homing")
+            assert process.interrupt() == 0
+            assert "Traceback" not in process.output
+            assert not model.axis.moving(time.time_ns())
+            assert 1.0 < model.axis.position_mm(time.time_ns()) < 150.0
+        finally:
+            process.kill()
