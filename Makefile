@@ -1,6 +1,7 @@
 # make scan   a simulated scan: cloud, picture, error against the truth
 # make report the paper's experiments again: report/index.html
 # make tradeoff speed against error again, and the README's table from it
+# make faults the fault table of docs/faults.md again, from its tests
 # make test   every test
 # make check  lint, types, import contracts
 #
@@ -41,7 +42,7 @@ INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/*
 # numba sees changes of a file, not of what the file imports: its cache goes when a kernel changes.
 KERNELS := $(shell grep -rl --include='*.py' 'import.*njit' eschorty_ros)
 
-.PHONY: help setup scan report tradeoff test check lint format types contracts clean
+.PHONY: help setup scan report tradeoff faults test check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -57,6 +58,9 @@ report: $(SETUP) $(BUILD)/kernels.stamp
 tradeoff: $(SETUP) $(BUILD)/kernels.stamp
 	@$(ENTER) eschorty report --out report --only tradeoff
 	@$(ENTER) python -m eschorty_ros.report.readme_table report/tradeoff-changes.csv README.md
+
+faults: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
+	@$(ENTER) python test/fault_table.py
 
 test: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
