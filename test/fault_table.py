@@ -48,7 +48,7 @@ FAULTS = {
     "x3": "shutdown at any time",
 }
 _NAME = re.compile(r"test_fault_([usx]\d+)_(\w+)")
-_SAYS = re.compile(r"driver: (?P<driver>.+?)[;.] user reads: (?P<user>.+?)(?<!\.\.)\.?$", re.S)
+_SAYS = re.compile(r"driver: (?P<driver>.+?)[;.] user reads: (?P<user>.+?\.\.\.|.+?)\.?$", re.S)
 
 
 @dataclass(frozen=True)
