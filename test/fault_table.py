@@ -104,14 +104,12 @@ def fault_tests() -> list[FaultTest]:
 
 def result_rows(tests: list[FaultTest]) -> list[tuple[str, FaultTest]]:
     """Begin of each test's row, up to the result."""
-    return [
-        (
-            f"| {test.id.upper()} {FAULTS[test.id]} | {_NAME.fullmatch(test.name)[2]} "
-            f"({Path(test.file).stem.removeprefix('test_')}) | {_cell(test.driver)} | {_cell(test.user)} |",
-            test,
-        )
-        for test in tests
-    ]
+    rows = []
+    for test in tests:
+        case = f"{_NAME.fullmatch(test.name)[2]} ({Path(test.file).stem.removeprefix('test_')})"
+        cells = (f"{test.id.upper()} {FAULTS[test.id]}", case, test.driver, test.user)
+        rows.append(("| " + " | ".join(map(_cell, cells)) + " |", test))
+    return rows
 
 
 def catalogue_table() -> str:
