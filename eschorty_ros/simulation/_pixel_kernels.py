@@ -220,6 +220,8 @@ def _relight(
         # One run over both spans, unless they lie apart: what is between stays untouched.
         first, last = (min(lo, old_lo), max(hi, old_hi)) if hi > lo else (old_lo, old_hi)
         apart = hi < old_lo or lo > old_hi
+        if old_hi <= old_lo:
+            first, last, apart = lo, hi, False
         n, earliest = _live(
             pixels, column, old_lo if apart else first, old_hi if apart else last, t_us, light,
             model, tables, seed, out, n,
@@ -244,6 +246,17 @@ def _relight(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _trim(pixels, column, spans):
+    """Leave out rows with nothing pending at both ends: a line that moved on is not revisited."""
+    lo, hi = spans[column, 2], spans[column, 3]
+    while lo < hi and pixels[np.uintp(column), np.uintp(lo)].t_next == np.inf:
+        lo += 1
+    while lo < hi and pixels[np.uintp(column), np.uintp(hi - 1)].t_next == np.inf:
+        hi -= 1
+    spans[column, 2], spans[column, 3] = lo, hi
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _run_columns(pixels, spans, due, begin, until_us, model, tables, seed, out, n):
     """Everything that is due up to ``until_us`` in the columns from ``begin`` on.
 
@@ -260,6 +273,7 @@ def _run_columns(pixels, spans, due, begin, until_us, model, tables, seed, out, 
         if earliest == _FULL:
             return column, n
         due[column] = earliest
+        _trim(pixels, column, spans)
     return pixels.shape[0], n
 
 
