@@ -65,7 +65,7 @@ class Reports:
             "stream_restarts": stream.restarts,
             "queue": len(self._mailbox),
             "events_per_second": self._diagnostics_rate.read(counters["events"]),
-            **_clock_values(stream),
+            **clock_values(stream),
             "profiles": self._pipeline.profiles,
             "points": self._pipeline.points,
             "points_waiting_for_stage": placer.waiting,
@@ -85,7 +85,7 @@ class Reports:
         return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
 
 
-def _clock_values(stream: PacketStream) -> dict[str, Any]:
+def clock_values(stream: PacketStream) -> dict[str, Any]:
     """Offset, drift and residual of the sensor's clock, and what the stage's edges say of it."""
     epoch = stream.epoch
     if epoch is None:
