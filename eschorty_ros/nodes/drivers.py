@@ -107,7 +107,7 @@ def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage
 
 
 def _apt(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
-    from eschorty_ros.hardware.stage.apt_stage import open_stage
+    from eschorty_ros.hardware.stage.apt_open import open_stage
 
     settings = AptSettings(
         controller=parameters["controller"],

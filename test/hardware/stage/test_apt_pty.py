@@ -12,8 +12,9 @@ from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.apt_model import AptModel
 from eschorty_ros.emulation.pty_port import PtyPort
 from eschorty_ros.hardware.stage import apt_port
+from eschorty_ros.hardware.stage.apt_open import open_stage
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
-from eschorty_ros.hardware.stage.apt_stage import AptStage, open_stage
+from eschorty_ros.hardware.stage.apt_stage import AptStage
 
 DEADLINE_S = 20.0
 

@@ -1,0 +1,268 @@
+"""What status messages say: where the stage is, what has become of its motion, what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.core.motion_fit import MotionFit
+from eschorty_ros.hardware.protocols import StageState
+from eschorty_ros.hardware.stage import apt_messages as apt
+from eschorty_ros.hardware.stage.apt_follow import BEGIN_NS, TOLERANCE_MM, Kind, Motion, Outcome
+from eschorty_ros.hardware.stage.apt_judge import LATE_NS, Judge, Status, Verdict
+
+BYTE_NS = 86_806
+REQUEST_NS = 6 * BYTE_NS
+ANSWER_NS = 20 * BYTE_NS
+WARN_AGE_NS = 500_000_000
+FAULT_AGE_NS = 1_500_000_000
+_POLL_LOST_NS = 250_000_000
+# A host that stood still itself has not looked often enough to call the controller silent.
+_LOOKS_LEAST = 20
+
+
+class Actions(Protocol):
+    """What follows from what the status messages say."""
+
+    def ask_status(self) -> None:
+        """Ask for another status message."""
+
+    def stop(self) -> None:
+        """Profiled stop."""
+
+    def fail(self, error: DeviceError, escalate: bool = False) -> None:
+        """Stop for good; ``escalate`` when the carriage may not obey."""
+
+
+class Tracker:
+    """State of the axis as its status messages tell it; not thread-safe.
+
+    Parameters
+    ----------
+    actions : Actions
+    now_ns : callable
+        Steady clock.
+    clock_ns : callable
+        Clock of ``StageState.t_ns``.
+
+    Attributes
+    ----------
+    scale : Scale
+    fit : MotionFit
+    judge : Judge
+    motion : Motion or None
+        The motion under way.
+    status : Status or None
+        The newest message that was believed.
+    failure : DeviceError or None
+    blocked_sense : int
+        Sign of the way that a limit has barred.
+    """
+
+    def __init__(
+        self, actions: Actions, now_ns: Callable[[], int], clock_ns: Callable[[], int]
+    ) -> None:
+        self.scale = apt.Scale()
+        self.fit = MotionFit(TOLERANCE_MM)
+        self.judge = Judge()
+        self.motion: Motion | None = None
+        self.status: Status | None = None
+        self.failure: DeviceError | None = None
+        self.blocked_sense = 0
+        self._actions = actions
+        self._now_ns, self._clock_ns = now_ns, clock_ns
+        self._status_ns: int | None = None
+        self._poll: tuple[int, int] | None = None
+        self._unmatched_until_ns = 0
+        self._rest_ns = 0
+        self._looks = 0
+
+    @property
+    def age_ns(self) -> int:
+        """Time since the last status message; 0 before the first."""
+        return 0 if self._status_ns is None else self._now_ns() - self._status_ns
+
+    @property
+    def homing(self) -> bool:
+        """Whether the axis is on its way to its reference."""
+        return self.motion is not None and self.motion.kind is Kind.HOME
+
+    def has(self, bits: int) -> bool:
+        """Whether one of the status bits is set."""
+        return self.status is not None and bool(self.status.bits & bits)
+
+    def order(
+        self, kind: Kind, start_mm: float, target_mm: float, speed: float, limit_s: float
+    ) -> None:
+        """Expect a motion that ends within ``limit_s``."""
+        now_ns = self._now_ns()
+        deadline_ns = now_ns + round(limit_s * 1e9)
+        self.motion = Motion(kind, start_mm, target_mm, speed, now_ns, deadline_ns)
+
+    def order_stop(self, deceleration_mm_s2: float) -> None:
+        """Expect the motion under way to end in a ramp."""
+        motion = self.motion
+        if motion is None:
+            return
+        if motion.kind is Kind.MOVE:
+            self.fit.stop(self._clock_ns() + REQUEST_NS, deceleration_mm_s2)
+        motion.stop()
+
+    def ask(self) -> bool:
+        """Whether to ask for a status now; if so, the request goes out at once."""
+        now_ns, poll = self._now_ns(), self._poll
+        # One at a time: so an answer belongs to its request.
+        if poll is not None:
+            if now_ns - poll[1] < _POLL_LOST_NS:
+                return False
+            # Its answer may still come, and must not be taken for the next one's.
+            self._unmatched_until_ns = now_ns + LATE_NS
+        self._poll = self._clock_ns(), now_ns
+        return True
+
+    def state(self, t_ns: int | None, lag_ns: int) -> StageState:
+        """Position, velocity and flags at ``t_ns``, by default as new as they can be known."""
+        until_ns, status = self.fit.until_ns, self.status
+        assert until_ns is not None
+        assert status is not None
+        newest_ns = min(self._clock_ns() - lag_ns, until_ns)
+        t_ns = newest_ns if t_ns is None else min(t_ns, until_ns)
+        position, velocity = (float(value) for value in self.fit.state(t_ns))
+        flags = apt.decode_bits(status.bits)
+        if self.age_ns > WARN_AGE_NS:
+            flags = (*flags, "status_late")
+        moving = self.motion is not None or t_ns < self._rest_ns
+        homed = bool(status.bits & apt.HOMED) and not self.homing
+        return StageState(position, velocity, t_ns, homed, moving, flags)
+
+    def look(self) -> None:
+        """Notice what does not come: status messages, the end of a motion."""
+        self._looks += 1
+        motion = self.motion
+        if self.age_ns > FAULT_AGE_NS and self._looks >= _LOOKS_LEAST:
+            self._actions.fail(
+                DeviceGoneError(
+                    f"the stage controller is silent for {FAULT_AGE_NS * 1e-9:g} s; check its "
+                    "power and cable"
+                )
+            )
+        elif motion is not None and self._now_ns() > motion.deadline_ns:
+            self._actions.fail(
+                DeviceError(
+                    f"the stage's {motion.kind.value} does not end in time; check the travel "
+                    "for obstacles, then configure again"
+                )
+            )
+
+    def hear(self, frame: apt.Frame, received_ns: int, clock_ns: int) -> None:
+        """Take one status message, received at this time of both clocks."""
+        latest_ns = clock_ns - ANSWER_NS
+        earliest_ns = None
+        if self._poll is not None and received_ns >= self._unmatched_until_ns:
+            earliest_ns = min(self._poll[0] + REQUEST_NS, latest_ns)
+        self._poll = None
+        position_mm = self.scale.mm(frame.whole("position"))
+        status = Status(position_mm, frame.whole("bits"), earliest_ns, latest_ns)
+        self._status_ns, self._looks = received_ns, 0
+        motion = self.motion
+        expected = None
+        if motion is None and self.status is not None:
+            expected = (self.status.position_mm, self.status.position_mm)
+        elif motion is not None and motion.kind is not Kind.HOME:
+            expected = self.fit.expected_mm(
+                latest_ns - LATE_NS if earliest_ns is None else earliest_ns, latest_ns
+            )
+        speed = 0.0 if motion is None else motion.speed_mm_s
+        if self.status is None or self.failure is not None:
+            self.judge.forget()
+        match self.judge.judge(status, expected, speed):
+            case Verdict.ASK_AGAIN:
+                self._actions.ask_status()
+            case Verdict.CONTRADICTORY:
+                self._actions.fail(
+                    DeviceError(
+                        "two status messages of the stage running make no sense; check the cable "
+                        "for interference"
+                    )
+                )
+            case verdict:
+                self._believe(status, verdict)
+
+    def _believe(self, status: Status, verdict: Verdict) -> None:
+        before, self.status = self.status, status
+        if self.failure is not None:
+            if before is not None and before.position_mm == status.position_mm:
+                self.motion = None
+            return
+        if before is not None and not self.homing:
+            lost = before.bits & ~status.bits
+            if lost & (apt.HOMED | apt.ENABLED):
+                what = "its reference" if lost & apt.HOMED else "the axis enabled"
+                self._actions.fail(
+                    DeviceError(
+                        f"the stage controller does not have {what} any more, as after a restart; "
+                        "configure and home again"
+                    )
+                )
+                return
+            if verdict is Verdict.JUMPED:
+                jump_mm = status.position_mm - before.position_mm
+                self._actions.fail(
+                    DeviceError(
+                        f"the stage's encoder jumped by {jump_mm:.3f} mm; home again and check the "
+                        "encoder's cable"
+                    )
+                )
+                return
+        if status.bits & apt.FAULTS:
+            names = ", ".join(apt.decode_bits(status.bits & apt.FAULTS))
+            self._actions.fail(
+                DeviceError(f"the stage controller reports {names}; clear its cause")
+            )
+            return
+        if not (self.homing and status.bits & apt.HOMED):
+            self.fit.observe(status.position_mm, status.latest_ns, status.earliest_ns)
+        if self.motion is not None:
+            self._follow(self.motion, before, status, verdict)
+
+    def _follow(
+        self, motion: Motion, before: Status | None, status: Status, verdict: Verdict
+    ) -> None:
+        what, at_mm = motion.kind.value, status.position_mm
+        match motion.follow(before, status, verdict, self._now_ns()):
+            case Outcome.MET_LIMIT:
+                self.blocked_sense = motion.sense
+                self._actions.stop()
+            case Outcome.ENDED:
+                self._end(motion, status)
+            case Outcome.NOT_BEGUN:
+                self._actions.fail(
+                    DeviceError(
+                        f"the stage does not begin its {what} within {BEGIN_NS * 1e-9:g} s; check "
+                        "its front panel, the interlock and the motor cable"
+                    )
+                )
+            case Outcome.STUCK:
+                self._actions.fail(
+                    DeviceError(
+                        f"the stage is stuck at {at_mm:.3f} mm on its {what} to "
+                        f"{motion.target_mm:.3f} mm; check the travel for obstacles, then "
+                        "configure again"
+                    ),
+                    escalate=True,
+                )
+
+    def _end(self, motion: Motion, status: Status) -> None:
+        self.motion = None
+        self._rest_ns = status.latest_ns
+        if status.bits & apt.HOMED and motion.kind is Kind.HOME:
+            # Before, the encoder counted from somewhere else.
+            self.fit = MotionFit(TOLERANCE_MM)
+            self.fit.observe(status.position_mm, status.latest_ns, status.earliest_ns)
+            return
+        planned_mm = float(self.fit.state(status.latest_ns)[0])
+        if abs(planned_mm - status.position_mm) > TOLERANCE_MM:
+            self.fit.doubt()
+        if self.blocked_sense and motion.sense == -self.blocked_sense:
+            self.blocked_sense = 0
