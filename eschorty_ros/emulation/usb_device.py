@@ -195,6 +195,8 @@ class EmulatedUsbDevice:
         self._gone = value
         if value:
             self.claims.clear()
+        with self._waiting:
+            self._waiting.notify_all()
         for pipe in self._pipes.values():
             pipe.wake()
 
@@ -283,7 +285,8 @@ class EmulatedUsbDevice:
         self.check(endpoint)
         if self.mute:
             with self._waiting:
-                self._wait(self._waiting, timeout_ms / 1e3 if timeout_ms else None)
+                if not self._gone:
+                    self._wait(self._waiting, timeout_ms / 1e3 if timeout_ms else None)
             raise UsbFault(errno.ENODEV if self._gone else errno.ETIMEDOUT)
 
     def _string(self, index: int) -> bytes:

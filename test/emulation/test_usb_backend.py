@@ -110,7 +110,8 @@ def test_after_replug_the_old_handle_stays_dead_and_a_new_search_finds_the_devic
     assert fresh.read(IN, 64).tobytes() == b"y"
 
 
-def test_unplugging_wakes_a_waiting_read():
+@pytest.mark.parametrize("mute", [False, True])
+def test_unplugging_wakes_a_waiting_read(mute):
     loop = Loop(wait=threading.Condition.wait)
     device = opened(loop)
     codes = []
@@ -123,6 +124,7 @@ def test_unplugging_wakes_a_waiting_read():
 
     device.write(OUT, b"x")
     device.read(IN, 64)
+    loop.mute = mute
     reader = threading.Thread(target=read)
     reader.start()
     loop.gone = True
