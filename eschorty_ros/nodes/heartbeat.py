@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 from rclpy.node import Node
 from std_msgs.msg import Header
 
 from eschorty_ros.nodes import qos
+from eschorty_ros.nodes.peer import own_sign
 
-PERIOD_S = 0.03
+PERIOD_S = 0.1
+LOOK_S = 0.02
+LAST_BEATS = 3
 
 
 class Heartbeat:
-    """Publishes a ``std_msgs/Header`` every 30 ms for as long as ``healthy()`` is true.
+    """Publishes a ``std_msgs/Header`` every 0.1 s for as long as ``healthy()`` is true.
 
-    In a thread of its own, so that a busy executor does not look like a dead device; it ends with
-    the node's context. The laser goes dark when the beats stop (see ``nodes/laser.py``).
+    The header's ``frame_id`` says which process beats (see ``peer``), so that a laser node on the
+    same host sees it die; the last beats say that they are the last. In a thread of its own, so
+    that a busy executor does not look like a dead device; it ends with the node's context.
 
     Parameters
     ----------
@@ -26,22 +31,43 @@ class Heartbeat:
         ``camera/heartbeat`` or the like.
     healthy : callable
         Whether the device does what it should, right now; called in the thread, must not wait.
+
+    Attributes
+    ----------
+    beating : bool
+        Whether the last beat said that all is well.
     """
 
     def __init__(self, node: Node, topic: str, healthy: Callable[[], bool]) -> None:
         self._node = node
         self._healthy = healthy
+        self.beating = False
         self._publisher = node.create_publisher(Header, topic, qos.heartbeat())
-        threading.Thread(target=self._beat, name=topic, daemon=True).start()
+        threading.Thread(target=self._run, name=topic, daemon=True).start()
 
-    def _beat(self) -> None:
+    def _run(self) -> None:
         pause = threading.Event()
-        while not pause.wait(PERIOD_S) and self._node.context.ok():
-            if not self._healthy():
+        last_beats = 0
+        beat_s = 0.0
+        while not pause.wait(LOOK_S) and self._node.context.ok():
+            healthy, now_s = self._healthy(), time.monotonic()
+            if healthy:
+                last_beats = LAST_BEATS
+            due = healthy != self.beating or now_s - beat_s >= PERIOD_S
+            if not due or last_beats == 0:
                 continue
-            message = Header(stamp=self._node.get_clock().now().to_msg())
-            try:
-                self._publisher.publish(message)
-            except Exception:
-                # A signal may end the context, or the node be destroyed, in between.
+            if not self._publish(stopped=not healthy):
                 return
+            self.beating, beat_s = healthy, now_s
+            last_beats -= not healthy
+
+    def _publish(self, *, stopped: bool) -> bool:
+        message = Header(
+            stamp=self._node.get_clock().now().to_msg(), frame_id=own_sign(stopped=stopped)
+        )
+        try:
+            self._publisher.publish(message)
+        except Exception:
+            # A signal may end the context, or the node be destroyed, in between.
+            return False
+        return True

@@ -47,12 +47,12 @@ TABLE = (
     Param("duty", 0.5, "share of the period with light", "", 0.001, 0.999, dynamic=True),
     Param("waveform", "square", "shape of the gate", choices=WAVEFORMS, dynamic=True),
     Param("arm_timeout", 10.0, "how long laser/arm allows laser/enable", "s", 0.1, 3600.0),
-    Param("heartbeat_timeout", 0.18, "age at which laser/heartbeat is stale", "s", 0.05, 60.0),
+    Param("heartbeat_timeout", 1.0, "age at which laser/heartbeat is stale", "s", 0.05, 60.0),
     Param("max_on_time", 600.0, "longest time on", "s", 0.1, 86400.0),
     Param("interlock_required", False, "interlock is open until laser/interlock says closed"),
     Param("watch", " ".join(WATCHED), "nodes whose heartbeats light needs: camera, stage, none"),
-    Param("camera_timeout", 0.18, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
-    Param("stage_timeout", 0.18, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
+    Param("camera_timeout", 1.0, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
+    Param("stage_timeout", 1.0, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
     Param("readback_rate", 5.0, "how often the generator is read back", "Hz", 0.1, 20.0),
     *drivers.LASER_TABLE,
 )
@@ -62,11 +62,12 @@ class LaserNode(DeviceNode):
     """``laser/arm``, ``laser/enable``, ``laser/heartbeat``, ``laser/interlock`` -> ``laser/state``.
 
     ``laser/interlock`` (std_msgs/Bool): true means open, and open means dark; until a message says
-    otherwise it is open when ``interlock_required``, else closed. Light ends on a stale
-    ``laser/heartbeat`` (whoever wants light), ``camera/heartbeat`` or ``stage/heartbeat``, an open
-    interlock, after ``max_on_time``, and when the generator does not read back as asked. This is
-    looked after by threads on the steady clock, also when the executor is stuck. Spin it with
-    several threads: commands take their time, heartbeats do not wait.
+    otherwise it is open when ``interlock_required``, else closed. Light ends when
+    ``laser/heartbeat`` (whoever wants light), ``camera/heartbeat`` or ``stage/heartbeat`` is stale
+    or its sender on this host dies, with an open interlock, after ``max_on_time``, and when the
+    generator does not read back as asked. This is looked after by threads on the steady clock,
+    also when the executor is stuck. Spin it with several threads: commands take their time,
+    heartbeats do not wait.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -190,8 +191,8 @@ class LaserNode(DeviceNode):
             self._keeper.darken("interlock open")
         self._keeper.tell()
 
-    def _on_heartbeat(self, topic: str, _: Header) -> None:
-        self._keeper.gate.beat(topic)
+    def _on_heartbeat(self, topic: str, message: Header) -> None:
+        self._keeper.gate.beat(topic, message.frame_id)
 
     def _alarm(self, text: str) -> None:
         # As in _log.

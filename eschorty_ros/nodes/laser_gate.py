@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 
+from eschorty_ros.nodes.peer import Peer, read_sign
+
 LEASE = "laser/heartbeat"
 
 
@@ -18,7 +20,8 @@ class LaserGate:
     max_on_s : float
         Longest time on.
     leases : mapping of str to float
-        Topics that must beat, and the age in seconds at which each one's last beat is stale.
+        Topics that must beat, and the age in seconds at which each one's last beat is stale. A
+        sender on this host that dies or stands still, or says that it stops, is stale at once.
     interlock_open : bool
         What the interlock is taken for until somebody says otherwise.
     now_s : callable
@@ -45,6 +48,8 @@ class LaserGate:
         self._now_s = now_s
         self._armed_s: float | None = None
         self._beat_s: dict[str, float] = {}
+        self._peers: dict[str, Peer | None] = {}
+        self._stopped: set[str] = set()
         self._on_s: float | None = None
         self.gap_max_s: dict[str, float] = {}
         self.interlock_open = interlock_open
@@ -66,8 +71,16 @@ class LaserGate:
         """Allow ``enable`` for a while."""
         self._armed_s = self._now_s()
 
-    def beat(self, topic: str = LEASE) -> None:
-        """Note that a heartbeat has arrived."""
+    def beat(self, topic: str = LEASE, sign: str = "") -> None:
+        """Note that a heartbeat has arrived, and whose it is (see ``peer``)."""
+        peer, stopped = read_sign(sign)
+        if stopped:
+            # Somebody else's end is no news: another one may beat on the same topic.
+            if peer == self._peers.get(topic):
+                self._stopped.add(topic)
+            return
+        self._peers[topic] = peer
+        self._stopped.discard(topic)
         now_s = self._now_s()
         if self._on_s is not None and topic in self._beat_s:
             gap_s = now_s - self._beat_s[topic]
@@ -103,14 +116,23 @@ class LaserGate:
     def _unsafe(self) -> str | None:
         if self.interlock_open:
             return "interlock open; close it"
-        now_s = self._now_s()
         for topic, timeout_s in self._leases.items():
-            beat_s = self._beat_s.get(topic)
-            if beat_s is None:
-                return f"no {topic}; {_remedy(topic)}"
-            if now_s - beat_s > timeout_s:
-                return f"{topic} older than {timeout_s:g} s; {_remedy(topic)}"
+            trouble = self._trouble(topic, timeout_s)
+            if trouble:
+                return f"{trouble}; {_remedy(topic)}"
         return None
+
+    def _trouble(self, topic: str, timeout_s: float) -> str:
+        beat_s = self._beat_s.get(topic)
+        if beat_s is None:
+            return f"no {topic}"
+        if topic in self._stopped:
+            return f"{topic} says stopped"
+        if self._now_s() - beat_s > timeout_s:
+            return f"{topic} older than {timeout_s:g} s"
+        peer = self._peers.get(topic)
+        trouble = peer.trouble() if peer is not None else ""
+        return f"{topic}: {trouble}" if trouble else ""
 
 
 def _remedy(topic: str) -> str:

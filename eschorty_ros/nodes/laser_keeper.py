@@ -19,7 +19,7 @@ from eschorty_ros.nodes.laser_readback import (
     wrong_waveform,
 )
 
-WATCH_PERIOD_S = 0.01
+WATCH_PERIOD_S = 0.02
 
 
 class LaserKeeper:

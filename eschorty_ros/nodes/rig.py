@@ -16,18 +16,21 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import LaserState
-from eschorty_ros.nodes import qos
-from eschorty_ros.nodes.conversions import m_from_mm, stamp_from_ns
+from eschorty_ros.nodes.conversions import m_from_mm
+from eschorty_ros.nodes.heartbeat import Heartbeat
+from eschorty_ros.nodes.laser_gate import LEASE
 from eschorty_ros.nodes.scan_monitor import ScanMonitor
 from eschorty_ros.nodes.scan_sequence import ScanCanceled, ScanFailure
 
-_TICK_S = 0.01
-_HEARTBEAT_S = 0.03
+_TICK_S = 0.02
+# A sequence that has not come by for so long hangs.
+_TICK_LIMIT_S = 1.0
+# For the first beats to arrive.
+_BEATS_S = 0.15
 _RESEND_S = 2.0
 
 
@@ -60,7 +63,9 @@ class LaserStageRig:
         group = ReentrantCallbackGroup()
         # In a group of its own, one message at a time, so that samples stay in order.
         self.monitor = ScanMonitor(node, MutuallyExclusiveCallbackGroup())
-        self._heartbeat = node.create_publisher(Header, "laser/heartbeat", qos.heartbeat())
+        self._beating = False
+        self._tick_s = 0.0
+        self._heartbeat = Heartbeat(node, LEASE, self._wants_light)
         self._clients = {
             name: node.create_client(kind, name, callback_group=group)
             for name, kind in (
@@ -73,8 +78,6 @@ class LaserStageRig:
         self._stage = ActionClient(node, MoveStage, "stage/move", callback_group=group)
         self._sent: Any = None
         self._ended = threading.Event()
-        self._beating = False
-        self._beat_s = 0.0
         self._watching = False
         self._shielded = False
         self._canceled: Callable[[], bool] = lambda: False
@@ -181,8 +184,13 @@ class LaserStageRig:
 
     def laser_on(self) -> None:
         """See ``Rig``."""
-        self._beating = True
         self._pause()
+        self._beating = True
+        self._wait(lambda: self._heartbeat.beating, self._service_timeout_s,
+                   "laser: no heartbeat of its own")  # fmt: skip
+        beaten_s = time.monotonic()
+        while time.monotonic() < beaten_s + _BEATS_S:
+            self._pause()
         for name, request in (
             ("laser/arm", Trigger.Request()),
             ("laser/enable", SetBool.Request(data=True)),
@@ -240,16 +248,15 @@ class LaserStageRig:
 
     # Waiting
 
+    def _wants_light(self) -> bool:
+        return self._beating and time.monotonic() - self._tick_s < _TICK_LIMIT_S
+
     def _pause(self) -> None:
-        """One tick: heartbeat, feedback, and the reasons to end."""
+        """One tick: sign of life, feedback, and the reasons to end."""
         if self._ended.is_set() or not self._node.context.ok():
             raise ScanFailure(f"{self._node.get_name()}: the node was shut down")
-        now_s = time.monotonic()
+        self._tick_s = time.monotonic()
         with self._living_context():
-            if self._beating and now_s - self._beat_s >= _HEARTBEAT_S:
-                self._beat_s = now_s
-                stamp = stamp_from_ns(self._node.get_clock().now().nanoseconds)
-                self._heartbeat.publish(Header(stamp=stamp))
             self._feedback(self._phase)
         if self._watching:
             self.monitor.check_laser()

@@ -23,6 +23,7 @@ from eschorty_ros.hardware.laser.guarded import GuardedLaser
 from eschorty_ros.hardware.protocols import LaserOutput
 
 OFF_LIMIT_S = 0.25
+SILENCE_S = 0.5
 TEST_FOLDER = str(Path(__file__).parents[1])
 
 
@@ -40,7 +41,7 @@ def device(tmp_path: Path) -> Iterator[Generator]:
 
 @pytest.fixture
 def laser(device: Generator) -> Iterator[GuardedLaser]:
-    made = GuardedLaser(MAKE, device.settings)
+    made = GuardedLaser(MAKE, device.settings, silence_s=SILENCE_S)
     yield made
     with contextlib.suppress(DeviceError):
         made.close()
@@ -103,7 +104,7 @@ import ctypes, faulthandler, os, signal, subprocess, sys, time
 for number in (signal.SIGHUP, signal.SIGTERM):
     signal.signal(number, signal.SIG_DFL)  # inherited as ignored under nohup
 from eschorty_ros.hardware.laser.guarded import GuardedLaser
-laser = GuardedLaser("generator_double:GeneratorLaser", {"path": sys.argv[1]})
+laser = GuardedLaser("generator_double:GeneratorLaser", {"path": sys.argv[1]}, silence_s=0.5)
 laser.arm()
 laser.enable()
 print(laser.guard_pid, flush=True)
@@ -192,7 +193,7 @@ def test_dark_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
 def test_dark_when_the_owner_hangs(owner: Owner) -> None:
     took_s = owner.die("gil")
     print(f"silent: dark after {took_s * 1e3:.1f} ms")
-    assert took_s < 0.5 + OFF_LIMIT_S
+    assert took_s < SILENCE_S + OFF_LIMIT_S
 
 
 def test_guard_is_deaf_to_the_terminal(owner: Owner) -> None:
@@ -208,7 +209,7 @@ def test_silence_disarms_until_armed_again(laser: GuardedLaser, device: Generato
     light(laser)
     began_ns = time.monotonic_ns()
     ctypes.PyDLL(None).usleep(900_000)
-    assert device.off_after_s(began_ns) < 0.5 + OFF_LIMIT_S
+    assert device.off_after_s(began_ns) < SILENCE_S + OFF_LIMIT_S
     state = laser.readback()
     assert state.output is LaserOutput.OFF
     assert "silent for 0.5 s" in state.reason

@@ -23,7 +23,12 @@ from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.domain import free_domain
 
 MODULE = "eschorty_ros.nodes.laser"
-PARAMETERS = {"arm_timeout": 1.0, "max_on_time": 3.0, "watch": "none"}
+PARAMETERS = {
+    "arm_timeout": 1.0,
+    "heartbeat_timeout": 0.5,
+    "max_on_time": 3.0,
+    "watch": "none",
+}
 
 
 class Bench:

@@ -36,7 +36,8 @@ BEATING = ("laser", "camera", "stage")
 class Bench:
     """Generator, laser node and whoever has to be alive, each a process."""
 
-    def __init__(self, folder: Path, **parameters: Any) -> None:
+    def __init__(self, folder: Path, stand_ins: tuple[str, ...], **parameters: Any) -> None:
+        self._stand_ins = stand_ins
         self._held = contextlib.ExitStack()
         self.awg: AwgProcess = self._held.enter_context(awg_process(folder))
         self.observer = self._held.enter_context(Observer(free_domain(), "safety_observer"))
@@ -57,9 +58,10 @@ class Bench:
 
     def revive(self) -> None:
         """Start the stand-ins that do not run."""
-        for name in BEATING:
+        for name in self._stand_ins:
             if name not in self.beating:
-                self.beating[name] = self._process("beating", {"topic": f"{name}/heartbeat"})
+                topics = " ".join(f"{word}/heartbeat" for word in name.split())
+                self.beating[name] = self._process("beating", {"topics": topics})
 
     def lose(self, name: str, number: int = signal.SIGKILL) -> int:
         """Send a stand-in a deadly signal; the time of it."""
@@ -113,8 +115,10 @@ def importable() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def running(folder: Path, **parameters: Any) -> Iterator[Bench]:
-    made = Bench(folder, **parameters)
+def running(
+    folder: Path, stand_ins: tuple[str, ...] = (" ".join(BEATING),), **parameters: Any
+) -> Iterator[Bench]:
+    made = Bench(folder, stand_ins, **parameters)
     try:
         yield made
     finally:
@@ -123,7 +127,7 @@ def running(folder: Path, **parameters: Any) -> Iterator[Bench]:
 
 @pytest.fixture(scope="module")
 def shared(importable: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with running(tmp_path_factory.mktemp("laser")) as made:
+    with running(tmp_path_factory.mktemp("laser"), BEATING) as made:
         yield made
 
 
@@ -167,9 +171,10 @@ def test_laser_node_is_stopped(lit: Bench) -> None:
     assert "not armed" in lit.enable().message
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGUSR1])
 @pytest.mark.parametrize("name", BEATING)
 def test_whoever_light_depends_on_dies(lit: Bench, name: str, number: int) -> None:
+    """Killed, stopped, or well no longer and saying so; all with the default parameters."""
     sent_ns = lit.lose(name, number)
     lit.dark_after(f"{name} {signal.Signals(number).name}", sent_ns)
     wait_until(lambda: f"{name}/heartbeat" in lit.states[-1].reason, "the reason")

@@ -71,7 +71,7 @@ class GuardedLaser:
         make: str,
         settings: Mapping[str, Any],
         *,
-        silence_s: float = 0.5,
+        silence_s: float = 1.0,
         answer_s: float = 5.0,
     ) -> None:
         self._beat_s = silence_s / BEATS_PER_SILENCE
