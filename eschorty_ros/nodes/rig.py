@@ -29,8 +29,8 @@ from eschorty_ros.nodes.scan_sequence import ScanCanceled, ScanFailure
 _TICK_S = 0.02
 # A sequence that has not come by for so long hangs.
 _TICK_LIMIT_S = 1.0
-# For the first beats to arrive.
-_BEATS_S = 0.15
+# In refusals for want of a sign of life.
+_BEAT = "/heartbeat"
 _RESEND_S = 2.0
 
 
@@ -188,18 +188,25 @@ class LaserStageRig:
         self._beating = True
         self._wait(lambda: self._heartbeat.beating, self._service_timeout_s,
                    "laser: no heartbeat of its own")  # fmt: skip
-        beaten_s = time.monotonic()
-        while time.monotonic() < beaten_s + _BEATS_S:
+        ends_s = time.monotonic() + self._service_timeout_s
+        while refusal := self._light():
+            # Camera and stage that have only just come up beat soon.
+            if _BEAT not in refusal or time.monotonic() > ends_s:
+                raise ScanFailure(f"laser: {refusal}")
             self._pause()
+        self._wait(lambda: self.monitor.output == LaserState.OUTPUT_ON, self._service_timeout_s,
+                   "laser: its output does not read back on")  # fmt: skip
+
+    def _light(self) -> str:
+        """Arm and enable; why not, ``""`` when it was done."""
         for name, request in (
             ("laser/arm", Trigger.Request()),
             ("laser/enable", SetBool.Request(data=True)),
         ):
             answer = self._call(name, request)
             if not answer.success:
-                raise ScanFailure(f"laser: {answer.message}")
-        self._wait(lambda: self.monitor.output == LaserState.OUTPUT_ON, self._service_timeout_s,
-                   "laser: its output does not read back on")  # fmt: skip
+                return str(answer.message)
+        return ""
 
     def laser_off(self) -> None:
         """See ``Rig``."""
