@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from eschorty_ros.core.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.hardware.stage.apt_messages import Scale
 
 SAMPLING_NS = 102_400
 EMERGENCY_MM_S2 = 14_883.0
@@ -30,6 +31,36 @@ class PulsePattern:
     forward: tuple[float, float, int] | None
     reverse: tuple[float, float, int] | None
     width_ns: int
+
+
+def pulse_pattern(
+    pulses: dict[str, int], forward: bool, reverse: bool, scale: Scale
+) -> PulsePattern:
+    """Pattern of a trigger message's fields, for the directions that are switched on."""
+    steps: list[tuple[float, float, int] | None] = []
+    for sense, on in (("forward", forward), ("reverse", reverse)):
+        first, interval, count = (
+            pulses[f"{field}_{sense}"] for field in ("start", "interval", "count")
+        )
+        wanted = on and interval > 0
+        steps.append((scale.mm(first), scale.mm(interval), count) if wanted else None)
+    return PulsePattern(steps[0], steps[1], pulses["width_us"] * 1000)
+
+
+def stage_data(
+    travel_mm: float, speed_mm_s: float, acceleration_mm_s2: float, scale: Scale
+) -> dict[str, int | bytes]:
+    """Fields of the stage data of a DDS220."""
+    return {
+        "channel": 1,
+        "part": b"DDS220",
+        "serial": 45_000_001,
+        "counts_per_unit": round(scale.counts_per_mm),
+        "maximum": scale.position(travel_mm),
+        "acceleration": scale.acceleration(acceleration_mm_s2),
+        "deceleration": scale.acceleration(EMERGENCY_MM_S2),
+        "velocity": scale.velocity(speed_mm_s),
+    }
 
 
 class Axis:
@@ -80,6 +111,24 @@ class Axis:
     def encoder_mm(self, at_ns: int) -> float:
         """Read the encoder."""
         return self.position_mm(at_ns) - self.encoder_offset_mm
+
+    def bits(self, at_ns: int, ordered: bool, enabled: bool) -> int:
+        """Status bits of limits and motion; ``ordered`` while an order is being carried out."""
+        velocity = self.velocity_mm_s(at_ns)
+        here, (low, high) = self.position_mm(at_ns), self.travel_mm
+        blocked = self.obstacle_mm is not None and abs(here - self.obstacle_mm) < 1e-6
+        return sum(
+            mask
+            for mask, holds in (
+                (0x0001, here >= high + 1e-6 or blocked),
+                (0x0002, here <= low - 1e-6),
+                (0x0010, ordered and velocity > 0.0),
+                (0x0020, ordered and velocity < 0.0),
+                (0x2000, enabled and not ordered),
+                (0x4000, self.stalled and ordered),
+            )
+            if holds
+        )
 
     def moving(self, at_ns: int) -> bool:
         """Whether the motion is not over."""

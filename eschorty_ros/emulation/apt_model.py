@@ -7,24 +7,17 @@ simplest one: a move while another is under way is ignored, a homed axis reads 0
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 
 from eschorty_ros.core.motion import MotionPlan
-from eschorty_ros.emulation.apt_axis import EMERGENCY_MM_S2, Axis, PulsePattern
+from eschorty_ros.emulation.apt_axis import EMERGENCY_MM_S2, Axis, pulse_pattern, stage_data
+from eschorty_ros.emulation.apt_frames import HostFrames, answer
 from eschorty_ros.emulation.apt_wire import BYTE_NS, Disturbance, Wire
 from eschorty_ros.hardware.stage import apt_messages as apt
 
 UPDATE_NS = 100_000_000
 SILENT_AFTER = 50
 CONTROLLERS = ("kbd101", "bbd30x")
-
-_HOST_LAYOUTS = {layout.id: layout for layout in apt.TO_CONTROLLER.values()}
-_ANSWERS = {
-    layout.name: layout
-    for layouts in apt.FROM_CONTROLLER.values()
-    for layout in layouts  # the long form of a message comes last
-}
 
 
 class AptModel:
@@ -102,7 +95,7 @@ class AptModel:
         self._limits = (speed_max_mm_s, acceleration_max_mm_s2)
         self._in = Wire(byte_ns)
         self._out = Wire(byte_ns, late_ns)
-        self._heard = bytearray()
+        self._commands = HostFrames()
         self._power_up()
 
     def _power_up(self) -> None:
@@ -146,8 +139,8 @@ class AptModel:
             return b""
         now_ns = self._clock_ns()
         for at_ns, data in self._in.take(now_ns):
-            self._heard += data
-            self._listen(at_ns)
+            for name, address, values in self._commands.feed(data):
+                self._obey(name, address, values, at_ns)
         self._complete(now_ns)
         while self._updates_ns is not None and self._updates_ns <= now_ns:
             self._say_status("status", self._updates_ns)
@@ -168,33 +161,6 @@ class AptModel:
             self._say("error")
 
     # What the host sends
-
-    def _listen(self, at_ns: int) -> None:
-        heard = self._heard
-        while len(heard) >= apt.HEADER_BYTES:
-            id, length = struct.unpack_from("<HH", heard)
-            layout = _HOST_LAYOUTS.get(id)
-            long = bool(heard[4] & apt.LONG)
-            known = layout is not None and long == bool(layout.payload) and heard[5] == apt.HOST
-            if layout is None or not known or (long and length != layout.payload_bytes):
-                del heard[0]
-                continue
-            size = apt.HEADER_BYTES + layout.payload_bytes
-            if len(heard) < size:
-                return
-            body = bytes(heard[:size])
-            del heard[:size]
-            fields = (
-                struct.unpack_from("<" + layout.payload, body, apt.HEADER_BYTES)
-                if layout.payload
-                else body[2:4]
-            )
-            self._obey(
-                layout.name,
-                body[4] & ~apt.LONG,
-                dict(zip(layout.fields, fields, strict=False)),
-                at_ns,
-            )
 
     def _obey(self, name: str, address: int, values: dict[str, int], at_ns: int) -> None:
         self._complete(at_ns)
@@ -282,17 +248,8 @@ class AptModel:
             pulses = self._settings.get("set_rack_trigger")
             wired = self._settings.get("set_rack_port", {}).get("mode") == 1
             modes = {pulses["out_mode"]} if pulses and wired and self._armed else set()
-        self.axis.pattern = None
-        if pulses is None:
-            return
-        steps: list[tuple[float, float, int] | None] = []
-        for sense, own_mode in (("forward", 0x0D), ("reverse", 0x0E)):
-            first, interval, count = (
-                pulses[f"{field}_{sense}"] for field in ("start", "interval", "count")
-            )
-            on = bool(modes & {own_mode, 0x0F}) and interval > 0
-            steps.append((self.scale.mm(first), self.scale.mm(interval), count) if on else None)
-        self.axis.pattern = PulsePattern(steps[0], steps[1], pulses["width_us"] * 1000)
+        forward, reverse = bool(modes & {0x0D, 0x0F}), bool(modes & {0x0E, 0x0F})
+        self.axis.pattern = pulse_pattern(pulses, forward, reverse, self.scale) if pulses else None
 
     # What the controller sends
 
@@ -321,24 +278,8 @@ class AptModel:
         self._say("info", address, at_ns, model=model, notes=b"", channels=1, **values, **versions)
 
     def _tell_axis(self, at_ns: int) -> None:
-        speed, acceleration = self._limits
         low, high = self.axis.travel_mm
-        counts = self.scale
-        self._say(
-            "axis",
-            at_ns=at_ns,
-            channel=1,
-            stage=0,
-            axis=0,
-            part=b"DDS220",
-            serial=45_000_001,
-            counts_per_unit=round(counts.counts_per_mm),
-            minimum=0,
-            maximum=counts.position(high - low),
-            acceleration=counts.acceleration(acceleration),
-            deceleration=counts.acceleration(EMERGENCY_MM_S2),
-            velocity=counts.velocity(speed),
-        )
+        self._say("axis", 0, at_ns, **stage_data(high - low, *self._limits, self.scale))
 
     def _say_status(self, name: str, at_ns: int) -> None:
         self._unacknowledged += 1
@@ -356,27 +297,22 @@ class AptModel:
         )
 
     def _bits(self, at_ns: int) -> int:
-        velocity = self.axis.velocity_mm_s(at_ns)
-        moving = bool(self._ending)
-        here, (low, high) = self.axis.position_mm(at_ns), self.axis.travel_mm
-        blocked = self.axis.obstacle_mm is not None and abs(here - self.axis.obstacle_mm) < 1e-6
-        return self.extra_bits | sum(
-            mask
-            for mask, holds in (
-                (0x0000_0001, here >= high + 1e-6 or blocked),
-                (0x0000_0002, here <= low - 1e-6),
-                (0x0000_0010, moving and velocity > 0.0),
-                (0x0000_0020, moving and velocity < 0.0),
-                (0x0000_0100, True),
-                (0x0000_0200, self._ending == "homed"),
-                (0x0000_0400, self.homed),
-                (0x0000_1000, self.enabled),
-                (0x0000_2000, self.enabled and not moving),
-                (0x0000_4000, self.axis.stalled and moving),
-                (0x1000_0000, True),
-                (0x8000_0000, self.enabled),
+        ending = self._ending
+        return (
+            self.extra_bits
+            | self.axis.bits(at_ns, bool(ending), self.enabled)
+            | sum(
+                mask
+                for mask, holds in (
+                    (0x0000_0100, True),
+                    (0x0000_0200, ending == "homed"),
+                    (0x0000_0400, self.homed),
+                    (0x0000_1000, self.enabled),
+                    (0x1000_0000, True),
+                    (0x8000_0000, self.enabled),
+                )
+                if holds
             )
-            if holds
         )
 
     def _say(
@@ -384,17 +320,5 @@ class AptModel:
     ) -> None:
         if self.mute or name in self.withheld:
             return
-        layout = _ANSWERS[name]
-        if name in ("moved", "stopped") and not values:
-            layout = apt.FROM_CONTROLLER[layout.id][0]
-        fields = [values.get(field, 0) for field in layout.fields]
-        source = source or self._address
-        if layout.payload:
-            payload = struct.pack("<" + layout.payload, *fields)
-            head = struct.pack("<HHBB", layout.id, len(payload), apt.HOST | apt.LONG, source)
-        else:
-            payload = b""
-            first, second = (*fields, 0, 0)[:2]
-            head = struct.pack("<HBBBB", layout.id, first, second, apt.HOST, source)
-        frame = self.disturbance.apply(head + payload)
+        frame = self.disturbance.apply(answer(name, source or self._address, **values))
         self._out.put(frame, self._clock_ns() if at_ns is None else at_ns)

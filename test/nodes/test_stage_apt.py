@@ -84,7 +84,7 @@ def test_moves_with_odometry_on_the_true_motion(
 
 
 def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Observer) -> None:
-    """driver: the node leaves the active state. user reads: stage lost: the stage's port failed."""
+    """driver: the node leaves the active state; user reads: stage lost: the stage's port failed."""
     process = NodeProcess(
         "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
     )
@@ -103,7 +103,7 @@ def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Ob
 
 
 def test_fault_x3_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
-    """driver: stops the carriage, closes the port, within 2 s. user reads: nothing; exit code 0."""
+    """driver: stops the carriage, closes the port, within 2 s; user reads: nothing; exit code 0."""
     model = AptModel(time.time_ns, power_up_mm=150.0)
     with PtyPort(model, tmp_path / "stage") as _:
         process = NodeProcess(

@@ -28,7 +28,7 @@ def at_rest(bench: AptBench) -> bool:
 
 
 def test_fault_s1_garbage_in_a_move() -> None:
-    """driver: skips it and goes on. user reads: skipped_bytes in the diagnostics."""
+    """driver: skips it and goes on; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
     bench = AptBench()
     bench.stage.move_to(200.0, 100.0)
@@ -40,7 +40,7 @@ def test_fault_s1_garbage_in_a_move() -> None:
 
 
 def test_fault_s2_lost_bytes_in_a_move() -> None:
-    """driver: asks again for what got lost. user reads: broken_frames and skipped_bytes."""
+    """driver: asks again for what got lost; user reads: broken_frames and skipped_bytes."""
     bench = AptBench(seed=3)
     bench.model.disturbance.loss_share = 0.05
     bench.move(200.0, 50.0)
@@ -51,7 +51,7 @@ def test_fault_s2_lost_bytes_in_a_move() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 def test_fault_s3_flipped_bits(rests: bool) -> None:
-    """driver: believes no single odd message, asks again. user reads: statuses_rejected."""
+    """driver: believes no single odd message, asks again; user reads: statuses_rejected."""
     bench = AptBench()
     bench.move(100.0)
     if not rests:
@@ -67,7 +67,7 @@ def test_fault_s3_flipped_bits(rests: bool) -> None:
 
 
 def test_fault_s3_two_running() -> None:
-    """driver: stops. user reads: two status messages running make no sense; check the cable."""
+    """driver: stops; user reads: two status messages running make no sense; check the cable."""
     bench = moving()
     bench.model.disturbance.flips = 2
     bench.model.disturbance.flip_bit = 16 + 21
@@ -83,7 +83,7 @@ def test_fault_s3_two_running() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 def test_fault_s4_encoder_jump(rests: bool) -> None:
-    """driver: two readings stop it. user reads: the encoder jumped by ... mm; home again."""
+    """driver: two readings stop it; user reads: the encoder jumped by ... mm; home again."""
     bench = AptBench()
     if not rests:
         bench.stage.move_to(200.0, 100.0)
@@ -98,7 +98,7 @@ def test_fault_s4_encoder_jump(rests: bool) -> None:
 
 
 def test_fault_s5_stall() -> None:
-    """driver: profiled stop, immediate stop, disable. user reads: stuck at ... on its move."""
+    """driver: profiled stop, immediate stop, disable; user reads: stuck at ... on its move."""
     bench = moving()
     bench.model.axis.freeze(bench.clock_ns())
     begun_ns = bench.now_ns
@@ -113,7 +113,7 @@ def test_fault_s5_stall() -> None:
 
 
 def test_fault_s5_position_error() -> None:
-    """driver: the same as for a stall. user reads: the stage is stuck at ..."""
+    """driver: the same as for a stall; user reads: the stage is stuck at ..."""
     bench = moving()
     bench.model.extra_bits = 0x4000
     assert "stuck at" in bench.failure()
@@ -121,7 +121,7 @@ def test_fault_s5_position_error() -> None:
 
 
 def test_fault_s6_unplug() -> None:
-    """driver: fails at once, every order after it, too. user reads: the stage's port failed: ..."""
+    """driver: fails at once, every order after it, too; user reads: the stage's port failed: ..."""
     bench = moving()
     bench.model.gone = True
     assert "port failed" in bench.failure()
@@ -132,7 +132,7 @@ def test_fault_s6_unplug() -> None:
 
 
 def test_fault_s6_silent_link() -> None:
-    """driver: warns after 0.5 s, fails after 1.5 s. user reads: silent for 1.5 s; check power."""
+    """driver: warns after 0.5 s, fails after 1.5 s; user reads: silent for 1.5 s; check power."""
     bench = AptBench()
     bench.model.mute = True
     bench.advance(0.7)
@@ -144,7 +144,7 @@ def test_fault_s6_silent_link() -> None:
 
 
 def test_fault_s7_limit_in_a_move() -> None:
-    """driver: stops, lets only back. user reads: met a limit at ... mm; move it back first."""
+    """driver: stops, lets only back; user reads: met a limit at ... mm; move it back first."""
     bench = AptBench()
     bench.model.axis.obstacle_mm = 80.0
     bench.move(200.0, 100.0)
@@ -160,7 +160,7 @@ def test_fault_s7_limit_in_a_move() -> None:
 
 
 def test_fault_s8_end_messages_missing() -> None:
-    """driver: finds the end of homing, move and stop in the status. user reads: nothing."""
+    """driver: finds the end of homing, move and stop in the status; user reads: nothing."""
     bench = AptBench(home=False)
     bench.model.withheld = {"moved", "stopped", "homed"}
     bench.stage.home()
@@ -174,7 +174,7 @@ def test_fault_s8_end_messages_missing() -> None:
 
 
 def test_fault_s9_keep_alive() -> None:
-    """driver: keeps alive from the writer's thread twice a second. user reads: nothing."""
+    """driver: keeps alive from the writer's thread twice a second; user reads: nothing."""
     bench = AptBench()
     bench.advance(5.0)
     sent = bench.sent(KEEP_ALIVE)
@@ -183,7 +183,7 @@ def test_fault_s9_keep_alive() -> None:
 
 
 def test_fault_s9_keep_alive_lost() -> None:
-    """driver: takes the silence for a dead link. user reads: silent for 1.5 s; check its power."""
+    """driver: takes the silence for a dead link; user reads: silent for 1.5 s; check its power."""
     bench = AptBench()
     for timer in bench.link._timers:
         if timer.period_ns == 500_000_000:
@@ -192,7 +192,7 @@ def test_fault_s9_keep_alive_lost() -> None:
 
 
 def test_fault_s10_not_enabled() -> None:
-    """driver: does not come up. user reads: does not enable the axis; check its front panel."""
+    """driver: does not come up; user reads: does not enable the axis; check its front panel."""
     bench = AptBench(home=False)
     bench.model.panel_disabled, bench.model.enabled = True, False
     with pytest.raises(DeviceError, match=r"does not enable the axis; check its front panel"):
@@ -200,14 +200,14 @@ def test_fault_s10_not_enabled() -> None:
 
 
 def test_fault_s10_disabled_later() -> None:
-    """driver: stops. user reads: does not have the axis enabled any more; configure and home."""
+    """driver: stops; user reads: does not have the axis enabled any more; configure and home."""
     bench = moving()
     bench.model.enabled = False
     assert "axis enabled any more" in bench.failure()
 
 
 def test_fault_s10_ignored_move() -> None:
-    """driver: sees no motion within 0.3 s. user reads: does not begin its move within 0.3 s."""
+    """driver: sees no motion within 0.3 s; user reads: does not begin its move within 0.3 s."""
     bench = AptBench()
     bench.model.ignores_moves = True
     bench.stage.move_to(100.0, 100.0)
@@ -218,7 +218,7 @@ def test_fault_s10_ignored_move() -> None:
 
 @pytest.mark.parametrize("text", ["", "Motor over temperature"])
 def test_fault_s11_error_message(text: str) -> None:
-    """driver: stops. user reads: the controller's code and words, or to look at its display."""
+    """driver: stops; user reads: the controller's code and words, or to look at its display."""
     bench = moving()
     bench.model.complain(17, text)
     read = bench.failure()
@@ -227,7 +227,7 @@ def test_fault_s11_error_message(text: str) -> None:
 
 
 def test_fault_s11_fault_bits() -> None:
-    """driver: stops when two messages say so. user reads: controller reports over_temperature."""
+    """driver: stops when two messages say so; user reads: controller reports over_temperature."""
     bench = moving()
     bench.model.extra_bits = 0x20000
     assert "reports over_temperature" in bench.failure()
@@ -236,7 +236,7 @@ def test_fault_s11_fault_bits() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 def test_fault_s12_controller_restarts(rests: bool) -> None:
-    """driver: stops. user reads: does not have its reference any more; configure and home."""
+    """driver: stops; user reads: does not have its reference any more; configure and home."""
     bench = AptBench()
     bench.move(60.0)
     if not rests:
@@ -252,7 +252,7 @@ def test_fault_s12_controller_restarts(rests: bool) -> None:
 
 
 def test_fault_s13_double_replies() -> None:
-    """driver: takes each answer once, by message and source. user reads: nothing."""
+    """driver: takes each answer once, by message and source; user reads: nothing."""
     bench = AptBench()
     bench.model.disturbance.repeats = 10_000
     bench.move(100.0)
@@ -261,7 +261,7 @@ def test_fault_s13_double_replies() -> None:
 
 
 def test_fault_s13_late_reply() -> None:
-    """driver: asks again, and the late answer harms nobody. user reads: nothing."""
+    """driver: asks again, and the late answer harms nobody; user reads: nothing."""
     late = {"ns": 0}
     bench = AptBench(late_ns=lambda: late["ns"])
     late["ns"] = 350_000_000
@@ -272,7 +272,7 @@ def test_fault_s13_late_reply() -> None:
 
 
 def test_fault_x1_host_stalls_in_a_move() -> None:
-    """driver: positions stay interpolated, the pause is filled in later. user reads: nothing."""
+    """driver: positions stay interpolated, the pause is filled in later; user reads: nothing."""
     bench = AptBench()
     bench.stage.move_to(200.0, 100.0)
     bench.advance(0.5)
@@ -288,7 +288,7 @@ def test_fault_x1_host_stalls_in_a_move() -> None:
 
 
 def test_fault_x3_close_while_homing() -> None:
-    """driver: stops and closes within 2 s, twice if need be. user reads: nothing."""
+    """driver: stops and closes within 2 s, twice if need be; user reads: nothing."""
     bench = AptBench(AptSettings(homing_mm_s=10.0), home=False, power_up_mm=150.0)
     bench.stage.home()
     bench.advance(1.0)

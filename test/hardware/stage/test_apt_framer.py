@@ -32,7 +32,7 @@ def test_frames_in_any_pieces() -> None:
 
 
 def test_fault_s1_garbage_between_frames() -> None:
-    """driver: skips it byte by byte and counts. user reads: skipped_bytes in the diagnostics."""
+    """driver: skips it byte by byte and counts; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
     for _ in range(200):
         garbage = chance.randbytes(chance.randrange(1, 40))
@@ -61,7 +61,7 @@ def test_nothing_but_known_frames_for_the_host_passes() -> None:
 
 
 def test_fault_s2_lost_bytes() -> None:
-    """driver: loses one or two frames a cut, never more. user reads: broken_frames counted."""
+    """driver: loses one or two frames a cut, never more; user reads: broken_frames counted."""
     chance = random.Random(2)
     framer = AptFramer()
     kept = []

@@ -61,7 +61,7 @@ def test_home_move_stop_and_close(port: str, model: AptModel) -> None:
 
 
 def test_fault_x2_second_client(port: str) -> None:
-    """driver: the port is opened exclusively. user reads: another program holds ...; close it."""
+    """driver: the port is opened exclusively; user reads: another program holds ...; close it."""
     stage = opened(port)
     try:
         with pytest.raises(DeviceError, match=r"another program holds .*stage; close it"):
@@ -71,7 +71,7 @@ def test_fault_x2_second_client(port: str) -> None:
 
 
 def test_fault_s6_unplug_on_the_port(port: str, model: AptModel) -> None:
-    """driver: its threads end, orders fail. user reads: the stage's port failed; check cable."""
+    """driver: its threads end, orders fail; user reads: the stage's port failed; check cable."""
     stage = opened(port)
     model.gone = True
     wait(lambda: not stage.healthy)

@@ -1,0 +1,58 @@
+"""APT frames from the controller's side: commands taken apart, answers put together."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+from eschorty_ros.hardware.stage import apt_messages as apt
+
+_HOST_LAYOUTS = {layout.id: layout for layout in apt.TO_CONTROLLER.values()}
+_ANSWERS = {
+    layout.name: layout
+    for layouts in apt.FROM_CONTROLLER.values()
+    for layout in layouts  # the long form of a message comes last
+}
+
+
+class HostFrames:
+    """Commands out of the bytes a host sends; what is none is skipped byte by byte."""
+
+    def __init__(self) -> None:
+        self._heard = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[tuple[str, int, dict[str, int]]]:
+        """Name, address and fields of each command that is whole with ``data``."""
+        heard = self._heard
+        heard += data
+        while len(heard) >= apt.HEADER_BYTES:
+            id, length = struct.unpack_from("<HH", heard)
+            layout = _HOST_LAYOUTS.get(id)
+            long = bool(heard[4] & apt.LONG)
+            known = layout is not None and long == bool(layout.payload) and heard[5] == apt.HOST
+            if layout is None or not known or (long and length != layout.payload_bytes):
+                del heard[0]
+                continue
+            size = apt.HEADER_BYTES + layout.payload_bytes
+            if len(heard) < size:
+                return
+            body = bytes(heard[:size])
+            del heard[:size]
+            fields = (
+                struct.unpack_from("<" + layout.payload, body, apt.HEADER_BYTES)
+                if layout.payload
+                else body[2:4]
+            )
+            yield layout.name, body[4] & ~apt.LONG, dict(zip(layout.fields, fields, strict=False))
+
+
+def answer(name: str, source: int, **values: int | bytes) -> bytes:
+    """Frame of the message ``name`` to the host; fields that are not given are 0."""
+    layout = _ANSWERS[name]
+    fields = [values.get(field, 0) for field in layout.fields]
+    if layout.payload:
+        payload = struct.pack("<" + layout.payload, *fields)
+        head = struct.pack("<HHBB", layout.id, len(payload), apt.HOST | apt.LONG, source)
+        return head + payload
+    first, second = (*fields, 0, 0)[:2]
+    return struct.pack("<HBBBB", layout.id, first, second, apt.HOST, source)
