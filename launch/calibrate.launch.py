@@ -7,20 +7,31 @@ ros2 launch eschorty_ros calibrate.launch.py --show-args
 from launch.substitutions import LaunchConfiguration
 from launch_ros.parameter_descriptions import ParameterValue
 
-from eschorty_ros.nodes.launching import declare, driver, node, number, reliable, text
+from eschorty_ros.nodes.launching import (
+    bench,
+    declare,
+    driver,
+    node,
+    number,
+    reliable,
+    text,
+    trigger_input,
+)
 from launch import LaunchDescription
 
 ARGUMENTS = (
     (
         "fake",
         "true",
-        "true: simulated camera, laser and stage; false: real ones",
+        "true: real drivers at an emulated bench; false: at real devices",
         ["true", "false"],
     ),
-    ("scene", "posts", "what a simulated camera sees: a scene's name or a mesh", None),
+    ("scene", "posts", "what stands on an emulated bench: a scene's name or a mesh", None),
     ("calibration", "config_3", "optical build as designed: a name in config/ or a file", None),
-    ("as_built", "config_3_as_built", "build that a simulated world really has", None),
-    ("pixels", "paper", "event pixels of a simulated camera", ["paper", "ideal", "noisy"]),
+    ("as_built", "config_3_as_built", "build that an emulated bench really has", None),
+    ("pixels", "paper", "event pixels of an emulated camera", ["paper", "ideal", "noisy"]),
+    ("trigger", "stage", "what is wired to the camera's trigger input: none, laser or stage",
+     ["none", "laser", "stage"]),
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000", None),
     ("distances", "posts", "what is known of the targets: a name in config/ or a CSV file", None),
     ("method", "joint", "what is fitted: k', b' and more under priors, or k' and b' alone",
@@ -37,10 +48,7 @@ def generate_launch_description():
     parameters = {
         "camera": {
             "driver": driver("evk4"),
-            "scene": text("scene"),
-            "calibration": text("calibration"),
-            "as_built": text("as_built"),
-            "pixels": text("pixels"),
+            "trigger_in_mode": trigger_input(),
             **reliable("publisher"),
         },
         "laser": {"driver": driver("awg"), "frequency": number("frequency")},
@@ -48,6 +56,7 @@ def generate_launch_description():
         "reconstruction": {
             "calibration": text("calibration"),
             "calibration_folder": text("calibration_folder"),
+            "trigger_source": text("trigger"),
             "distances": text("distances"),
             "method": text("method"),
             "capture_time": number("capture_time"),
@@ -58,4 +67,5 @@ def generate_launch_description():
         },
     }
     nodes = [node(name, table) for name, table in parameters.items()]
-    return LaunchDescription([*declare(ARGUMENTS), *nodes])
+    emulated = bench(scene="scene", calibration="as_built", pixels="pixels", trigger="trigger")
+    return LaunchDescription([*declare(ARGUMENTS), emulated, *nodes])

@@ -10,29 +10,45 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.parameter_descriptions import ParameterValue
 
-from eschorty_ros.nodes.launching import declare, driver, node, number, reliable, rviz, text
+from eschorty_ros.nodes.launching import (
+    bench,
+    declare,
+    driver,
+    node,
+    number,
+    reliable,
+    rviz,
+    text,
+    trigger_input,
+)
 from launch import LaunchDescription
 
 ARGUMENTS = (
     (
         "fake",
         "true",
-        "true: simulated camera, laser and stage; false: real ones",
+        "true: real drivers at an emulated bench; false: at real devices",
         ["true", "false"],
     ),
     (
         "scene",
         "steps",
-        "what a simulated camera sees: steps, plane, tilted, sphere, leaves, face, posts, receding "
-        "or a mesh",
+        "what stands on an emulated bench: steps, plane, tilted, sphere, leaves, face, posts, "
+        "receding or a mesh",
         None,
     ),
     ("calibration", "config_3", "optical build: a name in config/ or the path of a file", None),
     (
         "pixels",
         "paper",
-        "event pixels of a simulated camera",
+        "event pixels of an emulated camera",
         ["paper", "ideal", "noisy", "narrow"],
+    ),
+    (
+        "trigger",
+        "stage",
+        "what is wired to the camera's trigger input: none, laser or stage",
+        ["none", "laser", "stage"],
     ),
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000: one profile per period", None),
     ("speed", "0.05", "stage speed, m/s", None),
@@ -48,14 +64,16 @@ def nodes():
     parameters = {
         "camera": {
             "driver": driver("evk4"),
-            "scene": text("scene"),
-            "calibration": text("calibration"),
-            "pixels": text("pixels"),
+            "trigger_in_mode": trigger_input(),
             **reliable("publisher"),
         },
         "laser": {"driver": driver("awg"), "frequency": number("frequency")},
         "stage": {"driver": driver("apt")},
-        "reconstruction": {"calibration": text("calibration"), **reliable("subscription")},
+        "reconstruction": {
+            "calibration": text("calibration"),
+            "trigger_source": text("trigger"),
+            **reliable("subscription"),
+        },
         "scanner": {
             "auto_scan": ParameterValue(LaunchConfiguration("auto_scan"), value_type=bool),
             "start": number("start"),
@@ -67,9 +85,12 @@ def nodes():
 
 
 def generate_launch_description():
-    """Arguments, nodes; RViz on request, and closing it ends everything."""
+    """Arguments, bench, nodes; RViz on request, and closing it ends everything."""
     view = rviz()
     ending = OnProcessExit(
         target_action=view, on_exit=[EmitEvent(event=Shutdown(reason="RViz closed"))]
     )
-    return LaunchDescription([*declare(ARGUMENTS), *nodes(), view, RegisterEventHandler(ending)])
+    emulated = bench(scene="scene", calibration="calibration", pixels="pixels", trigger="trigger")
+    return LaunchDescription(
+        [*declare(ARGUMENTS), emulated, *nodes(), view, RegisterEventHandler(ending)]
+    )

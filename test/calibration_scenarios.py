@@ -14,7 +14,7 @@ from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
 from rclpy.action import ActionClient
 from ros_process import Observer, wait_until
-from scan_scenarios import EVENTS, SCAN_DEADLINE_S, Bench
+from scan_scenarios import EVENTS, SCAN_DEADLINE_S, Bench, device_parameters
 from std_msgs.msg import Bool
 
 from eschorty_ros.core.calibration import load_calibration, save_calibration
@@ -29,25 +29,18 @@ POSTS = bench_of_posts()
 TRUE_MM = np.linspace(800.0, 2100.0, 131)
 
 
-def camera_parameters(scene: str) -> dict[str, Any]:
-    """Parameters of a simulated camera whose world is not built as its calibration says."""
-    return {
-        "scene": scene,
-        "calibration": CALIBRATION,
-        "as_built": AS_BUILT,
-        "seed": 7,
-        f"{EVENTS}.publisher.reliability": "reliable",
-    }
+def bench_settings(laser_log: Path, scene: str) -> dict[str, Any]:
+    """A bench that is not built as the calibration says."""
+    return {"scene": scene, "calibration": AS_BUILT, "seed": 7, "laser_log": str(laser_log)}
 
 
-def node_parameters(laser_log: Path, folder: Path, scene: str) -> dict[str, dict[str, Any]]:
+def node_parameters(bench_folder: Path, folder: Path) -> dict[str, dict[str, Any]]:
     """Modules and parameters of the five nodes; calibrations are written to ``folder``."""
     return {
-        "eschorty_ros.nodes.laser": {"fake_log": laser_log},
-        "eschorty_ros.nodes.stage": {},
-        "eschorty_ros.nodes.camera": camera_parameters(scene),
+        **device_parameters(bench_folder),
         "eschorty_ros.nodes.reconstruction": {
             "calibration": CALIBRATION,
+            "trigger_source": "stage",
             "calibration_folder": folder,
             f"{EVENTS}.subscription.reliability": "reliable",
         },
@@ -138,7 +131,7 @@ def scan_error_mm(bench: CalibrationBench) -> np.ndarray:
     before = len(bench.clouds)
     status, result = bench.scan()
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    points = bench.cloud_after(before)
+    points = bench.cloud_after(before, result.points)
     error_mm = range_error_mm(points, named(KNOWN_SCENE), load_calibration(AS_BUILT).model())
     error_mm = error_mm[np.isfinite(error_mm)]
     assert len(error_mm) > 10_000

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from launch.actions import ExecuteProcess
 from ros_process import NAMESPACE, domain_environment
+
+from eschorty_ros.emulation.bench_process import bench_command
 
 
 def node_process(module: str, parameters: Mapping[str, Any], domain: int) -> ExecuteProcess:
@@ -21,3 +24,9 @@ def node_process(module: str, parameters: Mapping[str, Any], domain: int) -> Exe
         additional_env=domain_environment(domain),
         output="screen",
     )
+
+
+def bench_action(folder: Path, settings: Mapping[str, Any]) -> ExecuteProcess:
+    """A bench in ``folder`` as launch starts it."""
+    options = {name.replace("_", "-"): value for name, value in settings.items()}
+    return ExecuteProcess(cmd=bench_command(folder, options), name="bench", output="screen")

@@ -19,9 +19,9 @@ ROOT = Path(__file__).resolve().parents[1]
 LOGGED = """
 import functools, sys
 from eschorty_ros.nodes import one_process
-made = one_process.calibration_parameters
+made = one_process.bench_options
 log, seconds = sys.argv.pop(1), float(sys.argv.pop(1))
-one_process.calibration_parameters = lambda job: made(job) | {"laser": {"fake_log": log}}
+one_process.bench_options = lambda job: made(job) | {"laser-log": log}
 one_process.OneCalibration = functools.partial(one_process.OneCalibration, capture_s=seconds)
 from eschorty_ros.cli import main
 main(prog_name="eschorty")
@@ -30,7 +30,7 @@ main(prog_name="eschorty")
 
 @pytest.fixture
 def command(tmp_path):
-    """Starts the command as a process; the simulated laser logs to `laser.log`."""
+    """Starts the command as a process; the emulated generator logs to `laser.log`."""
     started = []
     environment = {key: value for key, value in os.environ.items() if key != "ROS_DOMAIN_ID"}
 
@@ -54,7 +54,7 @@ def command(tmp_path):
 
 
 def outputs(tmp_path):
-    """States in the simulated laser's log, in order."""
+    """States in the emulated generator's log, in order."""
     log = tmp_path / "laser.log"
     return re.findall(r"\b(on|off)\b", log.read_text().lower()) if log.exists() else []
 

@@ -21,9 +21,9 @@ ROOT = Path(__file__).resolve().parents[1]
 LOGGED = """
 import sys
 from eschorty_ros.nodes import one_process
-made = one_process.parameters
+made = one_process.bench_options
 log = sys.argv.pop(1)
-one_process.parameters = lambda scan: made(scan) | {"laser": {"fake_log": log}}
+one_process.bench_options = lambda job: made(job) | {"laser-log": log}
 from eschorty_ros.cli import main
 main(prog_name="eschorty")
 """
@@ -31,7 +31,7 @@ main(prog_name="eschorty")
 
 @pytest.fixture
 def command(tmp_path):
-    """Starts `eschorty scan` as a process; the simulated laser logs to `laser.log`."""
+    """Starts `eschorty scan` as a process; the emulated generator logs to `laser.log`."""
     started = []
     environment = {key: value for key, value in os.environ.items() if key != "ROS_DOMAIN_ID"}
 
@@ -56,7 +56,7 @@ def command(tmp_path):
 
 
 def outputs(log):
-    """States in the simulated laser's log, in order."""
+    """States in the emulated generator's log, in order."""
     return re.findall(r"\b(on|off)\b", log.read_text().lower()) if log.exists() else []
 
 

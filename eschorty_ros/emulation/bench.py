@@ -16,18 +16,10 @@ import click
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.emulation.bench_devices import Bench, BenchSettings
-from eschorty_ros.emulation.bench_folder import (
-    READY_FILE,
-    STAGE_PORT,
-    USB_SOCKET,
-    default_folder,
-    stage_port,
-    usb_spec,
-)
+from eschorty_ros.emulation.bench_folder import default_folder, stage_port, usb_spec
 from eschorty_ros.emulation.bench_physics import TRIGGERS, Imperfections
-from eschorty_ros.emulation.faults import FaultPlan, FaultScript, load_fault_plan
-from eschorty_ros.emulation.pty_port import PtyPort
-from eschorty_ros.emulation.usb_server import UsbServer
+from eschorty_ros.emulation.bench_server import serving
+from eschorty_ros.emulation.faults import FaultPlan, load_fault_plan
 from eschorty_ros.simulation.presets import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
 
@@ -69,11 +61,7 @@ def serve(folder: Path, settings: BenchSettings, faults: FaultPlan) -> None:
     ending = _Ending()
     with _folder_of_its_own(folder):
         bench = Bench(settings)
-        with (
-            FaultScript(faults, bench.by_name(), bench.physics.clock_ns) as script,
-            UsbServer(folder / USB_SOCKET, bench.usb_devices) as usb,
-            PtyPort(script.line(), folder / STAGE_PORT, lock=bench.physics.lock),
-        ):
+        with serving(bench, folder, faults) as usb:
             _announce(folder, settings)
             ending.wait()
             # Ctrl-C reaches the nodes, too: on their way out they need their devices.
@@ -83,9 +71,6 @@ def serve(folder: Path, settings: BenchSettings, faults: FaultPlan) -> None:
 
 
 def _announce(folder: Path, settings: BenchSettings) -> None:
-    ready = folder / READY_FILE
-    ready.with_suffix(".new").write_text(f"{os.getpid()}\n")
-    ready.with_suffix(".new").replace(ready)
     print(
         f"bench: {settings.scene}, {settings.calibration}; trigger {settings.trigger}; "
         f"USB {usb_spec(folder)}, stage {stage_port(folder)}",
@@ -109,10 +94,7 @@ def _folder_of_its_own(folder: Path) -> Iterator[None]:
             raise DeviceError(
                 f"bench folder {folder}: another bench uses it; end it or choose another folder"
             ) from error
-        try:
-            yield
-        finally:
-            (folder / READY_FILE).unlink(missing_ok=True)
+        yield
 
 
 @click.command(

@@ -69,13 +69,13 @@ class Bench:
     def __init__(
         self, settings: BenchSettings, clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        scene = named(settings.scene)
+        self._scene = named(settings.scene)
         calibration = load_calibration(settings.calibration)
         pixels = preset(settings.pixels)
         warm_up(calibration)
 
         def world() -> World:
-            return World(scene, calibration, pixels, settings.seed, settings.background_hz)
+            return World(self._scene, calibration, pixels, settings.seed, settings.background_hz)
 
         self.physics = Physics(
             world,
@@ -90,6 +90,10 @@ class Bench:
         # A command and the world's present exclude each other.
         self.laser.mutex = self.physics.lock
         self.camera = Evk4Model(self.physics)
+
+    def look_at(self, scene: str) -> None:
+        """Put another scene in front of the camera, for the next start of its stream."""
+        self._scene = named(scene)
 
     def by_name(self) -> dict[str, Any]:
         """Name the models as fault plans do."""

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     # Only names: the process that guards the laser starts without numpy.
     from eschorty_ros.core.modulation import Modulation
-    from eschorty_ros.core.motion import MotionPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +183,6 @@ class LinearStage(Protocol):
 
     def statistics(self) -> dict[str, float]:
         """Counters for diagnostics, by name with unit."""
-
-    def plan(self) -> MotionPlan | None:
-        """Tell the motion under way in host time, ``None`` when the device does not know it."""
 
     def close(self) -> None:
         """Stop and release; idempotent."""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import threading
 from typing import Any
 
 from event_camera_msgs.msg import EventPacket
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import TimeReference
 from std_srvs.srv import Trigger
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
@@ -18,32 +15,26 @@ from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
 from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.neuromorphic import NeuromorphicEvk4
 from eschorty_ros.hardware.protocols import EventSource
-from eschorty_ros.msg import LaserState, StageMotion
+from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.camera_packets import PacketPublisher
 from eschorty_ros.nodes.camera_parameters import (
     EVK4_TABLE,
-    FAKE_TABLE,
     missing_bias_file,
 )
-from eschorty_ros.nodes.conversions import ns_from_stamp, stamp_from_ns
-from eschorty_ros.nodes.device_messages import plan_from_motion, readback_from_state
 from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.packets import SIZE_MAX_BYTES
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
-from eschorty_ros.simulation.fake_camera import FakeCamera
 
 READ_TIMEOUT_S = 0.02
 STOP_TIMEOUT_S = 3.0
-REPORT_DEPTH = 1000
 
 _LOSSES = ("drops", "gaps", "sensor_drop_words")
 
 TABLE = (
-    drivers.DRIVER,
-    *FAKE_TABLE,
+    *drivers.DRIVER,
     *EVK4_TABLE,
     Param("frame_id", "eschorty_optical", "frame of the packets' headers"),
     Param("event_message_time_threshold", 0.004, "age at which a packet leaves", "s", 0.0, 1.0),
@@ -59,12 +50,10 @@ TABLE = (
 
 
 class CameraNode(DeviceNode):
-    """Topics ``camera/events`` and ``camera/clock``; biases as parameters.
+    """Topic ``camera/events``; biases as parameters.
 
     A packet's stamp is the host time at which its first byte arrived. While a lost camera is
     looked for the node stays active and reports an error; the stream then restarts at ``seq`` 0.
-    A simulated camera is told what ``laser/state`` and ``stage/motion`` say, with their stamps as
-    the times until which they are final, so it sees both exactly, however late the messages come.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -83,21 +72,8 @@ class CameraNode(DeviceNode):
             qos_overriding_options=qos.overridable(),
         )
         self._packets = PacketPublisher(events, 1280, 720, self.parameters["frame_id"])
-        self._clock_reference = self.create_publisher(TimeReference, "camera/clock", qos.latched())
-        reports = MutuallyExclusiveCallbackGroup()
         self.create_subscription(
-            LaserState,
-            "laser/state",
-            self._on_laser,
-            qos.latched(REPORT_DEPTH),
-            callback_group=reports,
-        )
-        self.create_subscription(
-            StageMotion,
-            "stage/motion",
-            self._on_stage,
-            qos.stream(REPORT_DEPTH),
-            callback_group=reports,
+            LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )
         self.create_service(Trigger, "~/save_biases", self._save_biases)
         self.create_service(Trigger, "~/dump_statistics", self._dump_statistics)
@@ -134,11 +110,6 @@ class CameraNode(DeviceNode):
             self.parameters["event_message_size_threshold"],
         )
         source.start()
-        if isinstance(source, FakeCamera):
-            reference = TimeReference(source=source.identity.serial)
-            reference.header.stamp = stamp_from_ns(source.sensor_zero_ns())
-            reference.header.frame_id = self.parameters["frame_id"]
-            self._clock_reference.publish(reference)
         self._ending.clear()
         self._thread = threading.Thread(
             target=self._stream, args=(source,), name="camera stream", daemon=True
@@ -238,25 +209,7 @@ class CameraNode(DeviceNode):
         return response
 
     def _on_laser(self, message: LaserState) -> None:
-        with self._refused():
-            readback = readback_from_state(message)
-            self._laser_hz = readback.modulation.frequency_hz
-            if isinstance(self._source, FakeCamera):
-                self._source.observe_laser(readback, ns_from_stamp(message.header.stamp))
-
-    def _on_stage(self, message: StageMotion) -> None:
-        if isinstance(self._source, FakeCamera):
-            with self._refused():
-                self._source.observe_stage(
-                    plan_from_motion(message), ns_from_stamp(message.header.stamp)
-                )
-
-    @contextlib.contextmanager
-    def _refused(self) -> Any:
-        try:
-            yield
-        except EschortyError as error:
-            self.get_logger().error(f"report refused: {error}")
+        self._laser_hz = message.frequency
 
     def _report(self) -> diagnostics.Report:
         source, packets, words = self._source, self._packets, self._packets.words

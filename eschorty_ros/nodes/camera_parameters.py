@@ -16,29 +16,6 @@ from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACK
 from eschorty_ros.hardware.camera.pixel_selection import windows_of
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
 from eschorty_ros.nodes.parameters import Param
-from eschorty_ros.simulation.presets import PRESETS
-from eschorty_ros.simulation.world import BACKGROUND_HZ
-
-FAKE_TABLE = (
-    Param("scene", "steps", "fake camera: what it looks at, a scene's name or a mesh file"),
-    Param("calibration", "config_3", "fake camera: optical build, a name or a file"),
-    Param("as_built", "", "fake camera: build as it really is; empty: as calibration says"),
-    Param(
-        "pixels",
-        "paper",
-        "fake camera: preset of the event pixels",
-        choices=tuple(PRESETS),
-    ),
-    Param("seed", 1, "fake camera: seed of the pixels and of the noise", "", 0, 2**31 - 1),
-    Param(
-        "background_rate",
-        BACKGROUND_HZ,
-        "fake camera: background events of one pixel",
-        "Hz",
-        0.0,
-        100.0,
-    ),
-)
 
 _FULL_FRAME = (0, 0, WIDTH, HEIGHT)
 

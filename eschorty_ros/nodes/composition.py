@@ -1,4 +1,4 @@
-"""All nodes in one process on simulated hardware, spinning beside a client's own node."""
+"""All nodes in one process, spinning beside a client's own node; the bench in another one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.emulation.bench_process import bench_process
 from eschorty_ros.nodes.camera import CameraNode
 from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.nodes.laser import LaserNode
@@ -27,6 +28,7 @@ from eschorty_ros.nodes.spin import make_safe, turn, undisturbed
 from eschorty_ros.nodes.stage import StageNode
 
 NAMESPACE = "/eschorty"
+DEVICES = ("camera", "laser", "stage")
 NODES = {
     "camera": CameraNode,
     "laser": LaserNode,
@@ -42,7 +44,7 @@ Tables = dict[str, dict[str, Any]]
 
 
 def lossless_events() -> Tables:
-    """Parameters that let no event get lost; a simulated camera can wait."""
+    """Parameters that let no event get lost; an emulated camera can wait."""
     topic = f"{NAMESPACE}/camera/events"
     return {
         node: {"qos_overrides": {topic: {end: {"reliability": "reliable"}}}}
@@ -90,50 +92,62 @@ class Composition:
 
 
 @contextlib.contextmanager
-def composition(values: Tables) -> Iterator[Composition]:
+def composition(values: Tables, bench: Mapping[str, object] | None = None) -> Iterator[Composition]:
     """All nodes with these parameters; on leaving, whatever happened, the laser is off.
 
-    Unless ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own, so that they meet no
-    other instrument.
+    With ``bench``, options of ``eschorty-bench``, the devices are emulated by a process of its
+    own that lives as long. Unless ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own,
+    so that they meet no other instrument.
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with contextlib.ExitStack() as ending:
+        folder = Path(ending.enter_context(tempfile.TemporaryDirectory(prefix="eschorty_")))
+        tables = {name: dict(table) for name, table in values.items()}
+        if bench is not None:
+            for name in DEVICES:
+                tables.setdefault(name, {})["bench"] = str(folder / "bench")
+            ending.enter_context(bench_process(folder / "bench", bench))
+        file = folder / "parameters.yaml"
+        file.write_text(_parameter_file(tables))
+        yield ending.enter_context(_running(file))
+
+
+@contextlib.contextmanager
+def _running(parameter_file: Path) -> Iterator[Composition]:
     nodes: list[Node] = []
-    with tempfile.TemporaryDirectory(prefix="eschorty_") as folder:
-        file = Path(folder) / "parameters.yaml"
-        file.write_text(_parameter_file(values))
-        rclpy.init(
-            args=[
-                "--ros-args",
-                *("-r", f"__ns:={NAMESPACE}"),
-                *("--params-file", str(file)),
-                *("--log-level", "warn"),
-            ],
-            domain_id=None if os.environ.get("ROS_DOMAIN_ID") else free_domain(),
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        executor = MultiThreadedExecutor(THREADS)
-        ending = threading.Event()
-        thread = threading.Thread(target=_spin, args=(executor, ending), name="nodes")
-        try:
-            for factory in NODES.values():
-                nodes.append(factory())
-            nodes.append(client := Node("eschorty_client"))
-            made = Composition(client, nodes)
+    rclpy.init(
+        args=[
+            "--ros-args",
+            *("-r", f"__ns:={NAMESPACE}"),
+            *("--params-file", str(parameter_file)),
+            *("--log-level", "warn"),
+        ],
+        domain_id=None if os.environ.get("ROS_DOMAIN_ID") else free_domain(),
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    executor = MultiThreadedExecutor(THREADS)
+    ending = threading.Event()
+    thread = threading.Thread(target=_spin, args=(executor, ending), name="nodes")
+    try:
+        for factory in NODES.values():
+            nodes.append(factory())
+        nodes.append(client := Node("eschorty_client"))
+        made = Composition(client, nodes)
+        for node in nodes:
+            executor.add_node(node)
+        thread.start()
+        yield made
+    finally:
+        with undisturbed():
+            make_safe(nodes)
+            ending.set()
+            # An ended context also ends callbacks that wait, such as homing.
+            rclpy.try_shutdown()
+            if thread.is_alive():
+                thread.join(5.0)
+            executor.shutdown(timeout_sec=2.0)
             for node in nodes:
-                executor.add_node(node)
-            thread.start()
-            yield made
-        finally:
-            with undisturbed():
-                make_safe(nodes)
-                ending.set()
-                # An ended context also ends callbacks that wait, such as homing.
-                rclpy.try_shutdown()
-                if thread.is_alive():
-                    thread.join(5.0)
-                executor.shutdown(timeout_sec=2.0)
-                for node in nodes:
-                    node.destroy_node()
+                node.destroy_node()
 
 
 def _parameter_file(values: Tables) -> str:

@@ -1,14 +1,16 @@
 """Driver names of the ``driver`` parameter and what makes each of them.
 
-A driver is imported when it is asked for: a laser node does not load the simulated world.
+A driver is imported when it is asked for. ``fake`` is the real driver at an emulated bench.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.errors import ArgumentError, DeviceGoneError
+from eschorty_ros.emulation.bench_folder import READY_FILE, bench_folder, stage_port, usb_spec
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.protocols import EventSource, LaserModulator, LinearStage
 from eschorty_ros.hardware.stage.apt_setup import CONTROLLERS, AptSettings
@@ -19,12 +21,9 @@ ClockNs = Callable[[], int]
 Device = TypeVar("Device")
 Registry = dict[str, Callable[[Mapping[str, Any], ClockNs], Device]]
 
-DRIVER = Param("driver", "fake", "device driver; 'fake' simulates the device")
-
-LASER_AWG = from_settings(AwgSettings)
-LASER_TABLE = (
-    Param("fake_log", "", "fake laser: file that gets one line per change of the output"),
-    *LASER_AWG,
+DRIVER = (
+    Param("driver", "fake", "device driver; 'fake' is the real one at an emulated bench"),
+    Param("bench", "", "folder of that bench; empty: the user's in this ROS domain"),
 )
 STAGE_TABLE = (
     Param("port", "", "serial port or pyserial URL of the stage controller; empty finds it"),
@@ -40,27 +39,21 @@ STAGE_TABLE = (
     Param("trigger_interval", 0.002, "distance of pulses for the camera; 0 = none", "m", 0.0, 0.1),
     Param("trigger_port", 1, "output of the controller that gives the pulses", "", 1, 3),
 )
+REAL = {"camera": "evk4", "laser": "awg", "stage": "apt"}
+
+LASER_TABLE = from_settings(AwgSettings)
+
+
+def _bench(parameters: Mapping[str, Any]) -> Path:
+    """Folder of the bench the node is to use."""
+    folder = bench_folder(parameters["bench"])
+    if not (folder / READY_FILE).exists():
+        raise DeviceGoneError(f"no emulated bench in {folder}; start eschorty-bench")
+    return folder
 
 
 def _fake_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
-    from eschorty_ros.core.calibration import load_calibration
-    from eschorty_ros.simulation.fake_camera import FakeCamera
-    from eschorty_ros.simulation.presets import preset
-    from eschorty_ros.simulation.scene import named
-    from eschorty_ros.simulation.warm_up import warm_up
-    from eschorty_ros.simulation.world import World
-
-    # The world is as it is, whatever the instrument is believed to be.
-    calibration = load_calibration(parameters["as_built"] or parameters["calibration"])
-    warm_up(calibration)
-    world = World(
-        named(parameters["scene"]),
-        calibration,
-        preset(parameters["pixels"]),
-        seed=parameters["seed"],
-        background_hz=parameters["background_rate"],
-    )
-    return FakeCamera(world, clock_ns)
+    return _evk4({**parameters, "backend": usb_spec(_bench(parameters))}, clock_ns)
 
 
 def _evk4(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
@@ -86,24 +79,16 @@ def _neuromorphic(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSour
 
 
 def _fake_laser(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
-    from eschorty_ros.simulation.fake_laser import FakeLaser
-
-    return FakeLaser(clock_ns, log_path=parameters["fake_log"] or None)
+    return _awg({**parameters, "backend": usb_spec(_bench(parameters))}, clock_ns)
 
 
 def _awg(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
     from eschorty_ros.hardware.laser.guarded import GuardedLaser
 
-    settings = {param.name: parameters[param.name] for param in LASER_AWG}
+    settings = {param.name: parameters[param.name] for param in LASER_TABLE}
     # Refused here, before a process is started for it.
     AwgSettings(**settings)
     return GuardedLaser("eschorty_ros.hardware.laser.awg:open_laser", settings)
-
-
-def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
-    from eschorty_ros.simulation.fake_stage import FakeStage
-
-    return FakeStage(clock_ns)
 
 
 def _apt(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
@@ -121,6 +106,10 @@ def _apt(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
         trigger_port=parameters["trigger_port"],
     )
     return open_stage(settings, clock_ns, parameters["port"], parameters["serial"])
+
+
+def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
+    return _apt({**parameters, "port": stage_port(_bench(parameters))}, clock_ns)
 
 
 CAMERAS: Registry[EventSource] = {

@@ -34,7 +34,7 @@ STATE_RATE_HZ = 20.0
 WATCHED = ("camera", "stage")
 
 TABLE = (
-    drivers.DRIVER,
+    *drivers.DRIVER,
     Param(
         "frequency",
         70.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, ExecuteProcess
 from launch.conditions import IfCondition
 from launch.substitutions import (
     EqualsSubstitution,
@@ -14,6 +14,7 @@ from launch.substitutions import (
 )
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import ExecutableInPackage
 
 from eschorty_ros.core.files import config_folders
 
@@ -43,14 +44,36 @@ def text(name: str) -> Any:
 
 
 def driver(real: str) -> Any:
-    """Choose the simulated device, or the real one's driver."""
+    """Choose the emulated bench, or the real device's driver."""
     return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
 
 
 def reliable(end: str) -> dict[str, Any]:
-    """Lossless events at one end; a simulated camera can wait, so nothing has to be lost."""
+    """Lossless events at one end; an emulated camera can wait, so nothing has to be lost."""
     if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
     return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
+
+
+def bench(**options: str) -> Any:
+    """Emulated devices in a process of their own when the argument ``fake`` is true.
+
+    ``options`` maps options of ``eschorty-bench`` to the launch arguments that give them.
+    """
+    command: list[Any] = [ExecutableInPackage(package="eschorty_ros", executable="bench")]
+    for option, argument in options.items():
+        command += [f"--{option}", LaunchConfiguration(argument)]
+    return ExecuteProcess(
+        cmd=command,
+        name="bench",
+        output="screen",
+        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("fake"), "true")),
+    )
+
+
+def trigger_input() -> Any:
+    """Switch the camera's trigger input on when the argument ``trigger`` says it is wired."""
+    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
+    return IfElseSubstitution(unwired, "disabled", "external")
 
 
 def node(executable: str, parameters: dict[str, Any]) -> Any:

@@ -42,7 +42,9 @@ Feedback = Callable[[float, str], None]
 class OneScan:
     """What to scan and how; mm and mm/s.
 
-    ``as_built`` is the build the simulated world has, where it is not as ``calibration`` says.
+    ``as_built`` is the build on the emulated bench, where it is not as ``calibration`` says.
+    ``hardware`` are parameters of the nodes of real devices, as ``read_hardware`` gives them;
+    without it the devices are emulated.
     """
 
     scene: str
@@ -54,6 +56,7 @@ class OneScan:
     seed: int = 0
     pixels: str = "paper"
     as_built: str = ""
+    hardware: Tables | None = None
 
     @property
     def sweep_s(self) -> float:
@@ -75,17 +78,32 @@ class Outcome:
 
 
 def parameters(scan: OneScan) -> Tables:
-    """Parameters of every node for a scan on simulated hardware."""
-    tables = lossless_events()
-    tables["camera"] |= _world(scan)
-    tables["reconstruction"]["calibration"] = scan.calibration
+    """Parameters of every node for a scan."""
+    tables = _at_the_bench() if scan.hardware is None else {**scan.hardware}
+    tables["reconstruction"] = {
+        "calibration": scan.calibration,
+        **tables.get("reconstruction", {}),
+    }
     return tables
 
 
-def _world(job: OneScan | OneCalibration) -> dict[str, Any]:
-    """Camera's parameters that tell what it looks at."""
-    names = ("scene", "calibration", "as_built", "seed", "pixels")
-    return {name: getattr(job, name) for name in names}
+def _at_the_bench() -> Tables:
+    """Parameters for a bench whose stage triggers the camera."""
+    tables = lossless_events()
+    tables["camera"]["trigger_in_mode"] = "external"
+    tables["reconstruction"]["trigger_source"] = "stage"
+    return tables
+
+
+def bench_options(job: OneScan | OneCalibration) -> dict[str, object]:
+    """Options of the bench on which the job is done; its stage triggers the camera."""
+    return {
+        "scene": job.scene,
+        "calibration": job.as_built or job.calibration,
+        "seed": job.seed,
+        "pixels": job.pixels,
+        "trigger": "stage",
+    }
 
 
 class Instrument:
@@ -137,7 +155,8 @@ class Instrument:
 @contextlib.contextmanager
 def instrument(scan: OneScan) -> Iterator[Instrument]:
     """All nodes for one scan; on leaving, whatever happened, the laser is off."""
-    with composition(parameters(scan)) as running:
+    bench = bench_options(scan) if scan.hardware is None else None
+    with composition(parameters(scan), bench) as running:
         yield Instrument(running)
 
 
@@ -205,9 +224,8 @@ class CalibrationOutcome:
 
 
 def calibration_parameters(job: OneCalibration) -> Tables:
-    """Parameters of every node for a calibration on simulated hardware."""
-    tables = lossless_events()
-    tables["camera"] |= _world(job)
+    """Parameters of every node for a calibration on emulated devices."""
+    tables = _at_the_bench()
     tables["reconstruction"] |= {
         "calibration": job.calibration,
         "calibration_folder": job.folder,
@@ -216,7 +234,7 @@ def calibration_parameters(job: OneCalibration) -> Tables:
 
 
 def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcome:
-    """Run all nodes on simulated hardware, calibrate once through the action, end them.
+    """Run all nodes on emulated devices, calibrate once through the action, end them.
 
     Parameters
     ----------
@@ -229,7 +247,7 @@ def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcom
     DeviceError
         When the nodes do not answer, refuse the goal or take far too long.
     """
-    with composition(calibration_parameters(job)) as running:
+    with composition(calibration_parameters(job), bench_options(job)) as running:
         feedback(0.0, "starting")
         action: ActionClient[Any, Any, Any] = ActionClient(running.client, Calibrate, "calibrate")
         running.wait_until_active(action)

@@ -1,4 +1,4 @@
-"""Stage node: moves as an action, odometry, and the planned motion for who needs it exact."""
+"""Stage node: moves as an action, odometry, and where it gives pulses."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from eschorty_ros.action import MoveStage
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.hardware.protocols import LinearStage, StageState
-from eschorty_ros.msg import PositionTrigger, StageMotion
+from eschorty_ros.msg import PositionTrigger
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
-from eschorty_ros.nodes.device_messages import motion_message, trigger_message
+from eschorty_ros.nodes.device_messages import trigger_message
 from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
 
-MOTION_RATE_HZ = 20.0
 FEEDBACK_PERIOD_S = 0.05
 POLL_S = 0.01
 # Odometry of so many periods is made up for.
@@ -33,7 +32,7 @@ FILL_MAX = 200
 ODOM_DEPTH = 2000
 
 TABLE = (
-    drivers.DRIVER,
+    *drivers.DRIVER,
     *drivers.STAGE_TABLE,
     Param("odom_rate", 100.0, "rate of stage/odom", "Hz", 1.0, 500.0),
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
@@ -45,7 +44,7 @@ TABLE = (
 
 
 class StageNode(DeviceNode):
-    """Action ``stage/move``; topics ``stage/odom``, ``stage/motion`` and ``stage/trigger``.
+    """Action ``stage/move``; topics ``stage/odom`` and ``stage/trigger``.
 
     Activate homes when needed. A goal that cannot be carried out (outside travel, too fast, not
     active, another motion under way) is accepted and aborted at once, because a rejection carries
@@ -61,7 +60,6 @@ class StageNode(DeviceNode):
         self.moves = 0
         self._told_ns = 0
         self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(ODOM_DEPTH))
-        self._motion = self.create_publisher(StageMotion, "stage/motion", qos.stream())
         self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
         self._move = ActionServer(
             self,
@@ -73,11 +71,10 @@ class StageNode(DeviceNode):
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
         ticking = MutuallyExclusiveCallbackGroup()
-        for period_s, tick in (
-            (1.0 / self.parameters["odom_rate"], self._publish_odom),
-            (1.0 / MOTION_RATE_HZ, self._publish_motion),
-        ):
-            self.create_timer(period_s, tick, callback_group=ticking, clock=self.steady_clock)
+        period_s = 1.0 / self.parameters["odom_rate"]
+        self.create_timer(
+            period_s, self._publish_odom, callback_group=ticking, clock=self.steady_clock
+        )
         diagnostics.Diagnostics(self, self._report, ticking)
         Heartbeat(self, "stage/heartbeat", self._healthy)
 
@@ -96,7 +93,7 @@ class StageNode(DeviceNode):
         stage = self._opened()
         if stage.state().homed:
             return
-        self._order(stage.home)
+        stage.home()
         limit_s = self.parameters["home_timeout"]
         end_s = time.monotonic() + limit_s
         while not stage.state().homed:
@@ -110,7 +107,7 @@ class StageNode(DeviceNode):
         """Profiled stop."""
         with self._lock:
             if self._stage is not None:
-                self._order(self._stage.stop)
+                self._stage.stop()
 
     def close_device(self) -> None:
         """Release the stage."""
@@ -136,12 +133,6 @@ class StageNode(DeviceNode):
         if stage is None:
             raise DeviceError(f"stage refused: node is {self.state_label}; configure it first")
         return stage
-
-    def _order(self, command: Any, *arguments: float) -> None:
-        """Give a command and tell the plan it makes, with nothing in between."""
-        with self._lock:
-            command(*arguments)
-            self._publish_motion()
 
     def _on_move(self, goal: Any) -> MoveStage.Result:
         if not self._busy.acquire(blocking=False):
@@ -182,7 +173,7 @@ class StageNode(DeviceNode):
                 f"stage refused: speed {m_from_mm(speed_mm_s):g} m/s; "
                 f"choose above 0 to {m_from_mm(stage.speed_max_mm_s):g} m/s"
             )
-        self._order(stage.move_to, target_mm, speed_mm_s)
+        stage.move_to(target_mm, speed_mm_s)
         self.moves += 1
 
     def _follow(self, goal: Any) -> StageState:
@@ -195,10 +186,10 @@ class StageNode(DeviceNode):
             if not state.moving:
                 return state
             if goal.is_cancel_requested and not stopping:
-                self._order(stage.stop)
+                stage.stop()
                 stopping = True
             if not self.context.ok():
-                self._order(stage.stop)
+                stage.stop()
                 raise DeviceError("move interrupted by shutdown")
             if time.monotonic() - feedback_s >= FEEDBACK_PERIOD_S:
                 feedback_s = time.monotonic()
@@ -259,22 +250,6 @@ class StageNode(DeviceNode):
         message.pose.covariance[7] = self.parameters["position_sigma"] ** 2
         message.twist.covariance[7] = self.parameters["velocity_sigma"] ** 2
         return message
-
-    def _publish_motion(self) -> None:
-        """Under the lock, so that stamp and plan agree and every change is told."""
-        with self._lock:
-            if self._stage is None or not self.context.ok():
-                return
-            stamp_ns = self.now_ns()
-            plan = self._stage.plan()
-            if plan is None:
-                return
-            try:
-                self._motion.publish(motion_message(plan, stamp_ns))
-            except Exception:
-                # A signal may end the context between the check and the publication.
-                if self.context.ok():
-                    raise
 
     def _report(self) -> diagnostics.Report:
         stage = self._stage

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import calibration_scenarios as scenarios
 import launch_testing.actions
-from launch_processes import node_process
+from launch_processes import bench_action, node_process
 
 import launch
 from eschorty_ros.nodes.domain import free_domain
@@ -19,16 +19,18 @@ from eschorty_ros.nodes.domain import free_domain
 FOLDER = Path(tempfile.mkdtemp(prefix="calibration_"))
 LASER_LOG, MADE = FOLDER / "output.log", FOLDER / "made"
 DOMAIN = free_domain()
+BENCH = Path(tempfile.mkdtemp(prefix="bench_"))
 
 
 def generate_test_description():
-    """Five nodes; the tests find the camera's process by name."""
+    """Bench and five nodes; the tests find the camera's process by name."""
     nodes = {
         module.rsplit(".", 1)[-1]: node_process(module, parameters, DOMAIN)
-        for module, parameters in scenarios.node_parameters(LASER_LOG, MADE, "posts").items()
+        for module, parameters in scenarios.node_parameters(BENCH, MADE).items()
     }
     ready = launch_testing.actions.ReadyToTest()
-    return launch.LaunchDescription([*nodes.values(), ready]), {"camera": nodes["camera"]}
+    bench = bench_action(BENCH, scenarios.bench_settings(LASER_LOG, "posts"))
+    return launch.LaunchDescription([bench, *nodes.values(), ready]), {"camera": nodes["camera"]}
 
 
 class TestCalibration(unittest.TestCase):
@@ -66,7 +68,7 @@ class TestShutdown(unittest.TestCase):
 
     def test_all_others_exit_cleanly(self, proc_info):
         codes = {info.process_name: info.returncode for info in proc_info}
-        assert len(codes) == 5
+        assert len(codes) == 6
         for name, code in codes.items():
             assert code == (-signal.SIGKILL if "camera" in name else 0), name
 

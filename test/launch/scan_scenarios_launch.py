@@ -11,23 +11,25 @@ from pathlib import Path
 
 import launch_testing.actions
 import scan_scenarios as scenarios
-from launch_processes import node_process
+from launch_processes import bench_action, node_process
 
 import launch
 from eschorty_ros.nodes.domain import free_domain
 
 LASER_LOG = Path(tempfile.mkdtemp(prefix="laser_")) / "output.log"
 DOMAIN = free_domain()
+BENCH = Path(tempfile.mkdtemp(prefix="bench_"))
 
 
 def generate_test_description():
-    """Five nodes; the tests find the camera's process by name."""
+    """Bench and five nodes; the tests find the camera's process by name."""
     nodes = {
         module.rsplit(".", 1)[-1]: node_process(module, parameters, DOMAIN)
-        for module, parameters in scenarios.node_parameters(LASER_LOG).items()
+        for module, parameters in scenarios.node_parameters(BENCH).items()
     }
     ready = launch_testing.actions.ReadyToTest()
-    return launch.LaunchDescription([*nodes.values(), ready]), {"camera": nodes["camera"]}
+    bench = bench_action(BENCH, scenarios.bench_settings(LASER_LOG))
+    return launch.LaunchDescription([bench, *nodes.values(), ready]), {"camera": nodes["camera"]}
 
 
 class TestScan(unittest.TestCase):
@@ -63,7 +65,7 @@ class TestShutdown(unittest.TestCase):
 
     def test_all_others_exit_cleanly(self, proc_info):
         codes = {info.process_name: info.returncode for info in proc_info}
-        assert len(codes) == 5
+        assert len(codes) == 6
         for name, code in codes.items():
             assert code == (-signal.SIGKILL if "camera" in name else 0), name
 

@@ -27,6 +27,7 @@ STARTED = {
 EXPECTED = {
     "scan.launch.py": {
         "fake",
+        "trigger",
         "scene",
         "pixels",
         "calibration",
@@ -39,6 +40,7 @@ EXPECTED = {
     },
     "calibrate.launch.py": {
         "fake",
+        "trigger",
         "scene",
         "pixels",
         "calibration",
@@ -72,6 +74,10 @@ def configurations(tree):
             used.add("rviz")
         elif node.func.id in ("driver", "reliable"):
             used.add("fake")
+        elif node.func.id == "trigger_input":
+            used.add("trigger")
+        elif node.func.id == "bench":
+            used |= {"fake", *(keyword.value.value for keyword in node.keywords)}
         elif (
             node.func.id in ("LaunchConfiguration", "number", "text")
             and node.args

@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import calibration_scenarios as scenarios
-from ros_process import NAMESPACE, NodeProcess, processes, wait_until
+from benches import bench_here
+from ros_process import NodeProcess, processes
 
 from eschorty_ros.nodes.domain import free_domain
 
@@ -16,38 +17,36 @@ CAMERA = "eschorty_ros.nodes.camera"
 
 
 class Instrument:
-    """The bench, the running nodes, and a camera that can be pointed elsewhere."""
+    """The test's view, the running nodes, and a camera that can be pointed elsewhere."""
 
-    def __init__(self, bench, running):
+    def __init__(self, bench, running, emulated, folder):
         self.bench = bench
         self.running = running
+        self._emulated = emulated
+        self._folder = folder
 
     def point_camera_at(self, scene):
         self.running["camera"].interrupt()
         self.running["camera"].kill()
-        self.running["camera"] = NodeProcess(
-            CAMERA, scenarios.camera_parameters(scene), domain=self.bench.domain
-        )
-        observer = self.bench.observer
-        observer.wait_for_state("camera", "active")
-        wait_until(
-            lambda: observer.node.count_subscribers(f"{NAMESPACE}/stage/motion"),
-            "a camera that listens to the stage",
-        )
+        self._emulated.look_at(scene)
+        parameters = scenarios.device_parameters(self._folder)[CAMERA]
+        self.running["camera"] = NodeProcess(CAMERA, parameters, domain=self.bench.domain)
+        self.bench.observer.wait_for_state("camera", "active")
 
 
 @pytest.fixture(scope="module")
 def instrument(tmp_path_factory):
-    """Five node processes and a bench; the reconstruction's end comes last."""
+    """Five node processes at a bench; the reconstruction's end comes last."""
     log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
     folder = Path(tmp_path_factory.mktemp("calibrations")) / "made"
     domain = free_domain()
-    nodes = scenarios.node_parameters(log, folder, scenarios.KNOWN_SCENE)
+    settings = scenarios.bench_settings(log, scenarios.KNOWN_SCENE)
     with (
-        processes(nodes, domain) as running,
+        bench_here(**settings) as (emulated, bench_folder),
+        processes(scenarios.node_parameters(bench_folder, folder), domain) as running,
         scenarios.bench(domain, log, folder) as bench,
     ):
-        yield Instrument(bench, running)
+        yield Instrument(bench, running, emulated, bench_folder)
         for name, process in running.items():
             print(f"--- {name}\n{process.output[-3000:]}")
 

@@ -4,63 +4,34 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from pathlib import Path
 
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
+from benches import bench_here
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
 from ros_process import Observer, wait_until
 
-from eschorty_ros.core.errors import DeviceError
-from eschorty_ros.hardware.protocols import EventChunk
-from eschorty_ros.nodes import drivers, qos
-from eschorty_ros.nodes.camera import CameraNode
+from eschorty_ros.emulation.bench_devices import Bench
+from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.nodes.laser import LaserNode
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.stage import StageNode
-from eschorty_ros.simulation.devices import FakeLaser, FakeStage
-
-
-class Frail:
-    """A device of which one method fails once it is unplugged."""
-
-    def __init__(self, device: Any, method: str) -> None:
-        self._device = device
-        self._method = method
-        self.unplugged = False
-        self.calls: list[str] = []
-
-    def __getattr__(self, name: str) -> Any:
-        attribute = getattr(self._device, name)
-        self.calls.append(name)
-        if name == self._method and self.unplugged:
-            raise DeviceError("device unplugged; plug it in and configure again")
-        return attribute
-
-
-class Silent:
-    """A camera without events."""
-
-    identity = FakeLaser(lambda: 0).identity
-    width, height = 1280, 720
-
-    def read(self, timeout_s: float) -> EventChunk:
-        return EventChunk(b"\x00\x80", 0)
-
-    def statistics(self) -> dict[str, float]:
-        return {}
-
-    def start(self) -> None: ...
-
-    open = stop = close = start
-
 
 Run = Callable[[type[DeviceNode]], DeviceNode]
+
+
+@pytest.fixture(scope="module")
+def emulated() -> Iterator[tuple[Bench, Path]]:
+    with bench_here() as (bench, folder):
+        yield bench, folder
 
 
 @pytest.fixture
@@ -70,15 +41,16 @@ def observer() -> Iterator[Observer]:
 
 
 @pytest.fixture
-def run(observer: Observer) -> Iterator[Run]:
+def run(observer: Observer, emulated: tuple[Bench, Path]) -> Iterator[Run]:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=observer.domain)
     executor = MultiThreadedExecutor(4, context=context)
     thread = threading.Thread(target=executor.spin, daemon=True)
     nodes: list[DeviceNode] = []
+    folder = Parameter("bench", value=str(emulated[1]))
 
     def start(kind: type[DeviceNode]) -> DeviceNode:
-        node = kind(context=context, namespace="eschorty")
+        node = kind(context=context, namespace="eschorty", parameter_overrides=[folder])
         nodes.append(node)
         executor.add_node(node)
         thread.start()
@@ -95,45 +67,37 @@ def run(observer: Observer) -> Iterator[Run]:
     context.try_shutdown()
 
 
-@pytest.mark.parametrize(
-    ("kind", "registry", "device", "method", "last"),
-    [
-        (CameraNode, drivers.CAMERAS, Silent(), "read", "close"),
-        (LaserNode, drivers.LASERS, FakeLaser(lambda: 0), "readback", "close"),
-        (StageNode, drivers.STAGES, None, "state", "close"),
-    ],
-    ids=["camera", "laser", "stage"],
-)
-def test_lost_device_is_closed_and_reported(
+@pytest.mark.parametrize(("kind", "name"), [(LaserNode, "laser"), (StageNode, "stage")])
+def test_lost_device_is_closed_reported_and_left_alone(
     kind: type[DeviceNode],
-    registry: dict[str, Any],
-    device: Any,
-    method: str,
-    last: str,
+    name: str,
     run: Run,
     observer: Observer,
-    monkeypatch: pytest.MonkeyPatch,
+    emulated: tuple[Bench, Path],
 ) -> None:
-    made: list[Frail] = []
-
-    def make(_: Any, clock_ns: Callable[[], int]) -> Frail:
-        made.append(Frail(device or FakeStage(clock_ns), method))
-        return made[-1]
-
-    monkeypatch.setitem(registry, "fake", make)
+    device = emulated[0].by_name()[name]
     node = run(kind)
     reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
-    made[0].unplugged = True
+    device.gone = True
     wait_until(lambda: node.state_label == "unconfigured", "the node unconfigured")
-    assert made[0].calls[-1] == last
-    assert "device unplugged" in node.failure
+    print(node.failure)
+    assert node.failure
+    assert "\n" not in node.failure
+    told = node.failure.split(": ")[-1]
     wait_until(
         lambda: any(
-            status.level == DiagnosticStatus.ERROR and "device unplugged" in status.message
+            status.level == DiagnosticStatus.ERROR and told in status.message
             for array in reports
             for status in array.status
         ),
         "the failure on /diagnostics",
     )
-    made[0].unplugged = False
-    monkeypatch.setitem(registry, "fake", lambda _, clock_ns: device or FakeStage(clock_ns))
+    if hasattr(device, "replug"):
+        device.replug()
+    else:
+        device.gone = False
+    time.sleep(3.0)
+    assert node.state_label == "unconfigured", "nothing starts by itself after a failure"
+    assert observer.change_state(name, "configure")
+    assert observer.change_state(name, "activate")
+    assert node.active

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import scan_scenarios as scenarios
+from benches import bench_elsewhere
 from ros_process import NodeProcess, processes
 
 from eschorty_ros.nodes.domain import free_domain
@@ -17,14 +18,15 @@ SCANNER = "eschorty_ros.nodes.scanner"
 
 @pytest.fixture(scope="module")
 def instrument(tmp_path_factory):
-    """Five node processes and a bench; the camera's death comes last."""
+    """Five node processes at a bench; the camera's death comes last."""
     log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
     domain = free_domain()
     with (
-        processes(scenarios.node_parameters(log), domain) as running,
+        bench_elsewhere(**scenarios.bench_settings(log)) as folder,
+        processes(scenarios.node_parameters(folder), domain) as running,
         scenarios.bench(domain, log) as bench,
     ):
-        yield bench, running
+        yield bench, running, scenarios.node_parameters(folder)
         for name, process in running.items():
             print(f"--- {name}\n{process.output[-3000:]}")
 
@@ -46,19 +48,17 @@ def test_bad_parameters_are_refused(instrument):
 
 
 def test_scanner_interrupted_mid_scan_leaves_the_laser_off_and_the_next_one_scans(instrument):
-    bench, running = instrument
+    bench, running, parameters = instrument
     first = running["scanner"]
     scenarios.scanner_interrupted(bench, lambda: first.send(signal.SIGINT))
     assert first.wait(10.0) == 0, first.output
     assert "Traceback" not in first.output, first.output
     first.kill()
-    running["scanner"] = NodeProcess(
-        SCANNER, scenarios.node_parameters(Path())[SCANNER], domain=bench.domain
-    )
+    running["scanner"] = NodeProcess(SCANNER, parameters[SCANNER], domain=bench.domain)
     scenarios.full_scan(bench)
 
 
 def test_killed_camera_ends_the_scan(instrument):
-    bench, running = instrument
+    bench, running, _ = instrument
     scenarios.camera_killed(bench, lambda: running["camera"].send(signal.SIGKILL))
     assert all(process.running() for name, process in running.items() if name != "camera")

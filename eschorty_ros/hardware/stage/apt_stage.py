@@ -162,10 +162,6 @@ class AptStage:
                 raise self._tracker.failure
             return self._tracker.state(t_ns, round(self.lag_s * 1e9))
 
-    def plan(self) -> None:
-        """Tell nothing: only the controller knows when a motion began."""
-        return
-
     @property
     def healthy(self) -> bool:
         """Whether status messages come and nothing has failed."""

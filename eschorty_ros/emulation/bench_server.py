@@ -1,0 +1,40 @@
+"""The other ends of a bench's cables, in a folder where drivers find them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from eschorty_ros.emulation.bench_devices import Bench
+from eschorty_ros.emulation.bench_folder import READY_FILE, STAGE_PORT, USB_SOCKET
+from eschorty_ros.emulation.faults import FaultPlan, FaultScript
+from eschorty_ros.emulation.pty_port import PtyPort
+from eschorty_ros.emulation.usb_server import UsbServer
+
+
+@contextlib.contextmanager
+def serving(bench: Bench, folder: Path, faults: FaultPlan | None = None) -> Iterator[UsbServer]:
+    """Serve a bench in an existing folder while inside.
+
+    The file ``ready`` holds this process's id while everything is there.
+
+    Raises
+    ------
+    DeviceError
+        When socket or port cannot be made there.
+    """
+    plan = faults or FaultPlan(faults=[])
+    ready = folder / READY_FILE
+    with (
+        FaultScript(plan, bench.by_name(), bench.physics.clock_ns) as script,
+        UsbServer(folder / USB_SOCKET, bench.usb_devices) as usb,
+        PtyPort(script.line(), folder / STAGE_PORT, lock=bench.physics.lock),
+    ):
+        try:
+            ready.with_suffix(".new").write_text(f"{os.getpid()}\n")
+            ready.with_suffix(".new").replace(ready)
+            yield usb
+        finally:
+            ready.unlink(missing_ok=True)
