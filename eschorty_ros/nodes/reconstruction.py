@@ -219,12 +219,20 @@ class ReconstructionNode(Node):
         response.success, response.message = self._in_worker(begin_end)
         if not response.success:
             return response
-        if not finished.wait(self.parameters["stage_timeout"] + 30.0):
+        if not self._awaited(finished, self.parameters["stage_timeout"] + 30.0):
             response.success = False
             response.message = "the scan was not assembled in time; see the node's log"
             return response
         fill_end_scan(response, reports[0])
         return response
+
+    def _awaited(self, event: threading.Event, timeout_s: float) -> bool:
+        """Wait for the worker's event; after a signal nobody works any more."""
+        end_s = time.monotonic() + timeout_s
+        while not event.wait(0.1):
+            if time.monotonic() > end_s or self._closing.is_set() or not self.context.ok():
+                return event.is_set()
+        return True
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
         """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
