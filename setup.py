@@ -28,7 +28,7 @@ setup(
             sorted(
                 str(path.relative_to(HERE))
                 for path in HERE.glob("config/*")
-                if path.suffix in (".csv", ".xml", ".yaml")
+                if path.suffix in (".csv", ".rules", ".xml", ".yaml")
             ),
         )
     ],
