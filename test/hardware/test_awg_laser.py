@@ -272,6 +272,33 @@ def test_off_interrupts_what_is_under_way(bench: AwgBench, monkeypatch: pytest.M
         laser.enable()
 
 
+@pytest.mark.parametrize("operation", ["readback", "enable"])
+def test_interrupted_light_can_be_switched_on_again(
+    bench: AwgBench, monkeypatch: pytest.MonkeyPatch, operation: str
+) -> None:
+    laser = bench.ready_laser()
+    if operation == "readback":
+        laser.enable()
+    meddler = Meddler(laser)
+    execute = bench.model._execute
+
+    def slow(text: str) -> None:
+        execute(text)
+        if "BASE:FREQuency?" in text and meddler.ident is None:
+            meddler.start()
+            while not laser._offs_waiting:
+                pass
+
+    monkeypatch.setattr(bench.model, "_execute", slow)
+    with pytest.raises(DeviceError, match="interrupted by switching off"):
+        getattr(laser, operation)()
+    meddler.join(5.0)
+    assert not bench.model.lit
+    laser.arm()
+    laser.enable()
+    assert bench.model.lit
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

@@ -241,9 +241,11 @@ class AwgLaser:
         try:
             yield
         except BaseException as error:
-            self._ready = False
             self._armed = False
-            self._reason = str(error)
+            if not isinstance(error, InterruptedByOffError):
+                # Who interrupts has no quarrel with the settings: they may be lit again.
+                self._ready = False
+                self._reason = str(error)
             try:
                 self._darken()
             except DeviceError as second:
