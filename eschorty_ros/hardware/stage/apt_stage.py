@@ -252,11 +252,16 @@ class AptStage:
             )
 
     def _check_health(self) -> None:
-        with self._lock:
+        # The writer waits for nobody: it also keeps the controller's watchdog quiet.
+        if not self._lock.acquire(timeout=HEALTH_S):
+            return
+        try:
             now_ns = self._link.now_ns()
             due = [frame for at_ns, frame in self._stopping if at_ns <= now_ns]
             self._stopping = [entry for entry in self._stopping if entry[0] > now_ns]
             self._tracker.look()
+        finally:
+            self._lock.release()
         for frame in due:
             self._link.write_at_once(frame)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -85,6 +86,37 @@ def test_fault_s6_unplug_on_the_port(port: str, model: AptModel) -> None:
     model.gone = False
     wait(lambda: Path(port).exists())
     opened(port).close()
+
+
+def test_fault_s9_blocked_callback(port: str, model: AptModel) -> None:
+    """driver: keeps alive while whoever listens to it hangs; user reads: nothing."""
+    stage = opened(port)
+    heard: list[float] = []
+    obey = model._obey
+
+    def listening(name: str, address: int, values: dict[str, int], at_ns: int) -> None:
+        if name == "keep_alive":
+            heard.append(time.monotonic())
+        obey(name, address, values, at_ns)
+
+    model._obey = listening  # type: ignore[method-assign]
+    release = threading.Event()
+
+    def hang() -> None:
+        with stage._lock:
+            release.wait(2.5)
+
+    try:
+        blocker = threading.Thread(target=hang)
+        blocker.start()
+        begun_s = time.monotonic()
+        wait(lambda: sum(at > begun_s for at in heard) >= 4)
+        release.set()
+        blocker.join()
+        wait(lambda: stage.healthy)
+    finally:
+        release.set()
+        stage.close()
 
 
 def test_ports_are_found_by_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
