@@ -1,4 +1,4 @@
-"""When the laser may be on, without ROS: arming, leases and their holders, interlock, longest time."""
+"""When the laser may be on, without ROS: arming, leases, interlock, longest time."""
 
 from __future__ import annotations
 
