@@ -53,7 +53,7 @@ class Spring:
 class Firehose(Evk4Model):
     """A camera that always has as much data as is asked for."""
 
-    _data = memoryview(bytes(1 << 20))
+    _data = memoryview(b"\x2a" * (1 << 20))
 
     def bulk_in(self, endpoint, size, timeout_ms):
         return self._data[:size]
