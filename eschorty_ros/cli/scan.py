@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 @click.command("scan")
 @sweep_options
 @click.option(
+    "--hardware",
+    metavar="CONFIG",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Scan with real devices: a YAML file of parameters by node; docs/hardware.md.",
+)
+@click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
     default=Path("scan"),
@@ -35,25 +41,31 @@ def command(
     calibration: str,
     pixels: str,
     seed: int,
+    hardware: Path | None,
     out: Path,
 ) -> None:
-    """Scan a simulated scene with camera, laser, stage, reconstruction and scanner nodes.
+    """Scan a scene with camera, laser, stage, reconstruction and scanner nodes.
 
-    The nodes run in this process, on simulated hardware, over ordinary ROS 2 topics. Written are
-    scan.pcd (the cloud, metres, in eschorty_base) and scan.png (depth map, 3-D view, error map);
-    printed is the cloud's error against the scene. The noise depends on when things happen, so
-    two runs differ slightly.
+    The nodes run in this process over ordinary ROS 2 topics, their drivers at devices that another
+    process emulates around a simulated scene, or with --hardware at real ones. Written are
+    scan.pcd (the cloud, metres, in eschorty_base) and scan.png (depth map, 3-D view, and of a
+    simulated scene the error map); its error is printed, too. The noise depends on when things
+    happen, so two runs differ slightly.
 
     \b
     Examples:
       eschorty scan
       eschorty scan --scene sphere --speed 20 --out sphere
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
+      eschorty scan --hardware bench.yaml --calibration my.yaml
     """  # noqa: D301
     check_sweep(start, stop)
     nodes = one_process("scan")
     _check(scene, calibration)
-    request = nodes.OneScan(scene, calibration, start, stop, speed, frequency, seed, pixels)
+    tables = nodes.read_hardware(hardware) if hardware is not None else None
+    request = nodes.OneScan(
+        scene, calibration, start, stop, speed, frequency, seed, pixels, hardware=tables
+    )
     out.mkdir(parents=True, exist_ok=True)
     with (
         ended_by_signals(),
@@ -86,6 +98,13 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
         kept = f" ({len(outcome.points):,} points kept in {out / 'scan.pcd'})"
         raise DeviceError(outcome.message + (kept if len(outcome.points) else ""))
     calibration = load_calibration(request.calibration)
+    if request.hardware is not None:
+        title = f"{request.frequency_hz:g} Hz, {request.speed_mm_s:g} mm/s, {request.calibration}"
+        direction = calibration.stage_direction
+        figure = figures.scan_figure(outcome.points, None, title, direction)
+        figures.save(figure, out / "scan.png")
+        pairs(f"{out / 'scan.pcd'}, {out / 'scan.png'}", _counted(outcome))
+        return
     truth = scenes.named(request.scene)
     model, direction = calibration.model(), calibration.stage_direction
     error_mm = accuracy.range_error_mm(outcome.points, truth, model, direction)
@@ -101,20 +120,26 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
     _print(outcome, measured, sweep.seconds, out)
 
 
+def _counted(outcome: Outcome) -> dict[str, str]:
+    return {
+        "profiles": f"{outcome.profiles:,}",
+        "points": f"{len(outcome.points):,}",
+        "events": f"{outcome.events:,} ({outcome.events_dropped:,} dropped, "
+        f"{outcome.packets_lost:,} packets lost)",
+    }
+
+
 def _print(outcome: Outcome, measured: Accuracy, seconds: float, out: Path) -> None:
-    lost = outcome.packets_lost
     pairs(
         f"{out / 'scan.pcd'}, {out / 'scan.png'}",
         {
-            "profiles": f"{outcome.profiles:,}",
+            **_counted(outcome),
             "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
             "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole periods",
             "median |range error|": f"{measured.error_median_mm:.3f} mm",
             "95th percentile": f"{measured.error_p95_mm:.3f} mm",
             "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, "
             f"{measured.within_2_sigma:.1%}",
-            "events": f"{outcome.events:,} ({outcome.events_dropped:,} dropped, "
-            f"{lost:,} packets lost)",
             "seconds of sweep": f"{seconds:.2f}",
         },
     )

@@ -32,6 +32,9 @@ from eschorty_ros.nodes.composition import (
     lossless_events,
     wait,
 )
+from eschorty_ros.nodes.hardware_file import read_hardware
+
+__all__ = ["OneCalibration", "OneScan", "calibrate_once", "instrument", "read_hardware"]
 
 SLACK_S = 60.0
 

@@ -1,0 +1,56 @@
+"""The file of `eschorty scan --hardware`: real drivers, and no misspelt parameter."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.core.errors import FormatError
+from eschorty_ros.nodes.hardware_file import read_hardware
+
+GUIDE = Path(__file__).parents[2] / "docs" / "hardware.md"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "bench.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_real_drivers_unless_told(tmp_path):
+    tables = read_hardware(
+        written(tmp_path, "laser: {driver: fake}\nstage: {port: /dev/ttyUSB0}\n")
+    )
+    assert {name: table["driver"] for name, table in tables.items()} == {
+        "camera": "evk4",
+        "laser": "fake",
+        "stage": "apt",
+    }
+    assert tables["stage"]["port"] == "/dev/ttyUSB0"
+    assert set(read_hardware(written(tmp_path, ""))) == {"camera", "laser", "stage"}
+
+
+def test_the_guides_example_is_accepted(tmp_path):
+    example = GUIDE.read_text().split("```yaml\n")[1].split("```")[0]
+    tables = read_hardware(written(tmp_path, example))
+    assert tables["camera"]["serial"] == "00051234"
+    assert tables["reconstruction"] == {"trigger_source": "stage"}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("camra: {}", ("'camra' is no node", "did you mean camera?")),
+        ("laser: {hihg_v: 5.0}", ("'hihg_v' is no parameter of laser", "did you mean high_v?")),
+        ("laser: 5", ("laser is 5", "write parameters under it")),
+        ("[1]", ("it holds [1]",)),
+        ("laser: {", ("correct the YAML",)),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line(tmp_path, text, words):
+    with pytest.raises(FormatError) as refused:
+        read_hardware(written(tmp_path, text))
+    assert "\n" not in str(refused.value)
+    for word in (*words, "bench.yaml"):
+        assert word in str(refused.value)
