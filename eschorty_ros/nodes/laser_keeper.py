@@ -18,8 +18,10 @@ from eschorty_ros.nodes.laser_readback import (
     wrong_output,
     wrong_waveform,
 )
+from eschorty_ros.nodes.lookout import Lookout
 
 WATCH_PERIOD_S = 0.02
+_PATIENCE_S = 1.0
 
 
 class LaserKeeper:
@@ -27,7 +29,7 @@ class LaserKeeper:
 
     Two threads run while it is open: one asks the gate, the other reads the generator back, and
     switches off when that is not what was asked. Commands wait for each other; switching off waits
-    for none of them.
+    for none of them, and voids those that would lead to light.
 
     Parameters
     ----------
@@ -75,8 +77,9 @@ class LaserKeeper:
         self._requested = LaserOutput.OFF
         self._reason = "off at start"
         self._warned: set[str] = set()
-        self._ending = threading.Event()
-        self._threads: list[threading.Thread] = []
+        # Counts switching off; what was asked for before it must not end in light.
+        self._offs = 0
+        self._lookouts: list[Lookout] = []
         self.switch_offs = 0
         self.unknown = ""
 
@@ -97,23 +100,15 @@ class LaserKeeper:
         told = laser.readback()
         self._refuse_difference(told)
         self._hear(told)
-        self._ending.clear()
-        self._threads = [
-            threading.Thread(target=self._look_after, args=(look, every_s), name=name, daemon=True)
-            for look, every_s, name in (
-                (self._watch, WATCH_PERIOD_S, "laser watchdog"),
-                (self._read, self._readback_period_s, "laser read-back"),
-            )
+        self._lookouts = [
+            Lookout("laser watchdog", self._watch, WATCH_PERIOD_S, self._blind),
+            Lookout("laser read-back", self._read, self._readback_period_s, self._blind),
         ]
-        for thread in self._threads:
-            thread.start()
 
     def close(self) -> None:
         """Switch off and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
-        self._ending.set()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(1.0)
+        for lookout in self._lookouts:
+            lookout.end(_PATIENCE_S)
         with self._lock:
             laser, self._laser = self._laser, None
             self._generation += 1
@@ -132,7 +127,7 @@ class LaserKeeper:
         """Set another modulation; light that is on goes on with it, unless it is refused."""
         if self._laser is None:
             return
-        with self._command() as laser:
+        with self._command() as (laser, _):
             before, self._asked = self._asked, modulation
             try:
                 laser.configure(modulation)
@@ -149,15 +144,20 @@ class LaserKeeper:
         """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be."""
         if self.gate.interlock_open:
             raise DeviceError("laser refused: interlock open; close it")
-        with self._command() as laser:
+        with self._command() as (laser, offs):
             laser.arm()
-            self.gate.arm()
-            self._reason = "armed"
+            with self._lock:
+                self._refuse_void(offs)
+                self.gate.arm()
+                self._reason = "armed"
 
     def enable(self) -> None:
-        """Switch on; raises ``DeviceError`` with the reason when it must not be, or fails."""
-        with self._command() as laser:
+        """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
+        with self._command() as (laser, offs):
             with self._lock:
+                self._refuse_void(offs)
+                if self._requested is LaserOutput.ON:
+                    return
                 refusal = self.gate.refusal()
                 if refusal is not None:
                     raise DeviceError(f"laser refused: {refusal}")
@@ -191,6 +191,7 @@ class LaserKeeper:
                 raise DeviceError(self.unknown) from error
             finally:
                 self._generation += 1
+                self._offs += 1
                 self.switch_offs += self._requested is LaserOutput.ON
                 self.gate.switched_off()
                 self._requested, self._reason = LaserOutput.OFF, reason
@@ -221,7 +222,9 @@ class LaserKeeper:
             return None if told is None else LaserSnapshot(self._requested, told, self._reason)
 
     @contextlib.contextmanager
-    def _command(self) -> Iterator[LaserModulator]:
+    def _command(self) -> Iterator[tuple[LaserModulator, int]]:
+        """Wait for a turn; gives the laser, and the count of offs when the turn was asked for."""
+        offs = self._offs
         with self._commands:
             with self._lock:
                 laser = self._laser
@@ -230,12 +233,16 @@ class LaserKeeper:
                 self._generation += 1
                 self._commanding = True
             try:
-                yield laser
+                yield laser, offs
             finally:
                 with self._lock:
                     self._generation += 1
                     self._commanding = False
                     self.tell()
+
+    def _refuse_void(self, offs: int) -> None:
+        if offs != self._offs:
+            raise DeviceError(f"laser refused: {self._reason}")
 
     def _hear(self, told: LaserReadback) -> None:
         """Note what the generator says."""
@@ -271,13 +278,9 @@ class LaserKeeper:
         if difference:
             raise DeviceError(f"laser: {difference}; look at the generator")
 
-    def _look_after(self, look: Callable[[], None], every_s: float) -> None:
-        try:
-            while not self._ending.wait(every_s):
-                look()
-        except Exception as error:
-            self.darken(f"watching it failed: {error!r}")
-            self._alarm(f"laser: watching it failed: {error!r}")
+    def _blind(self, error: Exception) -> None:
+        self.darken(f"watching it failed: {error!r}")
+        self._alarm(f"laser: watching it failed: {error!r}")
 
     def _watch(self) -> None:
         # Under the lock: somebody may be switching off already.

@@ -20,6 +20,7 @@ from generator_double import MAKE, Generator
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser.guarded import GuardedLaser
+from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.protocols import LaserOutput
 
 OFF_LIMIT_S = 0.25
@@ -235,6 +236,16 @@ def test_dark_when_the_guard_dies(laser: GuardedLaser, device: Generator, number
     assert not device.lit()
 
 
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_closing_when_the_guard_has_just_died_is_dark(device: Generator, number: int) -> None:
+    laser = GuardedLaser(MAKE, device.settings)
+    light(laser)
+    os.kill(laser.guard_pid, number)
+    with contextlib.suppress(DeviceError):
+        laser.close()
+    assert not device.lit()
+
+
 def test_guard_whose_driver_crashes(device: Generator) -> None:
     laser = GuardedLaser(MAKE, {**device.settings, "crash": "readback"})
     light(laser)
@@ -286,6 +297,25 @@ def test_mute_generator_is_unknown_and_the_guard_insists(device: Generator) -> N
     assert device.lit()
     device.press("SPEAK")
     assert device.off_after_s(time.monotonic_ns()) < 3.0
+
+
+def test_switching_off_is_tried_again_when_it_failed_in_the_dark(
+    laser: GuardedLaser, device: Generator
+) -> None:
+    device.press("MUTE")
+    with pytest.raises(DeviceError, match="gone"):
+        laser.disable()
+    device.press("SPEAK")
+    laser.disable()
+    light(laser)
+    assert device.lit()
+
+
+def test_another_generator_does_not_pass_for_the_lost_one(device: Generator) -> None:
+    make = maker(MAKE, device.settings)
+    with pytest.raises(DeviceError, match="generator 41 is gone, 42 is there; connect 41"):
+        open_again(make, "41")
+    open_again(make, "42").close()
 
 
 def _thread(step: Callable[[], object], failures: list[Exception]) -> Callable[[], None]:

@@ -8,7 +8,6 @@ process that started it ends in any way, dumps core, is stopped, or is silent fo
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import queue
 import select
@@ -17,7 +16,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -30,29 +29,12 @@ from eschorty_ros.hardware.laser.guard_wire import (
     readback_message,
     standing_still,
 )
+from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput
 
 _LOOK_S = 0.02
 _RETRY_S = 0.25
 _INSIST_S = 30.0
-
-
-def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
-    """Look up what opens the generator: ``module:callable`` with keywords.
-
-    Raises
-    ------
-    DeviceError
-        When there is no such callable.
-    """
-    module, _, attribute = name.partition(":")
-    try:
-        make = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise DeviceError(
-            f"laser driver {name!r} cannot be loaded ({error}); install it"
-        ) from error
-    return lambda: make(**settings)
 
 
 class Guard:
@@ -144,16 +126,20 @@ class Guard:
 
     def _switch_off(self) -> None:
         self._epoch += 1
-        laser = self._laser
-        if laser is None:
+        if self._laser is None:
             return
-        if self._unknown:
-            raise DeviceError(self._unknown)
+        unknown = self._unknown
+        if unknown and self._insisting is not None and self._insisting.is_alive():
+            raise DeviceError(unknown)
         try:
-            laser.disable()
+            if unknown:
+                self._open_again()
+            else:
+                self._laser.disable()
         except Exception as error:
-            self._unknown = f"{error}; trying again"
+            self._unknown = str(error)
             if self._lit:
+                self._unknown = f"{error}; trying again"
                 self._insisting = threading.Thread(target=self._insist, name="laser off")
                 self._insisting.start()
             raise
@@ -165,16 +151,20 @@ class Guard:
         while self._unknown and time.monotonic() < end_s:
             time.sleep(_RETRY_S)
             try:
-                if self._laser is not None:
-                    with contextlib.suppress(Exception):
-                        self._laser.close()
-                if self._make is not None:
-                    self._laser = self._make()
+                self._open_again()
             except Exception as error:
                 self._unknown = f"{error}; trying again"
             else:
-                self._lit, self._unknown = False, ""
                 _say("laser guard: output off at last")
+
+    def _open_again(self) -> None:
+        assert self._laser is not None
+        assert self._make is not None
+        serial = self._laser.identity.serial
+        with contextlib.suppress(Exception):
+            self._laser.close()
+        self._laser = open_again(self._make, serial)
+        self._lit, self._unknown = False, ""
 
     def _try_to_switch_off(self, reason: str) -> None:
         lit = self._lit

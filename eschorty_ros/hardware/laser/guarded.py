@@ -22,7 +22,6 @@ from eschorty_ros.core.errors import (
     EschortyError,
 )
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.hardware.laser.guard import maker
 from eschorty_ros.hardware.laser.guard_wire import (
     Message,
     Wire,
@@ -32,6 +31,7 @@ from eschorty_ros.hardware.laser.guard_wire import (
     readback_from,
     standing_still,
 )
+from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.protocols import DeviceIdentity, LaserReadback
 
 GUARD = "eschorty_ros.hardware.laser.guard"
@@ -78,7 +78,7 @@ class GuardedLaser:
         self._answer_s = answer_s
         self._numbers = itertools.count()
         self._waiting: dict[int, queue.SimpleQueue[Message]] = {}
-        self._opened = self._closing = self._ending = False
+        self._opened = self._closing = self._dismissed = self._ending = False
         self._lost = ""
         self._direct = threading.Lock()
         self._off_confirmed = False
@@ -161,12 +161,14 @@ class GuardedLaser:
             return
         self._closing = True
         try:
+            if self._opened:
+                # While the guard's death is still made up for.
+                self.disable()
+            self._dismissed = True
             if not self._lost:
                 self._call("close", OFF_S)
-            elif self._opened:
-                self._switch_off_directly()
         finally:
-            self._ending = True
+            self._dismissed = self._ending = True
             self._thread.join(EXIT_S)
             self._wire.close()
             # It may still be at a generator that does not answer; reaped when it ends.
@@ -214,7 +216,7 @@ class GuardedLaser:
                 self._wire.send({"do": "beat"})
             if standing_still(self._guard.pid):
                 self._guard.kill()
-        if not self._closing:
+        if not self._dismissed:
             self._replace_guard()
 
     def _replace_guard(self) -> None:
@@ -242,7 +244,7 @@ class GuardedLaser:
             end_s = time.monotonic() + _DIRECT_S
             while not self._off_confirmed:
                 try:
-                    self._open_directly().close()
+                    open_again(self._open_directly, self.identity.serial).close()
                     self._off_confirmed = True
                 except EschortyError as error:
                     if time.monotonic() > end_s:

@@ -1,0 +1,44 @@
+"""Opening a generator by the name of what opens it, and none but the lost one again."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.hardware.protocols import LaserModulator
+
+
+def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
+    """Look up what opens the generator: ``module:callable`` with keywords.
+
+    Raises
+    ------
+    DeviceError
+        When there is no such callable.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        make = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise DeviceError(
+            f"laser driver {name!r} cannot be loaded ({error}); install it"
+        ) from error
+    return lambda: make(**settings)
+
+
+def open_again(make: Callable[[], LaserModulator], serial: str) -> LaserModulator:
+    """Open the generator that was lost, dark; another one says nothing about its output.
+
+    Raises
+    ------
+    DeviceError
+        It is not there.
+    """
+    laser = make()
+    found = laser.identity.serial
+    if serial and found and found != serial:
+        laser.close()
+        raise DeviceError(f"generator {serial} is gone, {found} is there; connect {serial}")
+    return laser
