@@ -23,6 +23,7 @@ from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.domain import free_domain
 
 MODULE = "eschorty_ros.nodes.laser"
+OFF_LIMIT_S = 0.25
 PARAMETERS = {
     "arm_timeout": 1.0,
     "heartbeat_timeout": 0.5,
@@ -163,7 +164,8 @@ def test_light_ends_after_the_longest_time_on(bench: Bench) -> None:
     bench.switch_on()
     bench.wait_dark()
     on_ns, off_ns = bench.switched_ns()
-    assert (off_ns - on_ns) * 1e-9 >= 3.0
+    # Counted from the request, which the generator takes some time to fulfil.
+    assert (off_ns - on_ns) * 1e-9 < 3.0 + OFF_LIMIT_S
     wait_until(lambda: "max_on_time" in bench.states[-1].reason, "the reason in laser/state")
 
 
