@@ -128,11 +128,12 @@ class Guard:
         self._epoch += 1
         if self._laser is None:
             return
-        unknown = self._unknown
-        if unknown and self._insisting is not None and self._insisting.is_alive():
+        unknown, insisting = self._unknown, self._insisting
+        if unknown and insisting is not None and insisting.is_alive():
             raise DeviceError(unknown)
         try:
-            if unknown:
+            if unknown and insisting is not None:
+                # Whoever insisted has closed it.
                 self._open_again()
             else:
                 self._laser.disable()
@@ -143,7 +144,7 @@ class Guard:
                 self._insisting = threading.Thread(target=self._insist, name="laser off")
                 self._insisting.start()
             raise
-        self._lit = False
+        self._lit, self._unknown = False, ""
 
     def _insist(self) -> None:
         """Open the generator anew until it is off; the means at hand have failed."""
