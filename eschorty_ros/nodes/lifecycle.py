@@ -120,7 +120,9 @@ class DeviceNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the device."""
-        self.failure = self.waiting = ""
+        self.failure = ""
+        if not self._auto_starting:
+            self.waiting = ""
         self._faulted.clear()
         opening = self._open_if_there if self._auto_starting else self.open_device
         if not self._attempt("configure", opening) or self.waiting:
@@ -178,7 +180,7 @@ class DeviceNode(LifecycleNode):
             self._auto_starting = True
             configured = self.trigger_configure()
             self._auto_starting = False
-        else:
+        if self.state_label != "unconfigured" or self.failure:
             self.waiting = ""
         if self.waiting:
             self._start_timer.timer_period_ns = round(RETRY_S * 1e9)
@@ -196,6 +198,8 @@ class DeviceNode(LifecycleNode):
             if self.waiting != self._told:
                 self.get_logger().warning(self.waiting)
             self._told = self.waiting
+        else:
+            self.waiting = ""
 
     def _leave_after_fault(self) -> None:
         if not self._faulted.is_set():
