@@ -238,7 +238,9 @@ class StageNode(DeviceNode):
         # After a longer silence the past is over.
         fill = missed if len(missed) <= FILL_MAX else ()
         self._told_ns = newest.t_ns
-        return [*(stage.state(t_ns) for t_ns in fill), newest]
+        # Where the axis had no reference yet, nothing is told afterwards.
+        told = [(t_ns, stage.state(t_ns)) for t_ns in fill]
+        return [*(state for t_ns, state in told if state.t_ns == t_ns), newest]
 
     def _odometry(self, state: StageState) -> Odometry:
         message = Odometry(child_frame_id=self.parameters["stage_frame"])

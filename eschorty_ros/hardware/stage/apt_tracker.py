@@ -76,6 +76,7 @@ class Tracker:
         self._poll: tuple[int, int] | None = None
         self._unmatched_until_ns = 0
         self._rest_ns = 0
+        self._known_from_ns = 0
         self._looks = 0
 
     @property
@@ -126,8 +127,8 @@ class Tracker:
         until_ns, status = self.fit.until_ns, self.status
         assert until_ns is not None
         assert status is not None
-        newest_ns = min(self._clock_ns() - lag_ns, until_ns)
-        t_ns = newest_ns if t_ns is None else min(t_ns, until_ns)
+        wanted_ns = self._clock_ns() - lag_ns if t_ns is None else t_ns
+        t_ns = min(max(wanted_ns, self._known_from_ns), until_ns)
         position, velocity = (float(value) for value in self.fit.state(t_ns))
         flags = apt.decode_bits(status.bits)
         if self.age_ns > WARN_AGE_NS:
@@ -260,6 +261,7 @@ class Tracker:
             # Before, the encoder counted from somewhere else.
             self.fit = MotionFit(TOLERANCE_MM)
             self.fit.observe(status.position_mm, status.latest_ns, status.earliest_ns)
+            self._known_from_ns = self.fit.until_ns or 0
             return
         planned_mm = float(self.fit.state(status.latest_ns)[0])
         if abs(planned_mm - status.position_mm) > TOLERANCE_MM:
