@@ -9,7 +9,7 @@ from typing import Any
 
 from std_msgs.msg import String
 
-from eschorty_ros.nodes.laser import LaserNode
+from eschorty_ros.nodes.laser import THREADS, LaserNode
 from eschorty_ros.nodes.spin import run
 
 
@@ -28,4 +28,4 @@ class BreakableLaser(LaserNode):
 
 
 if __name__ == "__main__":
-    sys.exit(run(BreakableLaser, threads=3))
+    sys.exit(run(BreakableLaser, threads=THREADS))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
@@ -31,6 +31,7 @@ from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run
 
 STATE_RATE_HZ = 20.0
+THREADS = 4
 WATCHED = ("camera", "stage")
 
 TABLE = (
@@ -84,7 +85,8 @@ class LaserNode(DeviceNode):
             log=self._log,
             readback_period_s=1.0 / self.parameters["readback_rate"],
         )
-        control = MutuallyExclusiveCallbackGroup()
+        # Switching off must not wait for a command under way; the keeper keeps them in order.
+        control = ReentrantCallbackGroup()
         self.create_service(Trigger, "laser/arm", self._on_arm, callback_group=control)
         self.create_service(SetBool, "laser/enable", self._on_enable, callback_group=control)
         signs = MutuallyExclusiveCallbackGroup()
@@ -263,7 +265,7 @@ def _modulation(values: dict[str, Any]) -> Modulation:
 
 def main() -> None:
     """Entry point of the laser node."""
-    sys.exit(run(LaserNode, threads=3))
+    sys.exit(run(LaserNode, threads=THREADS))
 
 
 if __name__ == "__main__":

@@ -7,55 +7,12 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from held_laser import HeldLaser
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserReadback
 from eschorty_ros.nodes.laser_gate import LEASE, LaserGate
 from eschorty_ros.nodes.laser_keeper import LaserKeeper
-
-
-class HeldLaser:
-    """In memory; a command named in ``hold`` waits for ``go`` before it is carried out."""
-
-    def __init__(self) -> None:
-        self.identity = DeviceIdentity("held", "1")
-        self.hold = ""
-        self.reached, self.go = threading.Event(), threading.Event()
-        self.lit = self.armed = False
-        self.modulation = Modulation(70.0)
-        self.lightings = 0
-
-    def _wait(self, command: str) -> None:
-        if self.hold == command:
-            self.reached.set()
-            assert self.go.wait(5.0)
-
-    def configure(self, modulation: Modulation) -> None:
-        self._wait("configure")
-        self.modulation = modulation
-
-    def arm(self) -> None:
-        self._wait("arm")
-        self.armed = True
-
-    def enable(self) -> None:
-        self._wait("enable")
-        if not self.armed:
-            raise DeviceError("not armed")
-        self.armed, self.lit = False, True
-        self.lightings += 1
-
-    def disable(self) -> None:
-        self.armed = self.lit = False
-
-    def readback(self) -> LaserReadback:
-        self._wait("readback")
-        output = LaserOutput.ON if self.lit else LaserOutput.OFF
-        return LaserReadback(output, self.modulation, None, 0)
-
-    def close(self) -> None:
-        self.disable()
 
 
 @pytest.fixture

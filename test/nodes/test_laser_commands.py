@@ -1,0 +1,73 @@
+"""The laser node's services while one of them is under way."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+
+import rclpy
+from held_laser import HeldLaser
+from rclpy.context import Context
+from rclpy.executors import MultiThreadedExecutor
+from ros_process import NAMESPACE, Observer, wait_until
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+
+from eschorty_ros.nodes import drivers, qos
+from eschorty_ros.nodes.domain import free_domain
+from eschorty_ros.nodes.laser import THREADS, LaserNode
+from eschorty_ros.nodes.laser_gate import LEASE
+
+
+@pytest.fixture
+def observer() -> Iterator[Observer]:
+    with Observer(free_domain(), "laser_observer") as made:
+        yield made
+
+
+@pytest.fixture
+def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldLaser]:
+    held = HeldLaser()
+    monkeypatch.setattr(drivers, "make", lambda *_: held)
+    context = Context()
+    rclpy.init(args=["--ros-args", "-p", "watch:=none", "-p", "heartbeat_timeout:=60.0"],
+               context=context, domain_id=observer.domain)  # fmt: skip
+    node = LaserNode(context=context, namespace=NAMESPACE)
+    executor = MultiThreadedExecutor(THREADS, context=context)
+    executor.add_node(node)
+    spinning = threading.Thread(target=executor.spin, daemon=True)
+    spinning.start()
+    yield held
+    held.go.set()
+    executor.shutdown(1.0)
+    node.safe_state()
+    node.destroy_node()
+    context.try_shutdown()
+    spinning.join(5.0)
+
+
+def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser: HeldLaser) -> None:
+    observer.wait_for_state("laser", "active")
+    heart = observer.publisher(Header, LEASE, qos.heartbeat())
+    wait_until(heart.get_subscription_count, "the heartbeat's subscriber")
+    heart.publish(Header())
+    wait_until(lambda: observer.call(Trigger, "laser/arm").success, "arming")
+    laser.hold = "enable"
+    enabling = threading.Thread(
+        target=lambda: observer.call(SetBool, "laser/enable", SetBool.Request(data=True))
+    )
+    enabling.start()
+    assert laser.reached.wait(5.0)
+    off = threading.Thread(
+        target=lambda: observer.call(SetBool, "laser/enable", SetBool.Request(data=False))
+    )
+    off.start()
+    assert laser.switched_off.wait(2.0), "switching off waits"
+    laser.go.set()
+    enabling.join()
+    off.join()
+    assert laser.lightings == 0
