@@ -20,7 +20,7 @@ class HeldLaser:
         self.switched_off = threading.Event()
         self.lit = self.armed = False
         self.modulation = Modulation(70.0)
-        self.lightings = 0
+        self.lightings = self.offs = 0
 
     def _wait(self, command: str) -> None:
         if self.hold == command:
@@ -44,6 +44,7 @@ class HeldLaser:
 
     def disable(self) -> None:
         self.armed = self.lit = False
+        self.offs += 1
         if self.hold:
             self.switched_off.set()
 

@@ -188,8 +188,11 @@ class LaserNode(DeviceNode):
             raise DeviceError(f"laser refused: node is {self.state_label}; activate it first")
 
     def _on_interlock(self, message: Bool) -> None:
-        self._keeper.gate.interlock_open = bool(message.data)
-        if message.data:
+        gate = self._keeper.gate
+        opens = message.data and not gate.interlock_open
+        gate.interlock_open = bool(message.data)
+        # Said again it is no news; the watchdog looks at it all the time.
+        if opens:
             self._keeper.darken("interlock open")
         self._keeper.tell()
 

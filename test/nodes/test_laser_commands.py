@@ -10,11 +10,12 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
 import rclpy
+from eschorty_ros.msg import LaserState
 from held_laser import HeldLaser
 from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor
 from ros_process import NAMESPACE, Observer, wait_until
-from std_msgs.msg import Header
+from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.nodes import drivers, qos
@@ -71,3 +72,18 @@ def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser:
     enabling.join()
     off.join()
     assert laser.lightings == 0
+
+
+def test_interlock_that_goes_on_saying_open_switches_off_once(
+    observer: Observer, laser: HeldLaser
+) -> None:
+    observer.wait_for_state("laser", "active")
+    states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
+    before = laser.offs
+    interlock = observer.publisher(Bool, "laser/interlock", qos.stream(10))
+    for _ in range(5):
+        interlock.publish(Bool(data=True))
+    wait_until(lambda: states and states[-1].interlock_open, "the open interlock")
+    interlock.publish(Bool(data=False))
+    wait_until(lambda: not states[-1].interlock_open, "the closed interlock")
+    assert laser.offs == before + 1
