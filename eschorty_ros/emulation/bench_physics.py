@@ -31,6 +31,7 @@ PACKET_US = 1_008
 
 _PACKETS_AT_ONCE = 4
 _PACKET_S = PACKET_US * 1e-6
+_PULSE_MAX_NS = 1_000_000_000
 _PPB = 1_000_000_000
 
 
@@ -174,9 +175,12 @@ class Physics:
             return
         with self.lock:
             now_ns = self.clock_ns()
-            if now_ns > self._collected_ns:
+            if now_ns <= self._collected_ns:
+                return
+            # Asked for a thousand times a second: a carriage at rest gives no pulses.
+            if self._collected_ns <= self._plan.end_ns + _PULSE_MAX_NS:
                 self._stage_edges.extend(self._pulses(self._collected_ns, now_ns))
-                self._collected_ns = now_ns
+            self._collected_ns = now_ns
 
     def start(self) -> None:
         """Begin streaming; the sensor's clock reads 0 now."""

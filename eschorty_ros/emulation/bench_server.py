@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from eschorty_ros.emulation.bench_folder import READY_FILE, STAGE_PORT, USB_SOCK
 from eschorty_ros.emulation.faults import FaultPlan, FaultScript
 from eschorty_ros.emulation.pty_port import PtyPort
 from eschorty_ros.emulation.usb_server import UsbServer
+
+_SWITCH_S = 5e-4
 
 
 @contextlib.contextmanager
@@ -25,6 +28,8 @@ def serving(bench: Bench, folder: Path, faults: FaultPlan | None = None) -> Iter
     DeviceError
         When socket or port cannot be made there.
     """
+    # Answers are short and urgent beside the simulation's long turns.
+    sys.setswitchinterval(_SWITCH_S)
     plan = faults or FaultPlan(faults=[])
     ready = folder / READY_FILE
     with (
