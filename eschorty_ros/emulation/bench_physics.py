@@ -184,8 +184,9 @@ class Physics:
 
     def start(self) -> None:
         """Begin streaming; the sensor's clock reads 0 now."""
+        # Before the lock: laser and stage go on acting while the world is made.
+        world = self._make_world()
         with self._simulating, self.lock:
-            world = self._make_world()
             self.collect_pulses()
             self._stage_edges.clear()
             self._news.clear()
