@@ -125,7 +125,7 @@ class Steps(UniformReflectance):
 
     base_mm: float = 1320.0
     column_levels_mm: tuple[float, ...] = (0.0, 2.0, 5.0, 25.0, 60.0, 20.0, -40.0, -45.0)
-    stage_levels_mm: tuple[float, ...] = (0.0, 2.0, 40.0, 38.0, 36.0, -40.0, 62.0, 60.0, 0.0)
+    stage_levels_mm: tuple[float, ...] = (0.0, 2.0, -40.0, -38.0, -36.0, 40.0, 62.0, 60.0, 0.0)
     stage_band_mm: float = 25.0
 
     def __post_init__(self) -> None:
