@@ -30,6 +30,8 @@ SCENE = "steps"
 EDGE_MM = 4.0
 CALIBRATION = "config_3"
 START_M, STOP_M, SPEED_M_S, FREQUENCY_HZ = 0.020, 0.040, 0.050, 70.0
+SLOW_HZ = 20.0
+"""Of sweeps that something happens in: events few enough to be simulated as they come."""
 SCAN_DEADLINE_S = 90.0
 
 
@@ -203,7 +205,7 @@ def full_scan(bench: Bench) -> None:
 def cancel_scan(bench: Bench) -> None:
     """Cancel in the middle: light off, stage stopped, what there is published."""
     before = len(bench.clouds)
-    handle = bench.start(stop=0.120, speed=0.015)
+    handle = bench.start(stop=0.120, speed=0.015, frequency=SLOW_HZ)
     bench.wait_for_sweep()
     canceled = handle.cancel_goal_async()
     wait_until(canceled.done, "an answer to the cancel request")
@@ -258,7 +260,7 @@ def bad_parameters(bench: Bench) -> None:
 
 def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
     """The scanner ends mid-scan: without its heartbeat the laser switches off."""
-    bench.start(stop=0.200, speed=0.015)
+    bench.start(stop=0.200, speed=0.015, frequency=SLOW_HZ)
     bench.wait_for_sweep()
     assert bench.output_lines()[-1] == "ON"
     interrupt()
@@ -269,7 +271,7 @@ def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
     before = len(bench.clouds)
     # Slow: DDS holds everybody's messages for some seconds after a process was killed.
-    bench.start(stop=0.200, speed=0.015)
+    bench.start(stop=0.200, speed=0.015, frequency=SLOW_HZ)
     bench.wait_for_sweep()
     kill()
     killed_s = time.monotonic()
