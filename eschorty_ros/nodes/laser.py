@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -50,7 +51,8 @@ TABLE = (
     Param("arm_timeout", 10.0, "how long laser/arm allows laser/enable", "s", 0.1, 3600.0),
     Param("heartbeat_timeout", 1.0, "age at which laser/heartbeat is stale", "s", 0.05, 60.0),
     Param("max_on_time", 600.0, "longest time on", "s", 0.1, 86400.0),
-    Param("interlock_required", False, "interlock is open until laser/interlock says closed"),
+    Param("interlock_required", False, "interlock is open unless laser/interlock says closed"),
+    Param("interlock_timeout", 1.0, "age at which a required 'closed' is stale", "s", 0.05, 60.0),
     Param("watch", " ".join(WATCHED), "nodes whose heartbeats light needs: camera, stage, none"),
     Param("camera_timeout", 1.0, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
     Param("stage_timeout", 1.0, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
@@ -62,8 +64,9 @@ TABLE = (
 class LaserNode(DeviceNode):
     """``laser/arm``, ``laser/enable``, ``laser/heartbeat``, ``laser/interlock`` -> ``laser/state``.
 
-    ``laser/interlock`` (std_msgs/Bool): true means open, and open means dark; until a message says
-    otherwise it is open when ``interlock_required``, else closed. Light ends when
+    ``laser/interlock`` (std_msgs/Bool): true means open, and open means dark. With
+    ``interlock_required`` it is open unless a message within ``interlock_timeout`` says closed,
+    else closed until one says open. Light ends when
     ``laser/heartbeat`` (whoever wants light), ``camera/heartbeat`` or ``stage/heartbeat`` is stale
     or its sender on this host dies, with an open interlock, after ``max_on_time``, and when the
     generator does not read back as asked. This is looked after by threads on the steady clock,
@@ -142,7 +145,11 @@ class LaserNode(DeviceNode):
             self.parameters["arm_timeout"],
             self.parameters["max_on_time"],
             timeouts,
-            interlock_open=self.parameters["interlock_required"],
+            interlock_timeout_s=(
+                self.parameters["interlock_timeout"]
+                if self.parameters["interlock_required"]
+                else math.inf
+            ),
         )
 
     def _apply(self, values: dict[str, Any]) -> None:

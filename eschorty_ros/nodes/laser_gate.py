@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 
@@ -22,8 +23,9 @@ class LaserGate:
     leases : mapping of str to float
         Topics that must beat, and the age in seconds at which each one's last beat is stale. A
         sender on this host that dies or stands still, or says that it stops, is stale at once.
-    interlock_open : bool
-        What the interlock is taken for until somebody says otherwise.
+    interlock_timeout_s : float
+        Age at which the last word that the interlock is closed counts no more: it is open then,
+        and until the first one. Infinity: closed until somebody says otherwise.
     now_s : callable
         Steady clock in seconds.
 
@@ -39,7 +41,7 @@ class LaserGate:
         max_on_s: float,
         leases: Mapping[str, float],
         *,
-        interlock_open: bool = False,
+        interlock_timeout_s: float = math.inf,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._arm_timeout_s = arm_timeout_s
@@ -52,7 +54,20 @@ class LaserGate:
         self._stopped: set[str] = set()
         self._on_s: float | None = None
         self.gap_max_s: dict[str, float] = {}
-        self.interlock_open = interlock_open
+        self._interlock_timeout_s = interlock_timeout_s
+        self._said_open = False
+        self._closed_s = -math.inf
+
+    @property
+    def interlock_open(self) -> bool:
+        """Whether the interlock is said to be open, or nobody has said lately that it is not."""
+        return self._said_open or self._now_s() - self._closed_s > self._interlock_timeout_s
+
+    @interlock_open.setter
+    def interlock_open(self, is_open: bool) -> None:
+        self._said_open = is_open
+        if not is_open:
+            self._closed_s = self._now_s()
 
     @property
     def armed(self) -> bool:

@@ -66,6 +66,23 @@ def test_refusals_name_what_is_missing(gate: LaserGate, clock: Clock) -> None:
     assert "expired after 10 s" in str(gate.refusal())
 
 
+def test_a_required_interlock_is_open_unless_it_says_closed_again_and_again(clock: Clock) -> None:
+    gate = LaserGate(10.0, 60.0, {}, interlock_timeout_s=1.0, now_s=clock)
+    gate.arm()
+    assert "interlock open" in str(gate.refusal())
+    gate.interlock_open = False
+    assert gate.refusal() is None
+    gate.switched_on()
+    clock.now_s += 0.99
+    assert gate.must_end() is None
+    clock.now_s += 0.02
+    assert "interlock open" in str(gate.must_end())
+    gate.interlock_open = False
+    assert gate.must_end() is None
+    gate.interlock_open = True
+    assert "interlock open" in str(gate.must_end())
+
+
 def test_each_lease_ends_at_its_own_age(gate: LaserGate, clock: Clock) -> None:
     light(gate)
     clock.now_s += 0.99

@@ -242,14 +242,17 @@ def test_fault_u9_generator_restarted(lit: Bench) -> None:
     lit.light()
 
 
-def test_interlock_that_is_required_is_open_until_it_says_closed(tmp_path: Path) -> None:
-    with running(tmp_path, interlock_required=True) as bench:
+def test_interlock_that_is_required_is_open_unless_it_says_closed(tmp_path: Path) -> None:
+    with running(tmp_path, interlock_required=True, interlock_timeout=5.0) as bench:
         bench.observer.wait_for_state("laser", "active")
         wait_until(lambda: bench.states and bench.states[-1].interlock_open, "the interlock open")
         assert "interlock open" in bench.arm().message
         bench.interlock.publish(Bool(data=False))
         wait_until(lambda: not bench.states[-1].interlock_open, "the interlock closed")
         bench.light()
+        # Nobody says closed any more.
+        wait_until(lambda: bench.states[-1].output == LaserState.OUTPUT_OFF, "the laser off", 10.0)
+        assert "interlock open" in bench.states[-1].reason
 
 
 def _child(pid: int, module: str) -> int:
