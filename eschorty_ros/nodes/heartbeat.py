@@ -50,7 +50,7 @@ class Heartbeat:
         last_beats = 0
         beat_s = 0.0
         while not pause.wait(LOOK_S) and self._node.context.ok():
-            healthy, now_s = self._healthy(), time.monotonic()
+            healthy, now_s = self._asked(), time.monotonic()
             if healthy:
                 last_beats = LAST_BEATS
             due = healthy != self.beating or now_s - beat_s >= PERIOD_S
@@ -60,6 +60,13 @@ class Heartbeat:
                 return
             self.beating, beat_s = healthy, now_s
             last_beats -= not healthy
+
+    def _asked(self) -> bool:
+        try:
+            return self._healthy()
+        except Exception as error:
+            self._node.get_logger().error(f"health not known: {error!r}", once=True)
+            return False
 
     def _publish(self, *, stopped: bool) -> bool:
         message = Header(

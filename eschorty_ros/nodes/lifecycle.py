@@ -107,12 +107,12 @@ class DeviceNode(LifecycleNode):
 
     def fault(self, reason: str) -> None:
         """Report that the device failed, from any thread: safe at once, unconfigured soon."""
-        if self._faulted.is_set():
-            return
-        self._faulted.set()
-        self.failure = reason
-        self.get_logger().error(reason)
-        self._fault_guard.trigger()
+        known, self.failure = self.failure, reason
+        if reason != known:
+            self.get_logger().error(reason)
+        if not self._faulted.is_set():
+            self._faulted.set()
+            self._fault_guard.trigger()
 
     def now_ns(self) -> int:
         """Read the node's ROS time, int64 nanoseconds."""

@@ -182,7 +182,8 @@ class AsyncReader:
         """Take a finished transfer; runs in whichever thread handles libusb's events."""
         library, done = self._library, transfer.contents
         status = done.status
-        if done.actual_length:
+        # What completes after a failed transfer lies behind a gap that is not marked yet.
+        if done.actual_length and self._failure is None:
             data = ctypes.string_at(done.buffer, done.actual_length)
             self._received.append((data, self._clock_ns()))
         resting = status in (library.LIBUSB_TRANSFER_COMPLETED, library.LIBUSB_TRANSFER_TIMED_OUT)

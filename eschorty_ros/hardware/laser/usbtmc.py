@@ -84,12 +84,12 @@ class UsbTmc:
         self._name = name
         self._timeout_ms = max(1, round(timeout_s * 1e3))
         self._tag = 0
-        interface = self._tmc_interface()
-        self._interface = interface.bInterfaceNumber
-        self._out = self._endpoint(interface, usb.util.ENDPOINT_OUT)
-        self._in = self._endpoint(interface, usb.util.ENDPOINT_IN)
-        self._packet = self._in.wMaxPacketSize
         try:
+            interface = self._tmc_interface()
+            self._interface = interface.bInterfaceNumber
+            self._out = self._endpoint(interface, usb.util.ENDPOINT_OUT)
+            self._in = self._endpoint(interface, usb.util.ENDPOINT_IN)
+            self._packet = self._in.wMaxPacketSize
             self._detached = claim(device, self._interface, name)
         except DeviceError:
             usb.util.dispose_resources(device)
