@@ -33,6 +33,7 @@ from eschorty_ros.nodes.calibration_sequence import (
 from eschorty_ros.nodes.cloud_messages import image_message
 from eschorty_ros.nodes.rig import LaserStageRig
 from eschorty_ros.nodes.scan_sequence import End
+from eschorty_ros.nodes.spin import unless_shut_down
 from eschorty_ros.nodes.transforms import OPTICAL
 
 _FEEDBACK_S = 0.2
@@ -115,7 +116,9 @@ class Calibrator:
         try:
             request = request_from_goal(goal.request)
             check_request(request)
-            return self._calibrate(goal, request)
+            with unless_shut_down(self._node):
+                return self._calibrate(goal, request)
+            return Calibrate.Result(message="the node was shut down")
         except EschortyError as error:
             return self._refuse(goal, str(error))
         finally:

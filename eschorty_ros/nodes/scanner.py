@@ -31,7 +31,7 @@ from eschorty_ros.nodes.scan_sequence import (
     check_request,
     run_scan,
 )
-from eschorty_ros.nodes.spin import run
+from eschorty_ros.nodes.spin import run, unless_shut_down
 
 TABLE = (
     Param("auto_scan", False, "do one scan as soon as the other nodes are there"),
@@ -153,12 +153,14 @@ class ScannerNode(Node):
             self.get_logger().error(line)
         else:
             self.get_logger().info(line)
-        _close(goal, outcome.end)
+        with unless_shut_down(self):
+            _close(goal, outcome.end)
         return result
 
     def _refuse(self, goal: Any, reason: str) -> Any:
         self.get_logger().error(f"scan refused: {reason}")
-        goal.abort()
+        with unless_shut_down(self):
+            goal.abort()
         return Scan.Result(success=False, message=reason)
 
     def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:

@@ -18,6 +18,7 @@ from rclpy.executors import (
     MultiThreadedExecutor,
     SingleThreadedExecutor,
 )
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 from eschorty_ros.core.errors import EschortyError
@@ -39,6 +40,16 @@ def make_safe(nodes: Sequence[Node]) -> None:
             safe_state()
         except Exception as error:
             print(f"{node.get_name()}: not safe: {error}", file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def unless_shut_down(node: Node) -> Iterator[None]:
+    """Swallow the errors of a context that a signal has ended meanwhile: nobody is left to tell."""
+    try:
+        yield
+    except (_rclpy.RCLError, _rclpy.InvalidHandle):
+        if node.context.ok():
+            raise
 
 
 def _interrupt_once() -> None:

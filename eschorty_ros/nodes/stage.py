@@ -22,7 +22,7 @@ from eschorty_ros.nodes.device_messages import trigger_message
 from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.parameters import Param
-from eschorty_ros.nodes.spin import run
+from eschorty_ros.nodes.spin import run, unless_shut_down
 
 FEEDBACK_PERIOD_S = 0.05
 POLL_S = 0.01
@@ -149,13 +149,15 @@ class StageNode(DeviceNode):
         self._begin(target_mm, speed_mm_s)
         state = self._follow(goal)
         if goal.is_cancel_requested:
-            goal.canceled()
+            with unless_shut_down(self):
+                goal.canceled()
             return self._result(False, "canceled: stopped", state)
         if abs(state.position_mm - target_mm) > 1e-3:
             raise DeviceError(
                 f"stopped at {state.position_mm:.3f} mm on the way to {target_mm:.3f} mm"
             )
-        goal.succeed()
+        with unless_shut_down(self):
+            goal.succeed()
         return self._result(True, "arrived", state)
 
     def _begin(self, target_mm: float, speed_mm_s: float) -> None:
@@ -205,7 +207,8 @@ class StageNode(DeviceNode):
         if not self.context.ok():
             return MoveStage.Result(success=False, message=reason)
         self.get_logger().warning(reason)
-        goal.abort()
+        with unless_shut_down(self):
+            goal.abort()
         stage, state = self._stage, None
         with contextlib.suppress(EschortyError):
             state = stage.state() if stage is not None else None
