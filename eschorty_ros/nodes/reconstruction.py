@@ -72,6 +72,7 @@ class ReconstructionNode(Node):
         self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
         self._mailbox = Mailbox(self.parameters["packets_max"])
         self._ending: tuple[Callable[[ScanReport], None], ...] = ()
+        self._ended_s = 0.0
         self._reports = Reports(self, self._pipeline, self._mailbox)
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
@@ -213,7 +214,8 @@ class ReconstructionNode(Node):
             finished.set()
 
         def begin_end() -> None:
-            self._pipeline.close_period(request.scan_id, time.monotonic())
+            self._ended_s = time.monotonic()
+            self._pipeline.close_period(request.scan_id, self._ended_s)
             self._ending = (done,)
 
         response.success, response.message = self._in_worker(begin_end)
@@ -281,7 +283,8 @@ class ReconstructionNode(Node):
         self._outputs.points(placed)
         if until_ns is not None:
             self._outputs.event_frame(until_ns)
-        if self._ending and self._pipeline.placer.waiting == 0:
+        # Background makes profiles after the light is off, too; nobody waits for those.
+        if self._ending and not self._pipeline.placer.holds(self._ended_s):
             callbacks, self._ending = self._ending, ()
             report = self._pipeline.end_scan()
             self._outputs.scan(report.scan, self.get_clock().now().nanoseconds)

@@ -68,6 +68,10 @@ class StagePlacer:
             self._waiting.append((now_s, timed))
             self.waiting += len(timed.profiles)
 
+    def holds(self, until_s: float) -> bool:
+        """Whether a profile that arrived by steady time ``until_s`` still waits."""
+        return bool(self._waiting) and self._waiting[0][0] <= until_s
+
     def ready(self, now_s: float) -> list[tuple[TimedProfiles, NDArray[np.float64]]]:
         """Profiles whose position is known, each with its positions (mm, float64), oldest first."""
         placed = []

@@ -86,6 +86,19 @@ def test_points_wait_for_the_stage_and_are_never_extrapolated():
     assert (placer.points_without_stage, placer.waiting) == (2, 0)
 
 
+def test_profiles_of_the_background_after_the_end_keep_nobody_waiting():
+    placer = StagePlacer(gap_s=0.0, timeout_s=10.0)
+    placer.add_profiles(timed([T0_NS + 500_000]), 0.0)
+    placer.add_profiles(timed([T0_NS + 2_000_000]), 1.0)
+    assert placer.holds(0.5)
+    placer.add_stage(T0_NS, 10.0)
+    placer.add_stage(T0_NS + 1_000_000, 11.0)
+    placer.ready(1.1)
+    assert placer.waiting == 1
+    assert not placer.holds(0.5)
+    assert placer.holds(1.0)
+
+
 def test_a_gap_in_the_odometry_is_not_bridged():
     placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
     placer.add_stage(T0_NS, 10.0)
