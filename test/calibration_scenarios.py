@@ -108,6 +108,12 @@ class CalibrationBench(Bench):
         wait_until(lambda: self.active, "a latched calibration", SCAN_DEADLINE_S)
         return self.active[-1]
 
+    def wait_for_active(self, calibration_id: str) -> None:
+        """Wait until this calibration is the one told; "" is the design."""
+        wait_until(
+            lambda: self.newest.id == calibration_id, f"calibration {calibration_id!r} on its topic"
+        )
+
     @contextlib.contextmanager
     def nothing_changes(self) -> Iterator[None]:
         """Within it the active calibration and the folder stay as they are."""
@@ -157,7 +163,6 @@ def calibrated_scan_is_right(bench: CalibrationBench) -> None:
 
 def nine_posts(bench: CalibrationBench, method: str) -> None:
     """Nine posts give range within 1 mm RMS; result, file and latched message agree."""
-    told = len(bench.active)
     status, result = bench.calibrate(method=method)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     assert result.success
@@ -183,8 +188,8 @@ def nine_posts(bench: CalibrationBench, method: str) -> None:
     assert (result.frame.width, result.frame.height) == (1280, 720)
     assert result.frame.encoding == "mono8"
     assert max(result.frame.data) == 255
-    wait_until(lambda: len(bench.active) > told, "the calibration on its topic")
-    assert (bench.newest.id, bench.newest.file) == (made.id, result.file)
+    bench.wait_for_active(made.id)
+    assert bench.newest.file == result.file
     table = dict(zip(bench.newest.parameters, bench.newest.values, strict=True))
     assert table["b_prime_px"] == made.b_prime_px
     assert any(f.matched == len(POSTS) and len(f.residuals) == len(POSTS) for f in bench.seen)
@@ -209,7 +214,7 @@ def moving_target(bench: CalibrationBench) -> None:
         rms_mm = float(np.sqrt(np.mean(error**2)))
         print(f"moved by the stage: range RMS {rms_mm:.3f} mm from {near_mm:g} to {far_mm:g} mm")
         assert rms_mm < bound_mm
-    assert bench.newest.id == result.calibration_id
+    bench.wait_for_active(result.calibration_id)
     bench.assert_dark_and_at_rest()
 
 
@@ -339,11 +344,11 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
     assert answer.success, answer.message
     answer = load(bench, CALIBRATION)
     assert answer.success, answer.message
-    wait_until(lambda: bench.newest.id == "", "the design on its topic")
+    bench.wait_for_active("")
     answer = load(bench, folder / "kept.yaml")
     assert answer.success, answer.message
     assert answer.id == told
-    wait_until(lambda: bench.newest.id == told, "the calibration on its topic")
+    bench.wait_for_active(told)
 
 
 def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
