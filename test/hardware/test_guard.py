@@ -135,13 +135,13 @@ time.sleep(30.0)
 class Owner:
     """A process that has switched the light on."""
 
-    def __init__(self, device: Generator) -> None:
+    def __init__(self, device: Generator, stderr: int = subprocess.DEVNULL) -> None:
         self.device = device
         self.process = subprocess.Popen(
             [sys.executable, "-c", OWNER, str(device.path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            stderr=stderr,
             text=True,
         )
         self.guard_pid = int(self._line())
@@ -204,6 +204,41 @@ def test_guard_is_deaf_to_the_terminal(owner: Owner) -> None:
     assert owner.device.lit()
     assert os.getsid(owner.guard_pid) == owner.guard_pid
     assert owner.send(signal.SIGKILL) < OFF_LIMIT_S
+
+
+def test_nobody_reading_what_the_guard_says_keeps_it_from_nothing(device: Generator) -> None:
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writing, b"x" * 4096)
+    os.set_blocking(writing, True)
+    owner = Owner(device, stderr=writing)
+    try:
+        for number in (signal.SIGSTOP, signal.SIGKILL):
+            assert owner.send(number) < OFF_LIMIT_S
+        _wait_for_end(owner.guard_pid)
+    finally:
+        os.close(reading)
+        os.close(writing)
+        owner.close()
+
+
+def test_guard_imports_nothing_from_the_current_folder(
+    device: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("json", "socket", "generator_double", "eschorty_ros"):
+        (tmp_path / f"{module}.py").write_text("raise SystemExit('from the current folder')")
+    monkeypatch.chdir(tmp_path)
+    test_close_switches_off_and_releases(device)
+
+
+def test_guard_runs_the_package_that_started_it(
+    device: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also from a checkout that is no more than the current folder."""
+    monkeypatch.setenv("PYTHONPATH", TEST_FOLDER)
+    test_close_switches_off_and_releases(device)
 
 
 def test_silence_disarms_until_armed_again(laser: GuardedLaser, device: Generator) -> None:

@@ -1,8 +1,8 @@
 """The laser's guard: a process that owns the generator and outlives whatever its owner dies of.
 
-Started by ``GuardedLaser`` as ``python -m eschorty_ros.hardware.laser.guard <descriptor> <pid>``,
-in a session of its own and deaf to the terminal's signals. It switches the output off when the
-process that started it ends in any way, dumps core, is stopped, or is silent for too long.
+Started by ``GuardedLaser`` in a session of its own, deaf to the terminal's signals. It switches the
+output off when the process that started it ends in any way, dumps core, is stopped, or is silent
+for too long.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser.guard_wire import (
     Message,
@@ -35,6 +36,7 @@ from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput
 _LOOK_S = 0.02
 _RETRY_S = 0.25
 _INSIST_S = 30.0
+_SAY_S = 0.1
 
 
 class Guard:
@@ -251,13 +253,20 @@ class Guard:
 
 
 def _say(text: str) -> None:
-    # Whoever read it may be gone.
-    with contextlib.suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
+    """Tell standard error; whoever reads it may be gone or stuck and is not waited for long."""
+
+    def write() -> None:
+        with contextlib.suppress(OSError):
+            os.write(2, f"{text}\n".encode())
+
+    writer = threading.Thread(target=write, name="laser guard's words", daemon=True)
+    with contextlib.suppress(RuntimeError):
+        writer.start()
+        writer.join(_SAY_S)
 
 
 def main() -> None:
-    """Entry point of the guard process."""
+    """Entry point of the guard process; arguments: the wire's descriptor, the owner's pid."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
     descriptor, owner_pid = (int(argument) for argument in sys.argv[1:])
@@ -265,10 +274,6 @@ def main() -> None:
     end.set_inheritable(False)
     try:
         Guard(Wire(end), owner_pid).run()
-    except EschortyError as error:
-        _say(f"laser guard: {error}")
+    except Exception:
+        _say(f"laser guard: {traceback.format_exc()}")
         sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.errors import (
@@ -34,7 +35,13 @@ from eschorty_ros.hardware.laser.guard_wire import (
 from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.protocols import DeviceIdentity, LaserReadback
 
-GUARD = "eschorty_ros.hardware.laser.guard"
+# The guard runs the package that runs here, wherever it lies, and searches no current folder: with
+# -P and the package's own folder on the path no longer than it takes to find the package.
+_START_GUARD = (
+    "import sys; sys.path.insert(0, sys.argv.pop(1)); import eschorty_ros; del sys.path[0]; "
+    "from eschorty_ros.hardware.laser.guard import main; main()"
+)
+_PACKAGE_FOLDER = str(Path(__file__).parents[3])
 BEATS_PER_SILENCE = 5
 OPEN_S = 20.0
 OFF_S = 2.0
@@ -85,8 +92,9 @@ class GuardedLaser:
         # Both ends close on exec, the guard's is handed to the guard alone.
         here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with there:
+            arguments = (_PACKAGE_FOLDER, str(there.fileno()), str(os.getpid()))
             self._guard = subprocess.Popen(
-                [sys.executable, "-m", GUARD, str(there.fileno()), str(os.getpid())],
+                [sys.executable, "-P", "-c", _START_GUARD, *arguments],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(there.fileno(),),
                 start_new_session=True,
