@@ -52,6 +52,13 @@ class _Timer:
         self.period_ns, self.action, self.due_ns = period_ns, action, due_ns
 
 
+def _port_failure(error: Exception) -> DeviceGoneError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return DeviceGoneError(
+        f"the stage's port failed: {reason}; check the cable, then configure again"
+    )
+
+
 class AptLink:
     """Frames to and from one controller.
 
@@ -62,7 +69,7 @@ class AptLink:
     on_frame : callable
         Called for every frame with its time of receipt, in the reader's thread.
     on_lost : callable
-        Called once when the port fails, with the reason.
+        Called once when the port or a thread fails, with the reason.
     now_ns : callable
         Steady clock.
     wait : callable
@@ -101,7 +108,7 @@ class AptLink:
     def start(self) -> None:
         """Begin to read and write in threads."""
         for name, loop in (("apt reader", self._read_loop), ("apt writer", self._write_loop)):
-            thread = threading.Thread(target=loop, name=name, daemon=True)
+            thread = threading.Thread(target=self._run, args=(loop,), name=name, daemon=True)
             self._threads.append(thread)
             thread.start()
 
@@ -119,18 +126,31 @@ class AptLink:
             self._news.notify_all()
 
     def send_now(self, *frames: bytes) -> None:
-        """Write past every queue, in the caller's thread; on the wire when it returns."""
-        self._check()
+        """Write past every queue, in the caller's thread; on the wire when it returns.
+
+        Tried even on a link that has failed: the controller may still hear a stop.
+
+        Raises
+        ------
+        DeviceGoneError
+            When the port fails or is closed.
+        """
+        self._check_open()
         # The writer holds the lock for one frame at most. Should it hang, two frames may mix:
         # better than no stop.
         held = self._port_lock.acquire(timeout=_STOP_LOCK_S)
         try:
             for frame in frames:
-                self._write(frame)
+                self._port.write(frame)
+        except _GONE_EXCEPTIONS as error:
+            failure = _port_failure(error)
+        else:
+            return
         finally:
             if held:
                 self._port_lock.release()
-        self._check()
+        self._fail(failure)
+        raise failure
 
     def request(self, frame: bytes, answer: str, source: int, timeout_s: float) -> Frame:
         """Send ``frame`` and wait for the message ``answer`` from ``source``.
@@ -139,18 +159,20 @@ class AptLink:
         ------
         DeviceTimeoutError
             When it does not come in time.
-        DeviceGoneError
-            When the port fails.
+        DeviceError
+            When the link fails.
         """
         key = (answer, source)
         future: Future[Frame] = Future()
         with self._news:
             self._answers[key] = future
-        self.send(frame)
-        self.wait_until(future.done, timeout_s)
-        with self._news:
-            if self._answers.get(key) is future:
-                del self._answers[key]
+        try:
+            self.send(frame)
+            self.wait_until(future.done, timeout_s)
+        finally:
+            with self._news:
+                if self._answers.get(key) is future:
+                    del self._answers[key]
         if future.done():
             return future.result()
         self._check()
@@ -190,17 +212,18 @@ class AptLink:
                 timer.due_ns = max(timer.due_ns + timer.period_ns, now_ns + timer.period_ns // 2)
                 timer.action()
         while self._queue:
-            with self._port_lock:
-                self._write(self._queue.popleft())
+            self.write_at_once(self._queue.popleft())
         due_ns = min((timer.due_ns for timer in self._timers), default=now_ns + 10**9)
         return max(due_ns - self.now_ns(), 0) * 1e-9
 
-    def write_at_once(self, frame: bytes) -> int:
-        """Write a frame from a timer's action; the time just before."""
-        with self._port_lock:
-            sent_ns = self.now_ns()
-            self._write(frame)
-        return sent_ns
+    def write_at_once(self, frame: bytes) -> None:
+        """Write a frame past the queue, from a timer's action or a frame's."""
+        try:
+            with self._port_lock:
+                self._port.write(frame)
+        except _GONE_EXCEPTIONS as error:
+            # Without the lock: whoever is told may wait for one who waits for it.
+            self._fail(_port_failure(error))
 
     def close(self) -> None:
         """End the threads and release the port; idempotent."""
@@ -216,25 +239,27 @@ class AptLink:
     def _check(self) -> None:
         if self._lost is not None:
             raise self._lost
+        self._check_open()
+
+    def _check_open(self) -> None:
         if self._closing.is_set():
             raise DeviceGoneError("the stage's port is closed; open the stage again")
 
-    def _write(self, frame: bytes) -> None:
-        try:
-            self._port.write(frame)
-        except _GONE_EXCEPTIONS as error:
-            self._fail(error)
-
-    def _fail(self, error: Exception) -> None:
+    def _fail(self, failure: DeviceError) -> None:
         if self._lost is not None or self._closing.is_set():
             return
-        reason = " ".join(str(error).split()) or type(error).__name__
-        self._lost = DeviceGoneError(
-            f"the stage's port failed: {reason}; check the cable, then configure again"
-        )
-        self._on_lost(self._lost)
+        self._lost = failure
+        self._on_lost(failure)
         with self._news:
             self._news.notify_all()
+
+    def _run(self, loop: Callable[[], None]) -> None:
+        try:
+            loop()
+        except Exception as error:
+            text = " ".join(repr(error).split())
+            self._fail(DeviceError(f"the stage's driver failed: {text}; configure again"))
+            raise
 
     def _read_loop(self) -> None:
         port = self._port
@@ -245,7 +270,7 @@ class AptLink:
                 if data:
                     data += port.read(port.in_waiting)
             except _GONE_EXCEPTIONS as error:
-                self._fail(error)
+                self._fail(_port_failure(error))
                 return
             self.receive(data)
 

@@ -295,7 +295,7 @@ class AptStage:
 
     def _on_lost(self, error: DeviceError) -> None:
         with self._lock:
-            self._tracker.failure = self._tracker.failure or error
+            self.fail(error)
 
     def fail(self, error: DeviceError, escalate: bool = False) -> None:
         """Stop at once; a stuck carriage also loses its current."""

@@ -88,6 +88,37 @@ def test_fault_s6_unplug_on_the_port(port: str, model: AptModel) -> None:
     opened(port).close()
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("thread", ["apt reader", "apt writer"])
+def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
+    port: str, model: AptModel, thread: str
+) -> None:
+    stage = opened(port)
+
+    def mistake(*_: object) -> None:
+        assert threading.current_thread().name == thread
+        raise ZeroDivisionError("nobody thought of it")
+
+    try:
+        stage.home()
+        wait(lambda: stage.state().homed and not stage.state().moving)
+        stage.move_to(200.0, 50.0)
+        wait(lambda: model.axis.moving(time.time_ns()))
+        if thread == "apt reader":
+            stage._tracker.hear = mistake  # type: ignore[method-assign]
+        else:
+            stage._link.every(1.0, mistake)
+        wait(lambda: not stage.healthy)
+        for call in (stage.state, stage.home, lambda: stage.move_to(10.0, 10.0)):
+            with pytest.raises(DeviceError, match=r"driver failed: Zero.*nobody thought of it.*;"):
+                call()
+        wait(lambda: not model.axis.moving(time.time_ns()))
+        assert model.axis.position_mm(time.time_ns()) < 150.0
+    finally:
+        stage.close()
+    assert not [t for t in stage._link._threads if t.is_alive()]
+
+
 def test_fault_s9_blocked_callback(port: str, model: AptModel) -> None:
     """driver: keeps alive while whoever listens to it hangs; user reads: nothing."""
     stage = opened(port)

@@ -1,0 +1,54 @@
+"""The link by itself, on a port that fails."""
+
+from __future__ import annotations
+
+import errno
+import threading
+
+import pytest
+
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.hardware.stage.apt_link import AptLink
+
+
+class DeadPort:
+    timeout: float | None = None
+    in_waiting = 0
+
+    def read(self, size: int = 1) -> bytes:
+        return b""
+
+    def write(self, data: bytes) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    def close(self) -> None:
+        pass
+
+
+def test_whoever_hears_of_a_failure_may_use_the_link() -> None:
+    """As the reader does, which asks again while the listener waits for its lock."""
+    heard: list[DeviceError] = []
+
+    def on_lost(error: DeviceError) -> None:
+        reader = threading.Thread(target=link.write_at_once, args=(b"again",), daemon=True)
+        reader.start()
+        reader.join(5.0)
+        assert not reader.is_alive()
+        heard.append(error)
+
+    link = AptLink(DeadPort(), lambda frame, at_ns: None, on_lost)
+    link.write_at_once(b"frame")
+    assert [str(error) for error in heard] == [
+        "the stage's port failed: [Errno 5] Input/output error; check the cable, then configure "
+        "again"
+    ]
+    with pytest.raises(DeviceGoneError, match="port failed"):
+        link.send(b"frame")
+
+
+def test_request_that_cannot_be_sent_leaves_nothing_behind() -> None:
+    link = AptLink(DeadPort(), lambda frame, at_ns: None, lambda error: None)
+    link.close()
+    with pytest.raises(DeviceGoneError, match="port is closed"):
+        link.request(b"frame", "info", 0x50, 1.0)
+    assert not link._answers
