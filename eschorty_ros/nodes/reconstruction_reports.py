@@ -71,6 +71,7 @@ class Reports:
             "points_waiting_for_stage": placer.waiting,
             "points_without_stage": placer.points_without_stage,
             "stage_samples_late": placer.late_samples,
+            "stage_restarts": placer.track_restarts,
             "faults": self.faults,
             **{f"reconstructor_{name}": count for name, count in sorted(counters.items())},
         }

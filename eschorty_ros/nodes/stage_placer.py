@@ -13,6 +13,8 @@ from eschorty_ros.nodes.sensor_epoch import TimedProfiles
 __all__ = ["StagePlacer", "TimedProfiles"]
 
 _HISTORY_US = 600_000_000
+# Odometry comes in order: what lies further back than this was stamped by a clock set anew.
+_CLOCK_BACK_US = 100_000
 # A stage that rests gives no pulses, and a wire may be off: nobody waits longer for an edge.
 _EDGE_WAIT_S = 0.3
 
@@ -36,21 +38,26 @@ class StagePlacer:
         Points discarded because no position covers their time.
     waiting : int
         Points that wait for a stage position.
+    track_restarts : int
+        Times the odometry began anew because its stamps went back: the clock was set, or a
+        recording is played again.
     track : StageTrack
-        The odometry over ROS time, us.
+        The odometry over ROS time, us, since the last restart.
     """
 
     def __init__(self, gap_s: float, timeout_s: float) -> None:
         self.timeout_s = timeout_s
         self.points_without_stage = 0
         self.waiting = 0
+        self.track_restarts = 0
+        self._late_before = 0
         self.track = StageTrack(max_gap_us=round(gap_s * 1e6) or None)
         self._waiting: deque[tuple[float, TimedProfiles]] = deque()
 
     @property
     def late_samples(self) -> int:
         """Stage samples that were not later than the one before, and so were not used."""
-        return self.track.dropped
+        return self._late_before + self.track.dropped
 
     def set_gap(self, gap_s: float) -> None:
         """Change the longest bridged distance of two samples."""
@@ -58,7 +65,12 @@ class StagePlacer:
 
     def add_stage(self, t_ns: int, position_mm: float) -> None:
         """Add one stage sample at ROS time ``t_ns``."""
-        self.track.append(t_ns // NS_PER_US, position_mm)
+        t_us = t_ns // NS_PER_US
+        if self.track.last_us is not None and t_us < self.track.last_us - _CLOCK_BACK_US:
+            self._late_before += self.track.dropped
+            self.track = StageTrack(self.track.max_gap_us)
+            self.track_restarts += 1
+        self.track.append(t_us, position_mm)
         assert self.track.last_us is not None
         self.track.forget_before(self.track.last_us - _HISTORY_US)
 

@@ -106,3 +106,29 @@ def test_a_gap_in_the_odometry_is_not_bridged():
     placer.add_profiles(timed([T0_NS + 1_000_000_000]), 0.0)
     assert placer.ready(0.0) == []
     assert placer.points_without_stage == 1
+
+
+@pytest.mark.parametrize("back_s", [1, 3600])
+def test_odometry_of_a_clock_set_back_places_by_itself_alone(back_s):
+    """A recording played again or a host clock set back: old positions are wrong."""
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    for k in range(500):
+        placer.add_stage(T0_NS + k * 10_000_000, 0.1 * k)
+    again_ns = T0_NS + 4_990_000_000 - back_s * 1_000_000_000
+    for k in range(20):
+        placer.add_stage(again_ns + k * 10_000_000, 7.0)
+    placer.add_profiles(timed([again_ns + 55_000_000]), 0.0)
+    ((part, position_mm),) = placer.ready(0.0)
+    assert position_mm.tolist() == [7.0]
+    assert len(part.t_ns) == 1
+    assert (placer.track_restarts, placer.late_samples) == (1, 0)
+
+
+def test_an_odometry_sample_a_little_late_is_left_out():
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    for t_ms, position_mm in ((0, 0.0), (10, 1.0), (9, 50.0), (20, 2.0)):
+        placer.add_stage(T0_NS + t_ms * 1_000_000, position_mm)
+    placer.add_profiles(timed([T0_NS + 15_000_000]), 0.0)
+    ((_, position_mm),) = placer.ready(0.0)
+    np.testing.assert_allclose(position_mm, [1.5])
+    assert (placer.track_restarts, placer.late_samples) == (0, 1)
