@@ -58,6 +58,7 @@ class AptBench:
     ) -> None:
         self.settings = settings or AptSettings()
         self.now_ns = 0
+        self.clock_set_ns = 0
         self.model = AptModel(
             self.clock_ns, controller=self.settings.controller, bay=self.settings.bay, **model
         )
@@ -72,8 +73,12 @@ class AptBench:
     def clock_ns(self) -> int:
         return EPOCH_NS + self.now_ns
 
+    def host_clock_ns(self) -> int:
+        """The clock the driver stamps by, which somebody may have set by ``clock_set_ns``."""
+        return self.clock_ns() + self.clock_set_ns
+
     def open(self) -> AptStage:
-        return AptStage(self._make_link, self.clock_ns, self.settings)
+        return AptStage(self._make_link, self.host_clock_ns, self.settings)
 
     def _make_link(
         self,

@@ -21,13 +21,12 @@ from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
 from eschorty_ros.nodes.device_messages import trigger_message
 from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
+from eschorty_ros.nodes.odometry import new_states
 from eschorty_ros.nodes.parameters import Param
 from eschorty_ros.nodes.spin import run, unless_shut_down
 
 FEEDBACK_PERIOD_S = 0.05
 POLL_S = 0.01
-# Odometry of so many periods is made up for.
-FILL_MAX = 200
 # More than DDS's heartbeat of 3 s holds: what got lost can still be repeated.
 ODOM_DEPTH = 2000
 
@@ -224,26 +223,13 @@ class StageNode(DeviceNode):
         if stage is None:
             return
         try:
-            states = self._new_states(stage)
+            states = new_states(stage, self._told_ns, round(1e9 / self.parameters["odom_rate"]))
         except EschortyError as error:
             self.fault(f"stage lost: {error}")
             return
         for state in states:
+            self._told_ns = state.t_ns
             self._odom.publish(self._odometry(state))
-
-    def _new_states(self, stage: LinearStage) -> list[StageState]:
-        """Tell what has become known since the last odometry; a pause leaves no gap."""
-        newest = stage.state()
-        if newest.t_ns <= self._told_ns:
-            return []
-        period_ns = round(1e9 / self.parameters["odom_rate"])
-        missed = range(self._told_ns + period_ns, newest.t_ns - period_ns // 2, period_ns)
-        # After a longer silence the past is over.
-        fill = missed if len(missed) <= FILL_MAX else ()
-        self._told_ns = newest.t_ns
-        # Where the axis had no reference yet, nothing is told afterwards.
-        told = [(t_ns, stage.state(t_ns)) for t_ns in fill]
-        return [*(state for t_ns, state in told if state.t_ns == t_ns), newest]
 
     def _odometry(self, state: StageState) -> Odometry:
         message = Odometry(child_frame_id=self.parameters["stage_frame"])

@@ -181,6 +181,7 @@ class AptStage:
             "status_age_s": self._tracker.age_ns * 1e-9,
             "statuses_rejected": self._tracker.judge.rejected,
             "late_statuses": fit.late_readings,
+            "clock_sets": self._tracker.clock_sets,
             "frames": framer.frames,
             "skipped_bytes": framer.skipped_bytes,
             "broken_frames": framer.broken_frames,

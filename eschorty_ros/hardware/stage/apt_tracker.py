@@ -18,6 +18,8 @@ ANSWER_NS = 20 * BYTE_NS
 WARN_AGE_NS = 500_000_000
 FAULT_AGE_NS = 1_500_000_000
 _POLL_LOST_NS = 250_000_000
+# No drift between two messages and no simulated clock's step is so large.
+_CLOCK_SET_NS = 500_000_000
 # A host that stood still itself has not looked often enough to call the controller silent.
 _LOOKS_LEAST = 20
 
@@ -58,6 +60,8 @@ class Tracker:
     failure : DeviceError or None
     blocked_sense : int
         Sign of the way that a limit has barred.
+    clock_sets : int
+        Times the clock was set. Readings alone tell the rest of a motion under way then.
     """
 
     def __init__(
@@ -70,9 +74,11 @@ class Tracker:
         self.status: Status | None = None
         self.failure: DeviceError | None = None
         self.blocked_sense = 0
+        self.clock_sets = 0
         self._actions = actions
         self._now_ns, self._clock_ns = now_ns, clock_ns
         self._status_ns: int | None = None
+        self._offset_ns: int | None = None
         self._poll: tuple[int, int] | None = None
         self._unmatched_until_ns = 0
         self._rest_ns = 0
@@ -159,11 +165,12 @@ class Tracker:
     def hear(self, frame: apt.Frame, received_ns: int, clock_ns: int) -> None:
         """Take one status message, received at this time of both clocks."""
         latest_ns = clock_ns - ANSWER_NS
+        position_mm = self.scale.mm(frame.whole("position"))
+        self._notice_set_clock(position_mm, latest_ns, clock_ns - received_ns)
         earliest_ns = None
         if self._poll is not None and received_ns >= self._unmatched_until_ns:
             earliest_ns = min(self._poll[0] + REQUEST_NS, latest_ns)
         self._poll = None
-        position_mm = self.scale.mm(frame.whole("position"))
         status = Status(position_mm, frame.whole("bits"), earliest_ns, latest_ns)
         self._status_ns, self._looks = received_ns, 0
         motion = self.motion
@@ -189,6 +196,19 @@ class Tracker:
                 )
             case verdict:
                 self._believe(status, verdict)
+
+    def _notice_set_clock(self, position_mm: float, latest_ns: int, offset_ns: int) -> None:
+        """Begin anew with the positions when the clock has been set since the last message."""
+        before_ns, self._offset_ns = self._offset_ns, offset_ns
+        if before_ns is None or abs(offset_ns - before_ns) < _CLOCK_SET_NS:
+            return
+        self.clock_sets += 1
+        self._poll = None
+        self._rest_ns += offset_ns - before_ns
+        self.fit = MotionFit(TOLERANCE_MM)
+        self.fit.observe(position_mm, latest_ns)
+        self._known_from_ns = self.fit.until_ns or 0
+        self.judge.forget()
 
     def _believe(self, status: Status, verdict: Verdict) -> None:
         before, self.status = self.status, status

@@ -200,3 +200,24 @@ def test_a_silent_controller_and_an_empty_bay_are_named() -> None:
 def test_wrong_settings_are_refused(wrong: dict, text: str) -> None:
     with pytest.raises(ArgumentError, match=text):
         AptSettings(**wrong)
+
+
+@pytest.mark.parametrize("set_s", [-2, -3600, 3600])
+@pytest.mark.parametrize("moving", [False, True], ids=["at rest", "moving"])
+def test_a_host_clock_that_is_set_leaves_the_odometry_going(set_s: int, moving: bool) -> None:
+    bench = AptBench()
+    bench.move(10.0)
+    if moving:
+        bench.stage.move_to(110.0, 100.0)
+        bench.advance(0.3)
+    bench.clock_set_ns = set_s * 1_000_000_000
+    bench.advance(0.3)
+    state = bench.stage.state()
+    assert abs(state.t_ns - bench.host_clock_ns()) < 200_000_000
+    true_mm = bench.model.axis.position_mm(state.t_ns - bench.clock_set_ns)
+    # On the way, readings alone tell where: they are as late as the line.
+    assert state.position_mm == pytest.approx(true_mm, abs=0.3 if moving else 1e-4)
+    bench.until(lambda: not bench.stage.state().moving, 5.0)
+    bench.move(40.0)
+    assert bench.stage.state().position_mm == pytest.approx(40.0, abs=5e-5)
+    assert bench.stage.healthy
