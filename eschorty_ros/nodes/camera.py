@@ -250,7 +250,8 @@ class CameraNode(DeviceNode):
 
 def main() -> None:
     """Entry point of the camera node."""
-    sys.exit(run(CameraNode))
+    # Opening takes seconds; another thread lets a signal cut it short.
+    sys.exit(run(CameraNode, threads=2))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -52,14 +53,15 @@ def unless_shut_down(node: Node) -> Iterator[None]:
             raise
 
 
-def _interrupt_once() -> None:
-    """Let only the first Ctrl-C interrupt: a launched node gets two, from terminal and launch."""
-    came = False
+def _interrupt_before(started: threading.Event) -> None:
+    """Let Ctrl-C interrupt what comes before ``started``; later it ends the context only.
+
+    An exception in the middle of a callback would leave half-made objects to their finalizers.
+    """
 
     def interrupt(*_: object) -> None:
-        nonlocal came
-        if not came:
-            came = True
+        if not started.is_set():
+            started.set()
             raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt)
@@ -114,10 +116,13 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     nodes: list[Node] = []
     executor: Executor | None = None
     code = 0
+    started = threading.Event()
     use_profile()
     try:
-        _interrupt_once()
+        _interrupt_before(started)
+        # Its own handler of SIGINT and SIGTERM ends the context and so the loop below.
         rclpy.init(args=list(args) if args is not None else None)
+        started.set()
         signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
         executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
         for factory in factories:

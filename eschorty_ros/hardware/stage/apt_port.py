@@ -16,7 +16,8 @@ BAUD = 115_200
 # First digits of the USB serial numbers of the controllers that move a DDS220.
 PREFIXES = {"kbd101": ("28",), "bbd30x": ("103",)}
 _SETTLE_S = 0.05
-_WRITE_S = 0.2
+# Frames are a few bytes and never wait on a port that works; a machine that stalls is no dead port.
+_WRITE_S = 2.0
 
 
 def find_port(controller: str, serial_number: str = "") -> str:
