@@ -18,11 +18,11 @@ pytest.importorskip("rclpy", reason="needs the package rclpy")
 ROOT = Path(__file__).resolve().parents[1]
 LOGGED = """
 import functools, sys
-from eschorty_ros.nodes import one_process
-made = one_process.bench_options
+from eschorty_ros.nodes import one_calibration as nodes
+made = nodes.bench_options
 log, seconds = sys.argv.pop(1), float(sys.argv.pop(1))
-one_process.bench_options = lambda job: made(job) | {"laser-log": log}
-one_process.OneCalibration = functools.partial(one_process.OneCalibration, capture_s=seconds)
+nodes.bench_options = lambda job: made(job) | {"laser-log": log}
+nodes.OneCalibration = functools.partial(nodes.OneCalibration, capture_s=seconds)
 from eschorty_ros.cli import main
 main(prog_name="eschorty")
 """

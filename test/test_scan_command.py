@@ -20,10 +20,10 @@ pytest.importorskip("rclpy", reason="needs the package rclpy")
 ROOT = Path(__file__).resolve().parents[1]
 LOGGED = """
 import sys
-from eschorty_ros.nodes import one_process
-made = one_process.bench_options
+from eschorty_ros.nodes import one_scan
+made = one_scan.bench_options
 log = sys.argv.pop(1)
-one_process.bench_options = lambda job: made(job) | {"laser-log": log}
+one_scan.bench_options = lambda job: made(job) | {"laser-log": log}
 from eschorty_ros.cli import main
 main(prog_name="eschorty")
 """

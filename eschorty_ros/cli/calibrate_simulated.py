@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from eschorty_ros.cli.console import pairs, progress_bar
-from eschorty_ros.cli.instrument import ended_by_signals, one_process
+from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.core.errors import FitError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def calibrate_simulated(
     EschortyError
         Without ROS 2.
     """
-    nodes = one_process("test")
+    one_calibration = nodes_module("one_calibration", make="test")
     from matplotlib.image import imsave
 
     from eschorty_ros.cli.calibration_output import finish
@@ -52,11 +52,11 @@ def calibrate_simulated(
 
     design, built = load_calibration(nominal), load_calibration(as_built)
     with ended_by_signals(), TemporaryDirectory(prefix="eschorty_") as folder:
-        job = nodes.OneCalibration(
+        job = one_calibration.OneCalibration(
             tuple(known), folder, calibration=nominal, as_built=as_built, method=method
         )
         with progress_bar("calibrating") as feedback:
-            outcome = nodes.calibrate_once(job, feedback)
+            outcome = one_calibration.calibrate_once(job, feedback)
     if outcome.calibration is None or outcome.targets is None:
         raise FitError(outcome.message)
     report = calibrate(outcome.targets, design, method, date=outcome.calibration.date)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import signal
 import sys
 from collections.abc import Iterator
@@ -12,19 +13,18 @@ from typing import NoReturn
 from eschorty_ros.core.errors import EschortyError
 
 
-def one_process(make: str) -> ModuleType:
-    """Import the composition of nodes; a missing ROS 2 is a stated failure.
+def nodes_module(name: str, make: str) -> ModuleType:
+    """Import a module of ``nodes``; a missing ROS 2 is a stated failure.
 
     ``make`` is the Makefile's target that does the same with all set-up.
     """
     try:
-        from eschorty_ros.nodes import one_process
+        return importlib.import_module(f"eschorty_ros.nodes.{name}")
     except ImportError as error:
         raise EschortyError(
             f"ROS 2 is not ready ({error}); run `make {make}`, or source a ROS 2 installation in "
             "which this package is built; `eschorty simulate` needs no ROS"
         ) from error
-    return one_process
 
 
 @contextlib.contextmanager

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
-from eschorty_ros.cli.instrument import ended_by_signals, one_process
+from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.errors import DeviceError
 
 if TYPE_CHECKING:
-    from eschorty_ros.nodes.one_process import OneScan, Outcome
+    from eschorty_ros.nodes.one_scan import OneScan, Outcome
     from eschorty_ros.report.accuracy import Accuracy
 
 
@@ -60,17 +60,19 @@ def command(
       eschorty scan --hardware bench.yaml --calibration my.yaml
     """  # noqa: D301
     check_sweep(start, stop)
-    nodes = one_process("scan")
+    one_scan = nodes_module("one_scan", make="scan")
     _check(scene, calibration)
-    tables = nodes.read_hardware(hardware) if hardware is not None else None
-    request = nodes.OneScan(
+    tables = None
+    if hardware is not None:
+        tables = nodes_module("hardware_file", make="scan").read_hardware(hardware)
+    request = one_scan.OneScan(
         scene, calibration, start, stop, speed, frequency, seed, pixels, hardware=tables
     )
     out.mkdir(parents=True, exist_ok=True)
     with (
         ended_by_signals(),
         progress_bar("scanning") as report,
-        nodes.instrument(request) as made,
+        one_scan.instrument(request) as made,
     ):
         outcome = made.scan(request, report)
     finish(request, outcome, out)
