@@ -18,6 +18,7 @@ class PacketPublisher:
     """Publishes one camera's stream; used by one thread at a time.
 
     A gap leaves one number out, a restart begins at 0 again: that is how readers learn of both.
+    What is not sent for want of a subscriber is a gap, too, once there has been one.
 
     Parameters
     ----------
@@ -45,6 +46,7 @@ class PacketPublisher:
         self._width = width
         self._height = height
         self._frame_id = frame_id
+        self._unheard = False
         self._packetizer = Packetizer(0, 2)
 
     def cut_by(self, age_ns: int, size_bytes: int) -> None:
@@ -70,7 +72,11 @@ class PacketPublisher:
         for stamp_ns, payload in payloads:
             if self._publisher.get_subscription_count() == 0:
                 self.unheard_bytes += len(payload)
+                self._unheard = True
                 continue
+            if self._unheard and self.seq:
+                self.seq += 1
+            self._unheard = False
             message = EventPacket(
                 height=self._height,
                 width=self._width,

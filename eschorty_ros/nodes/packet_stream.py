@@ -10,7 +10,14 @@ from eschorty_ros.core.clock import NS_PER_US, SensorClock, StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.pulses import PulseGrid
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
-from eschorty_ros.nodes.packet_times import WRAP_US, Packet, first_time_high_us, first_time_us
+from eschorty_ros.nodes.packet_times import (
+    WRAP_US,
+    Packet,
+    first_time_high_us,
+    first_time_us,
+    overtaken,
+    skips_time,
+)
 from eschorty_ros.nodes.sensor_epoch import SensorEpoch, TimedProfiles
 
 _GAP_NS = WRAP_US * NS_PER_US // 2
@@ -46,6 +53,9 @@ class PacketStream:
     ----------
     packets, packets_lost, restarts : int
         Packets reconstructed, missing by their ``seq``, and new starts of the stream.
+    packets_late : int
+        Packets that came twice or after later ones, and were not used; the latter are among
+        ``packets_lost``.
     clock_restarts : int
         Times the clock began anew because stamps or sensor times went back.
     announcement_expected : bool
@@ -63,6 +73,7 @@ class PacketStream:
         self.calibration = calibration
         self.packets = 0
         self.packets_lost = 0
+        self.packets_late = 0
         self.restarts = 0
         self.clock_restarts = 0
         self.announcement_expected = True
@@ -109,17 +120,20 @@ class PacketStream:
     @property
     def processed_until_ns(self) -> int | None:
         """ROS time up to which the stream has been reconstructed."""
-        newest_us = self._reconstructor.time_us if self._reconstructor is not None else None
-        if newest_us is None or self._epoch is None or self._epoch.clock.line is None:
+        # Also read by other threads than the one that processes.
+        reconstructor, epoch = self._reconstructor, self._epoch
+        newest_us = reconstructor.time_us if reconstructor is not None else None
+        line = epoch.clock.line if epoch is not None else None
+        if newest_us is None or line is None:
             return None
-        return self._epoch.clock.to_ns(newest_us + self._wraps * WRAP_US)
+        return line.to_ns(newest_us + self._wraps * WRAP_US)
 
     @property
     def counters(self) -> Counter[str]:
         """Counters of all reconstructors so far, summed by name."""
-        total = Counter(self._retired)
-        if self._reconstructor is not None:
-            total.update(self._reconstructor.counters)
+        total, reconstructor = Counter(self._retired), self._reconstructor
+        if reconstructor is not None:
+            total.update(reconstructor.counters)
         return total
 
     def announce_zero(self, zero_ns: int) -> None:
@@ -182,6 +196,10 @@ class PacketStream:
     def process(self, now_s: float) -> list[TimedProfiles]:
         """Reconstruct what can be; returns the profiles completed since the last call."""
         while self._held:
+            if overtaken(self._held[0], self._next_seq, self._last_stamp_ns):
+                self._held.popleft()
+                self.packets_late += 1
+                continue
             if self._next_seq is not None and self._held[0].seq < self._next_seq:
                 self._forget_stream()
             if not self._ready(self._held[0], now_s):
@@ -225,8 +243,13 @@ class PacketStream:
     def _push(self, packet: Packet) -> None:
         missing = 0 if self._next_seq is None else packet.seq - self._next_seq
         self.packets_lost += missing
-        if missing and packet.stamp_ns - self._last_stamp_ns > _GAP_NS:
+        time_us = self._reconstructor.time_us if self._reconstructor is not None else None
+        # Without a number left out it may be the host that stood still.
+        if packet.stamp_ns - self._last_stamp_ns > _GAP_NS and (
+            missing or skips_time(packet.data, time_us)
+        ):
             self._retire()
+            self._next_seq = None
         if self._reconstructor is None:
             self._wraps = self._missed_wraps(packet, first_time_high_us(packet.data))
             self._reconstructor = Reconstructor(

@@ -11,6 +11,10 @@ WRAP_US = 1 << 24
 _TIME_LOW, _TIME_HIGH = 0x6, 0x8
 # A stream repeats its time far more often than this.
 _WORDS_SEARCHED = 8192
+# A stream that goes on skips no more of its own time than this from one packet to the next.
+_STEP_US = 100_000
+# A packet at most so many numbers back that is stamped no later was overtaken on its way.
+_OVERTAKEN = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,25 @@ def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int
     if after_us is None or (t_us is not None and (before_us or 0) <= t_us <= after_us):
         return t_us
     return before_us
+
+
+def overtaken(packet: Packet, next_seq: int | None, last_stamp_ns: int) -> bool:
+    """Whether it is no restart of the stream but a packet that came twice or too late."""
+    if next_seq is None or packet.stamp_ns > last_stamp_ns:
+        return False
+    return 0 < packet.seq < next_seq <= packet.seq + _OVERTAKEN
+
+
+def skips_time(data: Any, before_us: int | None) -> bool:
+    """Whether sensor time does not go on at ``before_us``: something was left out in between.
+
+    Packets that a host at a standstill has only stamped late go on in the stream's own time. A
+    driver numbers only what it sends, and sends nothing while it sees no subscriber.
+    """
+    high_us = first_time_high_us(data)
+    if high_us is None or before_us is None:
+        return False
+    return _STEP_US < (high_us - (before_us & ~0xFFF)) % WRAP_US < WRAP_US - _STEP_US
 
 
 def _first_word_us(data: Any, before_us: int | None) -> int | None:

@@ -60,6 +60,7 @@ class Reports:
         values: dict[str, Any] = {
             "packets": stream.packets,
             "packets_lost": stream.packets_lost,
+            "packets_late": stream.packets_late,
             "packets_refused_queue_full": self._mailbox.overflows,
             "packets_held": stream.held,
             "stream_restarts": stream.restarts,

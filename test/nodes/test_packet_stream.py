@@ -229,6 +229,43 @@ def test_time_goes_on_over_a_gap_of_any_length(gap_us):
         assert part.t_ns.min() > ZERO_NS + shift_us * 1000 - 5_000_000
 
 
+@pytest.mark.parametrize("gap_us", [12_000_000, 40_000_000])
+def test_a_gap_without_numbers_is_told_from_a_host_that_stood_still(gap_us):
+    """A driver numbers only what it sends, and sends nothing while it sees no subscriber."""
+    first = sent(line())
+    later = sent(line(offset_us=gap_us % WRAP_US), gap_us - gap_us % WRAP_US, seq=len(first))
+    subject = unannounced()
+    run(subject, first)
+    parts = run(subject, later)
+    for part in (parts[0], parts[-1]):
+        part = part.retimed()
+        true_ns = ZERO_NS + (part.sensor.t_us % WRAP_US + gap_us - gap_us % WRAP_US) * 1000
+        assert np.abs(part.t_ns - true_ns).max() < 5_000_000
+    assert subject.clock_restarts == 0
+
+    stalled = unannounced()
+    half = len(first) // 2
+    run(stalled, first[:half])
+    last_ns = first[-1].stamp_ns + 1000 * gap_us
+    parts = run(stalled, [Packet(p.seq, last_ns, p.data) for p in first[half:]])
+    part = parts[-1].retimed()
+    assert np.abs(part.t_ns - ZERO_NS - part.sensor.t_us * 1000).max() < 5_000_000
+
+
+def test_packets_twice_or_in_the_wrong_order_are_no_restart_of_the_camera():
+    items = packets(line(), size=20_000)
+    expected = joined(run(announced(), items))
+    subject = announced()
+    seen = joined(run(subject, [*items[:4], items[3], *items[4:]]))
+    assert (subject.restarts, subject.packets_lost, subject.packets_late) == (0, 0, 1)
+    np.testing.assert_array_equal(seen.row, expected.row)
+
+    subject = announced()
+    run(subject, [*items[:4], items[5], items[4], *items[6:]])
+    assert (subject.restarts, subject.packets_lost, subject.packets_late) == (0, 1, 1)
+    assert subject.clock_announced
+
+
 def test_points_move_with_the_clock_until_they_are_placed():
     subject = unannounced()
     data = line()
