@@ -2,6 +2,7 @@
 # make report the paper's experiments again: report/index.html
 # make tradeoff speed against error again, and the README's table from it
 # make faults the fault table of docs/faults.md again, from its tests
+# make reference the tables of docs/interfaces.md again, from the nodes
 # make test   every test
 # make check  lint, types, import contracts
 #
@@ -42,7 +43,7 @@ INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/*
 # numba sees changes of a file, not of what the file imports: its cache goes when a kernel changes.
 KERNELS := $(shell grep -rl --include='*.py' 'import.*njit' eschorty_ros)
 
-.PHONY: help setup scan report tradeoff faults test check lint format types contracts clean
+.PHONY: help setup scan report tradeoff faults reference test check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -61,6 +62,9 @@ tradeoff: $(SETUP) $(BUILD)/kernels.stamp
 
 faults: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
 	@$(ENTER) python test/fault_table.py
+
+reference: $(SETUP) $(BUILD)/kernels.stamp
+	@$(ENTER) python test/interface_tables.py
 
 test: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)

@@ -22,9 +22,10 @@ Device = TypeVar("Device")
 Registry = dict[str, Callable[[Mapping[str, Any], ClockNs], Device]]
 
 DRIVER = (
-    Param("driver", "fake", "device driver; 'fake' is the real one at an emulated bench"),
+    Param("driver", "fake", "camera: evk4, neuromorphic; laser: awg; stage: apt; "
+          "fake: the real driver at an emulated bench"),
     Param("bench", "", "folder of that bench; empty: the user's in this ROS domain"),
-)
+)  # fmt: skip
 STAGE_TABLE = (
     Param("port", "", "serial port or pyserial URL of the stage controller; empty finds it"),
     Param("serial", "", "USB serial number of the stage controller; empty takes the only one"),

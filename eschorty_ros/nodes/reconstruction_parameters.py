@@ -30,9 +30,10 @@ TABLE = (
     Param("calibration_folder", "", "where calibrations are written; empty: eschorty in ROS's "
           "home"),
     Param("auto_calibrate", False, "calibrate once as soon as the other nodes are there"),
-    Param("distances", "posts", "its targets: a file's name in config/ or a path"),
-    Param("method", "joint", "its method", choices=METHODS),
-    Param("capture_time", 1.0, "its capture", "s", 1e-3, CAPTURE_MAX_S),
+    Param("distances", "posts", "auto_calibrate: targets, a file's name in config/ or a path"),
+    Param("method", "joint", "auto_calibrate: how it is fitted", choices=METHODS),
+    Param("capture_time", 1.0, "auto_calibrate: how long the targets are lit", "s",
+          1e-3, CAPTURE_MAX_S),
     Param("node_timeout", 60.0, "calibration: longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "calibration: longest wait for an answer", "s", 0.1, 60.0),
     Param("events_timeout", 3.0, "calibration: longest pause of the events while the laser is on",

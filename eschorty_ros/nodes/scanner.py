@@ -35,12 +35,12 @@ from eschorty_ros.nodes.spin import run, unless_shut_down
 
 TABLE = (
     Param("auto_scan", False, "do one scan as soon as the other nodes are there"),
-    Param("start", 0.01, "stage position at the automatic scan's start", "m", -1.0, 1.0),
-    Param("stop", 0.06, "stage position at its end", "m", -1.0, 1.0),
-    Param("speed", 0.05, "its speed", "m/s", 1e-6, 1.0),
-    Param("frequency", 0.0, "its modulation frequency; 0 keeps the laser's", "Hz",
+    Param("start", 0.01, "auto_scan: stage position where the sweep begins", "m", -1.0, 1.0),
+    Param("stop", 0.06, "auto_scan: stage position where it ends", "m", -1.0, 1.0),
+    Param("speed", 0.05, "auto_scan: stage speed", "m/s", 1e-6, 1.0),
+    Param("frequency", 0.0, "auto_scan: modulation frequency; 0 keeps the laser's", "Hz",
           0.0, FREQUENCY_MAX_HZ),
-    Param("duty", 0.0, "its duty; 0 keeps the laser's", "", 0.0, 0.999),
+    Param("duty", 0.0, "auto_scan: duty; 0 keeps the laser's", "", 0.0, 0.999),
     Param("travel_min", 0.0, "lower end of the stage's travel", "m", -1.0, 1.0),
     Param("travel_max", 0.22, "upper end of the stage's travel", "m", -1.0, 1.0),
     Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),

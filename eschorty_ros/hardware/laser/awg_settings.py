@@ -48,7 +48,10 @@ class AwgSettings:
         10000.0, "resistance at the output; 10000 = high impedance", "ohm", range=(50.0, 10000.0)
     )
     readback: str = _field(
-        "required", "what reading settings back decides", choices=READBACK_POLICIES
+        "required",
+        "reading settings back: required = silence is a failure; best_effort = goes on after "
+        "silence; off = never asks",
+        choices=READBACK_POLICIES,
     )
     usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 2.0))
 
