@@ -1,4 +1,4 @@
-"""README: its Python example runs, its tables name what exists."""
+"""README: its Python examples run, its tables name what exists."""
 
 import ast
 import re
@@ -10,17 +10,19 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
 
 
-def test_the_python_example_runs(tmp_path):
-    code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
+def test_the_python_examples_run(tmp_path):
+    code = "".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL))
     environment_code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
         "from eschorty_ros.core.calibration import load_calibration\n"
         "from eschorty_ros.simulation.recorder import simulate_recording\n"
         "from eschorty_ros.simulation.scene import named\n"
         "simulate_recording('rec', named('steps'), load_calibration('config_3'), stop_mm=14.0)\n"
+        "import pathlib, shutil; pathlib.Path('mine').mkdir()\n"
+        "shutil.copy('rec/events.raw', 'mine')\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", environment_code + code],
+        [sys.executable, "-c", environment_code + code + "load_recording('mine')\n"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -45,10 +47,18 @@ def test_every_launch_argument_is_in_the_table_with_its_default():
             assert f"`{default.value}`" in line
 
 
+def anchors(page):
+    """Names that headings of a page are linked by."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 def test_links_and_the_picture_exist():
     for document in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
-        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
-            assert (document.parent / target).exists(), f"{document.name}: {target}"
+        for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", document.read_text()):
+            file = document.parent / target if target else document
+            assert file.exists(), f"{document.name}: {target}"
+            assert not anchor or anchor in anchors(file), f"{document.name}: {target}#{anchor}"
     assert (ROOT / "docs" / "scan.png").stat().st_size < 500_000
 
 
