@@ -5,7 +5,7 @@ import pytest
 
 from eschorty_ros.core.cloud import POINT_DTYPE
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.report import figures
+from eschorty_ros.report import cloud_image, figures
 
 
 def step_cloud(lines=24, columns=320):
@@ -79,8 +79,8 @@ def test_without_truth_there_is_no_error_map(tmp_path):
 def test_the_depth_map_holds_each_point_once():
     points, _ = step_cloud()
     stage, range_mm = figures.stage_and_range_mm(points)
-    grid = figures.grid_of(points, stage)
-    image = figures.image_of(grid, points, range_mm)
+    grid = cloud_image.grid_of(points, stage)
+    image = cloud_image.image_of(grid, points, range_mm)
     assert image.shape == (24, 320)
     np.testing.assert_allclose(image.ravel(), range_mm)
     np.testing.assert_allclose(grid.stage_mm, np.arange(24) * 0.7, atol=1e-4)
