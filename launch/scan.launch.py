@@ -7,29 +7,22 @@ ros2 launch eschorty_ros scan.launch.py --show-args
 from launch.actions import EmitEvent, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.parameter_descriptions import ParameterValue
 
 from eschorty_ros.nodes.launching import (
+    FAKE,
+    TRIGGER,
     bench,
     declare,
-    driver,
+    instrument,
     node,
     number,
-    reliable,
     rviz,
-    text,
-    trigger_input,
+    truth,
 )
 from launch import LaunchDescription
 
 ARGUMENTS = (
-    (
-        "fake",
-        "true",
-        "true: real drivers at an emulated bench; false: at real devices",
-        ["true", "false"],
-    ),
+    FAKE,
     (
         "scene",
         "steps",
@@ -44,12 +37,7 @@ ARGUMENTS = (
         "event pixels of an emulated camera",
         ["paper", "ideal", "noisy", "narrow"],
     ),
-    (
-        "trigger",
-        "stage",
-        "what is wired to the camera's trigger input: none, laser or stage",
-        ["none", "laser", "stage"],
-    ),
+    TRIGGER,
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000: one profile per period", None),
     ("speed", "0.05", "stage speed, m/s", None),
     ("start", "0.01", "stage position where the sweep begins, m", None),
@@ -62,20 +50,9 @@ ARGUMENTS = (
 def nodes():
     """Make the five nodes with their parameters."""
     parameters = {
-        "camera": {
-            "driver": driver("evk4"),
-            "trigger_in_mode": trigger_input(),
-            **reliable("publisher"),
-        },
-        "laser": {"driver": driver("awg"), "frequency": number("frequency")},
-        "stage": {"driver": driver("apt")},
-        "reconstruction": {
-            "calibration": text("calibration"),
-            "trigger_source": text("trigger"),
-            **reliable("subscription"),
-        },
+        **instrument(),
         "scanner": {
-            "auto_scan": ParameterValue(LaunchConfiguration("auto_scan"), value_type=bool),
+            "auto_scan": truth("auto_scan"),
             "start": number("start"),
             "stop": number("stop"),
             "speed": number("speed"),

@@ -12,7 +12,6 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
@@ -197,12 +196,7 @@ class FaultScript:
         threading.Thread(target=self._run, name="fault-script", daemon=True).start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
 
     def line(self) -> ObservedLine:

@@ -11,7 +11,6 @@ import termios
 import threading
 import tty
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol
 
 from eschorty_ros.core.errors import DeviceError
@@ -69,12 +68,7 @@ class PtyPort:
     def __enter__(self) -> PtyPort:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from typing import Protocol
 from eschorty_ros.core.calibrate import METHODS
 from eschorty_ros.core.errors import ArgumentError, EschortyError
 from eschorty_ros.core.posts import KnownTarget
-from eschorty_ros.nodes.scan_sequence import End, ScanCanceled, check_laser
+from eschorty_ros.nodes.scan_sequence import End, Hands, ScanCanceled, check_laser
 
 CAPTURE_MAX_S = 120.0
 _DRAIN_S = 10.0
@@ -47,41 +47,11 @@ class CaptureOutcome:
     message: str = ""
 
 
-class CaptureRig(Protocol):
-    """What the sequence asks of the nodes; the same hands as a scan's (see ``Rig``)."""
-
-    def check_nodes(self) -> None:
-        """Raise ``ScanFailure`` naming the node that does not answer."""
-
-    def configure_laser(self, frequency_hz: float, duty: float) -> None:
-        """Set what is not 0."""
-
-    def move(self, position_mm: float, speed_mm_s: float) -> None:
-        """Move and wait until the stage is there."""
-
-    def stop_stage(self) -> None:
-        """End a move under way and wait for the stage to rest."""
-
-    def laser_on(self) -> None:
-        """Heartbeat, arm, enable."""
-
-    def laser_off(self) -> None:
-        """Disable; the heartbeat ends in any case."""
-
-    def watch(self, enabled: bool) -> None:
-        """Whether waiting raises ``ScanFailure`` when light or events stop."""
-
-    def shield(self) -> None:
-        """From here on waiting no longer raises ``ScanCanceled``."""
+class CaptureRig(Hands, Protocol):
+    """What a capture needs beyond a scan's hands."""
 
     def hold(self, duration_s: float) -> None:
         """Wait until so much sensor time has passed."""
-
-    def drain(self, no_progress_s: float) -> None:
-        """Wait until the reconstruction has passed the present time."""
-
-    def report(self, phase: str) -> None:
-        """Name the phase in the feedback."""
 
 
 def check_request(request: CaptureRequest) -> None:

@@ -25,6 +25,20 @@ Argument = tuple[str, str | None, str, list[str] | None]
 """Name, default (``None``: must be given), description, choices."""
 
 
+FAKE: Argument = (
+    "fake",
+    "true",
+    "true: real drivers at an emulated bench; false: at real devices",
+    ["true", "false"],
+)
+TRIGGER: Argument = (
+    "trigger",
+    "stage",
+    "what is wired to the camera's trigger input: none, laser or stage",
+    ["none", "laser", "stage"],
+)
+
+
 def declare(arguments: tuple[Argument, ...]) -> list[DeclareLaunchArgument]:
     """Launch arguments from a table."""
     return [
@@ -43,6 +57,11 @@ def text(name: str) -> Any:
     return ParameterValue(LaunchConfiguration(name), value_type=str)
 
 
+def truth(name: str) -> Any:
+    """Value of an argument that is true or false."""
+    return ParameterValue(LaunchConfiguration(name), value_type=bool)
+
+
 def driver(real: str) -> Any:
     """Choose the emulated bench, or the real device's driver."""
     return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
@@ -52,6 +71,31 @@ def reliable(end: str) -> dict[str, Any]:
     """Lossless events at one end; an emulated camera can wait, so nothing has to be lost."""
     if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
     return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
+
+
+def trigger_input() -> Any:
+    """Switch the camera's trigger input on when the argument ``trigger`` says it is wired."""
+    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
+    return IfElseSubstitution(unwired, "disabled", "external")
+
+
+def instrument(**reconstruction: Any) -> dict[str, dict[str, Any]]:
+    """Parameters of devices and reconstruction by node, from arguments that bear their names."""
+    return {
+        "camera": {
+            "driver": driver("evk4"),
+            "trigger_in_mode": trigger_input(),
+            **reliable("publisher"),
+        },
+        "laser": {"driver": driver("awg"), "frequency": number("frequency")},
+        "stage": {"driver": driver("apt")},
+        "reconstruction": {
+            "calibration": text("calibration"),
+            "trigger_source": text("trigger"),
+            **reconstruction,
+            **reliable("subscription"),
+        },
+    }
 
 
 def bench(**options: str) -> Any:
@@ -68,12 +112,6 @@ def bench(**options: str) -> Any:
         output="screen",
         condition=IfCondition(EqualsSubstitution(LaunchConfiguration("fake"), "true")),
     )
-
-
-def trigger_input() -> Any:
-    """Switch the camera's trigger input on when the argument ``trigger`` says it is wired."""
-    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
-    return IfElseSubstitution(unwired, "disabled", "external")
 
 
 def node(executable: str, parameters: dict[str, Any]) -> Any:

@@ -98,7 +98,7 @@ class LaserStageRig:
     # Rig
 
     def check_nodes(self) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         begun_ns = self.monitor.until_ns
         for there, failure in self._needed(begun_ns):
             self._wait(there, self._node_timeout_s, failure)
@@ -127,7 +127,7 @@ class LaserStageRig:
         ]
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         values = {"frequency": float(frequency_hz), "duty": float(duty)}
         wanted = {name: value for name, value in values.items() if value}
         if not wanted:
@@ -149,7 +149,7 @@ class LaserStageRig:
                    f"laser: its state does not show {wanted}")  # fmt: skip
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         self.monitor.samples.clear()
         goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
         # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
@@ -170,7 +170,7 @@ class LaserStageRig:
             raise ScanFailure(f"stage: {answer.result.message or 'the move did not succeed'}")
 
     def stop_stage(self) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         sent, self._sent = self._sent, None
         if sent is None:
             return
@@ -183,7 +183,7 @@ class LaserStageRig:
             self._answer(future, "stage/move")
 
     def laser_on(self) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         self._pause()
         self._beating = True
         self._wait(lambda: self._heartbeat.beating, self._service_timeout_s,
@@ -209,7 +209,7 @@ class LaserStageRig:
         return ""
 
     def laser_off(self) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         try:
             if self._beating:
                 answer = self._call("laser/enable", SetBool.Request(data=False))
@@ -223,16 +223,16 @@ class LaserStageRig:
             self._beating = False
 
     def watch(self, enabled: bool) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         self.monitor.restart_patience()
         self._watching = enabled
 
     def shield(self) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         self._shielded = True
 
     def drain(self, no_progress_s: float) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         target_ns = self._node.get_clock().now().nanoseconds
         self.monitor.restart_patience()
         while self.monitor.until_ns < target_ns:
@@ -247,7 +247,7 @@ class LaserStageRig:
             self._pause()
 
     def report(self, phase: str) -> None:
-        """See ``Rig``."""
+        """See ``Hands``."""
         self._phase = phase
         # On the way out after a signal there is nobody left to tell.
         with contextlib.suppress(ScanFailure), self._living_context():

@@ -73,8 +73,8 @@ class ScanOutcome:
     summary: ScanSummary = field(default_factory=ScanSummary)
 
 
-class Rig(Protocol):
-    """What the sequence asks of the nodes. Every waiting method calls ``pause``."""
+class Hands(Protocol):
+    """What a sequence asks of laser, stage and reconstruction. Waiting calls ``pause``."""
 
     def check_nodes(self) -> None:
         """Raise ``ScanFailure`` naming the node that does not answer."""
@@ -87,12 +87,6 @@ class Rig(Protocol):
 
     def stop_stage(self) -> None:
         """End a move under way and wait for the stage to rest."""
-
-    def begin_scan(self, request: ScanRequest) -> None:
-        """Have the reconstruction collect points."""
-
-    def end_scan(self, scan_id: str) -> ScanSummary:
-        """Have it publish what it collected."""
 
     def laser_on(self) -> None:
         """Heartbeat, arm, enable; returns when the output reads back on."""
@@ -111,6 +105,16 @@ class Rig(Protocol):
 
     def report(self, phase: str) -> None:
         """Name the phase in the feedback."""
+
+
+class Rig(Hands, Protocol):
+    """What a scan needs beyond that."""
+
+    def begin_scan(self, request: ScanRequest) -> None:
+        """Have the reconstruction collect points."""
+
+    def end_scan(self, scan_id: str) -> ScanSummary:
+        """Have it publish what it collected."""
 
 
 def check_request(request: ScanRequest, limits: ScanLimits) -> None:

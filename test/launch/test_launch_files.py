@@ -11,6 +11,9 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = ROOT / "launch"
+SHARED = ast.parse((ROOT / "eschorty_ros" / "nodes" / "launching.py").read_text()).body
+ROWS = {node.target.id: node.value for node in SHARED if isinstance(node, ast.AnnAssign)}
+FUNCTIONS = {node.name: node for node in SHARED if isinstance(node, ast.FunctionDef)}
 NODES = {"camera", "laser", "stage", "reconstruction", "scanner", "replay"}
 FRAMES = {"eschorty_base", "eschorty_stage", "eschorty_link", "eschorty_optical"}
 # Topic -> durability its publisher offers.
@@ -60,30 +63,24 @@ def declared(tree):
     """Names and descriptions in the file's ARGUMENTS table."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and node.targets[0].id == "ARGUMENTS":
-            return {row.elts[0].value: ast.unparse(row.elts[2]) for row in node.value.elts}
+            rows = [ROWS[row.id] if isinstance(row, ast.Name) else row for row in node.value.elts]
+            return {row.elts[0].value: ast.unparse(row.elts[2]) for row in rows}
     raise AssertionError("no ARGUMENTS table")
 
 
 def configurations(tree):
-    """Every argument name the file reads."""
+    """Every argument name the file reads, also by what it calls in `launching`."""
     used = set()
     for node in ast.walk(tree):
         if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
             continue
-        if node.func.id == "rviz":
-            used.add("rviz")
-        elif node.func.id in ("driver", "reliable"):
-            used.add("fake")
-        elif node.func.id == "trigger_input":
-            used.add("trigger")
-        elif node.func.id == "bench":
-            used |= {"fake", *(keyword.value.value for keyword in node.keywords)}
-        elif (
-            node.func.id in ("LaunchConfiguration", "number", "text")
-            and node.args
-            and isinstance(node.args[0], ast.Constant)
-        ):
-            used.add(node.args[0].value)
+        name = node.func.id
+        if name in ("LaunchConfiguration", "number", "text", "truth"):
+            used |= {value.value for value in node.args if isinstance(value, ast.Constant)}
+        elif name in FUNCTIONS:
+            used |= configurations(FUNCTIONS[name])
+        if name == "bench":
+            used |= {keyword.value.value for keyword in node.keywords}
     return used
 
 
