@@ -1,6 +1,8 @@
 """The commands as a user types them: output, files, exit codes."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -103,6 +105,44 @@ def test_a_stated_failure_is_one_line_on_stderr_and_exit_code_1(tmp_path):
     assert result.stderr.startswith("eschorty: ")
     assert result.stderr.count("\n") == 1
     assert "events.raw" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.EROFS, "Read-only file system", "out"), OSError(errno.ENOSPC, "No space left"),
+     NotADirectoryError(errno.ENOTDIR, "Not a directory", "file/x")],
+)  # fmt: skip
+def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
+    def refuse(_path):
+        raise error
+
+    monkeypatch.setattr("eschorty_ros.core.cloud.read_cloud", refuse)
+    result = run("info", cloud)
+    assert result.exit_code == 1
+    assert result.stderr.startswith("eschorty: cannot ")
+    assert result.stderr.count("\n") == 1
+    assert str(error.strerror) in result.stderr
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_work(monkeypatch, recording, tmp_path):
+    def work(*_arguments):
+        raise AssertionError("hours of work before the refusal")
+
+    monkeypatch.setattr("eschorty_ros.core.reconstruction.reconstruct_recording", work)
+    result = run("reconstruct", recording, "--out", tmp_path / "missing" / "cloud.pcd")
+    assert result.exit_code == 1
+    assert "cannot write" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_terminal_without_a_degree_sign_still_gets_its_table():
+    done = subprocess.run(
+        [sys.executable, "-c", NO_ROS, "design"],
+        cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, text=True,
+        timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "sheet" in done.stdout
 
 
 def test_ctrl_c_is_exit_code_130(monkeypatch, cloud):

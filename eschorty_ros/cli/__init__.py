@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import sys
 from typing import Any
 
 import click
@@ -52,16 +54,29 @@ class LazyGroup(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; stated failures become one line, Ctrl-C exit code 130."""
+        # A terminal that knows no degree sign gets a question mark.
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="replace")
         try:
             return super().invoke(ctx)
         except EschortyError as error:
             raise StatedFailure(" ".join(str(error).split())) from error
-        except (FileNotFoundError, PermissionError, IsADirectoryError, FileExistsError) as error:
-            named = error.filename or "a file"
-            raise StatedFailure(f"cannot use {named}: {error.strerror}; check the path") from error
+        except BrokenPipeError:
+            # Whoever reads the output has had enough; click ends it quietly.
+            raise
+        except OSError as error:
+            raise StatedFailure(_unusable(error)) from error
         except KeyboardInterrupt:
             click.echo("eschorty: interrupted", err=True)
             ctx.exit(INTERRUPTED)
+
+
+def _unusable(error: OSError) -> str:
+    """Tell which file cannot be used, and why, in one line."""
+    if error.filename is None:
+        return f"cannot go on: {error.strerror or error}; check disk and output"
+    return f"cannot use {error.filename}: {error.strerror}; check the path"
 
 
 @click.group(

@@ -216,8 +216,11 @@ def _check_usage(
 
 
 def _check_out(out: Path) -> None:
+    from eschorty_ros.core.files import check_writable
+
     if out.suffix not in (".yaml", ".yml"):
         raise click.UsageError(f"--out is {out}; give a path ending in .yaml")
+    check_writable(out)
 
 
 def _priors(given: tuple[str, ...]) -> dict[str, float] | None:

@@ -77,6 +77,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
       eschorty reconstruct rec --json --smoothing-half-width 0
     """  # noqa: D301
     from eschorty_ros.core.cloud import write_cloud
+    from eschorty_ros.core.files import check_writable
     from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
     from eschorty_ros.core.recording import load_recording
     from eschorty_ros.core.warm_up import warm_up
@@ -84,6 +85,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     target = out or recording / "cloud.pcd"
     if target.suffix not in (".pcd", ".ply"):
         raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
+    check_writable(target)
     chosen = Settings(**settings)
     loaded = load_recording(recording)
     with progress_bar("reconstructing") as report:

@@ -59,6 +59,8 @@ def command(
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
       eschorty scan --hardware bench.yaml --calibration my.yaml
     """  # noqa: D301
+    from eschorty_ros.core.files import check_writable
+
     check_sweep(start, stop)
     one_scan = nodes_module("one_scan", make="scan")
     _check(scene, calibration)
@@ -69,6 +71,7 @@ def command(
         scene, calibration, start, stop, speed, frequency, seed, pixels, hardware=tables
     )
     out.mkdir(parents=True, exist_ok=True)
+    check_writable(out / "scan.pcd")
     with (
         ended_by_signals(),
         progress_bar("scanning") as report,

@@ -22,23 +22,55 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         When the file cannot be written; names the path and the reason.
     """
     target = file_path("path", path)
+    partial = _partial(target)
+    try:
+        with _named(target):
+            with partial.open("wb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            partial.replace(target)
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Find out before long work whether ``atomic_write`` can write ``path``; leaves no trace.
+
+    Raises
+    ------
+    ArgumentError
+        When it cannot; names the path and the reason.
+    """
+    target = file_path("path", path)
+    if target.is_dir():
+        raise ArgumentError(f"cannot write {target}: it is a folder; give the name of a file")
+    partial = _partial(target)
+    try:
+        with _named(target):
+            partial.touch()
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def _partial(target: Path) -> Path:
     if not target.name:
         raise ArgumentError(f"cannot write {target}; give the name of a file")
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    return target.with_name(f".{target.name}.{os.getpid()}.partial")
+
+
+@contextmanager
+def _named(target: Path) -> Iterator[None]:
+    """Turn the system's refusal into one that names the file meant."""
     try:
-        with partial.open("wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(target)
+        yield
     except OSError as error:
         raise ArgumentError(
             f"cannot write {target}: {error.strerror or error}; choose a folder that exists, "
             "is writable and has room"
         ) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink()
 
 
 def config_folders() -> list[Path]:

@@ -66,6 +66,7 @@ CALLS: dict[str, Call] = {
         {"parts": Kind([[], None, 3, [3], [np.zeros(3)], "abc", [POINTS, None]])},
     ),
     "files.atomic_write": Call(write_atomically, {"path": "a.txt"}, PATH_ONLY),
+    "files.check_writable": Call(files.check_writable, {"path": "a.txt"}, PATH_ONLY),
     "recording.load_recording": Call(recording.load_recording, {}, PATH_ONLY),
     "recording.read_laser_yaml": Call(
         lambda path: (
