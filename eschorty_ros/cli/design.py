@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from eschorty_ros.cli.console import show, table
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from eschorty_ros.core.optical_build import Design
 
 
 @click.command("design")
@@ -81,13 +88,21 @@ def command(
     near, far = build.range_limits_mm
     # A pole on the sensor puts the last row at infinity.
     last = far if np.isfinite(far) else 20.0 * near
+    _print(build, np.linspace(near, last, ranges))
+    if out is not None:
+        _draw(build, np.linspace(near, last, 400), out)
+        click.echo(str(out))
+
+
+def _print(build: Design, range_mm: NDArray[np.float64]) -> None:
+    near, far = build.range_limits_mm
     made = table(
-        f"f {focal_mm:g} mm, f/{f_number:g}, sheet {theta_deg:g}°, sensor "
+        f"f {build.focal_length_mm:g} mm, f/{build.f_number:g}, sheet {build.theta_deg:g}°, sensor "
         f"{build.theta_prime_deg:.3f}°: {near:.1f} to {far:.1f} mm",
         *("range mm", "row px", "mm/row", "mm/column", "± focus mm", "swath mm"),
     )
-    at = build.at(np.linspace(near, last, ranges))
-    for index in range(ranges):
+    at = build.at(range_mm)
+    for index in range(len(range_mm)):
         made.add_row(
             f"{at.range_mm[index]:.1f}",
             f"{at.row[index]:.1f}",
@@ -102,19 +117,24 @@ def command(
         f"b' {build.model.b_prime_px:.2f} px, field {build.field_deg:.2f}°, "
         f"lens to Scheimpflug line {build.baseline_mm:.2f} mm"
     )
-    if out is not None:
-        from eschorty_ros.report import figures
 
-        fine = build.at(np.linspace(near, last, 400))
-        figures.save(
-            figures.design_figure(
-                fine.range_mm,
-                fine.row,
-                fine.range_per_row_mm,
-                fine.lateral_pitch_mm,
-                fine.depth_of_field_mm,
-                f"f {focal_mm:g} mm, f/{f_number:g}, sensor tilt {build.theta_prime_deg:.2f}°",
-            ),
-            out,
-        )
-        click.echo(str(out))
+
+def _draw(build: Design, range_mm: NDArray[np.float64], out: Path) -> None:
+    from eschorty_ros.report import figures
+
+    at = build.at(range_mm)
+    title = (
+        f"f {build.focal_length_mm:g} mm, f/{build.f_number:g}, "
+        f"sensor tilt {build.theta_prime_deg:.2f}°"
+    )
+    figures.save(
+        figures.design_figure(
+            at.range_mm,
+            at.row,
+            at.range_per_row_mm,
+            at.lateral_pitch_mm,
+            at.depth_of_field_mm,
+            title,
+        ),
+        out,
+    )

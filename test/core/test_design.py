@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.calibration import BUILDS, load_calibration
-from eschorty_ros.core.design import Design, design, design_for_ranges
+from eschorty_ros.core.design import design, design_for_ranges
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.optical_build import Design
 
 LENS = {"focal_length_mm": 24.0, "f_number": 2.0, "theta_deg": 85.87}
 RANGES_MM = [800.0, 1000.0, 1320.0, 1700.0, 2100.0, 2414.0]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from eschorty_ros.core.calibration import BUILDS, load_calibration
-from eschorty_ros.core.design import Design, design
+from eschorty_ros.core.design import design
+from eschorty_ros.core.optical_build import Design
 
 BEAM_MRAD = 1.0
 """Divergence of the paper's laser."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eschorty_ros.core.design import Design
+from eschorty_ros.core.optical_build import Design
 from eschorty_ros.report.experiment import DataTable
 from eschorty_ros.report.experiments._builds import beam_rows
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.calibration_fit import CalibrationFit, fit_targets
-from eschorty_ros.core.design import Design
+from eschorty_ros.core.optical_build import Design
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eschorty_ros.core.design import Design
+from eschorty_ros.core.optical_build import Design
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
