@@ -272,6 +272,15 @@ class LaserStageRig:
             raise ScanCanceled
         time.sleep(_TICK_S)
 
+    @contextlib.contextmanager
+    def _uncanceled(self) -> Iterator[None]:
+        """Within it a cancel has to wait."""
+        before, self._shielded = self._shielded, True
+        try:
+            yield
+        finally:
+            self._shielded = before
+
     def _wait(
         self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
     ) -> None:

@@ -32,14 +32,14 @@ class RosRig(LaserStageRig):
         if state is not None and state.scan_id:
             self._node.get_logger().warning(f"ending {state.scan_id}, which nobody ended")
             self.end_scan(state.scan_id)
-        answer = self._call(
-            "reconstruction/begin_scan",
-            BeginScan.Request(
-                scan_id=request.scan_id,
-                start=m_from_mm(request.start_mm),
-                stop=m_from_mm(request.stop_mm),
-            ),
+        begin = BeginScan.Request(
+            scan_id=request.scan_id,
+            start=m_from_mm(request.start_mm),
+            stop=m_from_mm(request.stop_mm),
         )
+        # Without its answer nobody would know that there is a scan to end.
+        with self._uncanceled():
+            answer = self._call("reconstruction/begin_scan", begin)
         if not answer.success:
             raise ScanFailure(f"reconstruction: {answer.message}")
 

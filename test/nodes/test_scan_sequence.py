@@ -1,12 +1,15 @@
 """The order of a scan: whatever fails, light off, stage at rest, points kept."""
 
 import math
+import threading
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.nodes.scan_rig import RosRig
 from eschorty_ros.nodes.scan_sequence import (
     End,
     ScanCanceled,
@@ -89,6 +92,46 @@ def test_the_first_reason_stays():
 
     rig.end_scan = end_scan
     assert run_scan(rig, REQUEST, LIMITS).message == "camera: gone"
+
+
+class Answered:
+    """A future that is done after some looks."""
+
+    def __init__(self, answer, looks):
+        self._answer, self._looks = answer, looks
+
+    def done(self):
+        self._looks -= 1
+        return self._looks < 0
+
+    def result(self):
+        return self._answer
+
+
+class CanceledRig(RosRig):
+    """The rig of a goal that is canceled while the reconstruction's answer is on its way."""
+
+    def __init__(self):
+        self._node = SimpleNamespace(context=SimpleNamespace(ok=lambda: True))
+        self.monitor = SimpleNamespace(reconstruction=None)
+        self._ended = threading.Event()
+        self._service_timeout_s = 5.0
+        self._phase, self._feedback = "", lambda phase: None
+        self._watching = self._shielded = False
+        self._canceled = lambda: True
+        answer = SimpleNamespace(success=True, message="")
+        self._clients = {
+            "reconstruction/begin_scan": SimpleNamespace(
+                call_async=lambda request: Answered(answer, 3)
+            )
+        }
+
+
+def test_a_cancel_waits_until_the_reconstruction_has_said_that_it_collects():
+    rig = CanceledRig()
+    rig.begin_scan(REQUEST)
+    with pytest.raises(ScanCanceled):
+        rig._pause()
 
 
 def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():
