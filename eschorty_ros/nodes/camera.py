@@ -110,9 +110,10 @@ class CameraNode(DeviceNode):
             self.parameters["event_message_size_threshold"],
         )
         source.start()
-        self._ending.clear()
+        # One for each thread: a thread that hung must not come to life again with the next.
+        ending = self._ending = threading.Event()
         self._thread = threading.Thread(
-            target=self._stream, args=(source,), name="camera stream", daemon=True
+            target=self._stream, args=(source, ending), name="camera stream", daemon=True
         )
         self._thread.start()
 
@@ -142,13 +143,13 @@ class CameraNode(DeviceNode):
         alive = thread is not None and thread.is_alive() and not self._ending.is_set()
         return alive and bool(getattr(source, "healthy", True))
 
-    def _stream(self, source: EventSource) -> None:
+    def _stream(self, source: EventSource, ending: threading.Event) -> None:
         try:
-            while not self._ending.is_set():
+            while not ending.is_set():
                 self._packets.take(source.read(READ_TIMEOUT_S), self.now_ns())
             self._packets.flush()
         except EschortyError as error:
-            if not self._ending.is_set():
+            if not ending.is_set():
                 self.fault(f"camera lost: {error}")
         except Exception as error:
             # A signal ends the context while this thread may be publishing.

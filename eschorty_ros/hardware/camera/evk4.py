@@ -86,6 +86,7 @@ class Evk4:
         self._ending = threading.Event()
         self._closed = False
         self._thread: threading.Thread | None = None
+        self._hung: threading.Thread | None = None
         self._turned_s = 0.0
         self._failed_transfers = 0
 
@@ -146,6 +147,10 @@ class Evk4:
         self._refuse_closed()
         if self._thread is not None:
             return
+        if self._hung is not None and self._hung.is_alive():
+            raise DeviceError(
+                f"{NAME} {self.identity.serial}: its last reads have not ended; configure it again"
+            )
         self.open()
         self._queue.open()
         self._keeper.require("start").start()
@@ -166,7 +171,13 @@ class Evk4:
         return self._queue.get(timeout_s)
 
     def stop(self) -> None:
-        """End streaming; idempotent."""
+        """End streaming; idempotent.
+
+        Raises
+        ------
+        DeviceError
+            When the camera fails, or the receiving thread hangs: ``close`` it then.
+        """
         self._ending.set()
         self._health.stop()
         thread, self._thread = self._thread, None
@@ -182,6 +193,12 @@ class Evk4:
             session = self._keeper.session
             if session is not None:
                 session.stop_reads()
+        if thread.is_alive():
+            # Another one beside it would share its reads.
+            self._hung = thread
+            raise DeviceError(
+                f"{NAME} {self.identity.serial}: its reads do not end; configure it again"
+            )
 
     def close(self) -> None:
         """Stop, power down, release; idempotent, never raises."""

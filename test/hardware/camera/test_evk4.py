@@ -201,6 +201,30 @@ def test_readers_wait_is_ended_by_stop() -> None:
         assert got == [None]
 
 
+def test_a_receiving_thread_that_hangs_gets_no_second_one_beside_it() -> None:
+    with Rig() as rig:
+        rig.streaming()
+        released = threading.Event()
+        session = rig.camera._keeper.session
+        assert session is not None
+        reading = threading.Event()
+
+        def hang(_timeout_s: float) -> tuple[bytes, int]:
+            reading.set()
+            released.wait(20.0)
+            return b"", 0
+
+        session.reader.read = hang  # type: ignore[method-assign]
+        assert reading.wait(5.0)
+        with pytest.raises(DeviceError, match="do not end"):
+            rig.camera.stop()
+        with pytest.raises(DeviceError, match="have not ended"):
+            rig.camera.start()
+        released.set()
+        receiving = [t for t in threading.enumerate() if t.name == "EVK4 events"]
+        assert len(receiving) <= 1
+
+
 def test_closed_camera_says_so() -> None:
     rig = Rig()
     rig.camera.open()
