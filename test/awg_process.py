@@ -48,7 +48,7 @@ class AwgProcess:
         """Whether the output is on now."""
         return self.outputs()[-1] == "ON"
 
-    def off_after_s(self, since_ns: int, patience_s: float = 10.0) -> float:
+    def off_after_s(self, since_ns: int, patience_s: float = 60.0) -> float:
         """How long after ``since_ns`` (CLOCK_MONOTONIC) the output was switched off."""
         end_s = time.monotonic() + patience_s
         while self.lit():

@@ -65,7 +65,8 @@ class CalibrationBench(Bench):
         """Send a goal with the posts of the bench unless others are given; the handle."""
         wait_until(self._calibrate.server_is_ready, "the calibrate action", SCAN_DEADLINE_S)
         self.observer.wait_for_answers("reconstruction", SCAN_DEADLINE_S)
-        self.seen.clear()
+        # A list of its own: feedback of the goal before may still come.
+        seen = self.seen = []
         values = {
             "targets": [
                 CalibrationTarget(range=post.range_mm * 1e-3, size=post.size_mm * 1e-3)
@@ -76,7 +77,7 @@ class CalibrationBench(Bench):
         }
         sent = self._calibrate.send_goal_async(
             Calibrate.Goal(**{**values, **goal}),
-            feedback_callback=lambda message: self.seen.append(message.feedback),
+            feedback_callback=lambda message: seen.append(message.feedback),
         )
         wait_until(sent.done, "an answer to the goal")
         handle = sent.result()
@@ -271,6 +272,7 @@ def useless_captures(bench: CalibrationBench) -> None:
         interlock.publish(Bool(data=True))
         status, result = bench.end()
         interlock.publish(Bool(data=False))
+        wait_until(lambda: not bench.laser[-1].interlock_open, "the interlock closed")
         assert status == GoalStatus.STATUS_ABORTED
         assert "laser: went off: interlock open" in result.message, result.message
         bench.assert_dark_and_at_rest()
@@ -369,4 +371,4 @@ def reconstruction_interrupted(bench: CalibrationBench, interrupt: Callable[[], 
     bench.wait_for_capture()
     assert bench.output_lines()[-1] == "ON"
     interrupt()
-    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log", 5.0)
+    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")

@@ -17,7 +17,7 @@ from eschorty_ros.hardware.camera.keeper import Reconnection
 from eschorty_ros.hardware.protocols import EventChunk
 
 SERIAL = 0x00051234
-PATIENCE_S = 20.0
+PATIENCE_S = 120.0
 
 
 def milliseconds(first: int, count: int) -> bytes:

@@ -22,15 +22,17 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserReadback
 
 MAKE = "generator_double:GeneratorLaser"
-TRANSFERS_PER_READBACK = 6
 
 
 class GeneratorLaser:
-    """Driver: every operation is a number of transfers, ``disable`` waits for one at most."""
+    """Driver: every operation is a number of transfers, ``disable`` waits for one at most.
 
-    def __init__(self, path: str, slow_s: float = 0.0, crash: str = "") -> None:
+    With ``held``, reading back makes that file and then waits until it is interrupted.
+    """
+
+    def __init__(self, path: str, held: str = "", crash: str = "") -> None:
         self.identity = DeviceIdentity("generator double", "42")
-        self._slow_s = slow_s
+        self._held = held
         self._crash = crash
         self._lock = threading.Lock()
         self._off_wanted = 0
@@ -76,7 +78,9 @@ class GeneratorLaser:
     def readback(self) -> LaserReadback:
         if self._crash:
             os._exit(7)
-        output = self._commands(*["READ"] * TRANSFERS_PER_READBACK)
+        if self._held:
+            self._hold()
+        output = self._commands("READ", "READ")
         return LaserReadback(LaserOutput[output], self._modulation, None, 0)
 
     def close(self) -> None:
@@ -84,13 +88,18 @@ class GeneratorLaser:
             self.disable()
         self._socket.close()
 
+    def _hold(self) -> None:
+        with self._lock:
+            Path(self._held).touch()
+            while not self._off_wanted:
+                time.sleep(0.002)
+
     def _commands(self, *commands: str) -> str:
         answer = ""
         with self._lock:
             for command in commands:
                 if self._off_wanted:
                     raise DeviceError("the generator's settings: interrupted by switching off")
-                time.sleep(self._slow_s)
                 answer = self._transfer(command)
         return answer
 
@@ -124,7 +133,7 @@ class Generator:
         """Whether there is light now."""
         return self.lines()[-1][1] == "ON"
 
-    def off_after_s(self, since_ns: int, patience_s: float = 10.0) -> float:
+    def off_after_s(self, since_ns: int, patience_s: float = 60.0) -> float:
         """How long after ``since_ns`` the light went off."""
         end_s = time.monotonic() + patience_s
         while self.lit():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 
+from waiting import DEADLINE_S
+
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserReadback
@@ -25,7 +27,7 @@ class HeldLaser:
     def _wait(self, command: str) -> None:
         if self.hold == command:
             self.reached.set()
-            assert self.go.wait(5.0)
+            assert self.go.wait(DEADLINE_S)
 
     def configure(self, modulation: Modulation) -> None:
         self._wait("configure")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +24,21 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.nodes.dds import use_profile
 
 NAMESPACE = "/eschorty"
-DEADLINE_S = 30.0
+_RESEND_S = 2.0
 
 
-def wait_until(
-    condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S, poll_s: float = 0.02
-) -> Any:
-    """The first truthy value of ``condition()``; fails with ``what`` after ``deadline_s``."""
-    end_s = time.monotonic() + deadline_s
-    while time.monotonic() < end_s:
-        value = condition()
-        if value:
-            return value
-        time.sleep(poll_s)
-    raise AssertionError(f"not within {deadline_s:g} s: {what}")
+def ros_minus_steady_ns() -> int:
+    """ROS time minus CLOCK_MONOTONIC, from the pair of readings least far apart of many."""
+    pairs = []
+    for _ in range(100):
+        before_ns, ros_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        pairs.append((after_ns - before_ns, ros_ns - (before_ns + after_ns) // 2))
+    return min(pairs)[1]
 
 
 class NodeProcess:
@@ -95,7 +93,7 @@ class NodeProcess:
         """Send a signal."""
         self._process.send_signal(number)
 
-    def wait(self, deadline_s: float = 10.0) -> int:
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
         """Exit code; fails with the output when the process does not end in time."""
         try:
             return self._process.wait(deadline_s)
@@ -108,7 +106,7 @@ class NodeProcess:
         """Whether the process is still there."""
         return self._process.poll() is None
 
-    def interrupt(self, deadline_s: float = 10.0) -> int:
+    def interrupt(self, deadline_s: float = DEADLINE_S) -> int:
         """SIGINT, then the exit code."""
         if self.running():
             self.send(signal.SIGINT)
@@ -119,7 +117,7 @@ class NodeProcess:
         fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-    def kill(self, patience_s: float = 3.0) -> None:
+    def kill(self, patience_s: float = 20.0) -> None:
         """SIGTERM, then SIGKILL if it still runs; always leaves nothing behind.
 
         A killed process would leave its shared memory.
@@ -194,28 +192,41 @@ class Observer:
     def call(
         self, service_type: Any, name: str, request: Any = None, deadline_s: float = DEADLINE_S
     ) -> Any:
-        """The service's response."""
-        client = self.node.create_client(service_type, name)
-        try:
-            wait_until(client.service_is_ready, f"service {name}", deadline_s)
+        """The service's response; the service's name begins with that of its node."""
+        with self._client(service_type, name, deadline_s) as client:
+            # A server that does not know the client yet would answer nobody.
+            self.wait_for_answers(name.split("/")[0], deadline_s)
             future = client.call_async(request if request is not None else service_type.Request())
             wait_until(future.done, f"answer of {name}", deadline_s)
             return future.result()
-        finally:
-            self.node.destroy_client(client)
 
     def ask(self, service_type: Any, name: str, deadline_s: float = DEADLINE_S) -> Any:
         """Response of a service that may be called again: a first answer can get lost.
 
-        A fresh server may not know yet where its answers go.
+        A fresh server may not know yet where its answers go, a killed one seems to be there still.
         """
+        futures: list[Any] = []
+        sent_s = -math.inf
 
-        def answered() -> Any:
-            with contextlib.suppress(AssertionError):
-                return self.call(service_type, name, deadline_s=2.0)
-            return None
+        def answered() -> bool:
+            nonlocal sent_s
+            if time.monotonic() - sent_s > _RESEND_S:
+                sent_s = time.monotonic()
+                futures.append(client.call_async(service_type.Request()))
+            return any(future.done() for future in futures)
 
-        return wait_until(answered, f"an answer of {name}", deadline_s)
+        with self._client(service_type, name, deadline_s) as client:
+            wait_until(answered, f"an answer of {name}", deadline_s)
+            return next(future.result() for future in futures if future.done())
+
+    @contextlib.contextmanager
+    def _client(self, service_type: Any, name: str, deadline_s: float) -> Iterator[Any]:
+        client = self.node.create_client(service_type, name)
+        try:
+            wait_until(client.service_is_ready, f"service {name}", deadline_s)
+            yield client
+        finally:
+            self.node.destroy_client(client)
 
     def wait_for_answers(self, node: str, deadline_s: float = DEADLINE_S) -> None:
         """Wait until ``node`` answers.

@@ -16,6 +16,7 @@ from eschorty_ros.core.calibration import load_calibration
 pytest.importorskip("rclpy", reason="needs the package rclpy")
 
 ROOT = Path(__file__).resolve().parents[1]
+DEADLINE_S = 300
 LOGGED = """
 import functools, sys
 from eschorty_ros.nodes import one_calibration as nodes
@@ -62,7 +63,7 @@ def outputs(tmp_path):
 def test_nine_posts_give_back_a_build_that_is_not_as_designed(command, tmp_path):
     out = tmp_path / "calibration.yaml"
     process = command(0.5, "--out", out)
-    stdout, stderr = process.communicate(timeout=100)
+    stdout, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, stderr
     made = load_calibration(out)
     assert made.parameters_fitted is not None
@@ -81,13 +82,13 @@ def test_nine_posts_give_back_a_build_that_is_not_as_designed(command, tmp_path)
 
 def test_a_signal_ends_it_dark_and_writes_nothing(command, tmp_path):
     process = command(60.0, "--out", tmp_path / "calibration.yaml")
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + DEADLINE_S
     while "on" not in outputs(tmp_path):
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == INTERRUPTED, stderr
     assert "Traceback" not in stderr
     assert outputs(tmp_path)[-1] == "off"
@@ -98,7 +99,7 @@ def test_posts_that_are_not_there_are_one_line_and_leave_an_old_file(command, tm
     out = tmp_path / "calibration.yaml"
     out.write_text("old")
     process = command(0.3, "--distances", "5000,6000,7000", "--out", out)
-    stdout, stderr = process.communicate(timeout=100)
+    stdout, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 1, stderr
     assert stdout == ""
     said = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
@@ -115,6 +116,6 @@ def test_what_belongs_to_files_is_wrong_usage(command, tmp_path, arguments):
     (tmp_path / "targets.csv").write_text("row,range_mm\n")
     given = [tmp_path / name if name.endswith(".csv") else name for name in arguments]
     process = command(0.3, *given)
-    _, stderr = process.communicate(timeout=100)
+    _, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 2, stderr
     assert "--fake takes no" in stderr

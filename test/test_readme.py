@@ -26,7 +26,7 @@ def test_the_python_examples_run(tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     assert "points" in done.stdout

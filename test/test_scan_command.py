@@ -18,6 +18,7 @@ from eschorty_ros.report.accuracy import Sweep
 pytest.importorskip("rclpy", reason="needs the package rclpy")
 
 ROOT = Path(__file__).resolve().parents[1]
+DEADLINE_S = 300
 LOGGED = """
 import sys
 from eschorty_ros.nodes import one_scan
@@ -62,7 +63,7 @@ def outputs(log):
 
 def test_a_scan_reaches_its_accuracy_and_ends_dark(command, tmp_path):
     process = command("--stop", 40, "--out", tmp_path / "scan")
-    stdout, stderr = process.communicate(timeout=100)
+    stdout, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, stderr
     points = read_cloud(tmp_path / "scan" / "scan.pcd")
     measured = assert_accurate(points, Sweep(10.0, 40.0, 50.0, 70.0))
@@ -78,13 +79,13 @@ def test_a_scan_reaches_its_accuracy_and_ends_dark(command, tmp_path):
 )
 def test_a_signal_ends_the_scan_dark_without_a_traceback(command, tmp_path, number, code):
     process = command("--speed", 2, "--out", tmp_path / "scan")
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + DEADLINE_S
     while "on" not in outputs(tmp_path / "laser.log"):
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.05)
     process.send_signal(number)
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == code, stderr
     assert "Traceback" not in stderr
     assert outputs(tmp_path / "laser.log")[-1] == "off"
@@ -101,7 +102,7 @@ def test_a_signal_ends_the_scan_dark_without_a_traceback(command, tmp_path, numb
 )
 def test_what_cannot_be_done_is_one_line_and_exit_code_1(command, tmp_path, arguments, named):
     process = command(*arguments, "--out", tmp_path / "scan")
-    stdout, stderr = process.communicate(timeout=60)
+    stdout, stderr = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 1, stderr
     assert stdout == ""
     said = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
@@ -127,7 +128,7 @@ main(prog_name="eschorty")
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=DEADLINE_S,
     )
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1

@@ -12,10 +12,10 @@ from pathlib import Path
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.emulation.bench_folder import READY_FILE
 
-START_S = 60.0
-"""A machine's first start compiles for some 20 s."""
+START_S = 300.0
+"""A machine's first start compiles for some 20 s, a slow one's for minutes."""
 
-_END_S = 5.0
+_END_S = 20.0
 _POLL_S = 0.02
 
 

@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from waiting import wait_until
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.emulation.bench_folder import STAGE_PORT, usb_spec
 from eschorty_ros.emulation.bench_process import bench_process
 from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.usb import open_backend
-
-DEADLINE_S = 60.0
-
-
-def wait_until(condition: Callable[[], Any], what: str) -> None:
-    end_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < end_s, what
-        time.sleep(0.01)
 
 
 @pytest.fixture

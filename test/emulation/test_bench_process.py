@@ -7,12 +7,11 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.emulation.bench_folder import (
@@ -25,15 +24,6 @@ from eschorty_ros.emulation.bench_folder import (
 )
 from eschorty_ros.emulation.bench_process import bench_command, bench_process
 from eschorty_ros.hardware.usb import open_backend
-
-DEADLINE_S = 60.0
-
-
-def wait_until(condition: Callable[[], Any], what: str) -> None:
-    end_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < end_s, what
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -75,7 +65,7 @@ def test_a_signal_ends_it_without_a_word(folder: Path, number: int) -> None:
     )
     wait_until((folder / READY_FILE).exists, "the bench ready")
     process.send_signal(number)
-    _, said = process.communicate(timeout=10)
+    _, said = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0
     assert said == ""
     assert not (folder / READY_FILE).exists()
@@ -130,7 +120,7 @@ def test_help_teaches() -> None:
         [sys.executable, "-m", "eschorty_ros.emulation.bench", "--help"],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=DEADLINE_S,
     )
     assert done.returncode == 0
     for word in ("FOLDER", "usb.sock", "--trigger", "--fault-plan", "Examples:", "Ctrl-C"):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
 import serial
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.emulation.pty_port import PtyPort
@@ -32,7 +32,7 @@ class Echo:
 
 
 def read(port: serial.Serial, size: int) -> bytes:
-    port.timeout = 5.0
+    port.timeout = DEADLINE_S
     return port.read(size)
 
 
@@ -55,16 +55,13 @@ def test_it_can_be_opened_again(tmp_path: Path) -> None:
 def test_an_unplugged_model_hangs_up_and_comes_back(tmp_path: Path) -> None:
     model = Echo()
     with PtyPort(model, tmp_path / "port"):
-        with serial.Serial(str(tmp_path / "port"), timeout=5.0) as port:
+        with serial.Serial(str(tmp_path / "port"), timeout=DEADLINE_S) as port:
             model.gone = True
             with pytest.raises((serial.SerialException, OSError)):
                 port.read(1)
-        assert not (tmp_path / "port").exists()
+        wait_until(lambda: not (tmp_path / "port").exists(), "the port's end")
         model.gone = False
-        end_s = time.monotonic() + 5.0
-        while not (tmp_path / "port").exists():
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        wait_until((tmp_path / "port").exists, "the port again")
         with serial.Serial(str(tmp_path / "port")) as port:
             port.write(b"again")
             assert read(port, 5) == b"again"
@@ -75,10 +72,7 @@ def test_a_host_that_does_not_read_holds_nothing_up(tmp_path: Path) -> None:
     with PtyPort(model, tmp_path / "port"), serial.Serial(str(tmp_path / "port")) as port:
         for _ in range(100):
             port.write(bytes(1000))
-        end_s = time.monotonic() + 5.0
-        while len(model.heard) < 100_000:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        wait_until(lambda: len(model.heard) == 100_000, "all bytes")
 
 
 def test_a_link_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 import usb.core
 import usb.util
 from usb_loop import IN, OUT, PACKET, Loop
+from waiting import DEADLINE_S
 
 from eschorty_ros.emulation.usb_backend import EmulatedBackend
 
@@ -128,7 +129,7 @@ def test_unplugging_wakes_a_waiting_read(mute):
     reader = threading.Thread(target=read)
     reader.start()
     loop.gone = True
-    reader.join(10)
+    reader.join(DEADLINE_S)
     assert codes == [errno.ENODEV]
 
 

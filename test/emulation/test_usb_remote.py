@@ -12,6 +12,7 @@ import pytest
 import usb.core
 import usb.util
 from usb_loop import IN, OUT, PACKET, Loop
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.emulation import usb_remote
@@ -78,10 +79,10 @@ def test_a_write_goes_through_while_another_thread_waits_in_a_read(path, opened)
     device = opened(path)
     got = []
     usb.util.claim_interface(device, 0)
-    reader = threading.Thread(target=lambda: got.append(device.read(IN, 64, 10_000).tobytes()))
+    reader = threading.Thread(target=lambda: got.append(device.read(IN, 64, 0).tobytes()))
     reader.start()
     device.write(OUT, b"here")
-    reader.join(10)
+    reader.join(DEADLINE_S)
     assert got == [b"here"]
 
 

@@ -40,7 +40,7 @@ def test_fault_x3_ctrl_c_in_the_initialisation_and_while_streaming(tmp_path: Pat
             end_well(running["camera"])
             # The line that follows the 2.6 s of initialisation.
             assert "1280 x 720" not in running["camera"].output
-        assert not model.claims
+        wait_until(lambda: not model.claims, "the claim's end")
         with processes(nodes, domain) as running, Observer(domain, "evk4_processes") as observer:
             packets = observer.collect(EventPacket, "camera/events", qos.events())
 
@@ -51,7 +51,7 @@ def test_fault_x3_ctrl_c_in_the_initialisation_and_while_streaming(tmp_path: Pat
             wait_until(arrived, "packets")
             end_well(running["camera"])
         assert model.watch.phase is Phase.OFF
-        assert not model.claims
+        wait_until(lambda: not model.claims, "the claim's end")
 
 
 def test_process_without_a_camera_waits_and_ends_well() -> None:

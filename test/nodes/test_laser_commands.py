@@ -17,6 +17,7 @@ from rclpy.executors import MultiThreadedExecutor
 from ros_process import NAMESPACE, Observer, wait_until
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
+from waiting import DEADLINE_S
 
 from eschorty_ros.nodes import drivers, qos
 from eschorty_ros.nodes.domain import free_domain
@@ -48,7 +49,7 @@ def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldL
     node.safe_state()
     node.destroy_node()
     context.try_shutdown()
-    spinning.join(5.0)
+    spinning.join(DEADLINE_S)
 
 
 def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser: HeldLaser) -> None:
@@ -62,12 +63,12 @@ def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser:
         target=lambda: observer.call(SetBool, "laser/enable", SetBool.Request(data=True))
     )
     enabling.start()
-    assert laser.reached.wait(5.0)
+    assert laser.reached.wait(DEADLINE_S)
     off = threading.Thread(
         target=lambda: observer.call(SetBool, "laser/enable", SetBool.Request(data=False))
     )
     off.start()
-    assert laser.switched_off.wait(2.0), "switching off waits"
+    assert laser.switched_off.wait(0.5 * DEADLINE_S), "switching off waits"
     laser.go.set()
     enabling.join()
     off.join()

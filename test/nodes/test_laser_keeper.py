@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
 from held_laser import HeldLaser
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
@@ -39,6 +39,21 @@ def keeper(laser: HeldLaser) -> Iterator[LaserKeeper]:
     made.close()
 
 
+class Turns:
+    """A lock that counts who has asked for it."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self.asked += 1
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
 def in_thread(step: Callable[[], None], failures: list[str]) -> threading.Thread:
     def attempt() -> None:
         try:
@@ -63,7 +78,7 @@ def test_arming_does_not_outlive_a_switching_off(keeper: LaserKeeper, laser: Hel
     laser.hold = "arm"
     failures: list[str] = []
     arming = in_thread(keeper.arm, failures)
-    assert laser.reached.wait(5.0)
+    assert laser.reached.wait(DEADLINE_S)
     keeper.darken("interlock open")
     laser.go.set()
     arming.join()
@@ -77,12 +92,13 @@ def test_what_waited_while_it_was_switched_off_is_void(
     keeper: LaserKeeper, laser: HeldLaser
 ) -> None:
     laser.hold = "configure"
+    keeper._commands = turns = Turns()  # type: ignore[assignment]
     failures: list[str] = []
     begun = [in_thread(lambda: keeper.configure(Modulation(80.0)), failures)]
-    assert laser.reached.wait(5.0)
+    assert laser.reached.wait(DEADLINE_S)
     begun.append(in_thread(keeper.arm, failures))
     begun.append(in_thread(keeper.enable, failures))
-    time.sleep(0.1)
+    wait_until(lambda: turns.asked == 3, "all three waiting for their turn")
     keeper.switch_off("switched off by request")
     laser.go.set()
     for thread in begun:
@@ -94,11 +110,13 @@ def test_what_waited_while_it_was_switched_off_is_void(
 
 def test_opened_again_it_is_watched_once(keeper: LaserKeeper, laser: HeldLaser) -> None:
     laser.hold = "readback"
-    assert laser.reached.wait(5.0)
+    assert laser.reached.wait(DEADLINE_S)
     keeper.close()
     laser.hold = ""
     keeper.open(HeldLaser(), Modulation(70.0))
     laser.go.set()
-    time.sleep(0.2)
-    named = [thread.name for thread in threading.enumerate() if thread.name.startswith("laser ")]
-    assert sorted(named) == ["laser read-back", "laser watchdog"]
+
+    def watching() -> list[str]:
+        return sorted(t.name for t in threading.enumerate() if t.name.startswith("laser "))
+
+    wait_until(lambda: watching() == ["laser read-back", "laser watchdog"], "the old one's end")

@@ -8,9 +8,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
-from ros_process import NodeProcess, Observer, wait_until
+from ros_process import NodeProcess, Observer
 from sensor_msgs.msg import Image, PointCloud2
 from tf2_msgs.msg import TFMessage
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.nodes import qos
@@ -57,10 +58,12 @@ def live(tmp_path_factory):
         }
         wait_until(lambda: topics["reconstruction/state"], "the node's state")
         replay = NodeProcess(
-            "eschorty_ros.nodes.replay", {"recording": recording.path}, domain=domain
+            "eschorty_ros.nodes.replay",
+            {"recording": recording.path, "timeout": DEADLINE_S},
+            domain=domain,
         )
         try:
-            assert replay.wait(60.0) == 0, replay.output
+            assert replay.wait() == 0, replay.output
             wait_until(lambda: topics["scan/points"], "scan/points")
             seen = len(topics["/diagnostics"])
             wait_until(lambda: len(topics["/diagnostics"]) > seen, "diagnostics")

@@ -5,8 +5,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from ros_process import NodeProcess, Observer, wait_until
+from ros_process import NodeProcess, Observer
 from sensor_msgs.msg import PointCloud2
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
@@ -44,12 +45,14 @@ def test_nodes_and_function_give_identical_points(recording, rate):
     }
     reconstruction = NodeProcess("eschorty_ros.nodes.reconstruction", parameters, domain=domain)
     replay = NodeProcess(
-        "eschorty_ros.nodes.replay", {"recording": recording.path, "rate": rate}, domain=domain
+        "eschorty_ros.nodes.replay",
+        {"recording": recording.path, "rate": rate, "timeout": DEADLINE_S},
+        domain=domain,
     )
     try:
         with Observer(domain) as observer:
             clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
-            assert replay.wait(60.0) == 0, replay.output
+            assert replay.wait() == 0, replay.output
             wait_until(lambda: clouds, "scan/points")
             points = points_from_message(clouds[0])
     finally:
@@ -68,7 +71,7 @@ def test_missing_recording_is_one_line(tmp_path):
         "eschorty_ros.nodes.replay", {"recording": tmp_path / "none"}, domain=free_domain()
     )
     try:
-        assert replay.wait(20.0) == 1
+        assert replay.wait() == 1
         lines = [line for line in replay.output.splitlines() if line.strip()]
         assert len(lines) == 1, replay.output
         assert "none" in lines[0]

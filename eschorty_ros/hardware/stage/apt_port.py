@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
+import select
 import time
+from typing import Any
 
 import serial
 from serial.tools import list_ports
@@ -18,6 +21,26 @@ PREFIXES = {"kbd101": ("28",), "bbd30x": ("103",)}
 _SETTLE_S = 0.05
 # Frames are a few bytes and never wait on a port that works; a machine that stalls is no dead port.
 _WRITE_S = 2.0
+
+
+class _Port(serial.Serial):
+    """A local port whose writing fails only while it takes no bytes.
+
+    Pyserial's own fails also when all was written and the host then stood still for a while.
+    """
+
+    def write(self, data: Any, /) -> int:
+        rest = bytes(data)
+        while rest:
+            try:
+                rest = rest[os.write(self.fileno(), rest) :]
+            except BlockingIOError:
+                pass
+            except OSError as error:
+                raise serial.SerialException(f"write failed: {error}") from error
+            if rest and not select.select([], [self.fileno()], [], _WRITE_S)[1]:
+                raise serial.SerialTimeoutException("Write timeout")
+        return len(data)
 
 
 def find_port(controller: str, serial_number: str = "") -> str:
@@ -62,7 +85,8 @@ def open_port(name: str) -> SerialPort:
         When it may not be opened or another program holds it.
     """
     try:
-        port = serial.serial_for_url(
+        make = serial.serial_for_url if "://" in name else _Port
+        port = make(
             name, BAUD, rtscts=True, exclusive=True, timeout=_SETTLE_S, write_timeout=_WRITE_S
         )
     except (serial.SerialException, OSError, ValueError) as error:

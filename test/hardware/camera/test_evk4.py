@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from evk4_bench import SERIAL, OnDemand, Rig, until
+from evk4_bench import PATIENCE_S, SERIAL, OnDemand, Rig, until
 
 from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceGoneError
 from eschorty_ros.emulation.evk4_model import Evk4Model
@@ -197,7 +197,7 @@ def test_readers_wait_is_ended_by_stop() -> None:
         reader = threading.Thread(target=lambda: got.append(rig.camera.read(30.0)))
         reader.start()
         rig.camera.stop()
-        reader.join(5.0)
+        reader.join(PATIENCE_S)
         assert got == [None]
 
 

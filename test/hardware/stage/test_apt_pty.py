@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
+import tty
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.apt_model import AptModel
@@ -17,14 +21,8 @@ from eschorty_ros.hardware.stage.apt_open import open_stage
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 from eschorty_ros.hardware.stage.apt_stage import AptStage
 
-DEADLINE_S = 20.0
-
-
-def wait(condition: object) -> None:
-    end_s = time.monotonic() + DEADLINE_S
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
+# To the far end it takes longer than anything that is waited for here.
+SLOW_MM_S = 10.0
 
 
 @pytest.fixture
@@ -43,20 +41,28 @@ def opened(port: str) -> AptStage:
     return open_stage(AptSettings(homing_mm_s=25.0), time.time_ns, port)
 
 
+def failed(stage: AptStage) -> bool:
+    try:
+        stage.state()
+    except DeviceError:
+        return True
+    return False
+
+
 def test_home_move_stop_and_close(port: str, model: AptModel) -> None:
     stage = opened(port)
     try:
         stage.home()
-        wait(lambda: stage.state().homed and not stage.state().moving)
+        wait_until(lambda: stage.state().homed and not stage.state().moving, "the reference")
         stage.move_to(40.0, 200.0)
-        wait(lambda: not stage.state().moving)
+        wait_until(lambda: not stage.state().moving, "rest")
         assert stage.state().position_mm == pytest.approx(40.0, abs=1e-4)
-        stage.move_to(200.0, 50.0)
-        time.sleep(0.3)
+        stage.move_to(200.0, SLOW_MM_S)
+        wait_until(lambda: stage.state().position_mm > 41.0, "motion")
         stage.stop()
-        wait(lambda: not stage.state().moving)
-        assert stage.state().position_mm < 80.0
-        assert stage.healthy
+        wait_until(lambda: not stage.state().moving, "rest")
+        assert stage.state().position_mm < 199.0
+        wait_until(lambda: stage.healthy, "fresh messages")
     finally:
         stage.close()
 
@@ -75,7 +81,8 @@ def test_fault_s6_unplug_on_the_port(port: str, model: AptModel) -> None:
     """driver: its threads end, orders fail; user reads: the stage's port failed; check cable."""
     stage = opened(port)
     model.gone = True
-    wait(lambda: not stage.healthy)
+    wait_until(lambda: failed(stage), "the failure")
+    assert not stage.healthy
     with pytest.raises(DeviceGoneError, match="port failed"):
         stage.state()
     stage.stop()
@@ -84,7 +91,7 @@ def test_fault_s6_unplug_on_the_port(port: str, model: AptModel) -> None:
     with pytest.raises(DeviceGoneError, match="no port"):
         opened(port)
     model.gone = False
-    wait(lambda: Path(port).exists())
+    wait_until(Path(port).exists, "the port again")
     opened(port).close()
 
 
@@ -101,18 +108,19 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
 
     try:
         stage.home()
-        wait(lambda: stage.state().homed and not stage.state().moving)
-        stage.move_to(200.0, 50.0)
-        wait(lambda: model.axis.moving(time.time_ns()))
+        wait_until(lambda: stage.state().homed and not stage.state().moving, "the reference")
+        stage.move_to(200.0, SLOW_MM_S)
+        wait_until(lambda: model.axis.moving(time.time_ns()), "motion")
         if thread == "apt reader":
             stage._tracker.hear = mistake  # type: ignore[method-assign]
         else:
             stage._link.every(1.0, mistake)
-        wait(lambda: not stage.healthy)
+        wait_until(lambda: failed(stage), "the failure")
+        assert not stage.healthy
         for call in (stage.state, stage.home, lambda: stage.move_to(10.0, 10.0)):
             with pytest.raises(DeviceError, match=r"driver failed: Zero.*nobody thought of it.*;"):
                 call()
-        wait(lambda: not model.axis.moving(time.time_ns()))
+        wait_until(lambda: not model.axis.moving(time.time_ns()), "rest")
         assert model.axis.position_mm(time.time_ns()) < 150.0
     finally:
         stage.close()
@@ -135,19 +143,50 @@ def test_fault_s9_blocked_callback(port: str, model: AptModel) -> None:
 
     def hang() -> None:
         with stage._lock:
-            release.wait(2.5)
+            release.wait(DEADLINE_S)
 
     try:
         blocker = threading.Thread(target=hang)
         blocker.start()
         begun_s = time.monotonic()
-        wait(lambda: sum(at > begun_s for at in heard) >= 4)
+        wait_until(lambda: sum(at > begun_s for at in heard) >= 4, "four signs of life")
         release.set()
         blocker.join()
-        wait(lambda: stage.healthy)
+        wait_until(lambda: stage.healthy, "fresh messages")
     finally:
         release.set()
         stage.close()
+
+
+def test_a_host_that_stood_still_after_writing_has_written(
+    port: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened_port = apt_port.open_port(port)
+    write = os.write
+
+    def stands_still(descriptor: int, data: bytes) -> int:
+        count = write(descriptor, data)
+        time.sleep(2.0 * apt_port._WRITE_S)
+        return count
+
+    try:
+        monkeypatch.setattr(os, "write", stands_still)
+        assert opened_port.write(b"\x92\x04\x00\x00\x21\x01") == 6
+    finally:
+        opened_port.close()
+
+
+def test_a_port_that_takes_nothing_fails(tmp_path: Path) -> None:
+    host, device = os.openpty()
+    tty.setraw(device)
+    opened_port = apt_port.open_port(os.ttyname(device))
+    try:
+        with pytest.raises(serial.SerialTimeoutException, match="Write timeout"):
+            opened_port.write(bytes(100_000))
+    finally:
+        opened_port.close()
+        os.close(host)
+        os.close(device)
 
 
 def test_ports_are_found_by_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
