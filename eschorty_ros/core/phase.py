@@ -133,9 +133,12 @@ class EdgeSchedule:
         state = self._state
         if target - int(state[S_LAST]) <= JUMP_PERIODS * self.period:
             return
-        step = self._step_at(target) - 2
+        # The edge of the profile that holds the target is still to come.
+        step = self._step_at(target) - 1 - self._every
         skipped = step - int(state[S_STEP])
         skipped -= skipped % self._every
+        if skipped <= 0:
+            return
         self.periods_jumped += skipped // self._every
         if state[S_TRIGGERED]:
             state[S_MISSED] += skipped

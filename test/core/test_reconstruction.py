@@ -105,6 +105,23 @@ def test_many_tiny_pieces_give_the_same_points():
         assert a.counters == b.counters
 
 
+@pytest.mark.parametrize("every", [2, 3, 7])
+def test_a_profile_of_several_periods_after_a_long_dark_stretch_has_its_own_time(every):
+    """Wherever in the profile's count the stretch of more than 4096 periods begins."""
+    rng = np.random.default_rng(SEED)
+    frequency_hz, dark_us = 5000.0, 1_500_000
+    settings = Settings(periods_per_profile=every)
+    t, x, y, p = line_events(rng, flat, frequency_hz=frequency_hz, periods=40, columns=60)
+    for shift in range(every):
+        later = t >= 1000 + (20 + shift) * 200
+        stream = encoded((t + later * (dark_us + 200 * shift), x, y, p))
+        found, _ = run(stream, Modulation(frequency_hz, on_edge_us=1000), settings,
+                       range(0, len(stream), 512))  # fmt: skip
+        since_us = found.t_us - found.edge_us
+        assert since_us.min() >= 0
+        assert since_us.max() < every * 200, f"seed {SEED}, shift {shift}"
+
+
 def _split_cases():
     rng = np.random.default_rng(SEED)
     events = line_events(rng, flat, frequency_hz=500.0, periods=12, columns=300, edge_us=5000)
