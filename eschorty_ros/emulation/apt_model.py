@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from eschorty_ros.core.motion import MotionPlan
-from eschorty_ros.emulation.apt_axis import EMERGENCY_MM_S2, Axis, pulse_pattern, stage_data
+from eschorty_ros.emulation.apt_axis import EMERGENCY_MM_S2, Axis, stage_data
 from eschorty_ros.emulation.apt_frames import HostFrames, answer
+from eschorty_ros.emulation.apt_memory import ASKING, SETTING, Memory
 from eschorty_ros.emulation.apt_wire import BYTE_NS, Disturbance, Wire
 from eschorty_ros.hardware.stage import apt_messages as apt
 
@@ -96,17 +97,12 @@ class AptModel:
         self._in = Wire(byte_ns)
         self._out = Wire(byte_ns, late_ns)
         self._commands = HostFrames()
+        self._memory = Memory(self.scale, self._rack)
         self._power_up()
 
     def _power_up(self) -> None:
         self.enabled = self.homed = False
-        self._velocity = {"channel": 1, "minimum": 0, "acceleration": 0, "velocity": 0}
-        self._velocity["velocity"] = self.scale.velocity(100.0)
-        self._velocity["acceleration"] = self.scale.acceleration(1000.0)
-        self._home = {"channel": 1, "direction": 2, "limit": 1, "velocity": 0, "offset": 0}
-        self._home["velocity"] = self.scale.velocity(10.0)
-        self._settings: dict[str, dict[str, int]] = {}
-        self._armed = False
+        self._memory.forget()
         self._ending = ""
         self._updates_ns: int | None = None
         self._unacknowledged = 0
@@ -117,7 +113,7 @@ class AptModel:
         self.axis.stop(now_ns, EMERGENCY_MM_S2)
         self._power_up()
         self.axis.encoder_offset_mm = self.axis.position_mm(now_ns)
-        self._program_pulses()
+        self.axis.pattern = self._memory.pattern
 
     def plan(self) -> MotionPlan:
         """Tell the motion under way or the rest after it, in the clock's time."""
@@ -168,8 +164,7 @@ class AptModel:
             occupied = 1 if values["bay"] == self._bay - 1 else 2
             self._say("bay", apt.RACK, at_ns, bay=values["bay"], state=occupied)
         elif name == "set_rack_port" and address in (apt.RACK, apt.SINGLE_UNIT):
-            self._settings[name] = values
-            self._program_pulses()
+            self._set(name, values)
         elif name == "request_info" and (address == self._address or address == apt.RACK):
             self._tell_info(address, at_ns)
         elif address == self._address:
@@ -187,25 +182,22 @@ class AptModel:
                 self.enabled = values["state"] == 1 and not self.panel_disabled
                 if not self.enabled:
                     self.axis.stop(at_ns, EMERGENCY_MM_S2)
-            case "set_velocity":
-                self._velocity = values
-            case "set_home":
-                self._home = values
-            case "set_ports" | "set_pulses" | "set_rack_trigger":
-                self._settings[name] = values
-                self._program_pulses()
-            case "set_rack_trigger_state":
-                self._armed = values["state"] == 1
-                self._program_pulses()
             case "home" | "move_absolute" | "stop":
                 self._motion(name, values, at_ns)
+            case _ if name in SETTING:
+                self._set(name, values)
             case _:
                 self._answer(name, at_ns)
+
+    def _set(self, name: str, values: dict[str, int]) -> None:
+        self._memory.keep(name.removeprefix("set_"), values)
+        self.axis.pattern = self._memory.pattern
 
     def _motion(self, name: str, values: dict[str, int], at_ns: int) -> None:
         # A motion begins now, not when its command came: the past has been told already.
         at_ns = max(at_ns, self._clock_ns())
-        speed, acceleration = self._obeyed()
+        speed = min(self._memory.speed_mm_s, self._limits[0])
+        acceleration = min(self._memory.acceleration_mm_s2, self._limits[1])
         if name == "stop":
             if self._ending:
                 self._ending = "stopped"
@@ -215,17 +207,12 @@ class AptModel:
             return
         if name == "home":
             self.homed = False
-            speed = min(self._home["velocity"] / self.scale.velocity_unit, speed)
+            speed = min(self._memory.homing_mm_s, speed)
             target = self.axis.travel_mm[0]
         else:
             target = self.scale.mm(values["position"]) + self.axis.encoder_offset_mm
         self._ending = "homed" if name == "home" else "moved"
         self.axis.move(at_ns, target, speed, acceleration)
-
-    def _obeyed(self) -> tuple[float, float]:
-        speed = self._velocity["velocity"] / self.scale.velocity_unit
-        acceleration = self._velocity["acceleration"] / self.scale.acceleration_unit
-        return min(speed, self._limits[0]), min(acceleration, self._limits[1])
 
     def _complete(self, now_ns: int) -> None:
         if not self._ending or self.axis.moving(now_ns) or self.axis.stalled:
@@ -239,18 +226,6 @@ class AptModel:
         else:
             self._say_status(ended, end_ns)
 
-    def _program_pulses(self) -> None:
-        """Make the pattern of what ports and pulses are set to."""
-        ports = self._settings.get("set_ports", {})
-        modes = {ports.get("mode_1"), ports.get("mode_2")}
-        pulses = self._settings.get("set_pulses")
-        if self._rack:
-            pulses = self._settings.get("set_rack_trigger")
-            wired = self._settings.get("set_rack_port", {}).get("mode") == 1
-            modes = {pulses["out_mode"]} if pulses and wired and self._armed else set()
-        forward, reverse = bool(modes & {0x0D, 0x0F}), bool(modes & {0x0E, 0x0F})
-        self.axis.pattern = pulse_pattern(pulses, forward, reverse, self.scale) if pulses else None
-
     # What the controller sends
 
     def _answer(self, name: str, at_ns: int) -> None:
@@ -259,17 +234,14 @@ class AptModel:
                 self._say_status("status", at_ns)
             case "request_axis":
                 self._tell_axis(at_ns)
-            case "request_velocity":
-                self._say("velocity", at_ns=at_ns, **self._velocity)
-            case "request_home":
-                self._say("home_parameters", at_ns=at_ns, **self._home)
             case "request_enabled":
                 self._say("enabled", at_ns=at_ns, channel=1, state=1 if self.enabled else 2)
-            case "request_ports" | "request_pulses" | "request_rack_trigger":
+            case _ if name in ASKING:
                 kind = name.removeprefix("request_")
-                values = self._settings.get(f"set_{kind}")
+                values = self._memory.kept(kind)
                 if values is not None:
-                    self._say(kind, at_ns=at_ns, **values)
+                    reply = "home_parameters" if kind == "home" else kind
+                    self._say(reply, at_ns=at_ns, **values)
 
     def _tell_info(self, address: int, at_ns: int) -> None:
         model = b"BBD301" if self._rack else b"KBD101"
