@@ -47,6 +47,15 @@ def test_installed_layout() -> None:
         assert os.access(script, os.X_OK)
 
 
+def test_both_lists_of_python_packages_are_the_same() -> None:
+    keys = {"pyserial": "serial", "pyusb": "usb", "pyyaml": "yaml"}
+    lines = (ROOT / "requirements" / "run.txt").read_text().splitlines()
+    names = [line.partition(">")[0] for line in lines if line and not line.startswith("#")]
+    needed = {element.text for element in ElementTree.parse(ROOT / "package.xml").iter()}
+    assert names
+    assert {f"python3-{keys.get(name, name)}" for name in names} <= needed
+
+
 def test_versions_agree() -> None:
     import eschorty_ros
 

@@ -1,15 +1,23 @@
 """The file of `eschorty scan --hardware`: real drivers, and no misspelt parameter."""
 
+import ast
+import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.core.errors import FormatError
+from eschorty_ros.nodes.composition import NODES
 from eschorty_ros.nodes.hardware_file import read_hardware
 
 GUIDE = Path(__file__).parents[2] / "docs" / "hardware.md"
+
+
+def examples(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.DOTALL)
 
 
 def written(folder: Path, text: str) -> Path:
@@ -32,10 +40,20 @@ def test_real_drivers_unless_told(tmp_path):
 
 
 def test_the_guides_example_is_accepted(tmp_path):
-    example = GUIDE.read_text().split("```yaml\n")[1].split("```")[0]
-    tables = read_hardware(written(tmp_path, example))
+    tables = read_hardware(written(tmp_path, examples("yaml")[-1]))
     assert tables["camera"]["serial"] == "00051234"
     assert tables["reconstruction"] == {"trigger_source": "stage"}
+
+
+def test_the_guides_parameters_and_launch_file_are_what_the_nodes_have(tmp_path):
+    given = yaml.safe_load(examples("yaml")[0])
+    values = {
+        name.removeprefix("/eschorty/"): table["ros__parameters"] for name, table in given.items()
+    }
+    assert read_hardware(written(tmp_path, yaml.safe_dump(values))) == values
+    launch = ast.parse(examples("python")[0])
+    nodes = next(part.value for part in launch.body if isinstance(part, ast.Assign))
+    assert ast.literal_eval(nodes) == tuple(NODES)
 
 
 @pytest.mark.parametrize(
