@@ -40,7 +40,12 @@ def test_every_launch_argument_is_in_the_table_with_its_default():
         for node in tree.body
         if isinstance(node, ast.Assign) and node.targets[0].id == "ARGUMENTS"
     )
-    for row in table.elts:
+    launching = ast.parse((ROOT / "eschorty_ros" / "nodes" / "launching.py").read_text())
+    shared = {
+        node.target.id: node.value for node in launching.body if isinstance(node, ast.AnnAssign)
+    }
+    for entry in table.elts:
+        row = shared[entry.id] if isinstance(entry, ast.Name) else entry
         name, default = row.elts[0].value, row.elts[1]
         line = next(line for line in README.splitlines() if re.match(rf"\| .*`{name}`", line))
         if isinstance(default, ast.Constant):
