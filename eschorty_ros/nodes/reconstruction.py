@@ -32,15 +32,14 @@ from eschorty_ros.nodes.conversions import laser_settings, mm_from_m, ns_from_st
 from eschorty_ros.nodes.mailbox import Mailbox
 from eschorty_ros.nodes.packet_times import Packet
 from eschorty_ros.nodes.parameters import Parameters, from_settings
-from eschorty_ros.nodes.pipeline import Pipeline, ScanReport
+from eschorty_ros.nodes.pipeline import Pipeline
 from eschorty_ros.nodes.reconstruction_outputs import Outputs
 from eschorty_ros.nodes.reconstruction_parameters import TABLE, modulation_override
-from eschorty_ros.nodes.reconstruction_reports import Reports, fill_end_scan
+from eschorty_ros.nodes.reconstruction_reports import Reports
+from eschorty_ros.nodes.scan_services import ScanServices
 from eschorty_ros.nodes.spin import run
-from eschorty_ros.srv import BeginScan, EndScan
 
 _STAGE_DEPTH = 2000
-_CONNECT_S = 3.0
 
 
 class ReconstructionNode(Node):
@@ -71,8 +70,6 @@ class ReconstructionNode(Node):
             self._pipeline.stream.set_laser(self._override, None)
         self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
         self._mailbox = Mailbox(self.parameters["packets_max"])
-        self._ending: tuple[Callable[[ScanReport], None], ...] = ()
-        self._ended_s = 0.0
         self._reports = Reports(self, self._pipeline, self._mailbox)
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
@@ -98,7 +95,6 @@ class ReconstructionNode(Node):
     def _make_interfaces(self) -> None:
         override = {"qos_overriding_options": qos.overridable()}
         bulk = MutuallyExclusiveCallbackGroup()
-        waiting = MutuallyExclusiveCallbackGroup()
         packets = self.create_subscription(EventPacket, "camera/events", self._on_packet,
                                            qos.events(), callback_group=bulk,
                                            **override)  # fmt: skip
@@ -113,17 +109,20 @@ class ReconstructionNode(Node):
         odometry = self.create_subscription(
             Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
         )
-        self._sources = (packets, odometry)
+        self._scans = ScanServices(
+            self,
+            self._pipeline,
+            (packets, odometry),
+            self._in_worker,
+            self._lives,
+            self.parameters["stage_timeout"],
+            self._outputs.scan,
+        )
         if self.parameters["publish_tf"]:
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
             self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
             now_ns = self.get_clock().now().nanoseconds
             self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
-        for kind, name, callback in (
-            (BeginScan, "reconstruction/begin_scan", self._on_begin),
-            (EndScan, "reconstruction/end_scan", self._on_end),
-        ):
-            self.create_service(kind, name, callback, callback_group=waiting)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.1, self._reports.publish_state, clock=steady)
         self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
@@ -182,66 +181,13 @@ class ReconstructionNode(Node):
             carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
             self._tf.publish(TFMessage(transforms=[carriage]))
 
-    def _on_begin(self, request: Any, response: Any) -> Any:
-        # A publisher may know this node's subscriptions before they know the publisher; whoever
-        # begins a scan must be able to rely on every message sent from then on.
-        missing = self._unconnected()
-        deadline_s = time.monotonic() + _CONNECT_S
-        while missing and time.monotonic() < deadline_s and not self._closing.wait(0.02):
-            missing = self._unconnected()
-        if missing:
-            response.success = False
-            response.message = f"nobody publishes {' and '.join(missing)}; start camera and stage"
-            return response
-        begin = partial(
-            self._pipeline.begin_scan,
-            request.scan_id,
-            mm_from_m(request.start),
-            mm_from_m(request.stop),
-        )
-        response.success, response.message = self._in_worker(begin)
-        return response
-
-    def _unconnected(self) -> list[str]:
-        return [source.topic_name for source in self._sources if not source.get_publisher_count()]
-
-    def _on_end(self, request: Any, response: Any) -> Any:
-        finished = threading.Event()
-        reports: list[ScanReport] = []
-
-        def done(report: ScanReport) -> None:
-            reports.append(report)
-            finished.set()
-
-        def begin_end() -> None:
-            self._ended_s = time.monotonic()
-            self._pipeline.close_period(request.scan_id, self._ended_s)
-            self._ending = (done,)
-
-        response.success, response.message = self._in_worker(begin_end)
-        if not response.success:
-            return response
-        if not self._awaited(finished, self.parameters["stage_timeout"] + 30.0):
-            response.success = False
-            response.message = "the scan was not assembled in time; see the node's log"
-            return response
-        fill_end_scan(response, reports[0])
-        return response
-
-    def _awaited(self, event: threading.Event, timeout_s: float) -> bool:
-        """Wait for the worker's event; after a signal nobody works any more."""
-        end_s = time.monotonic() + timeout_s
-        while not event.wait(0.1):
-            if time.monotonic() > end_s or self._closing.is_set() or not self.context.ok():
-                return event.is_set()
-        return True
-
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
         """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
-        # After a signal nobody works any more, and an exit must not wait for it.
-        return self._mailbox.run(
-            job, timeout_s, lambda: not self._closing.is_set() and self.context.ok()
-        )
+        return self._mailbox.run(job, timeout_s, self._lives)
+
+    def _lives(self) -> bool:
+        """Whether the worker works; after a signal it does not, and an exit must not wait."""
+        return not self._closing.is_set() and self.context.ok()
 
     def _use_calibration(self, calibration: Calibration) -> None:
         def use() -> None:
@@ -264,7 +210,7 @@ class ReconstructionNode(Node):
                 self._step()
             except Exception:
                 # The context is invalid after a signal; a failure then is no news.
-                if self._closing.is_set() or not self.context.ok():
+                if not self._lives():
                     return
                 self._reports.faults += 1
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
@@ -283,13 +229,7 @@ class ReconstructionNode(Node):
         self._outputs.points(placed)
         if until_ns is not None:
             self._outputs.event_frame(until_ns)
-        # Background makes profiles after the light is off, too; nobody waits for those.
-        if self._ending and not self._pipeline.placer.holds(self._ended_s):
-            callbacks, self._ending = self._ending, ()
-            report = self._pipeline.end_scan()
-            self._outputs.scan(report.scan, self.get_clock().now().nanoseconds)
-            for callback in callbacks:
-                callback(report)
+        self._scans.finish()
 
     def _on_change(self, values: dict[str, Any]) -> None:
         names = Settings.__dataclass_fields__
