@@ -7,9 +7,13 @@ from numba import int64, njit, types, uint16
 from eschorty_ros.core._bits import popcount64
 from eschorty_ros.core._evt3_words import (
     ADDR_X,
+    CONTINUED_4,
+    CONTINUED_12,
     DROPPED_EVENTS,
     DROPPED_TIME_HIGH,
     DROPPED_TIME_LOW,
+    ERC_EVENTS_IN,
+    ERC_EVENTS_OUT,
     EXT_TRIGGER,
     OTHERS,
     VECT_8,
@@ -17,7 +21,10 @@ from eschorty_ros.core._evt3_words import (
     VECT_BASE_X,
 )
 
-OFF, ON, TRIGGERS, DROP_WORDS, POLARITY = range(5)
+# The last three are state: polarity of vectors, which count a payload belongs to (0 for none), and
+# the bits of it that have come.
+OFF, ON, TRIGGERS, DROP_WORDS, ERC_IN, ERC_OUT, POLARITY, PAYLOAD_OF, PAYLOAD_BITS = range(9)
+SIZE = 9
 
 _U2 = types.Array(uint16, 1, "C", readonly=True)
 
@@ -46,4 +53,19 @@ def count_words(words, counts):
                 or subtype == DROPPED_EVENTS
             ):
                 counts[DROP_WORDS] += 1
+            counts[PAYLOAD_BITS] = 0
+            counts[PAYLOAD_OF] = 0
+            if subtype == ERC_EVENTS_IN:
+                counts[PAYLOAD_OF] = ERC_IN
+            elif subtype == ERC_EVENTS_OUT:
+                counts[PAYLOAD_OF] = ERC_OUT
+        elif (kind == CONTINUED_12 or kind == CONTINUED_4) and counts[PAYLOAD_OF] > 0:
+            bits = counts[PAYLOAD_BITS]
+            if kind == CONTINUED_12 and bits < 24:
+                counts[counts[PAYLOAD_OF]] += int64(word & 0xFFF) << bits
+                counts[PAYLOAD_BITS] = bits + 12
+            else:
+                if kind == CONTINUED_4 and bits == 24:
+                    counts[counts[PAYLOAD_OF]] += int64(word & 0xF) << 24
+                counts[PAYLOAD_OF] = 0
     counts[POLARITY] = polarity

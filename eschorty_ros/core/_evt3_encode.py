@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core import _evt3_words as w3
 from eschorty_ros.core._checks import whole
 from eschorty_ros.core._evt3_encode_kernels import NONE, T_US, _encode, _first_fall, _put_time
 from eschorty_ros.core.errors import ArgumentError
 
-_DROP = np.uint16(0xEEDA)
-"""OTHERS word of a sensor that has dropped events."""
+_TRIGGER = np.uint16(w3.EXT_TRIGGER << 12)
+_DROP = np.uint16(w3.OTHERS << 12 | w3.DROPPED_EVENTS)
+_COUNT_MAX = (1 << 28) - 1
 _IDLE_MAX_US = 3_600_000_000
 """Longest silence filled with TIME_HIGH words: one hour, 1.8 MB."""
 
@@ -61,6 +63,7 @@ class Encoder:
         trigger_t: ArrayLike | None = None,
         trigger_edge: ArrayLike | None = None,
         drop_t: ArrayLike | None = None,
+        rate_counts: ArrayLike | None = None,
     ) -> bytes:
         """Bytes of the next events, triggers and notes of dropped events.
 
@@ -75,6 +78,9 @@ class Encoder:
             trigger comes before the events.
         drop_t : array_like of int, shape (k,), optional
             Times (not falling) at which the stream says that the sensor dropped events.
+        rate_counts : array_like of int, shape (j, 3), optional
+            Reports of the event-rate control: time (not falling), events before and after it in
+            the period that ends there, below 2**28.
 
         Raises
         ------
@@ -99,14 +105,19 @@ class Encoder:
                 "give one edge per trigger"
             )
         drop_times = _checked("drop_t", _or_none(drop_t), np.int64, 1 << 62)
-        for name, series in (("t", times), ("trigger_t", trigger_times), ("drop_t", drop_times)):
+        report_times, counts = _reports(rate_counts)
+        for name, series in (
+            ("t", times),
+            ("trigger_t", trigger_times),
+            ("drop_t", drop_times),
+            ("rate_counts", report_times),
+        ):
             self._refuse_fall(name, series)
-        mark_times = np.concatenate((trigger_times, drop_times))
-        marks = np.concatenate((0xA000 | edges.astype(np.uint16), np.full(drop_times.size, _DROP)))
-        marks = marks.astype(np.uint16)
-        if drop_times.size:
-            order = np.argsort(mark_times, kind="stable")
-            mark_times, marks = mark_times[order], marks[order]
+        mark_times, marks = _merged_marks(
+            (trigger_times, _TRIGGER | edges.astype(np.uint16)),
+            (drop_times, np.full(drop_times.size, _DROP, dtype=np.uint16)),
+            (np.repeat(report_times, 8), _report_words(counts)),
+        )
         ends = [int(series[-1]) for series in (times, mark_times) if series.size]
         if not ends:
             return b""
@@ -160,6 +171,45 @@ class Encoder:
                 f"stay within {_IDLE_MAX_US} us"
             )
         return (end_us >> 12) - (begun_us >> 12) + 1
+
+
+def _reports(rate_counts: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Times of the rate control's reports, and per report the events before and after it."""
+    given = np.asarray(() if rate_counts is None else rate_counts)
+    if given.size == 0:
+        return np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise ArgumentError(
+            f"rate_counts has shape {given.shape}; give time, events before and after per report"
+        )
+    limits = ((1 << 62), _COUNT_MAX + 1, _COUNT_MAX + 1)
+    times, *counts = (
+        _checked("rate_counts", given[:, k], np.int64, limit) for k, limit in enumerate(limits)
+    )
+    return times, np.column_stack(counts)
+
+
+def _report_words(counts: NDArray[np.int64]) -> NDArray[np.uint16]:
+    """Eight words per report: two OTHERS with 28 bits of payload each."""
+    words = np.empty((len(counts), 2, 4), dtype=np.uint16)
+    words[:, :, 0] = w3.OTHERS << 12 | np.array((w3.ERC_EVENTS_IN, w3.ERC_EVENTS_OUT))
+    words[:, :, 1] = w3.CONTINUED_12 << 12 | counts & 0xFFF
+    words[:, :, 2] = w3.CONTINUED_12 << 12 | counts >> 12 & 0xFFF
+    words[:, :, 3] = w3.CONTINUED_4 << 12 | counts >> 24
+    return words.ravel()
+
+
+def _merged_marks(
+    *series: tuple[NDArray[np.int64], NDArray[np.uint16]],
+) -> tuple[NDArray[np.int64], NDArray[np.uint16]]:
+    """Words that are no events by time; at equal times in the order given."""
+    filled = [one for one in series if one[0].size]
+    if len(filled) == 1:
+        return filled[0]
+    times = np.concatenate([one[0] for one in series])
+    marks = np.concatenate([one[1] for one in series])
+    order = np.argsort(times, kind="stable")
+    return times[order], marks[order]
 
 
 def _or_none(values: ArrayLike | None) -> ArrayLike:

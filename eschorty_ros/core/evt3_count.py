@@ -22,15 +22,19 @@ class WordCounter:
         Edges at the trigger input.
     drop_words : int
         Reports of the sensor that it dropped time words or events.
+    erc_events_in, erc_events_out : int
+        Events before and after the event-rate control, by its own reports.
     """
 
     def __init__(self) -> None:
-        self._counts = np.zeros(5, np.int64)
+        self._counts = np.zeros(kernels.SIZE, np.int64)
 
     off = property(lambda self: int(self._counts[kernels.OFF]))
     on = property(lambda self: int(self._counts[kernels.ON]))
     triggers = property(lambda self: int(self._counts[kernels.TRIGGERS]))
     drop_words = property(lambda self: int(self._counts[kernels.DROP_WORDS]))
+    erc_events_in = property(lambda self: int(self._counts[kernels.ERC_IN]))
+    erc_events_out = property(lambda self: int(self._counts[kernels.ERC_OUT]))
 
     def add(self, data: bytes | bytearray | memoryview) -> None:
         """Count whole 16-bit words; a lone last byte is left out.

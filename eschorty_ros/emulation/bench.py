@@ -17,9 +17,10 @@ import click
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.emulation.bench_devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench_folder import default_folder, stage_port, usb_spec
-from eschorty_ros.emulation.bench_physics import TRIGGERS, Imperfections
+from eschorty_ros.emulation.bench_physics import TRIGGERS
 from eschorty_ros.emulation.bench_server import serving
 from eschorty_ros.emulation.faults import FaultPlan, load_fault_plan
+from eschorty_ros.emulation.imperfections import Imperfections
 from eschorty_ros.simulation.presets import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
 

@@ -10,8 +10,10 @@ from typing import Any
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.emulation.apt_model import AptModel
 from eschorty_ros.emulation.awg_model import AwgModel
-from eschorty_ros.emulation.bench_physics import Imperfections, Physics
+from eschorty_ros.emulation.bench_physics import Physics
+from eschorty_ros.emulation.evk4_control import sensor_control
 from eschorty_ros.emulation.evk4_model import Evk4Model
+from eschorty_ros.emulation.imperfections import Imperfections
 from eschorty_ros.emulation.usb_device import EmulatedUsbDevice
 from eschorty_ros.simulation.presets import preset
 from eschorty_ros.simulation.scene import named
@@ -90,6 +92,7 @@ class Bench:
         # A command and the world's present exclude each other.
         self.laser.mutex = self.physics.lock
         self.camera = Evk4Model(self.physics)
+        self.camera.configure = lambda settings: self.physics.set_sensor(sensor_control(settings))
 
     def look_at(self, scene: str) -> None:
         """Put another scene in front of the camera, for the next start of its stream."""

@@ -14,11 +14,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from fractions import Fraction
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan
+from eschorty_ros.emulation.imperfections import Imperfections
+from eschorty_ros.simulation.sensor_control import SensorControl
 from eschorty_ros.simulation.world import World
 
 TRIGGERS = ("none", "laser", "stage")
@@ -32,56 +33,6 @@ PACKET_US = 1_008
 _PACKETS_AT_ONCE = 4
 _PACKET_S = PACKET_US * 1e-6
 _PULSE_MAX_NS = 1_000_000_000
-_PPB = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Imperfections:
-    """Where the bench is not ideal.
-
-    Parameters
-    ----------
-    sensor_ppm, generator_ppm : float
-        How much faster than bench time the sensor's and the generator's clock run.
-    usb_jitter_ms : float
-        The camera's bytes arrive late by up to so much, evenly distributed.
-    missing_edges : float
-        Share of the trigger edges that the camera does not see.
-    seed : int
-        Of jitter and missing edges.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
-    """
-
-    sensor_ppm: float = 0.0
-    generator_ppm: float = 0.0
-    usb_jitter_ms: float = 0.0
-    missing_edges: float = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("sensor_ppm", -1000.0, 1000.0),
-            ("generator_ppm", -1000.0, 1000.0),
-            ("usb_jitter_ms", 0.0, 1000.0),
-            ("missing_edges", 0.0, 1.0),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ArgumentError(f"{name} is {value!r}; choose {low:g} to {high:g}")
-
-    @property
-    def sensor_rate(self) -> Fraction:
-        """Sensor time that passes per bench time."""
-        return 1 + Fraction(round(self.sensor_ppm * 1000), _PPB)
-
-    @property
-    def generator_rate(self) -> Fraction:
-        """Generator time that passes per bench time."""
-        return 1 + Fraction(round(self.generator_ppm * 1000), _PPB)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +40,12 @@ class _Light:
     since_ns: int
     on: bool
     modulation: Modulation | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Control:
+    since_ns: int
+    control: SensorControl
 
 
 class Physics:
@@ -150,7 +107,8 @@ class Physics:
         self._zero_ns = 0
         self._light = _Light(clock_ns(), False, None)
         self._plan = MotionPlan(clock_ns(), 0.0)
-        self._news: deque[_Light | MotionPlan] = deque()
+        self._control = _Control(clock_ns(), SensorControl())
+        self._news: deque[_Light | MotionPlan | _Control] = deque()
         self._stage_edges: deque[tuple[int, bool]] = deque()
         self._collected_ns = 0
         self._on_the_way: deque[tuple[int, bytes]] = deque()
@@ -168,6 +126,12 @@ class Physics:
         with self.lock:
             self._plan = plan
             self._news.append(plan)
+
+    def set_sensor(self, control: SensorControl) -> None:
+        """Learn that the sensor is set so from now on."""
+        with self.lock:
+            self._control = _Control(self.clock_ns(), control)
+            self._news.append(self._control)
 
     def collect_pulses(self) -> None:
         """Take the stage's trigger edges up to now; a later command changes only later ones."""
@@ -198,6 +162,7 @@ class Physics:
                 world.trigger_input = self._stage_trigger
             self._apply_light(world, self._light)
             self._apply_plan(world, self._plan)
+            world.set_sensor(0, self._control.control)
             self._on_the_way.clear()
             self._rest = b""
             self._running.set()
@@ -222,13 +187,14 @@ class Physics:
             time.sleep(min(_PACKET_S, left_s))
 
     def statistics(self) -> dict[str, float]:
-        """Count events, lag behind the bench's clock, late changes and trigger edges."""
+        """Count events, those the rate control dropped, lag, late changes and trigger edges."""
         world = self._world
         behind_ns = 0
         if world is not None and self._running.is_set():
             behind_ns = self.clock_ns() - self._zero_ns - self._bench_ns(world.now_us)
         return {
             "events": float(world.events if world is not None else 0),
+            "rate_dropped": float(world.rate_dropped if world is not None else 0),
             "behind_s": behind_ns * 1e-9,
             "late_changes": float(self.late_changes),
             "trigger_edges": float(self.edges),
@@ -247,6 +213,8 @@ class Physics:
         for change in news:
             if isinstance(change, _Light):
                 self._apply_light(world, change)
+            elif isinstance(change, _Control):
+                world.set_sensor(self._from_us(world, change.since_ns), change.control)
             else:
                 self._apply_plan(world, change)
         packets = (self._sensor_us(horizon_ns) - world.now_us) // PACKET_US

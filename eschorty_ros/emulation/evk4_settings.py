@@ -43,8 +43,8 @@ class SensorSettings:
     trigger_in : bool
     packet_period_us : int
         The sensor hands a packet over that often.
-    event_rate_limit : float or None
-        Events/s let through by the event-rate control, None when it is off.
+    event_rate : (int, int) or None
+        Events the event-rate control lets through per period, and the period (us); None when off.
     flicker_band_hz : (float, float) or None
         Band the anti-flicker filter removes, None when it is bypassed.
     noise_filter : (str, int) or None
@@ -57,7 +57,7 @@ class SensorSettings:
     pixels_off: frozenset[tuple[int, int]]
     trigger_in: bool
     packet_period_us: int
-    event_rate_limit: float | None
+    event_rate: tuple[int, int] | None
     flicker_band_hz: tuple[float, float] | None
     noise_filter: tuple[str, int] | None
 
@@ -75,7 +75,7 @@ def read_settings(registers: Registers) -> SensorSettings:
         trigger_in=bool(registers[_TRIGGER] & 1 << 10),
         # 16 us steps; 0 would never end a packet.
         packet_period_us=max(16, registers[_PACKET_PERIOD] & 0xFFF0),
-        event_rate_limit=_event_rate(registers),
+        event_rate=_event_rate(registers),
         flicker_band_hz=_flicker_band(registers),
         noise_filter=_noise_filter(registers),
     )
@@ -98,11 +98,11 @@ def _pixels(registers: Registers) -> frozenset[tuple[int, int]]:
     return frozenset((word & 0x7FF, word >> 16 & 0x7FF) for word in words if word >> 31)
 
 
-def _event_rate(registers: Registers) -> float | None:
+def _event_rate(registers: Registers) -> tuple[int, int] | None:
     period_us = registers[_ERC_PERIOD] & 0x3FF
     if registers[_ERC_ON] & 3 != 1 or not registers[_ERC_DROP] & 1 or not period_us:
         return None
-    return (registers[_ERC_COUNT] & 0x3FFFFF) * 1e6 / period_us
+    return registers[_ERC_COUNT] & 0x3FFFFF, period_us
 
 
 def _flicker_band(registers: Registers) -> tuple[float, float] | None:

@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.evt3_count import WordCounter
 from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
 from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.neuromorphic import NeuromorphicEvk4
@@ -31,7 +32,7 @@ from eschorty_ros.nodes.spin import run
 READ_TIMEOUT_S = 0.02
 STOP_TIMEOUT_S = 3.0
 
-_LOSSES = ("drops", "gaps", "sensor_drop_words")
+_LOSSES = ("drops", "gaps", "sensor_drop_words", "erc_events_dropped")
 
 TABLE = (
     *drivers.DRIVER,
@@ -143,6 +144,11 @@ class CameraNode(DeviceNode):
         alive = thread is not None and thread.is_alive() and not self._ending.is_set()
         return alive and bool(getattr(source, "healthy", True))
 
+    @property
+    def words(self) -> WordCounter:
+        """What was in the stream so far, listened to or not."""
+        return self._packets.words
+
     def _stream(self, source: EventSource, ending: threading.Event) -> None:
         try:
             while not ending.is_set():
@@ -203,7 +209,7 @@ class CameraNode(DeviceNode):
 
     def _dump_statistics(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         source = self._source
-        values = source.statistics() if source is not None else {}
+        values = source.statistics() | self._packets.losses if source is not None else {}
         response.success = source is not None
         response.message = ", ".join(f"{name} {value:g}" for name, value in values.items())
         self.get_logger().info(f"statistics: {response.message or 'the camera is not open'}")
@@ -213,7 +219,7 @@ class CameraNode(DeviceNode):
         self._laser_hz = message.frequency
 
     def _report(self) -> diagnostics.Report:
-        source, packets, words = self._source, self._packets, self._packets.words
+        source, packets, words = self._source, self._packets, self.words
         values: dict[str, Any] = {
             "device": source.identity.model if source is not None else "",
             "serial": source.identity.serial if source is not None else "",
@@ -225,7 +231,7 @@ class CameraNode(DeviceNode):
             "on_events_per_s": self._rates["on"].read(words.on),
             "off_events_per_s": self._rates["off"].read(words.off),
             "trigger_edges": words.triggers,
-            "sensor_drop_words": words.drop_words,
+            **packets.losses,
             "bytes_without_subscriber": packets.unheard_bytes,
         }
         if source is not None:

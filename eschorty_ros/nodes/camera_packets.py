@@ -49,6 +49,16 @@ class PacketPublisher:
         self._unheard = False
         self._packetizer = Packetizer(0, 2)
 
+    @property
+    def losses(self) -> dict[str, int]:
+        """What the sensor says of events it dropped, by name."""
+        words = self.words
+        return {
+            "sensor_drop_words": words.drop_words,
+            "erc_events_in": words.erc_events_in,
+            "erc_events_dropped": max(words.erc_events_in - words.erc_events_out, 0),
+        }
+
     def cut_by(self, age_ns: int, size_bytes: int) -> None:
         """Let packets leave at this age or size."""
         self._packetizer = Packetizer(age_ns, size_bytes)

@@ -17,6 +17,7 @@ from eschorty_ros.hardware.camera.pixel_selection import windows_of
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
 from eschorty_ros.nodes.parameters import Param
 
+_IGNORED = "; the emulated camera ignores it"
 _FULL_FRAME = (0, 0, WIDTH, HEIGHT)
 
 _BIAS_TABLE = tuple(
@@ -55,13 +56,13 @@ EVK4_TABLE = (
     Param(
         "erc_mode",
         "na",
-        "event-rate control, off unless enabled: what it drops falsifies the centroid of a line",
+        "event-rate control, off unless enabled: what it drops is told, and falsifies the centroid",
         choices=("na", "disabled", "enabled"),
     ),
     Param("erc_rate", 100_000_000, "rate beyond which it drops", "events/s", 5_000, RATE_MAX),
     Param("roi", _FULL_FRAME, "x, y, width, height per window; columns and rows multiply", "px"),
     Param("hot_pixels", "", "pixels to silence, at most 64: 'x,y x,y'"),
-    Param("trail_filter", False, "filter of trailing events"),
+    Param("trail_filter", False, "filter of trailing events" + _IGNORED),
     Param("trail_filter_type", "trail", "kind of that filter", choices=TYPES),
     Param("trail_filter_threshold", 10_000, "its time, in steps of 1 ms", "us", *THRESHOLD_US),
     Param(
@@ -70,7 +71,7 @@ EVK4_TABLE = (
         "trigger input; an EVK4 has no trigger output",
         choices=("disabled", "external"),
     ),
-    Param("anti_flicker", False, "filter of flicker: it erases a laser modulated in its band"),
+    Param("anti_flicker", False, "filter of flicker: erases a laser in its band" + _IGNORED),
     Param("anti_flicker_low", 50, "lower edge of its band", "Hz", *FREQUENCY_HZ),
     Param("anti_flicker_high", 520, "upper edge of its band", "Hz", *FREQUENCY_HZ),
     Param("anti_flicker_band_pass", False, "keep what flickers in the band instead"),

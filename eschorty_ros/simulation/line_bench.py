@@ -118,7 +118,7 @@ def simulate_line(
     pixels.run_until(duration_us)
     keys = pixels.take(duration_us)
     if readout is not None:
-        keys, _ = Readout(rows, readout).read_out(keys, duration_us)
+        keys = Readout(rows, readout).read_out(keys, duration_us).keys
     t, x, y, p = unpack(keys)
     return LineEvents(t, x, y, p, centre)
 

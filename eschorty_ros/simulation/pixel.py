@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.simulation._bias_kernels import _rebias
 from eschorty_ros.simulation._noise_table import DECISION_US, noise_table, passage_gaps, way_times
 from eschorty_ros.simulation._pixel_kernels import (
     PIXEL_DTYPE,
@@ -63,14 +64,51 @@ class PixelArray:
         if not (math.isfinite(background_hz) and background_hz >= 0.0):
             raise ArgumentError(f"background_hz is {background_hz!r}; choose 0 or more")
         self.columns, self.rows = columns, rows
-        self.parameters = parameters
+        self._background_hz = background_hz
         draws, kernel_seeds, hot_seed = np.random.SeedSequence(seed).spawn(3)
+        self._draws = draws
         self._seeds = kernel_seeds.generate_state(2, np.uint64)
-        self._pixels = self._settled(np.random.default_rng(draws))
+        self._hot = np.flatnonzero(
+            np.random.default_rng(hot_seed).random(columns * rows) < parameters.hot_fraction
+        )
+        self._pixels = _at_rest((columns, rows), parameters.background_intensity)
         self._spans = np.zeros((columns, 4), dtype=np.int64)
         self._due = np.full(columns, np.inf)
         self._light = np.empty(rows)
-        p = parameters
+        # Time of the next background event, and how many there have been.
+        self._process = np.array([np.inf, 0.0])
+        self._use(parameters)
+        if self._background_per_us:
+            first = np.random.default_rng(self._seeds).exponential()
+            self._process[0] = first / self._background_per_us
+        self._keys = np.empty(1 << 16, dtype=np.int64)
+        self._count = 0
+
+    def change(self, t_us: int, parameters: PixelParameters) -> None:
+        """Go on with what biases act on as in ``parameters`` from ``t_us`` on.
+
+        Light stays as it is until the next :meth:`relight`, hot pixels stay those they are. A
+        threshold that falls below what a pixel has already seen makes an event at once.
+
+        Parameters
+        ----------
+        t_us : int
+            Must not fall from call to call.
+        parameters : PixelParameters
+        """
+        self.run_until(t_us)
+        before, paced = self._model, self._background_per_us
+        self._use(parameters)
+        _rebias(self._pixels, self._spans, self._due, float(t_us), before, self._model)
+        if self._background_per_us != paced:
+            # Background has no memory: what is left of the wait goes on at the new rate.
+            left = (self._process[0] - t_us) * paced if paced else 1.0
+            now = self._background_per_us
+            self._process[0] = t_us + left / now if now else np.inf
+
+    def _use(self, p: PixelParameters) -> None:
+        """Take over parameters, thresholds of every pixel among them."""
+        self.parameters = p
         self._optics = np.array([p.sigma_rows, p.least_contrast, p.background_intensity])
         self._model = np.array(
             [
@@ -87,21 +125,14 @@ class PixelArray:
         correlation_us = max(p.follower_us, DECISION_US)
         risks = noise_table(correlation_us)
         self._tables = (risks, way_times(), passage_gaps(risks, correlation_us))
+        self._draw_thresholds()
         # Leaks of dark pixels come at random times too: each has its own phase and rate.
-        self._hot = np.flatnonzero(
-            np.random.default_rng(hot_seed).random(columns * rows) < p.hot_fraction
-        )
-        both_hz = background_hz * columns * rows + p.hot_hz * self._hot.size
-        total_hz = both_hz + p.leak_events_hz * columns * rows
+        both_hz = self._background_hz * self.columns * self.rows + p.hot_hz * self._hot.size
+        total_hz = both_hz + p.leak_events_hz * self.columns * self.rows
         self._background_per_us = total_hz * 1e-6
         self._shares = np.zeros(2)
         if total_hz:
             self._shares[:] = 0.5 * both_hz / total_hz, p.hot_hz * self._hot.size / total_hz
-        first = np.random.default_rng(self._seeds).exponential()
-        silent = self._background_per_us == 0.0
-        self._process = np.array([np.inf if silent else first / self._background_per_us, 0.0])
-        self._keys = np.empty(1 << 16, dtype=np.int64)
-        self._count = 0
 
     def relight(
         self,
@@ -223,23 +254,28 @@ class PixelArray:
     def _grow(self) -> None:
         self._keys = np.concatenate((self._keys, np.empty_like(self._keys)))
 
-    def _settled(self, rng: np.random.Generator) -> NDArray[np.void]:
-        """Pixels at rest in the background light, with their thresholds drawn."""
+    def _draw_thresholds(self) -> None:
+        """Give every pixel its thresholds; its mismatch is always the same."""
         p = self.parameters
-        shape = (self.columns, self.rows)
-        pixels = np.zeros(shape, dtype=PIXEL_DTYPE)
-        for name in ("u", "y", "y_ref", "u_settled"):
-            pixels[name] = 1.0 / p.background_intensity
-        pixels["state"] = WAITS
-        pixels["t_next"] = np.inf
+        rng = np.random.default_rng(self._draws)
         for name, threshold, sign in (
             ("on_factor", p.threshold_on, -1.0),
             ("off_factor", p.threshold_off, 1.0),
         ):
-            mismatch = rng.standard_normal(shape, dtype=np.float32) * p.threshold_mismatch
+            mismatch = rng.standard_normal(self._pixels.shape, dtype=np.float32)
+            mismatch *= p.threshold_mismatch
             theta = np.maximum(threshold * (1.0 + mismatch), p.threshold_min)
-            pixels[name] = np.exp(sign * theta)
-        return pixels
+            self._pixels[name] = np.exp(sign * theta)
+
+
+def _at_rest(shape: tuple[int, int], background_intensity: float) -> NDArray[np.void]:
+    """Pixels at rest in the background light, their thresholds still to be drawn."""
+    pixels = np.zeros(shape, dtype=PIXEL_DTYPE)
+    for name in ("u", "y", "y_ref", "u_settled"):
+        pixels[name] = 1.0 / background_intensity
+    pixels["state"] = WAITS
+    pixels["t_next"] = np.inf
+    return pixels
 
 
 def unpack(

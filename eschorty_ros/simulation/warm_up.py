@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.simulation.biases import Biases
 from eschorty_ros.simulation.scene import named
+from eschorty_ros.simulation.sensor_control import SensorControl
 from eschorty_ros.simulation.world import World
 
 
 def warm_up(calibration: Calibration) -> None:
-    """Simulate a millisecond of a lit plane in a world of its own.
+    """Simulate a millisecond of a lit plane, with a change of biases, in a world of its own.
 
     The first run on a machine compiles for some seconds; later runs load what that left in
     numba's cache. Without it a simulated camera falls silent at its first light.
     """
     world = World(named("plane"), calibration)
     world.set_laser(0, True, Modulation(1000.0, on_edge_us=0))
+    world.set_sensor(500, SensorControl(Biases(diff_on=1)))
     world.advance(1000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -15,12 +14,14 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan
-from eschorty_ros.core.recording import TRUTH_DTYPE
+from eschorty_ros.simulation.biases import parameters_from_biases
 from eschorty_ros.simulation.footprint import footprint
 from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
 from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.sensor_control import ControlTimeline, SensorControl
 from eschorty_ros.simulation.timeline import LaserTimeline, StageTimeline
+from eschorty_ros.simulation.truth_log import TruthLog
 
 BACKGROUND_HZ = 0.22
 """Background activity per pixel: 5 % of all events at 70 Hz with every column lit."""
@@ -37,7 +38,6 @@ _PIECE_US = 65_536
 EdgeSource = Callable[[int, int], list[tuple[int, bool]]]
 """Edges from one sensor time (us) to before another: time, rising; in order of time."""
 _TIME_HIGH_US = 4_096
-_PHASES_KEPT = 1_000_000
 
 
 class World:
@@ -51,6 +51,7 @@ class World:
     scene : Scene
     calibration : Calibration
     parameters : PixelParameters
+        Pixels under the factory's biases.
     seed : int
         Fixes thresholds, jitter and background.
     background_hz : float
@@ -78,13 +79,16 @@ class World:
         self.rows = self.model.rows
         self.events = 0
         self.trigger_input: EdgeSource | None = None
-        pixels = parameters or PixelParameters()
-        self._half_rows = pixels.half_width_rows
-        self._pixels = PixelArray(self.columns, self.rows, pixels, seed, background_hz)
+        self._factory = parameters or PixelParameters()
+        self._half_rows = self._factory.half_width_rows
+        self._pixels = PixelArray(self.columns, self.rows, self._factory, seed, background_hz)
         self._readout = Readout(self.rows, readout)
         self._encoder = Encoder(self.columns, self.rows)
         self._laser = LaserTimeline()
         self._stage = StageTimeline()
+        self._control = SensorControl()
+        self._controls = ControlTimeline()
+        self._truth = TruthLog(scene, self.model)
         self._every_column = np.arange(self.columns)
         self._now_us = 0
         self._handled_us = -1
@@ -95,7 +99,6 @@ class World:
         self._drawn_row = np.full(self.columns, np.nan)
         self._drawn_reflectance = np.full(self.columns, np.nan)
         self._was_split = np.zeros(self.columns, dtype=bool)
-        self._phases: deque[tuple[int, float]] = deque(maxlen=_PHASES_KEPT)
 
     @property
     def now_us(self) -> int:
@@ -104,8 +107,13 @@ class World:
 
     @property
     def dropped(self) -> int:
-        """Events lost in the readout so far; the stream says when, not how many."""
+        """Events lost so far because the readout was full; the stream says when, not how many."""
         return self._readout.dropped
+
+    @property
+    def rate_dropped(self) -> int:
+        """Events the event-rate control has dropped so far; the stream tells them."""
+        return self._readout.rate_dropped
 
     def set_laser(
         self,
@@ -149,6 +157,17 @@ class World:
         self._refuse_past("the plan's start", start_us)
         self._stage.set(start_us, plan, zero_ns, clock_rate)
 
+    def set_sensor(self, t_us: int, control: SensorControl) -> None:
+        """Run the sensor under ``control`` from ``t_us`` on; replaces what was set for later.
+
+        Raises
+        ------
+        ArgumentError
+            When ``t_us`` has been simulated already.
+        """
+        self._refuse_past("t_us", t_us)
+        self._controls.set(t_us, control)
+
     def laser_edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
         """Edges of the laser's gate signal, an ``EdgeSource``."""
         return self._laser.edges(begin_us, end_us)
@@ -168,10 +187,13 @@ class World:
         self._refuse_past("until_us", until_us)
         parts = []
         while self._now_us < until_us:
-            end_us = min(until_us, self._now_us + _PIECE_US)
+            control = self._controls.due(self._now_us)
+            if control is not None:
+                self._obey(control)
+            end_us = self._controls.next_us(min(until_us, self._now_us + _PIECE_US))
             self._follow(end_us)
             self._pixels.run_until(end_us)
-            keys, drops_us = self._readout.read_out(self._pixels.take(end_us), end_us)
+            keys, drops_us, periods = self._readout.read_out(self._pixels.take(end_us), end_us)
             if self._encoder.time_us is None:
                 parts.append(self._encoder.advance(0))
             self.events += keys.size
@@ -182,6 +204,7 @@ class World:
                     trigger_t=[t_us for t_us, _ in triggers],
                     trigger_edge=[int(rising) for _, rising in triggers],
                     drop_t=drops_us,
+                    rate_counts=periods,
                 )
             )
             # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
@@ -200,27 +223,28 @@ class World:
         ``t_us`` is the middle of the lit phase; a column counts as lit when its line falls on
         the sensor. The last million periods are kept.
         """
-        if not self._phases:
-            return np.empty(0, dtype=TRUTH_DTYPE)
-        parts = []
-        phases = list(self._phases)
-        for k in range(0, len(phases), 256):
-            t_us, stage_mm = zip(*phases[k : k + 256], strict=True)
-            range_mm = self.scene.range_mm(np.array(stage_mm), self._every_column, self.model)
-            row = self.model.row(range_mm, self._every_column)
-            phase, column = np.nonzero((row >= 0.0) & (row <= self.rows - 1.0))
-            part = np.empty(phase.size, dtype=TRUTH_DTYPE)
-            part["t_us"] = np.array(t_us)[phase]
-            part["column"] = column
-            part["range_mm"] = range_mm[phase, column]
-            parts.append(part)
-        return np.concatenate(parts)
+        return self._truth.table()
 
     def _refuse_past(self, name: str, t_us: int) -> None:
         if t_us < self._now_us:
             raise ArgumentError(
                 f"{name} is {t_us} us and {self._now_us} us are simulated; give a later time"
             )
+
+    def _obey(self, control: SensorControl) -> None:
+        """Set the sensor as ``control`` wants it from now on."""
+        before, self._control = self._control, control
+        if control.event_rate != before.event_rate:
+            self._readout.limit(self._now_us, control.event_rate)
+        if control.biases != before.biases:
+            pixels = parameters_from_biases(self._factory, control.biases)
+            self._pixels.change(self._now_us, pixels)
+            self._half_rows = pixels.half_width_rows
+            # Other thresholds see more of the line, or less: draw it anew.
+            self._drawn_row[:] = np.nan
+            self._drawn_mm = np.nan
+            if self._lit_since_us is not None:
+                self._step_us = self._now_us
 
     def _follow(self, end_us: int) -> None:
         """Apply every change of light before ``end_us``."""
@@ -293,5 +317,5 @@ class World:
     def _close_phase(self, t_us: int) -> None:
         """Note the lit phase that ends here; light goes on into the next unless it is dark."""
         middle_us = ((self._lit_since_us or 0) + t_us) // 2
-        self._phases.append((middle_us, self._stage.state(middle_us)[0]))
+        self._truth.add(middle_us, self._stage.state(middle_us)[0])
         self._lit_since_us = t_us

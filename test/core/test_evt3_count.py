@@ -40,3 +40,21 @@ def test_cuts_between_buffers_do_not_matter() -> None:
     print(f"seed 20: {len(events)} events, {decoder.counters}")
     assert np.count_nonzero(events.p) == whole.on
     assert len(events) == whole.on + whole.off
+
+
+def test_counts_of_the_rate_control_agree_with_the_decoder() -> None:
+    data = words(
+        0x8000, 0xE014, 0xF123, 0xF456, 0x7007, 0xE016, 0xF005, 0xF000, 0x7000,
+        0xE015, 0xFFFF, 0xFFFF, 0x700F,  # another subtype's
+        0xE014, 0xF005, 0xEEDA, 0xF0FF, 0xF000, 0x7000,  # cut short
+        0xE016, 0xF001, 0xF001, 0xF001, 0x7001,  # one too many
+    )  # fmt: skip
+    decoder = Decoder()
+    decoder.decode(data)
+    for size in (2, 6, len(data)):
+        counter = WordCounter()
+        for start in range(0, len(data), size):
+            counter.add(data[start : start + size])
+        assert counter.erc_events_in == decoder.counters.erc_events_in == 0x7456123 + 5
+        assert counter.erc_events_out == decoder.counters.erc_events_out == 5 + 0x1001
+        assert counter.drop_words == 1

@@ -148,6 +148,41 @@ def test_sort_readout_orders_by_time_row_polarity_column() -> None:
         assert (values == expected[order]).all()
 
 
+def test_reports_of_the_rate_control_come_whole_before_the_events_of_their_time() -> None:
+    reports = [[200, 0x7456123, 5], [400, 12, 12], [9000, 7, 0]]
+    data = evt3.Encoder().encode(
+        [150, 200, 8000], [1, 2, 3], [4, 4, 4], [1, 1, 1],
+        trigger_t=[200, 300], trigger_edge=[1, 0], drop_t=[200], rate_counts=reports,
+    )  # fmt: skip
+    words = [f"{word:04X}" for word in np.frombuffer(data, "<u2")]
+    begin = words.index("60C8") + 1
+    assert words[begin : begin + 2] == ["A001", "EEDA"]
+    expected = ["E014", "F123", "F456", "7007", "E016", "F005", "F000", "7000"]
+    assert words[begin + 2 : begin + 10] == expected
+    decoder = evt3.Decoder()
+    events = decoder.decode(data)
+    assert events.t.tolist() == [150, 200, 8000]
+    assert events.triggers.t.tolist() == [200, 300]
+    counters = decoder.counters
+    assert (counters.erc_events_in, counters.erc_events_out) == (0x7456123 + 19, 17)
+    assert (counters.broken_continuations, counters.sensor_dropped_events) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("reports", "message"),
+    [
+        ([[5, 1]], r"rate_counts has shape \(1, 2\)"),
+        ([5, 1, 1], r"rate_counts has shape \(3,\)"),
+        ([[5, 1, 1 << 28]], "rate_counts holds 268435456"),
+        ([[5, -1, 0]], "rate_counts holds -1"),
+        ([[5, 1, 1], [4, 1, 1]], r"rate_counts\[1\] is 4 us"),
+    ],
+)
+def test_bad_reports_are_refused(reports: list, message: str) -> None:
+    with pytest.raises(ArgumentError, match=message):
+        evt3.Encoder().encode([], [], [], [], rate_counts=reports)
+
+
 @pytest.mark.parametrize(
     ("events", "message"),
     [

@@ -12,7 +12,8 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan, plan_move
-from eschorty_ros.emulation.bench_physics import Imperfections, Physics
+from eschorty_ros.emulation.bench_physics import Physics
+from eschorty_ros.emulation.imperfections import Imperfections
 from eschorty_ros.simulation.scene import Plane
 from eschorty_ros.simulation.world import World
 

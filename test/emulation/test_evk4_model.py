@@ -333,7 +333,7 @@ def test_settings_are_told_by_their_effect():
     now = host.model.settings
     assert seen[-1] == now
     assert (now.columns_off, now.rows_off, now.pixels_off) == ({35}, {0}, {(9, 7)})
-    assert now.event_rate_limit == 20e6
+    assert now.event_rate == (4000, 200)
     assert now.flicker_band_hz == pytest.approx((1e6 / 1920, 1e6 / 19968))
     assert now.noise_filter == ("stc", 10_000)
 

@@ -62,7 +62,7 @@ CALLS: dict[str, Call] = {
     "evt3.Encoder": Call(evt3.Encoder, {"width": 64, "height": 64}, SIZE),
     "evt3.Encoder.encode": Call(
         method(evt3.Encoder, "encode"),
-        dict(EVENTS, trigger_t=[1], trigger_edge=[1], drop_t=[1]),
+        dict(EVENTS, trigger_t=[1], trigger_edge=[1], drop_t=[1], rate_counts=[[1, 2, 1]]),
         {
             "t": integers(-1, T_MAX, size=N),
             "x": integers(-1, 1280, 65535, size=N),
@@ -71,6 +71,9 @@ CALLS: dict[str, Call] = {
             "trigger_t": integers(-1, T_MAX, size=1),
             "trigger_edge": integers(-1, 2, size=1),
             "drop_t": Kind([bad for bad in integers(-1, T_MAX).refused if bad is not None]),
+            "rate_counts": Kind(
+                [[1, 2, 1], [[1, 2]], [[1.5, 2, 1]], [[-1, 2, 1]], [[1, 1 << 28, 1]], "abc"]
+            ),
         },
     ),
     "evt3.Encoder.advance": Call(

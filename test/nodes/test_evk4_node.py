@@ -13,6 +13,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 
+from camera_on_bench import StillBench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
 from event_camera_msgs.msg import EventPacket
@@ -85,9 +86,9 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
         thread = threading.Thread(target=executor.spin, daemon=True)
         nodes: list[CameraNode] = []
 
-        def begin(plugged: bool = True, **parameters: Any) -> Run:
+        def begin(plugged: bool = True, model: Evk4Model | None = None, **parameters: Any) -> Run:
             source = OnDemand()
-            model = Evk4Model(source)
+            model = model or Evk4Model(source)
             plug(BUS, *([model] if plugged else []))
             overrides = {"driver": "evk4", "backend": f"evk4_bench:backend?{BUS}", **parameters}
             node = CameraNode(
@@ -202,7 +203,7 @@ def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
     ).active()
     seen = run.model.settings
     assert seen.packet_period_us == 2000
-    assert seen.event_rate_limit == 30e6
+    assert seen.event_rate == (6000, 200)
     assert seen.rows_off == frozenset(range(720)) - frozenset(range(200, 500))
     assert seen.pixels_off == {(3, 4), (5, 6)}
     assert seen.noise_filter == ("trail", 5000)
@@ -212,6 +213,48 @@ def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
     status = run.status(lambda s: "anti-flicker" in s.message, "the warning")
     assert status.level == DiagnosticStatus.WARN
     assert "erases the laser's 70 Hz; switch it off" in status.message
+
+
+def test_a_bias_set_while_it_streams_thins_out_the_emulated_events(
+    start: Start, tmp_path: Path
+) -> None:
+    still = StillBench(tmp_path)
+    run = start(model=still.bench.camera).active()
+    words = run.node.words
+    still.light(500.0)
+
+    def on_events() -> int:
+        still.run(10, lambda: words.on + words.off)
+        before = words.on
+        still.run(50, lambda: words.on + words.off)
+        return words.on - before
+
+    counts = []
+    for offset in (-50, 0, 70, 140):
+        accepted, reason = run.observer.set_parameter("camera", "bias_diff_on", offset)
+        assert accepted, reason
+        counts.append(on_events())
+    print(counts)
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] < 0.8 * counts[1]
+    assert run.node.parameters["bias_diff_on"] == 140
+
+
+def test_what_the_rate_control_drops_is_told(start: Start, tmp_path: Path) -> None:
+    still = StillBench(tmp_path)
+    run = start(model=still.bench.camera, erc_mode="enabled", erc_rate=300_000).active()
+    words = run.node.words
+    still.light(500.0)
+    still.run(100, lambda: words.on + words.off)
+    dropped = still.statistic("rate_dropped")
+    assert dropped > still.statistic("events")
+    status = run.status(lambda s: "erc_events_dropped" in s.message, "the loss in the diagnostics")
+    assert status.level == DiagnosticStatus.WARN
+    told = {value.key: value.value for value in status.values}
+    assert 0 < int(told["erc_events_dropped"]) <= dropped
+    statistics = run.observer.call(Trigger, "camera/dump_statistics")
+    assert "erc_events_dropped" in statistics.message
+    assert "erc_rate_hz 300000" in statistics.message
 
 
 def test_neuromorphic_driver_without_a_camera_waits_in_one_line(start: Start) -> None:

@@ -116,7 +116,7 @@ def test_settings_reach_the_sensor() -> None:
         biases = dict(seen.biases)
         assert (biases["bias_diff_on"], biases["bias_fo"], biases["bias_hpf"]) == (20, -10, 0)
         assert seen.packet_period_us == 2000
-        assert seen.event_rate_limit == 50e6
+        assert seen.event_rate == (10_000, 200)
         assert seen.flicker_band_hz == pytest.approx((90, 110), rel=0.02)
         assert seen.noise_filter == ("stc", 7_000)
         assert seen.columns_off == frozenset()
@@ -134,7 +134,7 @@ def test_default_settings_leave_the_pixels_alone() -> None:
         rig.camera.open()
         seen = rig.model.settings
         assert {offset for _, offset in seen.biases} == {0}
-        assert (seen.event_rate_limit, seen.flicker_band_hz, seen.noise_filter) == (None,) * 3
+        assert (seen.event_rate, seen.flicker_band_hz, seen.noise_filter) == (None,) * 3
         assert not seen.trigger_in
         assert seen.packet_period_us == 1008
 
