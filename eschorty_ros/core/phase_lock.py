@@ -164,13 +164,15 @@ class PhaseLock:
         whole("watermark_us", watermark_us, -TIME_LIMIT, TIME_LIMIT)
         if self._end_us is None or watermark_us <= self._end_us:
             return False
-        if self._count >= _EVENTS_MIN:
+        triggered = self.schedule.triggered
+        # Edges that triggers set are not to be moved, in the block of the first one neither.
+        if self._count >= _EVENTS_MIN and not triggered:
             window = slice(0, self._count)
             found = estimate_phase(self._t[window], self._p[window], self._modulation)
             if found.found:
                 self._correct(found.edge_us)
         self._count = 0
-        self._end_us = self.schedule.middle_after(self._block)
+        self._end_us = None if triggered else self.schedule.middle_after(self._block)
         return True
 
     def _correct(self, edge_us: int) -> None:

@@ -105,6 +105,25 @@ def test_many_tiny_pieces_give_the_same_points():
         assert a.counters == b.counters
 
 
+@pytest.mark.parametrize("first", [6, 8, 10, 12])
+def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
+    """However the data come: the block in which the first trigger lies ends without correction."""
+    rng = np.random.default_rng(SEED)
+    period_us = 3000
+    t, x, y, p = line_events(
+        rng, flat, frequency_hz=1e6 / period_us, periods=20, columns=60, edge_us=5000
+    )
+    edges = 5000 + np.arange(first, 20) * period_us - 150
+    stream = encoded((t, x, y, p), edges[:1])
+    modulation = Modulation(1e6 / period_us)
+    whole, a = run(stream, modulation)
+    parts, b = run(stream, modulation, None, range(0, len(stream), 2048))
+    assert_same(whole, parts)
+    assert a.counters == b.counters
+    late = np.unique(whole.edge_us[whole.edge_us >= edges[0]])
+    np.testing.assert_array_equal(late, edges[: late.size])
+
+
 @pytest.mark.parametrize("every", [2, 3, 7])
 def test_a_profile_of_several_periods_after_a_long_dark_stretch_has_its_own_time(every):
     """Wherever in the profile's count the stretch of more than 4096 periods begins."""
