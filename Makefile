@@ -1,3 +1,4 @@
+# make setup  everything the others need; then `. .build/setup.sh` for a shell with it
 # make scan   a simulated scan: cloud, picture, error against the truth
 # make report the paper's experiments again: report/index.html
 # make tradeoff speed against error again, and the README's table from it

@@ -17,7 +17,7 @@ from eschorty_ros.core.errors import ArgumentError
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
     required=True,
-    help="Folder to make; must not hold a recording yet.",
+    help="Folder to make; must be new or empty.",
 )
 @click.option(
     "--duty",

@@ -119,8 +119,8 @@ class Steps(UniformReflectance):
     A tile lies at ``base_mm + column_levels_mm[i] + stage_levels_mm[j]``; the first and last
     stage band go on for ever. Walls between column bands run along the rays, so that no tile
     hides another. The default spans 207 mm around 1.32 m with steps from 2 to 102 mm. Between
-    10 and 110 mm the stage crosses one large step: the laser line is 7 mm thick there and lies
-    on both levels for as long.
+    10 and 110 mm the stage crosses one large step: the laser line is 7 mm thick there, to
+    where it fades, and lies on both levels for as long.
     """
 
     base_mm: float = 1320.0
