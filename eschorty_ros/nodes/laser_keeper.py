@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput, LaserReadback
 from eschorty_ros.nodes.laser_gate import LaserGate
-from eschorty_ros.nodes.laser_readback import (
-    LaserSnapshot,
-    unknown_text,
-    wrong_output,
-    wrong_waveform,
-)
+from eschorty_ros.nodes.laser_readback import LaserRecord, LaserSnapshot
 from eschorty_ros.nodes.lookout import Lookout
 
 WATCH_PERIOD_S = 0.02
@@ -48,8 +41,6 @@ class LaserKeeper:
     ----------
     switch_offs : int
         How often light ended.
-    unknown : str
-        Why the state of the output is unknown, empty when it is known.
     """
 
     def __init__(
@@ -72,16 +63,16 @@ class LaserKeeper:
         # Counts what may have changed the output; a read-back that began before is void.
         self._generation = 0
         self._laser: LaserModulator | None = None
-        self._asked: Modulation | None = None
-        self._told: LaserReadback | None = None
-        self._requested = LaserOutput.OFF
-        self._reason = "off at start"
-        self._warned: set[str] = set()
+        self._record = LaserRecord()
         # Counts switching off; what was asked for before it must not end in light.
         self._offs = 0
         self._lookouts: list[Lookout] = []
         self.switch_offs = 0
-        self.unknown = ""
+
+    @property
+    def unknown(self) -> str:
+        """Why the state of the output is unknown, empty when it is known."""
+        return self._record.unknown
 
     @property
     def device(self) -> str:
@@ -92,8 +83,8 @@ class LaserKeeper:
     def open(self, laser: LaserModulator, modulation: Modulation) -> None:
         """Take over a laser: off, with this modulation; raises ``DeviceError`` when refused."""
         with self._lock:
-            self._laser, self._asked = laser, modulation
-            self._requested, self._reason = LaserOutput.OFF, "off at start"
+            self._laser, self._record.asked = laser, modulation
+            self._record.requested, self._record.reason = LaserOutput.OFF, "off at start"
             self.gate.switched_off()
         laser.disable()
         laser.configure(modulation)
@@ -117,25 +108,26 @@ class LaserKeeper:
             try:
                 laser.close()
             except EschortyError as error:
-                self._note_unknown(error)
+                self._record.lose(error)
+                self.tell()
                 raise
             finally:
                 if not self.unknown:
-                    self._told = None
+                    self._record.told = None
 
     def configure(self, modulation: Modulation) -> None:
         """Set another modulation; light that is on goes on with it, unless it is refused."""
         if self._laser is None:
             return
         with self._command() as (laser, _):
-            before, self._asked = self._asked, modulation
+            before, self._record.asked = self._record.asked, modulation
             try:
                 laser.configure(modulation)
                 told = laser.readback()
                 self._refuse_difference(told)
             except EschortyError as error:
-                self._asked = before
-                if self._requested is LaserOutput.ON:
+                self._record.asked = before
+                if self._record.requested is LaserOutput.ON:
                     self.switch_off(str(error))
                 raise
             self._hear(told)
@@ -149,33 +141,33 @@ class LaserKeeper:
             with self._lock:
                 self._refuse_void(offs)
                 self.gate.arm()
-                self._reason = "armed"
+                self._record.reason = "armed"
 
     def enable(self) -> None:
         """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
         with self._command() as (laser, offs):
             with self._lock:
                 self._refuse_void(offs)
-                if self._requested is LaserOutput.ON:
+                if self._record.requested is LaserOutput.ON:
                     return
                 refusal = self.gate.refusal()
                 if refusal is not None:
                     raise DeviceError(f"laser refused: {refusal}")
-                self._requested = LaserOutput.ON
+                self._record.requested = LaserOutput.ON
                 self.gate.switched_on()
             try:
                 laser.enable()
                 told = laser.readback()
                 self._refuse_difference(told)
             except EschortyError as error:
-                if self._requested is LaserOutput.ON:
+                if self._record.requested is LaserOutput.ON:
                     self.switch_off(str(error))
                 raise
             with self._lock:
-                if self._requested is not LaserOutput.ON:
+                if self._record.requested is not LaserOutput.ON:
                     laser.disable()
-                    raise DeviceError(f"laser refused: {self._reason}")
-                self._reason = "switched on by request"
+                    raise DeviceError(f"laser refused: {self._record.reason}")
+                self._record.reason = "switched on by request"
                 self._hear(told)
 
     def switch_off(self, reason: str) -> None:
@@ -187,14 +179,15 @@ class LaserKeeper:
             try:
                 laser.disable()
             except EschortyError as error:
-                self._note_unknown(error)
+                self._record.lose(error)
+                self.tell()
                 raise DeviceError(self.unknown) from error
             finally:
                 self._generation += 1
                 self._offs += 1
-                self.switch_offs += self._requested is LaserOutput.ON
+                self.switch_offs += self._record.requested is LaserOutput.ON
                 self.gate.switched_off()
-                self._requested, self._reason = LaserOutput.OFF, reason
+                self._record.requested, self._record.reason = LaserOutput.OFF, reason
             self._hear_off(laser)
 
     def darken(self, reason: str) -> bool:
@@ -218,8 +211,7 @@ class LaserKeeper:
     def snapshot(self) -> LaserSnapshot | None:
         """Return what is known now, ``None`` before the generator has been opened."""
         with self._lock:
-            told = self._told
-            return None if told is None else LaserSnapshot(self._requested, told, self._reason)
+            return self._record.snapshot
 
     @contextlib.contextmanager
     def _command(self) -> Iterator[tuple[LaserModulator, int]]:
@@ -242,39 +234,26 @@ class LaserKeeper:
 
     def _refuse_void(self, offs: int) -> None:
         if offs != self._offs:
-            raise DeviceError(f"laser refused: {self._reason}")
+            raise DeviceError(f"laser refused: {self._record.reason}")
 
     def _hear(self, told: LaserReadback) -> None:
         """Note what the generator says."""
-        self._told = told
-        for text in told.warnings:
-            if text not in self._warned:
-                self._warned.add(text)
-                self._log(text)
-        self.unknown = ""
-        if told.output is LaserOutput.UNKNOWN:
-            self.unknown = unknown_text(told.reason or "the generator does not say")
+        for text in self._record.hear(told):
+            self._log(text)
         self.tell()
 
     def _hear_off(self, laser: LaserModulator) -> None:
         """Note what the generator says after it has confirmed that it is off."""
-        told = self._told
+        told: LaserReadback | None
         try:
             told = laser.readback()
         except EschortyError:
-            if told is not None:
-                told = replace(told, output=LaserOutput.OFF, output_since_ns=time.time_ns())
+            told = self._record.off_unread()
         if told is not None:
             self._hear(told)
 
-    def _note_unknown(self, error: Exception) -> None:
-        self.unknown = unknown_text(str(error))
-        if self._told is not None:
-            self._told = replace(self._told, output=LaserOutput.UNKNOWN)
-        self.tell()
-
     def _refuse_difference(self, told: LaserReadback) -> None:
-        difference = wrong_output(told, self._requested) or wrong_waveform(told, self._asked)
+        difference = self._record.difference(told)
         if difference:
             raise DeviceError(f"laser: {difference}; look at the generator")
 
@@ -286,7 +265,7 @@ class LaserKeeper:
         # Under the lock: somebody may be switching off already.
         with self._lock:
             reason = self.gate.must_end()
-            if reason is None and not self._living() and self._requested is LaserOutput.ON:
+            if reason is None and not self._living() and self._record.requested is LaserOutput.ON:
                 reason = "the node is shutting down"
             if reason is not None:
                 self.darken(reason)
@@ -305,11 +284,7 @@ class LaserKeeper:
             if generation != self._generation:
                 return
             self._hear(told)
-            wrong = wrong_output(told, self._requested)
-            if self._requested is LaserOutput.ON:
-                wrong = wrong or wrong_waveform(told, self._asked)
-            else:
-                wrong = wrong or self.unknown
+            wrong = self._record.calls_for_darkness(told)
         if wrong:
             self.darken(wrong)
 

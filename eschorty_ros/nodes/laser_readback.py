@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import LaserOutput, LaserReadback
@@ -47,3 +48,65 @@ def unknown_text(text: str) -> str:
     """Head a line with what it means, unless it says so itself."""
     heading = "laser state unknown: "
     return text if text.startswith(heading) else heading + text
+
+
+class LaserRecord:
+    """What was asked of a generator, and what is known of it; takes no lock.
+
+    Attributes
+    ----------
+    requested : LaserOutput
+    asked : Modulation or None
+    told : LaserReadback or None
+        The newest read-back, ``None`` before the first.
+    reason : str
+        Why the output was requested so.
+    unknown : str
+        Why the state of the output is unknown, empty when it is known.
+    """
+
+    def __init__(self) -> None:
+        self.requested = LaserOutput.OFF
+        self.asked: Modulation | None = None
+        self.told: LaserReadback | None = None
+        self.reason = "off at start"
+        self.unknown = ""
+        self._warned: set[str] = set()
+
+    @property
+    def snapshot(self) -> LaserSnapshot | None:
+        """What is known now, ``None`` before the first read-back."""
+        told = self.told
+        return None if told is None else LaserSnapshot(self.requested, told, self.reason)
+
+    def calls_for_darkness(self, told: LaserReadback) -> str:
+        """Why ``told``, just heard, is a reason to switch off, ``""`` when it is none."""
+        if self.requested is LaserOutput.ON:
+            return self.difference(told)
+        return wrong_output(told, self.requested) or self.unknown
+
+    def hear(self, told: LaserReadback) -> list[str]:
+        """Note what the generator says; its warnings that are new."""
+        self.told = told
+        self.unknown = ""
+        if told.output is LaserOutput.UNKNOWN:
+            self.unknown = unknown_text(told.reason or "the generator does not say")
+        fresh = [text for text in dict.fromkeys(told.warnings) if text not in self._warned]
+        self._warned.update(fresh)
+        return fresh
+
+    def off_unread(self) -> LaserReadback | None:
+        """Read-back to assume when the generator has confirmed no more than that it is off."""
+        if self.told is None:
+            return None
+        return replace(self.told, output=LaserOutput.OFF, output_since_ns=time.time_ns())
+
+    def lose(self, error: Exception) -> None:
+        """Note that the output may be anything."""
+        self.unknown = unknown_text(str(error))
+        if self.told is not None:
+            self.told = replace(self.told, output=LaserOutput.UNKNOWN)
+
+    def difference(self, told: LaserReadback) -> str:
+        """How ``told`` differs from what was asked, ``""`` when it does not."""
+        return wrong_output(told, self.requested) or wrong_waveform(told, self.asked)
