@@ -14,7 +14,7 @@ from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
 from rclpy.action import ActionClient
 from ros_process import Observer, wait_until
-from scan_scenarios import EVENTS, SCAN_DEADLINE_S, Bench, device_parameters
+from scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
 from std_msgs.msg import Bool
 
 from eschorty_ros.core.calibration import load_calibration, save_calibration
@@ -26,6 +26,8 @@ from eschorty_ros.simulation.scene_posts import bench as bench_of_posts
 CALIBRATION, AS_BUILT = "config_3", "config_3_as_built"
 KNOWN_SCENE = "steps"
 POSTS = bench_of_posts()
+# A capture that something happens in: few events.
+LONG = {"capture_time": 60.0, "frequency": SLOW_HZ}
 TRUE_MM = np.linspace(800.0, 2100.0, 131)
 
 
@@ -258,7 +260,7 @@ def useless_captures(bench: CalibrationBench) -> None:
         assert "left and right have the same range" in result.message, result.message
         bench.assert_dark_and_at_rest()
         # Canceled.
-        handle = bench.begin(capture_time=60.0)
+        handle = bench.begin(**LONG)
         bench.wait_for_capture()
         canceled = handle.cancel_goal_async()
         wait_until(canceled.done, "an answer to the cancel request")
@@ -267,7 +269,7 @@ def useless_captures(bench: CalibrationBench) -> None:
         bench.assert_dark_and_at_rest()
         # The laser goes off.
         interlock = bench.observer.publisher(Bool, "laser/interlock", qos.stream(10))
-        bench.begin(capture_time=60.0)
+        bench.begin(**LONG)
         bench.wait_for_capture()
         interlock.publish(Bool(data=True))
         status, result = bench.end()
@@ -281,7 +283,7 @@ def useless_captures(bench: CalibrationBench) -> None:
 def one_thing_at_a_time(bench: CalibrationBench) -> None:
     """No second calibration, scan or exchange while one is under way, and the other way round."""
     with bench.nothing_changes():
-        handle = bench.begin(capture_time=60.0)
+        handle = bench.begin(**LONG)
         bench.wait_for_capture()
         ended = handle.get_result_async()
         _, result = bench.calibrate()
@@ -291,7 +293,7 @@ def one_thing_at_a_time(bench: CalibrationBench) -> None:
         wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
         wait_until(ended.done, "the canceled calibration's end")
         assert ended.result().status == GoalStatus.STATUS_CANCELED
-        handle = bench.start(stop=0.2, speed=0.015)
+        handle = bench.start(**SLOW)
         bench.wait_for_sweep()
         _, result = bench.calibrate()
         assert "is being collected" in result.message
@@ -356,7 +358,7 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
 def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
     """The camera's process dies during a capture: aborted, named, light off, nothing changed."""
     with bench.nothing_changes():
-        bench.begin(capture_time=60.0)
+        bench.begin(**LONG)
         bench.wait_for_capture()
         kill()
         status, result = bench.end()
@@ -367,7 +369,7 @@ def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
 
 def reconstruction_interrupted(bench: CalibrationBench, interrupt: Callable[[], Any]) -> None:
     """The reconstruction ends during a capture: its way out, or the heartbeat's end, darkens."""
-    bench.begin(capture_time=60.0)
+    bench.begin(**LONG)
     bench.wait_for_capture()
     assert bench.output_lines()[-1] == "ON"
     interrupt()

@@ -33,6 +33,8 @@ class _Ending:
     """What a signal asks for: out at once while setting up, an orderly end later."""
 
     def __init__(self) -> None:
+        # Now: by the time the bench is made its parent may be gone.
+        self._parent = os.getppid()
         self._asked = threading.Event()
         self._serving = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -40,9 +42,8 @@ class _Ending:
 
     def wait(self) -> None:
         """Wait for a signal or for the end of the process that started this one."""
-        parent = os.getppid()
         self._serving = True
-        while not self._asked.wait(_POLL_S) and os.getppid() == parent:
+        while not self._asked.wait(_POLL_S) and os.getppid() == self._parent:
             pass
 
     def _ask(self, *_: object) -> None:

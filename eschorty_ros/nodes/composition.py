@@ -37,7 +37,8 @@ NODES = {
     "scanner": ScannerNode,
 }
 THREADS = 12
-START_S = 60.0
+START_S = 300.0
+"""A slow machine's first start compiles for minutes."""
 _POLL_S = 0.02
 
 Tables = dict[str, dict[str, Any]]

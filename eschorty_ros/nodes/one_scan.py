@@ -101,13 +101,19 @@ class Instrument:
             state = message.feedback
             feedback(float(state.progress), f"{state.phase} {state.points:,} points")
 
+        before = len(self._clouds)
         ended = result(self._action, goal, on_feedback, 5.0 * scan.sweep_s)
         if ended.points:
-            wait(lambda: bool(self._clouds), START_S, "no cloud came on scan/points")
+            # The newest may still be that of a scan before.
+            wait(
+                lambda: len(self._clouds) > before and self._clouds[-1].width == ended.points,
+                START_S,
+                "no cloud of this scan came on scan/points",
+            )
         return Outcome(
             bool(ended.success),
             str(ended.message),
-            _cloud_points(self._clouds),
+            _cloud_points(self._clouds if ended.points else []),
             int(ended.profiles),
             int(ended.events),
             int(ended.packets_lost),

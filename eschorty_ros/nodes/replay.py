@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -44,6 +45,7 @@ TABLE = (
 _PACKETS_AHEAD = 256
 _ROWS_AHEAD = 1000
 _POLL_S = 0.005
+_RESEND_S = 2.0
 
 
 class ReplayNode(Node):
@@ -127,6 +129,7 @@ class ReplayNode(Node):
                 start=m_from_mm(float(position_mm.min())),
                 stop=m_from_mm(float(position_mm.max())),
             ),
+            again=True,
         )
         lost_before = self._lost
         last_us = self._publish_stream()
@@ -248,11 +251,24 @@ class ReplayNode(Node):
             if time.monotonic() - self._advanced_s > timeout_s:
                 raise DeviceError(f"{fault} for {timeout_s:g} s; check that it runs")
 
-    def _call(self, client: Any, request: Any) -> Any:
+    def _call(self, client: Any, request: Any, *, again: bool = False) -> Any:
+        """Answer of a service, asked ``again`` and again where that does no harm.
+
+        A server that has just discovered this node may not know yet where to send its answer.
+        """
         self._advanced_s = time.monotonic()
-        future = client.call_async(request)
-        self._wait(future.done, f"no answer of {client.srv_name}")
-        answer = future.result()
+        futures: list[Any] = []
+        sent_s = -math.inf
+
+        def answered() -> bool:
+            nonlocal sent_s
+            if not futures or (again and time.monotonic() - sent_s > _RESEND_S):
+                sent_s = time.monotonic()
+                futures.append(client.call_async(request))
+            return any(future.done() for future in futures)
+
+        self._wait(answered, f"no answer of {client.srv_name}")
+        answer = next(future.result() for future in futures if future.done())
         if not answer.success:
             raise DeviceError(f"reconstruction: {answer.message}")
         return answer

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import calibration_scenarios as scenarios
 import launch_testing.actions
-from launch_processes import bench_action, node_process
+from launch_processes import TestShutdown, bench_action, node_process
 
 import launch
 from eschorty_ros.nodes.domain import free_domain
+
+__all__ = ["TestShutdown"]
 
 FOLDER = Path(tempfile.mkdtemp(prefix="calibration_"))
 LASER_LOG, MADE = FOLDER / "output.log", FOLDER / "made"
@@ -30,7 +32,8 @@ def generate_test_description():
     }
     ready = launch_testing.actions.ReadyToTest()
     bench = bench_action(BENCH, scenarios.bench_settings(LASER_LOG, "posts"))
-    return launch.LaunchDescription([bench, *nodes.values(), ready]), {"camera": nodes["camera"]}
+    arguments = {"camera": nodes["camera"], "laser_log": LASER_LOG}
+    return launch.LaunchDescription([bench, *nodes.values(), ready]), arguments
 
 
 class TestCalibration(unittest.TestCase):
@@ -60,17 +63,3 @@ class TestCalibration(unittest.TestCase):
     def test_5_killed_camera_ends_the_calibration(self, camera):
         pid = camera.process_details["pid"]
         scenarios.camera_killed(self.bench, lambda: os.kill(pid, signal.SIGKILL))
-
-
-@launch_testing.post_shutdown_test()
-class TestShutdown(unittest.TestCase):
-    """After launch has ended the nodes with SIGINT."""
-
-    def test_all_others_exit_cleanly(self, proc_info):
-        codes = {info.process_name: info.returncode for info in proc_info}
-        assert len(codes) == 6
-        for name, code in codes.items():
-            assert code == (-signal.SIGKILL if "camera" in name else 0), name
-
-    def test_laser_is_off(self):
-        assert LASER_LOG.read_text().splitlines()[-1].endswith("OFF")
