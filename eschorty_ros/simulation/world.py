@@ -15,7 +15,7 @@ from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.motion import MotionPlan
 from eschorty_ros.simulation.biases import parameters_from_biases
-from eschorty_ros.simulation.footprint import footprint
+from eschorty_ros.simulation.drawn_line import DrawnLine
 from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
 from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.scene import Scene
@@ -31,8 +31,6 @@ STEP_MM = 0.25
 
 _STEP_MAX_US = 5_000
 _STEP_MIN_US = 50
-_ROW_STEP = 0.02
-_REFLECTANCE_STEP = 0.01
 _PIECE_US = 65_536
 
 EdgeSource = Callable[[int, int], list[tuple[int, bool]]]
@@ -80,7 +78,6 @@ class World:
         self.events = 0
         self.trigger_input: EdgeSource | None = None
         self._factory = parameters or PixelParameters()
-        self._half_rows = self._factory.half_width_rows
         self._pixels = PixelArray(self.columns, self.rows, self._factory, seed, background_hz)
         self._readout = Readout(self.rows, readout)
         self._encoder = Encoder(self.columns, self.rows)
@@ -89,16 +86,11 @@ class World:
         self._control = SensorControl()
         self._controls = ControlTimeline()
         self._truth = TruthLog(scene, self.model)
-        self._every_column = np.arange(self.columns)
+        self._line = DrawnLine(scene, self.model, self._pixels)
         self._now_us = 0
         self._handled_us = -1
         self._lit_since_us: int | None = None
         self._step_us: int | None = None
-        self._drawn_mm = np.nan
-        self._drawn_level = 0.0
-        self._drawn_row = np.full(self.columns, np.nan)
-        self._drawn_reflectance = np.full(self.columns, np.nan)
-        self._was_split = np.zeros(self.columns, dtype=bool)
 
     @property
     def now_us(self) -> int:
@@ -239,10 +231,7 @@ class World:
         if control.biases != before.biases:
             pixels = parameters_from_biases(self._factory, control.biases)
             self._pixels.change(self._now_us, pixels)
-            self._half_rows = pixels.half_width_rows
-            # Other thresholds see more of the line, or less: draw it anew.
-            self._drawn_row[:] = np.nan
-            self._drawn_mm = np.nan
+            self._line.forget()
             if self._lit_since_us is not None:
                 self._step_us = self._now_us
 
@@ -264,55 +253,20 @@ class World:
                 self._darken(t_us)
 
     def _draw(self, t_us: int, level: float) -> None:
-        """Put the line where the scene has it now, in the columns where it changed."""
+        """Put the line where the scene has it now."""
         position_mm, velocity_mm_s = self._stage.state(t_us)
         if self._lit_since_us is None:
             self._lit_since_us = t_us
-        if level != self._drawn_level:
-            self._drawn_row[:] = np.nan
-            self._drawn_mm = np.nan
-            self._drawn_level = level
-        if position_mm != self._drawn_mm:
-            self._draw_at(t_us, position_mm)
-            self._drawn_mm = position_mm
+        self._line.draw(t_us, position_mm, level)
         pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
         self._step_us = t_us + int(min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US))
 
-    def _draw_at(self, t_us: int, position_mm: float) -> None:
-        seen = footprint(self.scene, self.model, position_mm, self._half_rows)
-        moved = ~(np.abs(seen.row - self._drawn_row) <= _ROW_STEP)
-        moved &= ~(np.isnan(seen.row) & np.isnan(self._drawn_row))
-        with np.errstate(invalid="ignore"):
-            moved |= np.abs(seen.reflectance - self._drawn_reflectance) > _REFLECTANCE_STEP
-        moved |= self._was_split
-        moved[seen.split] = False
-        if moved.any():
-            columns = self._every_column[moved]
-            self._pixels.relight(
-                t_us, columns, seen.row[moved], seen.reflectance[moved] * self._drawn_level
-            )
-            self._drawn_row[moved] = seen.row[moved]
-            self._drawn_reflectance[moved] = seen.reflectance[moved]
-        self._was_split[:] = False
-        if seen.split.size:
-            self._was_split[seen.split] = True
-            self._pixels.relight(
-                t_us,
-                seen.split,
-                seen.patch_row,
-                seen.patch_reflectance * self._drawn_level,
-                seen.low_row,
-                seen.high_row,
-            )
-
     def _darken(self, t_us: int) -> None:
         """Take the line away and note the phase that ends here."""
-        dark = np.zeros(self.columns)
-        self._pixels.relight(t_us, self._every_column, self._drawn_row, dark)
+        self._line.darken(t_us)
         self._close_phase(t_us)
         self._lit_since_us = None
         self._step_us = None
-        self._drawn_level = 0.0
 
     def _close_phase(self, t_us: int) -> None:
         """Note the lit phase that ends here; light goes on into the next unless it is dark."""
