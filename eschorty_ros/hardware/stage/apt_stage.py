@@ -10,13 +10,14 @@ import contextlib
 import threading
 from collections.abc import Callable
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
+from eschorty_ros.core.errors import DeviceError, DeviceTimeoutError
 from eschorty_ros.core.motion import plan_move
 from eschorty_ros.hardware.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_follow import Kind
 from eschorty_ros.hardware.stage.apt_judge import Status
 from eschorty_ros.hardware.stage.apt_link import AptLink
+from eschorty_ros.hardware.stage.apt_refusals import may_move, may_run_at, ready
 from eschorty_ros.hardware.stage.apt_setup import AptSettings, AptSetup
 from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, WARN_AGE_NS, Tracker
 
@@ -124,7 +125,8 @@ class AptStage:
         """Start a move; raises ``DeviceError`` when it cannot be carried out."""
         with self._lock:
             status = self._ready()
-            self._check_move(position_mm, speed_mm_s, status)
+            may_move(status, self._tracker.blocked_sense, position_mm, self.travel_mm)
+            may_run_at(speed_mm_s, self.speed_max_mm_s)
         speed, acceleration = self._setup.write_velocity(self._axis, speed_mm_s)
         with self._lock:
             status = self._ready()
@@ -208,34 +210,7 @@ class AptStage:
     # Orders
 
     def _ready(self) -> Status:
-        if self._tracker.failure is not None:
-            raise self._tracker.failure
-        if self._closed:
-            raise DeviceGoneError("the stage is closed; open it again")
-        if self._tracker.motion is not None:
-            raise DeviceError("the stage is moving; stop it or wait before the next move")
-        assert self._tracker.status is not None
-        if not self._tracker.status.bits & apt.ENABLED:
-            raise DeviceError("the stage is not enabled; check the front panel, configure again")
-        return self._tracker.status
-
-    def _check_move(self, position_mm: float, speed_mm_s: float, status: Status) -> None:
-        if not status.bits & apt.HOMED:
-            raise DeviceError("the stage is not homed; home it before moving")
-        low, high = self.travel_mm
-        if not low <= position_mm <= high:
-            raise DeviceError(
-                f"position_mm is {position_mm!r}; the travel is {low:g} to {high:g} mm"
-            )
-        if not 0.0 < speed_mm_s <= self.speed_max_mm_s:
-            raise DeviceError(
-                f"speed_mm_s is {speed_mm_s!r}; choose above 0 to {self.speed_max_mm_s:g} mm/s"
-            )
-        if self._tracker.blocked_sense * (position_mm - status.position_mm) > 0.0:
-            raise DeviceError(
-                f"the stage met a limit at {status.position_mm:.3f} mm; move it back from there "
-                "first, and check the travel for obstacles"
-            )
+        return ready(self._tracker, self._closed)
 
     def _send_now(self, name: str, **values: int) -> None:
         self._link.send_now(apt.pack(name, self._settings.address, **values))
