@@ -143,6 +143,16 @@ class Decoder:
             return None
         return int(self._state[w3.S_T_US])
 
+    @property
+    def settled_us(self) -> int | None:
+        """Time before which nothing comes any more; ``None`` before the first TIME_HIGH.
+
+        Earlier than ``time_us`` as long as the sensor may still take a TIME_LOW back.
+        """
+        if self._state[w3.S_RUN] == w3.RUN_START:
+            return None
+        return int(max(self._state[w3.S_FLOOR_US], self._state[w3.S_EPOCH_US]))
+
     def decode(self, data: Bytes) -> Events:
         """Events and triggers of the next bytes of the stream.
 

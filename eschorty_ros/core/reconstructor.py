@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core._checks import octets
+from eschorty_ros.core._checks import TIME_LIMIT, octets
 from eschorty_ros.core._window_kernels import TIME_LIMIT_US
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
@@ -64,6 +64,7 @@ class Reconstructor:
         )
         self._schedule_counts: dict[str, int] = {}
         self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
+        self._settled_us = -TIME_LIMIT
         self.first_t_us: int | None = None
         self.newest_t_us: int | None = None
         self._begin(modulation)
@@ -148,9 +149,13 @@ class Reconstructor:
         view = octets("data", data)
         for begin in range(0, len(view), PIECE_BYTES):
             events = self._decoder.decode(view[begin : begin + PIECE_BYTES])
-            now_us = self._decoder.time_us
+            now_us = self._decoder.settled_us
             if now_us is not None:
-                self._absorb(events, now_us)
+                # Periods before it are closed: a TIME_HIGH that steps back must not reopen them.
+                if len(events) and events.t[0] < self._settled_us:
+                    np.maximum(events.t, self._settled_us, out=events.t)
+                self._settled_us = max(self._settled_us, now_us)
+                self._absorb(events, self._settled_us)
         return self._finisher.push(self._assembler.take())
 
     def flush(self) -> Profiles:

@@ -105,6 +105,37 @@ def test_many_tiny_pieces_give_the_same_points():
         assert a.counters == b.counters
 
 
+def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():
+    """The word and its correction in two packets: nothing is closed early, nothing is late."""
+    rng = np.random.default_rng(SEED)
+    events = line_events(rng, flat, frequency_hz=5000.0, periods=30, columns=80)
+    words = np.frombuffer(encoded(events), "<u2")
+    places = np.flatnonzero(words >> 12 == 6)[50::200]
+    stream = np.insert(words, places, 0x6FFF)
+    cuts = 2 * (places + np.arange(1, len(places) + 1))
+    modulation = Modulation(5000.0, on_edge_us=1000)
+    whole, a = run(stream.tobytes(), modulation)
+    parts, b = run(stream.tobytes(), modulation, None, cuts.tolist())
+    plain, _ = run(words.tobytes(), modulation)
+    assert len(cuts) > 10
+    assert_same(whole, plain)
+    assert_same(whole, parts)
+    assert a.counters == b.counters
+
+
+def test_a_time_high_that_steps_back_reopens_no_period():
+    rng = np.random.default_rng(SEED)
+    events = line_events(rng, flat, frequency_hz=5000.0, periods=100, columns=40)
+    words = np.frombuffer(encoded(events), "<u2")
+    place = np.flatnonzero(words >> 12 == 8)[2] + 1
+    high = words[place - 1]
+    ahead = np.insert(words, place, [high + 2, high])
+    found, _ = run(ahead.tobytes(), Modulation(5000.0, on_edge_us=1000), None, [2 * (place + 1)])
+    since_us = found.t_us - found.edge_us
+    assert since_us.min() >= 0
+    assert since_us.max() < 200
+
+
 @pytest.mark.parametrize("first", [6, 8, 10, 12])
 def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
     """However the data come: the block in which the first trigger lies ends without correction."""
