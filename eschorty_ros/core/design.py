@@ -11,7 +11,7 @@ import math
 
 from eschorty_ros.core._checks import number, positive, whole
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.optical_build import Design, cot
+from eschorty_ros.core.optical_build import Design
 from eschorty_ros.core.optics import (
     COLUMNS,
     PIXEL_UM,
@@ -156,11 +156,12 @@ def _sensor_tilt_deg(
             )
         return tilt_deg
     assert baseline_mm is not None
-    cotangent = number("baseline_mm", baseline_mm) / focal_length_mm - cot(theta_deg)
+    sheet = 1.0 / math.tan(math.radians(theta_deg))
+    cotangent = number("baseline_mm", baseline_mm) / focal_length_mm - sheet
     if not 0.0 < cotangent < math.inf:
         raise ArgumentError(
             f"baseline_mm is {baseline_mm!r}; choose more than f cot(theta) = "
-            f"{focal_length_mm * cot(theta_deg):.3f} mm"
+            f"{focal_length_mm * sheet:.3f} mm"
         )
     return -math.degrees(math.atan(1.0 / cotangent))
 

@@ -12,8 +12,7 @@ from eschorty_ros.core._checks import reals
 from eschorty_ros.core.optics import Array, RangeModel, depth_of_field_mm
 
 
-def cot(angle_deg: float) -> float:
-    """Cotangent."""
+def _cot(angle_deg: float) -> float:
     return 1.0 / math.tan(math.radians(angle_deg))
 
 
@@ -68,7 +67,7 @@ class Design:
     @property
     def baseline_mm(self) -> float:
         """Lens centre to Scheimpflug line, ``f (cot theta + cot|theta'|)``, mm."""
-        return self.focal_length_mm * (cot(self.theta_deg) + cot(abs(self.theta_prime_deg)))
+        return self.focal_length_mm * (_cot(self.theta_deg) + _cot(abs(self.theta_prime_deg)))
 
     @property
     def range_limits_mm(self) -> tuple[float, float]:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from eschorty_ros.core._checks import TIME_LIMIT, exact, whole
 from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.phase import EdgeSchedule, PhaseEstimate, decide_window, estimate_phase
+from eschorty_ros.core.phase import EdgeSchedule
+from eschorty_ros.core.phase_estimate import PhaseEstimate, decide_window, estimate_phase
 
 FLUSH_US = 1 << 61
 _HELD_EVENTS_MAX = 1 << 22

@@ -16,7 +16,8 @@ from eschorty_ros.core.finishing import Finisher
 from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.noise import ActivityFilter
-from eschorty_ros.core.phase import EDGES_MAX, PhaseEstimate
+from eschorty_ros.core.phase import EDGES_MAX
+from eschorty_ros.core.phase_estimate import PhaseEstimate
 from eschorty_ros.core.phase_lock import FLUSH_US, PhaseLock
 from eschorty_ros.core.profile_assembler import ProfileAssembler
 from eschorty_ros.core.profiles import Profiles

@@ -9,7 +9,8 @@ import pytest
 from line_events import line_events
 
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.phase import EdgeSchedule, decide_window, estimate_phase
+from eschorty_ros.core.phase import EdgeSchedule
+from eschorty_ros.core.phase_estimate import decide_window, estimate_phase
 
 SEED = 31
 

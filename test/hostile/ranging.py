@@ -43,7 +43,7 @@ TARGET = dict.fromkeys(parameters(targets.Targets) - {"labels"}, 100.0)
 
 
 CALLS: dict[str, Call] = {
-    "design.Design.at": Call(
+    "optical_build.Design.at": Call(
         design.design(theta_prime_deg=-7.6, b_prime_px=-1100.0, **LENS).at,
         {"range_mm": [900.0, 1300.0]},
         {"range_mm": reals()},

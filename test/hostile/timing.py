@@ -16,6 +16,7 @@ from eschorty_ros.core import (
     motion,
     motion_fit,
     phase,
+    phase_estimate,
     phase_gate,
     phase_lock,
     position_edges,
@@ -325,13 +326,13 @@ CALLS: dict[str, Call] = {
     "phase_lock.PhaseLock.settle": Call(
         method(a_lock, "settle"), {"watermark_us": 5}, {"watermark_us": whole(T_MAX + 1)}
     ),
-    "phase.estimate_phase": Call(
-        phase.estimate_phase,
+    "phase_estimate.estimate_phase": Call(
+        phase_estimate.estimate_phase,
         {"t_us": TIMES, "polarity": SIGNS, "modulation": LASER},
         {"t_us": integers(2**63, size=N), "polarity": POLARITY},
     ),
-    "phase.decide_window": Call(
-        phase.decide_window,
+    "phase_estimate.decide_window": Call(
+        phase_estimate.decide_window,
         {"t_us": np.arange(5000), "watermark_us": 10**6, "modulation": LASER},
         {"t_us": exactly("i8", 5000, alone=True), "watermark_us": whole()},
     ),

@@ -22,10 +22,10 @@ from eschorty_ros.core.errors import EschortyError
 HANDED_OUT = {
     "calibrate.CalibrationReport", "calibrate.Rejected", "calibration_diagnostics.KProfile",
     "aggregate_frame.Pixels", "calibration_fit.CalibrationFit", "centroid.Centroids",
-    "design.Design", "design.DesignTable", "evt3.Counters", "evt3.Events", "evt3.Triggers",
-    "noise.FilterCounters", "offline.Result", "phase.PhaseEstimate", "position_edges.EdgeFit",
-    "post_finder.Post", "post_matching.PostMatch", "profiles.Profiles", "raw_file.Header",
-    "recording.Recording", "yaml_file.Schema",
+    "optical_build.Design", "optical_build.DesignTable", "evt3.Counters", "evt3.Events",
+    "evt3.Triggers", "noise.FilterCounters", "offline.Result", "phase_estimate.PhaseEstimate",
+    "position_edges.EdgeFit", "post_finder.Post", "post_matching.PostMatch", "profiles.Profiles",
+    "raw_file.Header", "recording.Recording", "yaml_file.Schema",
 }  # fmt: skip
 """Plain records that the package makes; nobody else has to."""
 TESTED_ELSEWHERE = {

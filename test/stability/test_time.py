@@ -20,7 +20,8 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Encoder, Events, Triggers, sort_readout
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.noise import ActivityFilter
-from eschorty_ros.core.phase import EdgeSchedule, estimate_phase
+from eschorty_ros.core.phase import EdgeSchedule
+from eschorty_ros.core.phase_estimate import estimate_phase
 from eschorty_ros.core.position_edges import fit_edges
 from eschorty_ros.core.profiles import Profiles, place
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
