@@ -95,6 +95,11 @@ class Reconstructor:
         return self._decoder.time_us
 
     @property
+    def settled_us(self) -> int | None:
+        """Sensor time before which nothing comes any more; ``None`` at first."""
+        return self._decoder.settled_us
+
+    @property
     def phase_missing(self) -> bool:
         """Whether a flush found no phase and cut from the first event's time on."""
         return self._lock.missing

@@ -257,7 +257,7 @@ class PacketStream:
             )
         elif missing:
             self._reconstructor.note_gap()
-        reconstructor, before_us = self._reconstructor, self._reconstructor.time_us
+        reconstructor, before_us = self._reconstructor, self._reconstructor.settled_us
         profiles = reconstructor.push(packet.data)
         self._observe(packet, before_us, reconstructor)
         self._collect(profiles)

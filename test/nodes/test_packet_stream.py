@@ -266,6 +266,26 @@ def test_packets_twice_or_in_the_wrong_order_are_no_restart_of_the_camera():
     assert subject.clock_announced
 
 
+def test_a_time_low_that_the_sensor_takes_back_does_not_move_the_clock():
+    """At the end of each packet; its correction begins the next."""
+    words = np.frombuffer(line(), "<u2")
+    decoder = Decoder()
+    plain, spoilt = [], []
+    for seq, piece in enumerate(np.split(words, np.flatnonzero(words >> 12 == 6)[50::50])):
+        decoder.decode(piece.tobytes())
+        stamp_ns = ZERO_NS + decoder.time_us * 1000
+        plain.append(Packet(seq, stamp_ns, piece.tobytes()))
+        spoilt.append(Packet(seq, stamp_ns, np.append(piece, np.uint16(0x6FFF)).tobytes()))
+    assert len(plain) > 50
+    zeros = []
+    for items in (plain, spoilt):
+        subject = unannounced()
+        run(subject, items)
+        assert subject.clock_restarts == 0
+        zeros.append(subject.epoch.clock.zero_ns)
+    assert abs(zeros[1] - zeros[0]) < 20_000
+
+
 def test_points_move_with_the_clock_until_they_are_placed():
     subject = unannounced()
     data = line()
