@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from short_folder import short_folder
+
 from eschorty_ros.emulation.awg_model import AwgModel, truth
 from eschorty_ros.emulation.usb_server import UsbServer
 
@@ -23,7 +25,8 @@ class AwgProcess:
 
     def __init__(self, folder: Path) -> None:
         self.log = folder / "generator.log"
-        path = folder / "usb.sock"
+        self._held = contextlib.ExitStack()
+        path = self._held.enter_context(short_folder()) / "usb.sock"
         self.backend = f"eschorty_ros.emulation.usb_remote:backend?{path}"
         self._process = subprocess.Popen(
             [sys.executable, __file__, str(path), str(self.log)],
@@ -59,6 +62,7 @@ class AwgProcess:
     def close(self) -> None:
         self._process.kill()
         self._process.communicate()
+        self._held.close()
 
     def _answer(self) -> None:
         assert self._process.stdout is not None

@@ -10,21 +10,15 @@ import contextlib
 import json
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from short_folder import short_folder
+
 from eschorty_ros.emulation.bench_devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench_process import bench_process
 from eschorty_ros.emulation.bench_server import serving
-
-
-@contextlib.contextmanager
-def short_folder() -> Iterator[Path]:
-    """A folder whose path leaves room for a Unix socket's."""
-    with tempfile.TemporaryDirectory(prefix="bench_") as folder:
-        yield Path(folder)
 
 
 @contextlib.contextmanager

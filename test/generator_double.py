@@ -17,6 +17,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from short_folder import short_folder
+
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserReadback
@@ -118,7 +120,9 @@ class Generator:
     """The generator's process, its log, and somebody at its front panel."""
 
     def __init__(self, folder: Path) -> None:
-        self.path, self.log = folder / "generator.sock", folder / "generator.log"
+        self._held = contextlib.ExitStack()
+        self.path = self._held.enter_context(short_folder()) / "generator.sock"
+        self.log = folder / "generator.log"
         self.settings = {"path": str(self.path)}
         self.process = subprocess.Popen([sys.executable, __file__, str(self.path), str(self.log)])
         while not self.path.exists():
@@ -151,6 +155,7 @@ class Generator:
     def close(self) -> None:
         self.process.kill()
         self.process.wait()
+        self._held.close()
 
 
 @contextlib.contextmanager

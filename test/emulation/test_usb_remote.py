@@ -11,6 +11,7 @@ import time
 import pytest
 import usb.core
 import usb.util
+from short_folder import short_folder
 from usb_loop import IN, OUT, PACKET, Loop
 from waiting import DEADLINE_S
 
@@ -26,8 +27,14 @@ def loop():
 
 
 @pytest.fixture
-def path(loop, tmp_path):
-    path = tmp_path / "usb.sock"
+def folder():
+    with short_folder() as folder:
+        yield folder
+
+
+@pytest.fixture
+def path(loop, folder):
+    path = folder / "usb.sock"
     with UsbServer(path, lambda: [loop]):
         yield str(path)
 
@@ -98,7 +105,7 @@ def test_a_client_cannot_claim_what_another_holds_until_that_one_closes(path, op
 
 def claim_when_free(device):
     """The server frees the claim when it sees the end of the link: a moment later."""
-    for _ in range(1000):
+    for _ in range(6000):
         try:
             return usb.util.claim_interface(device, 0)
         except usb.core.USBError:
@@ -131,8 +138,8 @@ def test_a_client_that_is_killed_frees_its_claim_and_leaves_no_read_behind(path,
     assert device.read(IN, 64).tobytes() == b"mine"
 
 
-def test_after_replug_or_a_dead_server_the_device_is_gone(tmp_path, loop, opened):
-    path = str(tmp_path / "usb.sock")
+def test_after_replug_or_a_dead_server_the_device_is_gone(folder, loop, opened):
+    path = str(folder / "usb.sock")
     server = UsbServer(path, lambda: [loop])
     device = opened(path)
     device.write(OUT, b"x")
@@ -150,12 +157,12 @@ def test_after_replug_or_a_dead_server_the_device_is_gone(tmp_path, loop, opened
     assert opened(path) is None
 
 
-def test_no_server_is_an_empty_bus(tmp_path, opened):
-    assert opened(tmp_path / "none.sock") is None
+def test_no_server_is_an_empty_bus(folder, opened):
+    assert opened(folder / "none.sock") is None
 
 
-def test_a_socket_left_behind_by_a_dead_server_is_replaced(tmp_path, loop, opened):
-    path = tmp_path / "usb.sock"
+def test_a_socket_left_behind_by_a_dead_server_is_replaced(folder, loop, opened):
+    path = folder / "usb.sock"
     path.write_text("")
     with UsbServer(path, lambda: [loop]):
         assert opened(path) is not None

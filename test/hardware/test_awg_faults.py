@@ -395,5 +395,5 @@ def test_off_from_many_threads_is_off(bench: AwgBench, log: Path) -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(10.0)
+        thread.join()
     assert states(log) == ["OFF", "ON", "OFF"]

@@ -265,7 +265,7 @@ def test_off_interrupts_what_is_under_way(bench: AwgBench, monkeypatch: pytest.M
     monkeypatch.setattr(bench.model, "_execute", slow)
     with pytest.raises(DeviceError, match="interrupted by switching off"):
         laser.configure(Modulation(500.0))
-    meddler.join(5.0)
+    meddler.join()
     assert after[0] == ":CHANnel1:OUTPut OFF"
     assert not any(" 25" in text or "OUTPut ON" in text for text in after)
     with pytest.raises(DeviceError, match="not armed"):
@@ -292,7 +292,7 @@ def test_interrupted_light_can_be_switched_on_again(
     monkeypatch.setattr(bench.model, "_execute", slow)
     with pytest.raises(DeviceError, match="interrupted by switching off"):
         getattr(laser, operation)()
-    meddler.join(5.0)
+    meddler.join()
     assert not bench.model.lit
     laser.arm()
     laser.enable()

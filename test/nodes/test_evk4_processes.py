@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
 from event_camera_msgs.msg import EventPacket
 from evk4_bench import OnDemand
 from ros_process import NodeProcess, Observer, processes, wait_until
+from short_folder import short_folder
 
 from eschorty_ros.emulation.evk4_model import Evk4Model
 from eschorty_ros.emulation.evk4_sequences import Phase
@@ -22,6 +24,12 @@ from eschorty_ros.nodes.domain import free_domain
 CAMERA = "eschorty_ros.nodes.camera"
 
 
+@pytest.fixture
+def socket() -> Iterator[Path]:
+    with short_folder() as folder:
+        yield folder / "usb.sock"
+
+
 def end_well(camera: NodeProcess) -> None:
     begun_s = time.monotonic()
     assert camera.interrupt() == 0, camera.output
@@ -29,12 +37,12 @@ def end_well(camera: NodeProcess) -> None:
     assert "Traceback" not in camera.output, camera.output
 
 
-def test_fault_x3_ctrl_c_in_the_initialisation_and_while_streaming(tmp_path: Path) -> None:
+def test_fault_x3_ctrl_c_in_the_initialisation_and_while_streaming(socket: Path) -> None:
     """driver: cuts it short, camera released or powered down, exit 0; user reads: nothing."""
     model, domain = Evk4Model(source := OnDemand()), free_domain()
-    backend = f"eschorty_ros.emulation.usb_remote:backend?{tmp_path / 'usb.sock'}"
+    backend = f"eschorty_ros.emulation.usb_remote:backend?{socket}"
     nodes = {CAMERA: {"driver": "evk4", "backend": backend}}
-    with UsbServer(tmp_path / "usb.sock", lambda: [model]):
+    with UsbServer(socket, lambda: [model]):
         with processes(nodes, domain) as running:
             wait_until(lambda: model.claims, "the claim")
             end_well(running["camera"])
