@@ -294,7 +294,7 @@ def one_thing_at_a_time(bench: CalibrationBench) -> None:
         wait_until(ended.done, "the canceled calibration's end")
         assert ended.result().status == GoalStatus.STATUS_CANCELED
         handle = bench.start(**SLOW)
-        bench.wait_for_sweep()
+        bench.wait_for_sweep(points=100)
         _, result = bench.calibrate()
         assert "is being collected" in result.message
         answer = load(bench, CALIBRATION)

@@ -111,12 +111,12 @@ class Bench:
         self.start(**goal)
         return self.result()
 
-    def wait_for_sweep(self) -> None:
-        """Wait until points of the sweep have been reconstructed."""
+    def wait_for_sweep(self, points: int = SWEPT_POINTS) -> None:
+        """Wait until more than so many points of the sweep have been reconstructed."""
 
         def swept() -> bool:
             assert not self._ended.done(), self._ended.result().result.message
-            return any(f.phase == "sweeping" and f.points > SWEPT_POINTS
+            return any(f.phase == "sweeping" and f.points > points
                        for f in list(self.feedback))  # fmt: skip
 
         wait_until(swept, "points of the sweep", SCAN_DEADLINE_S)
