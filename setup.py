@@ -10,7 +10,6 @@ REQUIREMENTS = [
     for line in (HERE / "requirements" / "run.txt").read_text().splitlines()
     if line and not line.startswith("#")
 ]
-NODES = ("camera", "laser", "stage", "reconstruction", "scanner", "replay")
 
 setup(
     name="eschorty_ros",
@@ -44,7 +43,6 @@ setup(
         "console_scripts": [
             "eschorty = eschorty_ros.cli:main",
             "eschorty-bench = eschorty_ros.emulation.bench:main",
-            *(f"eschorty-{node} = eschorty_ros.nodes.{node}:main" for node in NODES),
         ]
     },
 )

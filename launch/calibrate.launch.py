@@ -6,6 +6,8 @@ ros2 launch eschorty_ros calibrate.launch.py --show-args
 
 from eschorty_ros.nodes.launching import (
     FAKE,
+    PARAMETERS,
+    PIXELS,
     TRIGGER,
     bench,
     declare,
@@ -19,10 +21,11 @@ from launch import LaunchDescription
 
 ARGUMENTS = (
     FAKE,
+    PARAMETERS,
     ("scene", "posts", "what stands on an emulated bench: a scene's name or a mesh", None),
     ("calibration", "config_3", "optical build as designed: a name in config/ or a file", None),
     ("as_built", "config_3_as_built", "build that an emulated bench really has", None),
-    ("pixels", "paper", "event pixels of an emulated camera", ["paper", "ideal", "noisy"]),
+    PIXELS,
     TRIGGER,
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000", None),
     ("distances", "posts", "what is known of the targets: a name in config/ or a CSV file", None),

@@ -6,12 +6,13 @@ ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.parameter_descriptions import ParameterValue
 
-from eschorty_ros.nodes.launching import EVENTS, declare, node, number, rviz, text
+from eschorty_ros.nodes.launching import EVENTS, PARAMETERS, declare, node, number, rviz, text
 from launch import LaunchDescription
 
 ARGUMENTS = (
     ("recording", None, "folder with events.raw, stage.csv, laser.yaml, calibration.yaml", None),
     ("rate", "1.0", "speed of the replay against real time; 0 is as fast as possible", None),
+    PARAMETERS,
     ("rviz", "false", "true: show cloud, live profile and frames in RViz", ["true", "false"]),
 )
 
@@ -28,7 +29,6 @@ def generate_launch_description():
     replay = {
         "recording": text("recording"),
         "rate": number("rate"),
-        f"qos_overrides.{EVENTS}.publisher.reliability": "reliable",
     }
     return LaunchDescription(
         [

@@ -10,6 +10,8 @@ from launch.events import Shutdown
 
 from eschorty_ros.nodes.launching import (
     FAKE,
+    PARAMETERS,
+    PIXELS,
     TRIGGER,
     bench,
     declare,
@@ -23,6 +25,7 @@ from launch import LaunchDescription
 
 ARGUMENTS = (
     FAKE,
+    PARAMETERS,
     (
         "scene",
         "steps",
@@ -31,12 +34,7 @@ ARGUMENTS = (
         None,
     ),
     ("calibration", "config_3", "optical build: a name in config/ or the path of a file", None),
-    (
-        "pixels",
-        "paper",
-        "event pixels of an emulated camera",
-        ["paper", "ideal", "noisy", "narrow"],
-    ),
+    PIXELS,
     TRIGGER,
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000: one profile per period", None),
     ("speed", "0.05", "stage speed, m/s", None),

@@ -58,7 +58,7 @@ def command(
       eschorty scan
       eschorty scan --scene sphere --speed 20 --out sphere
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
-      eschorty scan --hardware bench.yaml --calibration my.yaml
+      eschorty scan --hardware lab.yaml --calibration my.yaml
     """  # noqa: D301
     from eschorty_ros.core.files import check_writable
 

@@ -1,4 +1,4 @@
-"""A YAML file of node parameters for real devices: what `eschorty scan --hardware` reads."""
+"""A ROS parameter file for real devices: what `eschorty scan --hardware` reads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from eschorty_ros.nodes import camera, laser, lifecycle, reconstruction_paramete
 from eschorty_ros.nodes.drivers import REAL
 from eschorty_ros.nodes.parameters import from_settings
 
-_TABLES = {
+_NAMESPACE = "/eschorty/"
+_KEY = "ros__parameters"
+TABLES = {
     "camera": camera.TABLE,
     "laser": laser.TABLE,
     "stage": stage.TABLE,
@@ -25,6 +27,9 @@ _TABLES = {
 def read_hardware(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
     """Read parameters by node; camera, laser and stage get their real drivers unless told.
 
+    The file is what launch files and ``--params-file`` take, with whole node names:
+    ``/eschorty/laser: {ros__parameters: {high_v: 3.3}}``.
+
     Raises
     ------
     FormatError
@@ -34,13 +39,17 @@ def read_hardware(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
     if not isinstance(data, dict):
         raise FormatError(f"{path}: it holds {data!r}; write node names with their parameters")
     tables: dict[str, dict[str, Any]] = {name: {"driver": real} for name, real in REAL.items()}
-    for name, values in data.items():
-        _known(path, "node", name, list(_TABLES))
+    for full_name, table in data.items():
+        _known(path, "node", full_name, [f"{_NAMESPACE}{name}" for name in TABLES])
+        name = full_name.removeprefix(_NAMESPACE)
+        values = table.get(_KEY) if isinstance(table, dict) and set(table) == {_KEY} else None
         if not isinstance(values, dict):
-            raise FormatError(f"{path}: {name} is {values!r}; write parameters under it")
-        names = [param.name for param in (*_TABLES[name], lifecycle.AUTO_START)]
+            raise FormatError(
+                f"{path}: {full_name} is {table!r}; write parameters under {_KEY} in it"
+            )
+        names = [param.name for param in (*TABLES[name], lifecycle.AUTO_START)]
         for parameter in values:
-            _known(path, f"parameter of {name}", parameter, names)
+            _known(path, f"parameter of {full_name}", parameter, names)
         tables.setdefault(name, {}).update(values)
     return tables
 
@@ -48,6 +57,6 @@ def read_hardware(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
 def _known(path: str | os.PathLike[str], what: str, name: object, names: list[str]) -> None:
     if name in names:
         return
-    near = get_close_matches(str(name), names, n=1)
+    near = get_close_matches(str(name), names, n=1, cutoff=0.5)
     remedy = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(names)}"
     raise FormatError(f"{path}: {name!r} is no {what}; {remedy}")

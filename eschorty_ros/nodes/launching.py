@@ -13,7 +13,7 @@ from launch.substitutions import (
     LaunchConfiguration,
 )
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
 from eschorty_ros.core.files import config_folders
@@ -23,6 +23,11 @@ EVENTS = f"/{NAMESPACE}/camera/events"
 
 Argument = tuple[str, str | None, str, list[str] | None]
 """Name, default (``None``: must be given), description, choices."""
+
+
+def _config_file(name: str) -> Path:
+    paths = [folder / name for folder in config_folders()]
+    return next((path for path in paths if path.is_file()), Path(name))
 
 
 FAKE: Argument = (
@@ -36,6 +41,18 @@ TRIGGER: Argument = (
     "stage",
     "what is wired to the camera's trigger input: none, laser or stage",
     ["none", "laser", "stage"],
+)
+PIXELS: Argument = (
+    "pixels",
+    "paper",
+    "event pixels of an emulated camera",
+    ["paper", "ideal", "noisy", "narrow"],
+)
+PARAMETERS: Argument = (
+    "parameters",
+    str(_config_file("parameters.yaml")),
+    "YAML file of parameters by node; what it holds overrides the other arguments",
+    None,
 )
 
 
@@ -115,13 +132,13 @@ def bench(**options: str) -> Any:
 
 
 def node(executable: str, parameters: dict[str, Any]) -> Any:
-    """One of the package's nodes, named as its executable."""
+    """One of the package's nodes, named as its executable; the file has the last word."""
     return Node(
         package="eschorty_ros",
         executable=executable,
         name=executable,
         namespace=NAMESPACE,
-        parameters=[parameters],
+        parameters=[parameters, ParameterFile(LaunchConfiguration("parameters"))],
         output="screen",
         emulate_tty=True,
     )
@@ -129,11 +146,9 @@ def node(executable: str, parameters: dict[str, Any]) -> Any:
 
 def rviz() -> Any:
     """RViz with the package's view, when the argument ``rviz`` is true."""
-    views = [folder / "scan.rviz" for folder in config_folders()]
-    view = next((path for path in views if path.is_file()), Path("scan.rviz"))
     return Node(
         package="rviz2",
         executable="rviz2",
-        arguments=["-d", str(view)],
+        arguments=["-d", str(_config_file("scan.rviz"))],
         condition=IfCondition(EqualsSubstitution(LaunchConfiguration("rviz"), "true")),
     )

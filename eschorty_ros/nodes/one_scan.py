@@ -13,7 +13,7 @@ from rclpy.action import ActionClient
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.action import Scan
-from eschorty_ros.core.cloud import POINT_DTYPE
+from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.cloud_messages import points_from_message
 from eschorty_ros.nodes.composition import START_S, Composition, Tables, composition, wait
@@ -48,7 +48,7 @@ class OneScan:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The action's result and the cloud (POINT_DTYPE) as it came over `scan/points`."""
+    """The action's result and the cloud (POINT_DTYPE, REFLECTANCE_DTYPE) as on `scan/points`."""
 
     success: bool
     message: str
@@ -133,7 +133,8 @@ def _cloud_points(clouds: list[PointCloud2]) -> NDArray[np.void]:
     if not clouds:
         return np.empty(0, POINT_DTYPE)
     seen = points_from_message(clouds[-1])
-    points = np.empty(len(seen), POINT_DTYPE)
-    for name in POINT_DTYPE.names or ():
+    names = seen.dtype.names or ()
+    points = np.empty(len(seen), REFLECTANCE_DTYPE if "reflectance" in names else POINT_DTYPE)
+    for name in points.dtype.names or ():
         points[name] = seen[name]
     return points

@@ -30,6 +30,7 @@ STARTED = {
 EXPECTED = {
     "scan.launch.py": {
         "fake",
+        "parameters",
         "trigger",
         "scene",
         "pixels",
@@ -43,6 +44,7 @@ EXPECTED = {
     },
     "calibrate.launch.py": {
         "fake",
+        "parameters",
         "trigger",
         "scene",
         "pixels",
@@ -55,7 +57,7 @@ EXPECTED = {
         "calibration_folder",
         "auto_calibrate",
     },
-    "replay.launch.py": {"recording", "rate", "rviz"},
+    "replay.launch.py": {"recording", "rate", "parameters", "rviz"},
 }
 
 
