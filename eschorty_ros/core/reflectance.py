@@ -29,6 +29,8 @@ ROOT_12 = math.sqrt(12.0)
 _FIXED = 0.11
 _PER_EVENT = 0.18
 _ENDS_PX = 0.41
+# No two surfaces differ by more than a factor of 1000, a retroreflector and black velvet included.
+_LOG_MAX = math.log(1e3)
 
 
 def events_per_row(width_px: Array, events: NDArray[np.integer]) -> float:
@@ -65,7 +67,8 @@ def relative_reflectance(
     Returns
     -------
     reflectance, sigma : ndarray of float64, shape (n,)
-        ``sigma`` is the standard deviation of one point; the reference's is not in it.
+        ``sigma`` is the standard deviation of one point; the reference's is not in it. NaN where
+        the width belongs to no line: a spread over background, more than a factor of 1000 off.
 
     Raises
     ------
@@ -97,7 +100,9 @@ def relative_reflectance(
             variance[part] += (_PER_EVENT / per_row) ** 2
         if white_width_px == 0.0:
             reference2[part] = np.median(width2[part])
-    reflectance = np.exp((width2 - reference2) / slope)
+    log_ratio = (width2 - reference2) / slope
+    log_ratio[np.abs(log_ratio) > _LOG_MAX] = np.nan
+    reflectance = np.exp(log_ratio)
     variance += 4.0 * width2 * (_ENDS_PX / slope) ** 2
     return reflectance, reflectance * np.sqrt(variance)
 

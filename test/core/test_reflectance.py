@@ -114,6 +114,14 @@ def test_points_without_spread_and_bad_arguments():
         relative_reflectance(np.zeros(2, int), none, np.ones(3, np.uint32), 1.0)
 
 
+def test_spread_over_background_has_no_reflectance():
+    edge_us, events = np.zeros(3, int), np.full(3, 60, np.uint32)
+    width_px = np.array([6.0, 6.0, 200.0])
+    rho, sigma = relative_reflectance(edge_us, width_px, events * [1, 1, 50], SIGMA_PX)
+    np.testing.assert_allclose(rho[:2], 1.0, rtol=1e-12)
+    assert np.isnan([rho[2], sigma[2]]).all()
+
+
 @pytest.mark.parametrize("extension", [".pcd", ".ply"])
 def test_cloud_carries_reflectance_only_when_asked(tmp_path, extension):
     model = load_calibration("config_3").model()
