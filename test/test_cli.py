@@ -177,6 +177,23 @@ def test_simulate_then_reconstruct_without_ros(recording):
     assert 1e-4 < facts["sigma_median_m"] < 2e-3
 
 
+def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path):
+    from eschorty_ros.simulation.world import World
+
+    advance = World.advance
+
+    def interrupted(world, until_us):
+        if world.now_us > 0:
+            raise KeyboardInterrupt
+        return advance(world, until_us)
+
+    monkeypatch.setattr(World, "advance", interrupted)
+    result = run("simulate", "--stop", 18, "--out", tmp_path / "rec")
+    assert result.exit_code == INTERRUPTED
+    assert "Traceback" not in result.output
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_simulate_refuses_to_overwrite_a_recording(recording):
     result = run("simulate", "--out", recording)
     assert result.exit_code == 1

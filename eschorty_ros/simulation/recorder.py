@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,7 +99,9 @@ def simulate_recording(
     world.set_stage(MotionPlan(0, start_mm))
     world.set_stage(move, 0)
     folder = _folder(out_dir)
-    with RawWriter(folder / EVENTS_FILE, width=world.columns, height=world.rows) as raw:
+    events = folder / EVENTS_FILE
+    writer = RawWriter(events, width=world.columns, height=world.rows)
+    with writer as raw, _removed_unless_whole(events):
         while world.now_us < end_us:
             raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
             if progress is not None:
@@ -111,6 +114,18 @@ def simulate_recording(
     truth = world.truth
     write_truth_csv(folder / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
     return load_recording(folder)
+
+
+@contextmanager
+def _removed_unless_whole(path: Path) -> Iterator[None]:
+    """Remove a file, and its folder when nothing else is in it, if the block is left early."""
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            path.unlink()
+            path.parent.rmdir()
+        raise
 
 
 def _folder(out_dir: str | os.PathLike[str]) -> Path:

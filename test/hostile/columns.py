@@ -52,7 +52,8 @@ def an_assembler() -> profile_assembler.ProfileAssembler:
 
 
 def blank_settings() -> dict[str, Any]:
-    return {name: getattr(settings.Settings(), name) for name in parameters(settings.Settings)}
+    blank = settings.Settings()
+    return {name: getattr(blank, name) for name in sorted(parameters(settings.Settings))}
 
 
 def settings_kind(name: str, value: Any) -> Kind:

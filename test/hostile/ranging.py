@@ -39,7 +39,7 @@ LENS_KINDS = {
 
 SIZES = {"columns": 1280, "rows": 720}
 
-TARGET = dict.fromkeys(parameters(targets.Targets) - {"labels"}, 100.0)
+TARGET = dict.fromkeys(sorted(parameters(targets.Targets) - {"labels"}), 100.0)
 
 
 CALLS: dict[str, Call] = {
