@@ -23,8 +23,9 @@ _WEIGHT_ONE = 1 << 20
 _REACH = 1.4
 _EDGE_PART = 8
 _CUT_ITERATIONS = 30
-# Below this part of the variance to expect, a cut line is taken to be narrower than the window's.
-_NARROWER = 0.4
+# Relative variance of a flat line's sample variance, times its count. A cut line whose variance
+# is one such standard deviation below what is to be expected is narrower than the window's.
+_SCATTER = 1.0
 # A column with more than this many times the line's variance holds stray events.
 _STRAY_FREE = 2.0
 # Square of the least factor on s/sqrt(N): a fit to part of a line amplifies what counts vary.
@@ -154,18 +155,20 @@ def _variance(count, sum_d, sum_d2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _uncut(mean, variance, sigma_max):
-    """Centre and sigma of a Gaussian whose part beyond 0 has this mean and variance.
+def _uncut(mean, variance, count, sigma_max):
+    """Centre and sigma of a Gaussian whose ``count`` events beyond 0 have this mean and variance.
 
-    Sigma is ``sigma_max`` unless the variance is far below what that lets expect; then both are
-    fitted. The centre is not behind 0. Returns also the part's variance over sigma squared. A part
-    that keeps 3 of its standard deviations from 0 is not cut.
+    Sigma is ``sigma_max`` unless the variance is below what that lets expect and the centre is
+    not at 0, where the two cannot be told apart; then both are fitted. The centre is not behind 0.
+    Returns also the part's variance over sigma squared, and what fitting sigma moved the centre
+    by. A part that keeps 3 of its standard deviations from 0 is not cut.
     """
     if mean > 3.0 * np.sqrt(variance):
-        return mean, np.sqrt(variance), 1.0
+        return mean, np.sqrt(variance), 1.0, 0.0
     sigma = sigma_max
     centre = mean
     ratio = 1.0
+    known = mean
     fitted = False
     for step in range(2 * _CUT_ITERATIONS):
         alpha = -centre / sigma
@@ -175,21 +178,24 @@ def _uncut(mean, variance, sigma_max):
         ratio = 1.0 + alpha * hazard - hazard * hazard
         centre = max(centre + (mean - centre - sigma * hazard) / ratio, 0.0)
         if step == _CUT_ITERATIONS:
-            fitted = variance < _NARROWER * ratio * sigma * sigma
+            known = centre
+            least = max(1.0 - np.sqrt(_SCATTER / count), 0.0)
+            fitted = centre > 0.0 and variance < least * ratio * sigma * sigma
             if not fitted:
                 break
         if fitted:
             sigma = min(np.sqrt(variance / ratio), sigma_max)
-    return centre, sigma, ratio
+    return centre, sigma, ratio, centre - known
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _uncut_row(row, sigma2, variance, window, half, rows, noise):
     """Row, its variance ``sigma2``, and whether the edge of the sensor cuts the window.
 
-    The line is taken to be centred on the sensor. What the correction adds counts half as an
-    error, and wholly at the end of that range; the more is cut off, the more the counts scatter
-    as independent ones do.
+    The line is taken to be centred on the sensor. Real lines are flatter than a Gaussian: what the
+    correction adds counts by seven tenths as an error, and wholly at the end of that range, and
+    half of what fitting the line's width changes does too. The more is cut off, the more the
+    counts scatter as independent ones do.
     """
     count = window[0]
     reach = half / FRACTION
@@ -199,12 +205,13 @@ def _uncut_row(row, sigma2, variance, window, half, rows, noise):
     beyond = min(from_low, from_high)
     if beyond > reach or max(from_low, from_high) <= reach or variance == 0.0:
         return row, sigma2, False
-    centre, sigma, ratio = _uncut(beyond, variance, reach * FRACTION / HALF_PER_SIGMA)
+    centre, sigma, ratio, moved = _uncut(beyond, variance, count, reach * FRACTION / HALF_PER_SIGMA)
     shift = beyond - centre
-    share = 1.0 if centre == 0.0 else 0.25
+    share = 1.0 if centre == 0.0 else 0.5
     factor2 = max(noise[N_FACTOR] ** 2, _CUT_FACTOR2)
     scatter2 = factor2 + max(1.0 - factor2, 0.0) * (1.0 - ratio)
-    wider2 = scatter2 * sigma**2 / (ratio * count) + noise[N_FLOOR] ** 2 + share * shift**2
+    wider2 = scatter2 * sigma**2 / (ratio * count) + noise[N_FLOOR] ** 2
+    wider2 += share * shift**2 + 0.25 * moved**2
     row = row - shift if from_low < from_high else row + shift
     # Another estimate than the mean may start closer to the edge than the correction is long.
     return min(max(row, -0.5), rows - 0.5), max(sigma2, wider2), True

@@ -197,10 +197,33 @@ def test_case_24_truncated_normal_is_inverted(sigma_px, measured):
             hazard = mpmath.npdf(alpha) / (1 - mpmath.ncdf(alpha))
             mean = sigma_px * (hazard - alpha)
             variance = sigma_px**2 * (1 + alpha * hazard - hazard**2)
-            centre, sigma, _ = _uncut(float(mean), float(variance), sigma_px)
-            assert sigma == sigma_px
+            centre, sigma, _, moved = _uncut(float(mean), float(variance), 20.0, sigma_px)
+            assert (sigma, moved) == (sigma_px, 0.0)
             worst = max(worst, abs(centre - float(share) * sigma_px) / sigma_px)
     measured("centre of a cut Gaussian from its visible part, sigma", worst, 1e-12)
+
+
+@pytest.mark.parametrize("method", ["mode_mean", "gauss_ml", "edge_mid"])
+@pytest.mark.parametrize(("row", "bias_px"), [(704.0, 0.3), (707.0, 0.6), (712.0, 1.5)])
+def test_case_24_flat_line_narrower_than_its_window(method, row, bias_px):
+    """Rows as bright pixels fire: as often in the whole line, which ends 10 rows off its middle.
+
+    From row 710 on the sensor cuts it. As a Gaussian of the window's width it would be 0.7, 1.6 and
+    2.7 rows too far out.
+    """
+    rng = np.random.default_rng(SEED)
+    rows, offsets = [], [0]
+    for _ in range(400):
+        line = np.rint(rng.uniform(row - 10.0, row + 10.0, 40))
+        rows.append(line[line < 720.0].astype(int))
+        offsets.append(offsets[-1] + rows[-1].size)
+    # Independent events: their mean scatters by s/sqrt(N), hence a factor of 1.
+    independent = 1.0 / METHOD_NOISE["mode_mean"].factor
+    found = estimate(np.concatenate(rows), offsets, method, sigma_factor=independent)
+    error = found.row - row
+    print(f"seed {SEED}: bias {np.median(error):.2f} px, sigma {np.median(found.sigma_row):.2f} px")
+    assert abs(np.median(error)) < bias_px
+    assert np.mean(np.abs(error) < 2.0 * found.sigma_row) > 0.93
 
 
 @every_method
