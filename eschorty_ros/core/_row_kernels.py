@@ -158,8 +158,9 @@ def _variance(count, sum_d, sum_d2):
 def _uncut(mean, variance, count, sigma_max):
     """Centre and sigma of a Gaussian whose ``count`` events beyond 0 have this mean and variance.
 
-    Sigma is ``sigma_max`` unless the variance is below what that lets expect and the centre is
-    not at 0, where the two cannot be told apart; then both are fitted. The centre is not behind 0.
+    Sigma is ``sigma_max`` unless the variance is below what that lets expect and at most a third of
+    the line is cut away, beyond which the two are hard to tell apart; then both are fitted. The
+    centre is not behind 0.
     Returns also the part's variance over sigma squared, and what fitting sigma moved the centre
     by. A part that keeps 3 of its standard deviations from 0 is not cut.
     """
@@ -180,7 +181,7 @@ def _uncut(mean, variance, count, sigma_max):
         if step == _CUT_ITERATIONS:
             known = centre
             least = max(1.0 - np.sqrt(_SCATTER / count), 0.0)
-            fitted = centre > 0.0 and variance < least * ratio * sigma * sigma
+            fitted = centre > 0.5 * sigma and variance < least * ratio * sigma * sigma
             if not fitted:
                 break
         if fitted:
