@@ -4,14 +4,14 @@ Run: python benchmark/simulation.py [--seconds 0.5] [--repeats 3]
 One core; thread time, best of the repeats, the stage moving at 50 mm/s. Time grows with the events
 as the lit columns do; the first line, the whole sensor in the dark, is background activity alone.
 
-Measured on a shared 2-core 2.5 GHz machine: 5.3 to 5.8 Mev/s per core on the steps at 70 to 500 Hz
-(4.8 to 5.1 on surfaces that move within a lit phase), 3.6 at 1 kHz and 0.8 at 5 kHz. All 1280
-columns lit at 70 Hz run at 1.1 to 1.4 times real time. From 1 kHz on a pixel rarely sets out from
-rest when the light changes: the risk of its noise is summed up, not looked up, and begun anew at
-each edge. A lit pixel and edge cost 60 to 100 ns at any frequency, but at 5 kHz only one in 14
-makes an event; with 160 columns a quarter of the time goes into the edge as a whole. Behind a
-high-pass the risk is always summed up: 2.0 to 2.2 Mev/s at 70 and 500 Hz, as linear in the lit
-columns.
+Measured on shared 2-core machines on several days, 640 columns or more: 4.4 to 5.8 Mev/s per core
+on the steps at 70 to 500 Hz (4.3 to 5.1 on surfaces that move within a lit phase), 2.9 to 3.6 at
+1 kHz; 0.7 to 0.8 at 5 kHz. All 1280 columns lit at 70 Hz run at 1.0 to 1.4 times real time. From
+1 kHz on a pixel rarely sets out from rest when the light changes: the risk of its noise is summed
+up, not looked up, and begun anew at each edge. A lit pixel and edge cost 60 to 100 ns at any
+frequency, but at 5 kHz only one in 14 makes an event; with 160 columns a quarter of the time goes
+into the edge as a whole. Behind a high-pass the risk is always summed up: 1.8 to 2.2 Mev/s at 70
+and 500 Hz, as linear in the lit columns.
 """
 
 from __future__ import annotations

@@ -177,17 +177,13 @@ def test_simulate_then_reconstruct_without_ros(recording):
     assert 1e-4 < facts["sigma_median_m"] < 2e-3
 
 
-def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path):
-    from eschorty_ros.simulation.world import World
+@pytest.mark.parametrize("step", ["world.World.advance", "recorder.write_truth_csv"])
+def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step):
+    def interrupted(*_):
+        assert (tmp_path / "rec" / "events.raw").is_file()
+        raise KeyboardInterrupt
 
-    advance = World.advance
-
-    def interrupted(world, until_us):
-        if world.now_us > 0:
-            raise KeyboardInterrupt
-        return advance(world, until_us)
-
-    monkeypatch.setattr(World, "advance", interrupted)
+    monkeypatch.setattr(f"eschorty_ros.simulation.{step}", interrupted)
     result = run("simulate", "--stop", 18, "--out", tmp_path / "rec")
     assert result.exit_code == INTERRUPTED
     assert "Traceback" not in result.output

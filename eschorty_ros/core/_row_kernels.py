@@ -160,9 +160,8 @@ def _uncut(mean, variance, count, sigma_max):
 
     Sigma is ``sigma_max`` unless the variance is below what that lets expect and at most a third of
     the line is cut away, beyond which the two are hard to tell apart; then both are fitted. The
-    centre is not behind 0.
-    Returns also the part's variance over sigma squared, and what fitting sigma moved the centre
-    by. A part that keeps 3 of its standard deviations from 0 is not cut.
+    centre is not behind 0. Returns also the part's variance over sigma squared, and what fitting
+    sigma moved the centre by. A part that keeps 3 of its standard deviations from 0 is not cut.
     """
     if mean > 3.0 * np.sqrt(variance):
         return mean, np.sqrt(variance), 1.0, 0.0
@@ -180,7 +179,7 @@ def _uncut(mean, variance, count, sigma_max):
         centre = max(centre + (mean - centre - sigma * hazard) / ratio, 0.0)
         if step == _CUT_ITERATIONS:
             known = centre
-            least = max(1.0 - np.sqrt(_SCATTER / count), 0.0)
+            least = 1.0 - np.sqrt(_SCATTER / count)
             fitted = centre > 0.5 * sigma and variance < least * ratio * sigma * sigma
             if not fitted:
                 break

@@ -99,32 +99,33 @@ def simulate_recording(
     world.set_stage(MotionPlan(0, start_mm))
     world.set_stage(move, 0)
     folder = _folder(out_dir)
-    events = folder / EVENTS_FILE
-    writer = RawWriter(events, width=world.columns, height=world.rows)
-    with writer as raw, _removed_unless_whole(events):
-        while world.now_us < end_us:
-            raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
-            if progress is not None:
-                progress(world.now_us, end_us)
-    # One sample past the end: the last events must lie between two samples.
-    t_us = np.arange(0, end_us + 2 * _STAGE_STEP_US, _STAGE_STEP_US, dtype=np.int64)
-    write_stage_csv(folder / STAGE_FILE, t_us, move.state(t_us * 1000)[0])
-    write_laser_yaml(folder / LASER_FILE, wave)
-    save_calibration(calibration, folder / CALIBRATION_FILE)
-    truth = world.truth
-    write_truth_csv(folder / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
+    writer = RawWriter(folder / EVENTS_FILE, width=world.columns, height=world.rows)
+    with _whole_or_absent(folder):
+        with writer as raw:
+            while world.now_us < end_us:
+                raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
+                if progress is not None:
+                    progress(world.now_us, end_us)
+        # One sample past the end: the last events must lie between two samples.
+        t_us = np.arange(0, end_us + 2 * _STAGE_STEP_US, _STAGE_STEP_US, dtype=np.int64)
+        write_stage_csv(folder / STAGE_FILE, t_us, move.state(t_us * 1000)[0])
+        write_laser_yaml(folder / LASER_FILE, wave)
+        save_calibration(calibration, folder / CALIBRATION_FILE)
+        truth = world.truth
+        write_truth_csv(folder / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
     return load_recording(folder)
 
 
 @contextmanager
-def _removed_unless_whole(path: Path) -> Iterator[None]:
-    """Remove a file, and its folder when nothing else is in it, if the block is left early."""
+def _whole_or_absent(folder: Path) -> Iterator[None]:
+    """Remove a recording, and its folder when nothing else is in it, if the block is left early."""
     try:
         yield
     except BaseException:
         with suppress(OSError):
-            path.unlink()
-            path.parent.rmdir()
+            for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE, TRUTH_FILE):
+                (folder / name).unlink(missing_ok=True)
+            folder.rmdir()
         raise
 
 
