@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core._values import number
 
 _PPB = 1_000_000_000
 
@@ -44,9 +44,7 @@ class Imperfections:
             ("usb_jitter_ms", 0.0, 1000.0),
             ("missing_edges", 0.0, 1.0),
         ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ArgumentError(f"{name} is {value!r}; choose {low:g} to {high:g}")
+            number(name, getattr(self, name), low, high)
 
     @property
     def sensor_rate(self) -> Fraction:
