@@ -24,12 +24,13 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserReadback
 
 MAKE = "generator_double:GeneratorLaser"
+_INTERRUPTED = "the generator's settings: interrupted by switching off"
 
 
 class GeneratorLaser:
     """Driver: every operation is a number of transfers, ``disable`` waits for one at most.
 
-    With ``held``, reading back makes that file and then waits until it is interrupted.
+    With ``held``, reading back makes that file, then waits until switching off interrupts it.
     """
 
     def __init__(self, path: str, held: str = "", crash: str = "") -> None:
@@ -81,7 +82,7 @@ class GeneratorLaser:
         if self._crash:
             os._exit(7)
         if self._held:
-            self._hold()
+            self._wait_for_interruption()
         output = self._commands("READ", "READ")
         return LaserReadback(LaserOutput[output], self._modulation, None, 0)
 
@@ -90,18 +91,20 @@ class GeneratorLaser:
             self.disable()
         self._socket.close()
 
-    def _hold(self) -> None:
+    def _wait_for_interruption(self) -> None:
+        # Interrupted while it has the lock: once it is free, switching off may be over unseen.
         with self._lock:
             Path(self._held).touch()
             while not self._off_wanted:
                 time.sleep(0.002)
+            raise DeviceError(_INTERRUPTED)
 
     def _commands(self, *commands: str) -> str:
         answer = ""
         with self._lock:
             for command in commands:
                 if self._off_wanted:
-                    raise DeviceError("the generator's settings: interrupted by switching off")
+                    raise DeviceError(_INTERRUPTED)
                 answer = self._transfer(command)
         return answer
 

@@ -116,7 +116,9 @@ def test_opened_again_it_is_watched_once(keeper: LaserKeeper, laser: HeldLaser) 
     keeper.open(HeldLaser(), Modulation(70.0))
     laser.go.set()
 
-    def watching() -> list[str]:
-        return sorted(t.name for t in threading.enumerate() if t.name.startswith("laser "))
+    once = ["laser read-back", "laser watchdog"]
 
-    wait_until(lambda: watching() == ["laser read-back", "laser watchdog"], "the old one's end")
+    def watching() -> list[str]:
+        return sorted(thread.name for thread in threading.enumerate() if thread.name in once)
+
+    wait_until(lambda: watching() == once, "the old one's end")
