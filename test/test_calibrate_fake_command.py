@@ -13,7 +13,7 @@ import pytest
 from eschorty_ros.cli import INTERRUPTED
 from eschorty_ros.core.calibration import load_calibration
 
-pytest.importorskip("rclpy", reason="needs the package rclpy")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 ROOT = Path(__file__).resolve().parents[1]
 DEADLINE_S = 300

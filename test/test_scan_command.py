@@ -15,7 +15,7 @@ from eschorty_ros.cli import INTERRUPTED
 from eschorty_ros.core.cloud import read_cloud
 from eschorty_ros.report.accuracy import Sweep
 
-pytest.importorskip("rclpy", reason="needs the package rclpy")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 ROOT = Path(__file__).resolve().parents[1]
 DEADLINE_S = 300

@@ -155,6 +155,18 @@ def _variance(count, sum_d, sum_d2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _uncut_step(mean, centre, sigma):
+    """Newton's next centre, not behind 0, of a Gaussian whose part beyond 0 has this mean.
+
+    Returns also the part's variance over sigma squared.
+    """
+    alpha = -centre / sigma
+    hazard = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * alpha * alpha) / math.erfc(alpha / np.sqrt(2.0))
+    ratio = 1.0 + alpha * hazard - hazard * hazard
+    return max(centre + (mean - centre - sigma * hazard) / ratio, 0.0), ratio
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _uncut(mean, variance, count, sigma_max):
     """Centre and sigma of a Gaussian whose ``count`` events beyond 0 have this mean and variance.
 
@@ -165,26 +177,18 @@ def _uncut(mean, variance, count, sigma_max):
     """
     if mean > 3.0 * np.sqrt(variance):
         return mean, np.sqrt(variance), 1.0, 0.0
-    sigma = sigma_max
-    centre = mean
-    ratio = 1.0
     known = mean
-    fitted = False
-    for step in range(2 * _CUT_ITERATIONS):
-        alpha = -centre / sigma
-        hazard = (
-            np.sqrt(2.0 / np.pi) * np.exp(-0.5 * alpha * alpha) / math.erfc(alpha / np.sqrt(2.0))
-        )
-        ratio = 1.0 + alpha * hazard - hazard * hazard
-        centre = max(centre + (mean - centre - sigma * hazard) / ratio, 0.0)
-        if step == _CUT_ITERATIONS:
-            known = centre
-            least = 1.0 - np.sqrt(_SCATTER / count)
-            fitted = centre > 0.5 * sigma and variance < least * ratio * sigma * sigma
-            if not fitted:
-                break
-        if fitted:
-            sigma = min(np.sqrt(variance / ratio), sigma_max)
+    ratio = 1.0
+    for _ in range(_CUT_ITERATIONS):
+        known, ratio = _uncut_step(mean, known, sigma_max)
+    least = 1.0 - np.sqrt(_SCATTER / count)
+    if known <= 0.5 * sigma_max or variance >= least * ratio * sigma_max * sigma_max:
+        return known, sigma_max, ratio, 0.0
+    centre = known
+    sigma = sigma_max
+    for _ in range(_CUT_ITERATIONS):
+        sigma = min(np.sqrt(variance / ratio), sigma_max)
+        centre, ratio = _uncut_step(mean, centre, sigma)
     return centre, sigma, ratio, centre - known
 
 

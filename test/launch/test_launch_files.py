@@ -110,8 +110,8 @@ def test_every_node_a_launch_file_starts_is_a_module():
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_launch_loads_the_description(name):
-    pytest.importorskip("launch", reason="needs the package launch")
-    pytest.importorskip("launch_ros", reason="needs the package launch_ros")
+    pytest.importorskip("launch", reason="launch is not installed")
+    pytest.importorskip("launch_ros", reason="launch_ros is not installed")
     from launch.actions import DeclareLaunchArgument
     from launch_ros.actions import Node
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from benches import bench_here
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from camera_on_bench import StillBench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus

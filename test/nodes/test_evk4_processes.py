@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from event_camera_msgs.msg import EventPacket
 from evk4_bench import OnDemand

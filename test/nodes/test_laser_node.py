@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from awg_process import AwgProcess
 from eschorty_ros.msg import LaserState

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from awg_process import AwgProcess, awg_process
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from action_msgs.msg import GoalStatus
 from benches import bench_here

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy (ROS 2) is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_process import NodeProcess, Observer, processes, wait_until
