@@ -10,7 +10,6 @@ import contextlib
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +20,28 @@ from eschorty_ros.emulation.usb_server import UsbServer
 
 
 class AwgProcess:
-    """The running generator."""
+    """The running generator, until the end of a ``with``; it ends with the tests, too."""
 
     def __init__(self, folder: Path) -> None:
         self.log = folder / "generator.log"
-        self._held = contextlib.ExitStack()
-        path = self._held.enter_context(short_folder()) / "usb.sock"
-        self.backend = f"eschorty_ros.emulation.usb_remote:backend?{path}"
-        self._process = subprocess.Popen(
-            [sys.executable, __file__, str(path), str(self.log)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self._answer()
+        with contextlib.ExitStack() as held:
+            path = held.enter_context(short_folder()) / "usb.sock"
+            self.backend = f"eschorty_ros.emulation.usb_remote:backend?{path}"
+            self._process = subprocess.Popen(
+                [sys.executable, __file__, str(path), str(self.log)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            held.callback(self._end)
+            self._answer()
+            self._held = held.pop_all()
+
+    def __enter__(self) -> AwgProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
 
     def do(self, command: str) -> None:
         """Make the generator fail, or touch its panel; done when this returns."""
@@ -59,25 +66,14 @@ class AwgProcess:
             time.sleep(0.005)
         return (truth(self.log)[-1][0] - since_ns) * 1e-9
 
-    def close(self) -> None:
+    def _end(self) -> None:
         self._process.kill()
         self._process.communicate()
-        self._held.close()
 
     def _answer(self) -> None:
         assert self._process.stdout is not None
         answer = self._process.stdout.readline().strip()
         assert answer == "done", answer
-
-
-@contextlib.contextmanager
-def awg_process(folder: Path) -> Iterator[AwgProcess]:
-    """A generator of its own."""
-    made = AwgProcess(folder)
-    try:
-        yield made
-    finally:
-        made.close()
 
 
 def serve(path: str, log: str) -> None:

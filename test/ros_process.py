@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,12 +24,16 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from spinning import spinning
 from waiting import DEADLINE_S, wait_until
 
+from eschorty_ros.nodes.conversions import ns_from_stamp
 from eschorty_ros.nodes.dds import use_profile
 
 NAMESPACE = "/eschorty"
 _RESEND_S = 2.0
+# However the tests end, the kernel then ends the nodes, too; where util-linux is.
+_ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
 
 
 def ros_minus_steady_ns() -> int:
@@ -41,8 +45,15 @@ def ros_minus_steady_ns() -> int:
     return min(pairs)[1]
 
 
+def told_after(messages: list[Any], t_ns: int) -> bool:
+    """Whether the newest message is about a later time: what is on its way may be older news."""
+    return bool(messages) and ns_from_stamp(messages[-1].header.stamp) > t_ns
+
+
 class NodeProcess:
-    """One node running as a process of its own.
+    """One node running as a process of its own, until ``kill`` or the end of a ``with``.
+
+    Start it in the main thread: it ends with the thread that started it.
 
     Parameters
     ----------
@@ -67,7 +78,8 @@ class NodeProcess:
         self._log = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed in kill()
             prefix=f"{module.rsplit('.', 1)[-1]}_", suffix=".log"
         )
-        command = [sys.executable, "-m", module, "--ros-args", "-r", f"__ns:={namespace}"]
+        command = [*_ENDING_WITH_PARENT, sys.executable, "-m", module]
+        command += ["--ros-args", "-r", f"__ns:={namespace}"]
         for name, value in (parameters or {}).items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ["-p", f"{name}:={text}"]
@@ -78,6 +90,12 @@ class NodeProcess:
             env=domain_environment(domain),
             start_new_session=True,
         )
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
 
     @property
     def pid(self) -> int:
@@ -153,28 +171,22 @@ class Observer:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         use_profile()
         self.domain = domain
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self.node = Node(name, namespace=namespace, context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
+        context = rclpy.Context()
+        with contextlib.ExitStack() as held:
+            rclpy.init(context=context, domain_id=domain)
+            held.callback(context.try_shutdown)
+            self.node = Node(name, namespace=namespace, context=context)
+            held.callback(self.node.destroy_node)
+            self._executor = SingleThreadedExecutor(context=context)
+            self._executor.add_node(self.node)
+            held.enter_context(spinning(self._executor))
+            self._held = held.pop_all()
 
     def __enter__(self) -> Observer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._closing.set()
-        self._thread.join()
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
-    def _spin(self) -> None:
-        while not self._closing.is_set():
-            self._executor.spin_once(timeout_sec=0.05)
+        self._held.close()
 
     def collect(self, message_type: Any, topic: str, profile: QoSProfile) -> list[Any]:
         """A list that grows by every message of ``topic`` from now on."""

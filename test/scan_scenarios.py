@@ -15,7 +15,7 @@ from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
-from ros_process import Observer, ros_minus_steady_ns, wait_until
+from ros_process import Observer, ros_minus_steady_ns, told_after, wait_until
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.calibration import load_calibration
@@ -87,8 +87,9 @@ class Bench:
 
     def start(self, **goal: float) -> Any:
         """Send a goal; the accepted handle."""
-        wait_until(self._action.server_is_ready, "the scan action", SCAN_DEADLINE_S)
+        # First: the action of a scanner that has just ended may still be there.
         self.observer.wait_for_answers("scanner", SCAN_DEADLINE_S)
+        wait_until(self._action.server_is_ready, "the scan action", SCAN_DEADLINE_S)
         # A list of its own: feedback of the goal before may still come.
         feedback = self.feedback = []
         values = {"start": START_M, "stop": STOP_M, "speed": SPEED_M_S, "frequency": FREQUENCY_HZ}
@@ -161,11 +162,6 @@ class Bench:
         assert self.laser[-1].output == LaserState.OUTPUT_OFF
         wait_until(lambda: told_after(self.odometry, now_ns), "new odometry")
         assert self.odometry[-1].twist.twist.linear.y == 0.0
-
-
-def told_after(messages: list[Any], t_ns: int) -> bool:
-    """Whether the newest message is about a later time: what is on its way may be older news."""
-    return bool(messages) and ns_from_stamp(messages[-1].header.stamp) > t_ns
 
 
 @contextlib.contextmanager

@@ -18,10 +18,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from awg_process import AwgProcess, awg_process
+from awg_process import AwgProcess
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
-from ros_process import NodeProcess, Observer, wait_until
+from ros_process import NodeProcess, Observer, told_after, wait_until
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -31,19 +31,26 @@ from eschorty_ros.nodes.domain import free_domain
 OFF_LIMIT_S = 0.25
 TEST_FOLDER = str(Path(__file__).parents[1])
 BEATING = ("laser", "camera", "stage")
+WAYS_TO_ACTIVE = {"unconfigured": "configure", "inactive": "activate"}
 # Whatever goes wrong here has to be noticed at once, without any of them; and none of them may
 # end the light when a loaded machine lets the stand-ins wait.
 TIMEOUTS = {f"{name}_timeout": 60.0 for name in ("heartbeat", "camera", "stage")}
 
 
 class Bench:
-    """Generator, laser node and whoever has to be alive, each a process."""
+    """Generator, laser node and whoever has to be alive, each a process that ``held`` ends."""
 
-    def __init__(self, folder: Path, stand_ins: tuple[str, ...], **parameters: Any) -> None:
+    def __init__(
+        self,
+        held: contextlib.ExitStack,
+        folder: Path,
+        stand_ins: tuple[str, ...],
+        **parameters: Any,
+    ) -> None:
         self._stand_ins = stand_ins
-        self._held = contextlib.ExitStack()
-        self.awg: AwgProcess = self._held.enter_context(awg_process(folder))
-        self.observer = self._held.enter_context(Observer(free_domain(), "safety_observer"))
+        self._held = held
+        self.awg = held.enter_context(AwgProcess(folder))
+        self.observer = held.enter_context(Observer(free_domain(), "safety_observer"))
         self.node = self._process(
             "breakable_laser",
             {"driver": "awg", "backend": self.awg.backend, **TIMEOUTS, **parameters},
@@ -58,7 +65,11 @@ class Bench:
         self.interlock = self.observer.publisher(Bool, "laser/interlock", qos.stream(10))
 
     def _process(self, module: str, parameters: dict[str, Any]) -> NodeProcess:
-        return NodeProcess(module, parameters, domain=self.observer.domain)
+        process = self._held.enter_context(
+            NodeProcess(module, parameters, domain=self.observer.domain)
+        )
+        self._held.callback(lambda: print(f"--- {process.module}\n{process.output}"))
+        return process
 
     def revive(self) -> None:
         """Start the stand-ins that do not run."""
@@ -72,7 +83,6 @@ class Bench:
         process = self.beating.pop(name)
         sent_ns = time.monotonic_ns()
         process.send(number)
-        self._held.callback(process.kill)
         return sent_ns
 
     def arm(self) -> Any:
@@ -82,32 +92,43 @@ class Bench:
         return self.observer.call(SetBool, "laser/enable", SetBool.Request(data=on))
 
     def light(self) -> None:
-        """Switch on, with everybody there."""
+        """Switch on, with everybody there, from whatever state the node is in; told on return."""
         self.revive()
-        if self.observer.lifecycle_state("laser") == "unconfigured":
-            self.observer.change_state("laser", "configure")
-            self.observer.change_state("laser", "activate")
-        self.observer.wait_for_state("laser", "active")
 
         def lit() -> bool:
+            state = self.observer.lifecycle_state("laser")
+            if state in WAYS_TO_ACTIVE:
+                # A guard that is about to end may still hold the generator.
+                self.observer.change_state("laser", WAYS_TO_ACTIVE[state])
+            if state != "active":
+                return False
             answers = self.arm(), self.enable()
             print("light:", *(answer.message for answer in answers))
             return all(answer.success for answer in answers)
 
         wait_until(lit, "light", poll_s=0.2)
+        self.wait_for_told(LaserState.OUTPUT_ON)
         time.sleep(0.3)
         assert self.awg.lit()
+
+    def wait_for_told(self, output: int, *, interlock_open: bool = False) -> None:
+        """Wait until a state from after now tells that this was asked for, and is so."""
+        now_ns = time.time_ns()
+
+        def told() -> bool:
+            state = self.states[-1]
+            return (
+                told_after([state], now_ns)
+                and state.requested == state.output == output
+                and state.interlock_open == interlock_open
+            )
+
+        wait_until(lambda: self.states and told(), f"output {output} in laser/state")
 
     def dark_after(self, cause: str, since_ns: int) -> None:
         took_s = self.awg.off_after_s(since_ns)
         print(f"{cause}: dark after {took_s * 1e3:.1f} ms")
         assert 0.0 < took_s < OFF_LIMIT_S
-
-    def close(self) -> None:
-        for process in (*self.beating.values(), self.node):
-            print(f"--- {process.module}\n{process.output}")
-            process.kill()
-        self._held.close()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -122,11 +143,8 @@ def importable() -> Iterator[None]:
 def running(
     folder: Path, stand_ins: tuple[str, ...] = (" ".join(BEATING),), **parameters: Any
 ) -> Iterator[Bench]:
-    made = Bench(folder, stand_ins, **parameters)
-    try:
-        yield made
-    finally:
-        made.close()
+    with contextlib.ExitStack() as held:
+        yield Bench(held, folder, stand_ins, **parameters)
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +189,7 @@ def test_laser_node_is_stopped(lit: Bench) -> None:
     lit.node.send(signal.SIGSTOP)
     lit.dark_after("SIGSTOP", sent_ns)
     lit.node.send(signal.SIGCONT)
-    wait_until(lambda: lit.states[-1].output == LaserState.OUTPUT_OFF, "off in laser/state")
+    lit.wait_for_told(LaserState.OUTPUT_OFF)
     assert "not armed" in lit.enable().message
 
 
@@ -203,7 +221,7 @@ def test_interlock(lit: Bench) -> None:
     lit.dark_after("interlock", sent_ns)
     assert "interlock open" in lit.arm().message
     lit.interlock.publish(Bool(data=False))
-    wait_until(lambda: not lit.states[-1].interlock_open, "the interlock closed")
+    lit.wait_for_told(LaserState.OUTPUT_OFF)
     lit.light()
 
 
@@ -231,6 +249,8 @@ def test_fault_u8_panel_touched_while_lit(lit: Bench) -> None:
     lit.awg.do("touch BASE:FREQuency 90")
     wait_until(lambda: not lit.awg.lit(), "dark")
     wait_until(lambda: "90" in lit.states[-1].reason, "the reason in laser/state")
+    # The fault that it ends with, lest it meets the next light.
+    lit.observer.wait_for_state("laser", "unconfigured")
 
 
 def test_fault_u9_generator_restarted(lit: Bench) -> None:
@@ -264,7 +284,9 @@ def test_interlock_that_is_required_is_open_unless_it_says_closed(tmp_path: Path
 def _child(pid: int, module: str) -> int:
     """Process started by any thread of ``pid`` that runs ``module``."""
     for task in Path(f"/proc/{pid}/task").iterdir():
-        for number in (task / "children").read_text().split():
-            if module in Path(f"/proc/{number}/cmdline").read_text():
-                return int(number)
+        # A thread or a child may end meanwhile.
+        with contextlib.suppress(OSError):
+            for number in (task / "children").read_text().split():
+                if module in Path(f"/proc/{number}/cmdline").read_text():
+                    return int(number)
     raise AssertionError(f"no process of {module}")
