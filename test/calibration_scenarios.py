@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from eschorty_ros.action import Calibrate
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
 from rclpy.action import ActionClient
-from ros_process import Observer, wait_until
+from ros_process import Observer, told_after, wait_until
 from scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
 from std_msgs.msg import Bool
 
@@ -65,8 +66,9 @@ class CalibrationBench(Bench):
 
     def begin(self, **goal: Any) -> Any:
         """Send a goal with the posts of the bench unless others are given; the handle."""
-        wait_until(self._calibrate.server_is_ready, "the calibrate action", SCAN_DEADLINE_S)
+        # First, as in ``start``.
         self.observer.wait_for_answers("reconstruction", SCAN_DEADLINE_S)
+        wait_until(self._calibrate.server_is_ready, "the calibrate action", SCAN_DEADLINE_S)
         # A list of its own: feedback of the goal before may still come.
         seen = self.seen = []
         values = {
@@ -195,7 +197,13 @@ def nine_posts(bench: CalibrationBench, method: str) -> None:
     assert bench.newest.file == result.file
     table = dict(zip(bench.newest.parameters, bench.newest.values, strict=True))
     assert table["b_prime_px"] == made.b_prime_px
-    assert any(f.matched == len(POSTS) and len(f.residuals) == len(POSTS) for f in bench.seen)
+    # The last feedback may come after the result.
+    wait_until(
+        lambda: any(
+            f.matched == len(POSTS) and len(f.residuals) == len(POSTS) for f in list(bench.seen)
+        ),
+        "feedback of every post",
+    )
     bench.assert_dark_and_at_rest()
 
 
@@ -274,7 +282,11 @@ def useless_captures(bench: CalibrationBench) -> None:
         interlock.publish(Bool(data=True))
         status, result = bench.end()
         interlock.publish(Bool(data=False))
-        wait_until(lambda: not bench.laser[-1].interlock_open, "the interlock closed")
+        said_ns = time.time_ns()
+        wait_until(
+            lambda: told_after(bench.laser, said_ns) and not bench.laser[-1].interlock_open,
+            "the interlock closed",
+        )
         assert status == GoalStatus.STATUS_ABORTED
         assert "laser: went off: interlock open" in result.message, result.message
         bench.assert_dark_and_at_rest()
