@@ -30,6 +30,7 @@ from eschorty_ros.nodes import (
     scanner,
     stage,
 )
+from eschorty_ros.nodes.domain import free_domain
 from eschorty_ros.nodes.lifecycle import AUTO_START
 from eschorty_ros.nodes.parameters import Param, from_settings
 
@@ -103,7 +104,7 @@ def every_node() -> Iterator[list[Node]]:
     """All nodes at rest, without devices."""
     options = ("-r", f"__ns:={NAMESPACE}", "--log-level", "error")
     given = ("-p", "auto_start:=false", "-p", "recording:=none")
-    rclpy.init(args=["--ros-args", *options, *given])
+    rclpy.init(args=["--ros-args", *options, *given], domain_id=free_domain())
     nodes: list[Node] = []
     try:
         nodes += [camera.CameraNode(), laser.LaserNode(), stage.StageNode()]

@@ -14,6 +14,7 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from ros_process import Observer, wait_until
+from spinning import spinning
 
 from eschorty_ros.core.errors import ArgumentError, DeviceError
 from eschorty_ros.nodes import diagnostics, lifecycle, qos
@@ -67,18 +68,15 @@ def run(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=observer.domain)
     executor = SingleThreadedExecutor(context=context)
-    thread = threading.Thread(target=executor.spin, daemon=True)
     nodes: list[Instrument] = []
 
     def start(*answers: Exception | None) -> Instrument:
         nodes.append(Instrument(Device(*answers), context=context))
         executor.add_node(nodes[0])
-        thread.start()
         return nodes[0]
 
-    yield start
-    executor.shutdown()
-    thread.join()
+    with spinning(executor):
+        yield start
     for node in nodes:
         node.destroy_node()
     context.try_shutdown()

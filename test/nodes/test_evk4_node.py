@@ -3,7 +3,6 @@
 # ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +20,7 @@ from evk4_bench import OnDemand, plug
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from ros_process import Observer, wait_until
+from spinning import spinning
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -83,7 +83,6 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     with Observer(free_domain(), "evk4_observer") as observer:
         rclpy.init(context=context, domain_id=observer.domain)
         executor = SingleThreadedExecutor(context=context)
-        thread = threading.Thread(target=executor.spin, daemon=True)
         nodes: list[CameraNode] = []
 
         def begin(plugged: bool = True, model: Evk4Model | None = None, **parameters: Any) -> Run:
@@ -99,15 +98,12 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             nodes.append(node)
             run = Run(observer, node, source, model)
             executor.add_node(node)
-            thread.start()
             return run
 
-        yield begin
-        for node in nodes:
-            node.safe_state()
-        executor.shutdown()
-        if nodes:
-            thread.join()
+        with spinning(executor):
+            yield begin
+            for node in nodes:
+                node.safe_state()
         for node in nodes:
             node.destroy_node()
         context.try_shutdown()
@@ -128,7 +124,8 @@ def test_events_stream_with_arrival_stamps(start: Start) -> None:
 
 
 def test_unplugged_camera_is_told_at_once_and_the_stream_restarts_at_zero(start: Start) -> None:
-    run = start().active()
+    # Looked for until it is back, however late that is.
+    run = start(reconnect_attempts=1000).active()
     run.packets_from(4)
     run.model.gone = True
     run.status(

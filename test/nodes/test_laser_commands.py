@@ -15,6 +15,7 @@ from held_laser import HeldLaser
 from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor
 from ros_process import NAMESPACE, Observer, wait_until
+from spinning import spinning
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from waiting import DEADLINE_S
@@ -36,20 +37,18 @@ def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldL
     held = HeldLaser()
     monkeypatch.setattr(drivers, "make", lambda *_: held)
     context = Context()
-    rclpy.init(args=["--ros-args", "-p", "watch:=none", "-p", "heartbeat_timeout:=60.0"],
-               context=context, domain_id=observer.domain)  # fmt: skip
+    # One beat and one arming have to last, whatever holds this process up.
+    given = ("-p", "watch:=none", "-p", "heartbeat_timeout:=60.0", "-p", "arm_timeout:=3600.0")
+    rclpy.init(args=["--ros-args", *given], context=context, domain_id=observer.domain)
     node = LaserNode(context=context, namespace=NAMESPACE)
     executor = MultiThreadedExecutor(THREADS, context=context)
     executor.add_node(node)
-    spinning = threading.Thread(target=executor.spin, daemon=True)
-    spinning.start()
-    yield held
-    held.go.set()
-    executor.shutdown(1.0)
+    with spinning(executor):
+        yield held
+        held.go.set()
     node.safe_state()
     node.destroy_node()
     context.try_shutdown()
-    spinning.join(DEADLINE_S)
 
 
 def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser: HeldLaser) -> None:
