@@ -4,9 +4,12 @@ Not through launch_testing's pytest plugin: it coordinates no ROS domains and fo
 releases late.
 """
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -18,21 +21,43 @@ TESTS = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize("name", ["scan", "calibration"])
-def test_scenarios_under_launch(name):
+def test_scenarios_under_launch(name, tmp_path):
     search = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "launch_testing.launch_test",
-            str(TESTS / "launch" / f"{name}_scenarios_launch.py"),
-        ],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(search)},
-        capture_output=True,
-        text=True,
-        timeout=540.0,
-        check=False,
-    )
-    print(done.stdout[-12_000:], done.stderr[-4_000:])
-    assert done.returncode == 0
-    assert "Ran 5 tests" in done.stdout + done.stderr
+    said = tmp_path / "said.log"
+    with (
+        said.open("w") as log,
+        subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "launch_testing.launch_test",
+                str(TESTS / "launch" / f"{name}_scenarios_launch.py"),
+            ],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(search)},
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        ) as process,
+    ):
+        try:
+            process.wait(540.0)
+        finally:
+            end_group(process)
+            print(said.read_text(errors="replace")[-16_000:])
+    assert process.returncode == 0
+    assert "Ran 5 tests" in said.read_text(errors="replace")
+
+
+def end_group(process):
+    """End what the command has left running, and the command itself when it is late.
+
+    A killed node would leave its shared memory.
+    """
+    with contextlib.suppress(ProcessLookupError):
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            os.killpg(process.pid, number)
+            end_s = time.monotonic() + 20.0
+            while time.monotonic() < end_s:
+                process.poll()
+                os.killpg(process.pid, 0)
+                time.sleep(0.1)

@@ -37,12 +37,14 @@ def live(tmp_path_factory):
         seed=4,
     )
     domain = free_domain()
-    node = NodeProcess(
-        "eschorty_ros.nodes.reconstruction",
-        {"stage_gap": 0.0, RELIABLE: "reliable"},
-        domain=domain,
-    )
-    with Observer(domain) as observer:
+    with (
+        NodeProcess(
+            "eschorty_ros.nodes.reconstruction",
+            {"stage_gap": 0.0, RELIABLE: "reliable"},
+            domain=domain,
+        ) as node,
+        Observer(domain) as observer,
+    ):
         topics = {
             name: observer.collect(kind, name, profile)
             for name, kind, profile in (
@@ -57,21 +59,19 @@ def live(tmp_path_factory):
             )
         }
         wait_until(lambda: topics["reconstruction/state"], "the node's state")
-        replay = NodeProcess(
+        with NodeProcess(
             "eschorty_ros.nodes.replay",
             {"recording": recording.path, "timeout": DEADLINE_S},
             domain=domain,
-        )
-        try:
-            assert replay.wait() == 0, replay.output
-            wait_until(lambda: topics["scan/points"], "scan/points")
-            seen = len(topics["/diagnostics"])
-            wait_until(lambda: len(topics["/diagnostics"]) > seen, "diagnostics")
-            yield observer, topics
-        finally:
-            print(node.output, replay.output)
-            replay.kill()
-            node.kill()
+        ) as replay:
+            try:
+                assert replay.wait() == 0, replay.output
+                wait_until(lambda: topics["scan/points"], "scan/points")
+                seen = len(topics["/diagnostics"])
+                wait_until(lambda: len(topics["/diagnostics"]) > seen, "diagnostics")
+                yield observer, topics
+            finally:
+                print(node.output, replay.output)
 
 
 def test_each_profile_is_one_period_in_the_moving_frame(live):

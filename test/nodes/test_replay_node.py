@@ -43,22 +43,24 @@ def test_nodes_and_function_give_identical_points(recording, rate):
         "stage_gap": 0.0,
         EVENTS: "reliable",
     }
-    reconstruction = NodeProcess("eschorty_ros.nodes.reconstruction", parameters, domain=domain)
-    replay = NodeProcess(
-        "eschorty_ros.nodes.replay",
-        {"recording": recording.path, "rate": rate, "timeout": DEADLINE_S},
-        domain=domain,
-    )
-    try:
-        with Observer(domain) as observer:
+    with (
+        NodeProcess(
+            "eschorty_ros.nodes.reconstruction", parameters, domain=domain
+        ) as reconstruction,
+        NodeProcess(
+            "eschorty_ros.nodes.replay",
+            {"recording": recording.path, "rate": rate, "timeout": DEADLINE_S},
+            domain=domain,
+        ) as replay,
+        Observer(domain) as observer,
+    ):
+        try:
             clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
             assert replay.wait() == 0, replay.output
             wait_until(lambda: clouds, "scan/points")
             points = points_from_message(clouds[0])
-    finally:
-        print(reconstruction.output, replay.output)
-        replay.kill()
-        reconstruction.kill()
+        finally:
+            print(reconstruction.output, replay.output)
     assert len(points) == len(expected)
     for name in ("x", "y", "z", "intensity", "sigma", "column"):
         np.testing.assert_array_equal(points[name], expected[name], err_msg=name)
@@ -67,13 +69,10 @@ def test_nodes_and_function_give_identical_points(recording, rate):
 
 
 def test_missing_recording_is_one_line(tmp_path):
-    replay = NodeProcess(
+    with NodeProcess(
         "eschorty_ros.nodes.replay", {"recording": tmp_path / "none"}, domain=free_domain()
-    )
-    try:
+    ) as replay:
         assert replay.wait() == 1
         lines = [line for line in replay.output.splitlines() if line.strip()]
         assert len(lines) == 1, replay.output
         assert "none" in lines[0]
-    finally:
-        replay.kill()

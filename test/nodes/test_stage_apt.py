@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import statistics
 import time
@@ -49,13 +50,16 @@ def observer() -> Iterator[Observer]:
 def test_moves_with_odometry_on_the_true_motion(
     port: str, model: AptModel, observer: Observer
 ) -> None:
-    process = NodeProcess(
-        "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
-    )
-    odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
-    triggers = observer.collect(PositionTrigger, "stage/trigger", qos.latched())
-    client = ActionClient(observer.node, MoveStage, "stage/move")
-    try:
+    with (
+        NodeProcess(
+            "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
+        ) as process,
+        contextlib.ExitStack() as held,
+    ):
+        odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
+        triggers = observer.collect(PositionTrigger, "stage/trigger", qos.latched())
+        client = ActionClient(observer.node, MoveStage, "stage/move")
+        held.callback(client.destroy)
         observer.wait_for_state("stage", "active")
         wait_until(client.server_is_ready, "stage/move")
         wait_until(lambda: triggers, "the trigger")
@@ -81,18 +85,14 @@ def test_moves_with_odometry_on_the_true_motion(
         assert off_mm < 0.1
         assert process.interrupt() == 0
         assert "Traceback" not in process.output
-    finally:
-        client.destroy()
-        process.kill()
 
 
 def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Observer) -> None:
     """driver: the node leaves the active state; user reads: stage lost: the stage's port failed."""
-    process = NodeProcess(
+    with NodeProcess(
         "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
-    )
-    told = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
-    try:
+    ) as process:
+        told = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
         observer.wait_for_state("stage", "active")
         model.gone = True
         wait_until(lambda: "stage lost: the stage's port failed" in process.output, "the log")
@@ -101,24 +101,22 @@ def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Ob
         )
         assert process.interrupt() == 0
         assert "Traceback" not in process.output
-    finally:
-        process.kill()
 
 
 def test_fault_x3_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
     """driver: stops the carriage, closes the port, within 2 s; user reads: nothing; exit code 0."""
     model = AptModel(time.time_ns, power_up_mm=150.0)
-    with PtyPort(model, tmp_path / "stage") as _:
-        process = NodeProcess(
+    with (
+        PtyPort(model, tmp_path / "stage"),
+        NodeProcess(
             "eschorty_ros.nodes.stage",
             {**SETTINGS, "homing_speed": 0.01, "port": str(tmp_path / "stage")},
             domain=observer.domain,
-        )
-        try:
-            wait_until(lambda: model.axis.moving(time.time_ns()), "homing")
-            assert process.interrupt() == 0
-            assert "Traceback" not in process.output
-            assert not model.axis.moving(time.time_ns())
-            assert 1.0 < model.axis.position_mm(time.time_ns()) < 150.0
-        finally:
-            process.kill()
+        ) as process,
+    ):
+        wait_until(lambda: model.axis.moving(time.time_ns()), "homing")
+        assert process.interrupt() == 0
+        assert "Traceback" not in process.output
+        # What the process said last may still be on the line.
+        wait_until(lambda: not model.axis.moving(time.time_ns()), "rest")
+        assert 1.0 < model.axis.position_mm(time.time_ns()) < 150.0

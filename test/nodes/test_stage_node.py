@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,14 +30,19 @@ SLOW_M_S = 0.01
 
 
 class Stage:
-    """A stage node and a client of it."""
+    """A stage node and a client of it; ``held`` ends both."""
 
-    def __init__(self, domain: int, observer: Observer, emulated: Bench, folder: Path) -> None:
+    def __init__(
+        self, held: contextlib.ExitStack, observer: Observer, emulated: Bench, folder: Path
+    ) -> None:
         self.emulated = emulated
-        self.process = NodeProcess("eschorty_ros.nodes.stage", {"bench": folder}, domain=domain)
+        self.process = held.enter_context(
+            NodeProcess("eschorty_ros.nodes.stage", {"bench": folder}, domain=observer.domain)
+        )
         self.odometry = observer.collect(Odometry, "stage/odom", qos.stream())
         self.observer = observer
         self._client = ActionClient(observer.node, MoveStage, "stage/move")
+        held.callback(self._client.destroy)
         observer.wait_for_state("stage", "active")
         wait_until(self._client.server_is_ready, "stage/move")
         wait_until(lambda: self.odometry, "odometry")
@@ -60,21 +66,15 @@ class Stage:
     def move(self, position: float, speed: float) -> Any:
         return self.finish(self.start(position, speed))
 
-    def close(self) -> None:
-        self._client.destroy()
-        self.process.kill()
-
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    domain = free_domain()
     with (
         bench_here() as (emulated, folder),
-        Observer(domain, "stage_observer") as observer,
+        Observer(free_domain(), "stage_observer") as observer,
+        contextlib.ExitStack() as held,
     ):
-        stage = Stage(domain, observer, emulated, folder)
-        yield stage
-        stage.close()
+        yield Stage(held, observer, emulated, folder)
 
 
 def test_activate_homes(stage: Stage) -> None:
