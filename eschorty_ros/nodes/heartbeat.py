@@ -9,12 +9,16 @@ from collections.abc import Callable
 from rclpy.node import Node
 from std_msgs.msg import Header
 
+from eschorty_ros.hardware.own_pauses import OwnPauses
 from eschorty_ros.nodes import qos
 from eschorty_ros.nodes.peer import own_sign
 
 PERIOD_S = 0.1
 LOOK_S = 0.02
 LAST_BEATS = 3
+# No device is called late for less, and each is heard of again within so many looks after it.
+PAUSE_S = 0.3
+RECOVERY_LOOKS = 10
 
 
 class Heartbeat:
@@ -22,7 +26,8 @@ class Heartbeat:
 
     The header's ``frame_id`` says which process beats (see ``peer``), so that a laser node on the
     same host sees it die; the last beats say that they are the last. In a thread of its own, so
-    that a busy executor does not look like a dead device; it ends with the node's context.
+    that a busy executor does not look like a dead device; it ends with the node's context. After a
+    pause of the process itself the device gets 0.2 s to be heard of again.
 
     Parameters
     ----------
@@ -48,9 +53,14 @@ class Heartbeat:
     def _run(self) -> None:
         pause = threading.Event()
         last_beats = 0
+        recovering = 0
         beat_s = 0.0
+        own_pauses = OwnPauses(LOOK_S)
         while not pause.wait(LOOK_S) and self._node.context.ok():
+            paused = own_pauses.look() > PAUSE_S
+            recovering = RECOVERY_LOOKS if paused else max(recovering - 1, 0)
             healthy, now_s = self._asked(), time.monotonic()
+            healthy |= self.beating and recovering > 0
             if healthy:
                 last_beats = LAST_BEATS
             due = healthy != self.beating or now_s - beat_s >= PERIOD_S

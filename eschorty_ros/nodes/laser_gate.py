@@ -102,6 +102,12 @@ class LaserGate:
             self.gap_max_s[topic] = max(gap_s, self.gap_max_s.get(topic, 0.0))
         self._beat_s[topic] = now_s
 
+    def forgive(self, pause_s: float) -> None:
+        """Let no beat age by a time in which this process itself stood still."""
+        now_s = self._now_s()
+        for topic, beat_s in list(self._beat_s.items()):
+            self._beat_s[topic] = min(beat_s + pause_s, now_s)
+
     def switched_on(self) -> None:
         """Note that the output has been switched on; asked again while on, its time runs on."""
         if self._on_s is None:

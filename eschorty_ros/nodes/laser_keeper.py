@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.own_pauses import OwnPauses
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput, LaserReadback
 from eschorty_ros.nodes.laser_gate import LaserGate
 from eschorty_ros.nodes.laser_readback import LaserRecord, LaserSnapshot
@@ -67,6 +68,7 @@ class LaserKeeper:
         # Counts switching off; what was asked for before it must not end in light.
         self._offs = 0
         self._lookouts: list[Lookout] = []
+        self._pauses = OwnPauses(WATCH_PERIOD_S)
         self.switch_offs = 0
 
     @property
@@ -91,6 +93,7 @@ class LaserKeeper:
         told = laser.readback()
         self._refuse_difference(told)
         self._hear(told)
+        self._pauses = OwnPauses(WATCH_PERIOD_S)
         self._lookouts = [
             Lookout("laser watchdog", self._watch, WATCH_PERIOD_S, self._blind),
             Lookout("laser read-back", self._read, self._readback_period_s, self._blind),
@@ -127,8 +130,7 @@ class LaserKeeper:
                 self._refuse_difference(told)
             except EschortyError as error:
                 self._record.asked = before
-                if self._record.requested is LaserOutput.ON:
-                    self.switch_off(str(error))
+                self._end_light(error)
                 raise
             self._hear(told)
 
@@ -160,8 +162,7 @@ class LaserKeeper:
                 told = laser.readback()
                 self._refuse_difference(told)
             except EschortyError as error:
-                if self._record.requested is LaserOutput.ON:
-                    self.switch_off(str(error))
+                self._end_light(error)
                 raise
             with self._lock:
                 if self._record.requested is not LaserOutput.ON:
@@ -236,6 +237,12 @@ class LaserKeeper:
         if offs != self._offs:
             raise DeviceError(f"laser refused: {self._record.reason}")
 
+    def _end_light(self, error: EschortyError) -> None:
+        """Switch off after a command that failed, unless somebody's switching off made it fail."""
+        with self._lock:
+            if self._record.requested is LaserOutput.ON:
+                self.switch_off(str(error))
+
     def _hear(self, told: LaserReadback) -> None:
         """Note what the generator says."""
         for text in self._record.hear(told):
@@ -262,8 +269,11 @@ class LaserKeeper:
         self._alarm(f"laser: watching it failed: {error!r}")
 
     def _watch(self) -> None:
+        pause_s = self._pauses.look()
         # Under the lock: somebody may be switching off already.
         with self._lock:
+            if pause_s:
+                self.gate.forgive(pause_s)
             reason = self.gate.must_end()
             if reason is None and not self._living() and self._record.requested is LaserOutput.ON:
                 reason = "the node is shutting down"
@@ -285,8 +295,8 @@ class LaserKeeper:
                 return
             self._hear(told)
             wrong = self._record.calls_for_darkness(told)
-        if wrong:
-            self.darken(wrong)
+            if wrong:
+                self.darken(wrong)
 
     def _lost(self, generation: int, error: EschortyError) -> None:
         """Give the laser up unless switching off is what interrupted the read-back."""

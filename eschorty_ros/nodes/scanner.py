@@ -184,7 +184,8 @@ class ScannerNode(Node):
                 feedback.points = max(state.points - points_before, 0)
                 feedback.profiles = max(state.profiles - profiles_before, 0)
                 feedback.events_per_second = state.events_per_second
-            goal.publish_feedback(feedback)
+            with unless_shut_down(self):
+                goal.publish_feedback(feedback)
 
         return send
 

@@ -194,12 +194,12 @@ class StageNode(DeviceNode):
                 raise DeviceError("move interrupted by shutdown")
             if time.monotonic() - feedback_s >= FEEDBACK_PERIOD_S:
                 feedback_s = time.monotonic()
-                goal.publish_feedback(
-                    MoveStage.Feedback(
-                        position=m_from_mm(state.position_mm),
-                        velocity=m_from_mm(state.velocity_mm_s),
-                    )
+                feedback = MoveStage.Feedback(
+                    position=m_from_mm(state.position_mm),
+                    velocity=m_from_mm(state.velocity_mm_s),
                 )
+                with unless_shut_down(self):
+                    goal.publish_feedback(feedback)
             time.sleep(POLL_S)
 
     def _aborted(self, goal: Any, reason: str) -> MoveStage.Result:

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -19,6 +20,8 @@ from generator_double import MAKE, Generator
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware import own_pauses
+from eschorty_ros.hardware.laser import guard, guard_wire
 from eschorty_ros.hardware.laser.guarded import GuardedLaser
 from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.protocols import LaserOutput
@@ -294,6 +297,52 @@ def test_closing_when_the_guard_has_just_died_is_dark(device: Generator, number:
     with contextlib.suppress(DeviceError):
         laser.close()
     assert not device.lit()
+
+
+class Hours:
+    """A steady clock that the guard reads and the test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = time.monotonic()
+        self.looks = 0
+
+    def monotonic(self) -> float:
+        self.looks += 1
+        return self.now_s
+
+    def pass_by(self, seconds: float) -> None:
+        """Let the time pass at once, and the guard look at it twice."""
+        self.now_s += seconds
+        seen = self.looks
+        # A turn of the guard reads the clock three times at most.
+        _wait_until(lambda: self.looks > seen + 6)
+
+
+def test_a_guard_that_stood_still_itself_calls_nobody_silent(
+    device: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hours = Hours()
+    monkeypatch.setattr(guard, "time", hours)
+    monkeypatch.setattr(own_pauses, "time", hours)
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    wire = guard_wire.Wire(here)
+    serving = threading.Thread(target=guard.Guard(guard_wire.Wire(there), os.getpid()).run)
+    serving.start()
+    try:
+        wire.send({"id": 0, "do": "open", "make": MAKE, "settings": device.settings,
+                   "silence_s": SILENCE_S})  # fmt: skip
+        for number, command in enumerate(("arm", "enable"), 1):
+            wire.send({"id": number, "do": command})
+        _wait_until(device.lit)
+        hours.pass_by(60.0)
+        assert device.lit()
+        for _ in range(int(SILENCE_S / 0.05) + 2):
+            hours.pass_by(0.05)
+        assert not device.lit()
+    finally:
+        here.close()
+        serving.join()
+        there.close()
 
 
 def test_guard_whose_driver_crashes(device: Generator) -> None:

@@ -141,3 +141,26 @@ def test_signs_are_read_back() -> None:
     assert own.trouble() == ""
     for text in ("", "camera", "a b c d", "host x", "host 1 started"):
         assert read_sign(text) == (None, False)
+
+
+def test_a_pause_of_the_watcher_ages_no_beat(gate: LaserGate, clock: Clock) -> None:
+    light(gate)
+    clock.now_s += 0.7
+    gate.beat(CAMERA)
+    clock.now_s += 5.0
+    gate.forgive(5.0)
+    assert gate.must_end() is None
+    clock.now_s += 0.4
+    assert "laser/heartbeat older than 1 s" in str(gate.must_end())
+    gate.beat()
+    # Heard after the pause, before it is noticed: not dated ahead.
+    gate.forgive(5.0)
+    clock.now_s += 1.1
+    assert "laser/heartbeat older than 1 s" in str(gate.must_end())
+
+
+def test_a_pause_of_the_watcher_lengthens_no_light(gate: LaserGate, clock: Clock) -> None:
+    light(gate)
+    clock.now_s += 601.0
+    gate.forgive(601.0)
+    assert "max_on_time" in str(gate.must_end())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -106,6 +107,37 @@ def test_what_waited_while_it_was_switched_off_is_void(
     assert failures == ["laser refused: switched off by request"] * 2
     assert not keeper.gate.armed
     assert laser.lightings == 0
+
+
+class Interrupted(HeldLaser):
+    """``enable`` is under way until switching off interrupts it, which goes on for a moment."""
+
+    def enable(self) -> None:
+        self.reached.set()
+        assert self.go.wait(DEADLINE_S)
+        raise DeviceError("interrupted by switching off")
+
+    def disable(self) -> None:
+        super().disable()
+        if self.reached.is_set() and not self.go.is_set():
+            self.go.set()
+            time.sleep(0.05)
+
+
+def test_the_reason_is_that_of_whoever_switched_off(keeper: LaserKeeper) -> None:
+    laser = Interrupted()
+    keeper.close()
+    keeper.open(laser, Modulation(70.0))
+    keeper.arm()
+    failures: list[str] = []
+    enabling = in_thread(keeper.enable, failures)
+    assert laser.reached.wait(DEADLINE_S)
+    keeper.darken("interlock open")
+    enabling.join()
+    assert failures == ["interrupted by switching off"]
+    snapshot = keeper.snapshot()
+    assert snapshot is not None
+    assert snapshot.reason == "interlock open"
 
 
 def test_opened_again_it_is_watched_once(keeper: LaserKeeper, laser: HeldLaser) -> None:

@@ -31,6 +31,7 @@ from eschorty_ros.hardware.laser.guard_wire import (
     standing_still,
 )
 from eschorty_ros.hardware.laser.opening import maker, open_again
+from eschorty_ros.hardware.own_pauses import OwnPauses
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput
 
 _LOOK_S = 0.02
@@ -67,6 +68,7 @@ class Guard:
         self._unknown = ""
         self._insisting: threading.Thread | None = None
         self._heard_s = time.monotonic()
+        self._pauses = OwnPauses(_LOOK_S)
         self._closing: Message | None = None
 
     def run(self) -> None:
@@ -80,6 +82,7 @@ class Guard:
         try:
             while self._closing is None:
                 ready = dict(poller.poll(_LOOK_S * 1e3))
+                self._heard_s += self._pauses.look()
                 if owner in ready:
                     break
                 messages = self._wire.receive()

@@ -48,6 +48,7 @@ OFF_S = 2.0
 EXIT_S = 2.0
 _DIRECT_S = 1.0
 _LOOK_S = 0.02
+_LATE_S = 0.1
 
 
 class GuardedLaser:
@@ -193,7 +194,7 @@ class GuardedLaser:
                 self._thread.join(EXIT_S)
                 raise DeviceGoneError(self._lost)
             self._wire.send({"id": number, "do": command, **arguments})
-            answer = answers.get(timeout=patience_s)
+            answer = _taken(answers, patience_s)
         except queue.Empty:
             raise DeviceTimeoutError(
                 f"laser guard: no answer to {command} within {patience_s:g} s; "
@@ -260,3 +261,12 @@ class GuardedLaser:
                             f"laser state unknown: its guard is gone; {error}"
                         ) from error
                     time.sleep(_LOOK_S)
+
+
+def _taken(answers: queue.SimpleQueue[Message], patience_s: float) -> Message:
+    """Take an answer; raises ``queue.Empty`` when none comes."""
+    try:
+        return answers.get(timeout=patience_s)
+    except queue.Empty:
+        # This process may have stood still itself: what has come meanwhile is being handed out.
+        return answers.get(timeout=_LATE_S)

@@ -31,6 +31,7 @@ class Outcome(Enum):
     ENDED = auto()
     MET_LIMIT = auto()
     NOT_BEGUN = auto()
+    LATE = auto()
     STUCK = auto()
 
 
@@ -67,9 +68,14 @@ class Motion:
         self.kind, self._resting = Kind.STOP, 0
 
     def follow(
-        self, before: Status | None, status: Status, verdict: Verdict, now_ns: int
+        self, before: Status | None, status: Status, verdict: Verdict, offset_ns: int
     ) -> Outcome:
-        """Learn from a status message that is believed, and the one before it."""
+        """Learn from a status message that is believed, and the one before it.
+
+        ``offset_ns`` is what the statuses' clock is ahead of the steady one. A status that is heard
+        late, since the host stood still, tells nothing of the time since it was taken.
+        """
+        not_before_ns = status.not_before_ns - offset_ns
         frozen = before is not None and abs(status.position_mm - before.position_mm) <= TOLERANCE_MM
         rests = frozen and not status.bits & apt.MOVING
         arrived = abs(status.position_mm - self.target_mm) <= TOLERANCE_MM
@@ -83,9 +89,11 @@ class Motion:
             return Outcome.MET_LIMIT
         if self._resting >= _READINGS_AT_REST and self._complete(status, arrived):
             return Outcome.ENDED
+        if not_before_ns > self.deadline_ns:
+            return Outcome.LATE
         if self.kind is Kind.STOP:
             return Outcome.GOING
-        if not self._seen_moving and now_ns - self.begun_ns > BEGIN_NS:
+        if not self._seen_moving and not_before_ns - self.begun_ns > BEGIN_NS:
             return Outcome.NOT_BEGUN
         wrong = bool(status.bits & apt.POSITION_ERROR)
         if not homing:
@@ -93,8 +101,10 @@ class Motion:
         if not wrong:
             self._wrong_since_ns = None
             return Outcome.GOING
-        self._wrong_since_ns = self._wrong_since_ns or now_ns
-        return Outcome.STUCK if now_ns - self._wrong_since_ns >= STALL_NS else Outcome.GOING
+        if self._wrong_since_ns is None:
+            self._wrong_since_ns = status.latest_ns - offset_ns
+        stuck_ns = not_before_ns - self._wrong_since_ns
+        return Outcome.STUCK if stuck_ns >= STALL_NS else Outcome.GOING
 
     def _complete(self, status: Status, arrived: bool) -> bool:
         """Whether rest is the end: told so, or where it was to be."""

@@ -39,6 +39,11 @@ class Status:
     latest_ns: int
 
     @property
+    def not_before_ns(self) -> int:
+        """Time before which it was not taken, whether its request is known or not."""
+        return self.latest_ns - LATE_NS if self.earliest_ns is None else self.earliest_ns
+
+    @property
     def critical(self) -> int:
         """Bits that must not change by themselves."""
         return self.bits & _CRITICAL
@@ -108,5 +113,5 @@ class Judge:
 
 def _reach_mm(first: Status, second: Status, speed_mm_s: float) -> float:
     """How far the carriage gets between two messages."""
-    begin_ns = first.latest_ns - LATE_NS if first.earliest_ns is None else first.earliest_ns
+    begin_ns = first.not_before_ns
     return 1.2 * speed_mm_s * max(second.latest_ns - begin_ns, 0) * 1e-9

@@ -59,6 +59,8 @@ class AptStage:
         self._lock = threading.RLock()
         self._stopping: list[tuple[int, bytes]] = []
         self._closed = False
+        # Counted so that a stop and an order that cross are noticed, on both sides.
+        self._stops = self._orders = 0
         # Frames may come at once; they wait for the tracker.
         with self._lock:
             self._link = make_link(self._on_frame, self._on_lost)
@@ -116,19 +118,23 @@ class AptStage:
             low, high = self.travel_mm
             speed = min(self._settings.homing_mm_s, self.speed_max_mm_s)
             limit_s = (high - low) / speed + 10.0
+            self._orders += 1
             self._tracker.order(Kind.HOME, high, low, speed, limit_s)
             self._tracker.fit.wander(self._clock_ns())
             self._tracker.blocked_sense = 0
             self._send_now("home", channel=apt.CHANNEL)
 
     def move_to(self, position_mm: float, speed_mm_s: float) -> None:
-        """Start a move; raises ``DeviceError`` when it cannot be carried out."""
+        """Start a move; raises ``DeviceError`` when it cannot be carried out or is stopped."""
         with self._lock:
+            stops = self._stops
             status = self._ready()
             may_move(status, self._tracker.blocked_sense, position_mm, self.travel_mm)
             may_run_at(speed_mm_s, self.speed_max_mm_s)
         speed, acceleration = self._setup.write_velocity(self._axis, speed_mm_s)
         with self._lock:
+            if stops != self._stops:
+                raise DeviceError("stage refused: it was stopped before the move began")
             status = self._ready()
             counts = self._tracker.scale.position(position_mm)
             target = self._tracker.scale.mm(counts)
@@ -137,6 +143,7 @@ class AptStage:
             if counts == self._tracker.scale.position(start):
                 return
             limit_s = distance / speed + 2.0 * speed / acceleration + 2.0
+            self._orders += 1
             self._tracker.order(Kind.MOVE, start, target, speed, limit_s)
             order_ns = self._clock_ns()
             self._send_now("move_absolute", channel=apt.CHANNEL, position=counts)
@@ -146,10 +153,18 @@ class AptStage:
 
     def stop(self) -> None:
         """Profiled stop; idempotent, and on the wire at once."""
+        orders = self._orders
+        self._stops += 1
+        self._send_stop()
+        with self._lock:
+            if orders != self._orders:
+                # An order may have gone out after it.
+                self._send_stop()
+            self._tracker.order_stop(self.acceleration_mm_s2)
+
+    def _send_stop(self) -> None:
         with contextlib.suppress(DeviceError):
             self._send_now("stop", channel=apt.CHANNEL, mode=_PROFILED)
-        with self._lock:
-            self._tracker.order_stop(self.acceleration_mm_s2)
 
     def state(self, t_ns: int | None = None) -> StageState:
         """Position, velocity and flags at ``t_ns``, by default the newest time that is known.

@@ -144,21 +144,13 @@ class Tracker:
         return StageState(position, velocity, t_ns, homed, moving, flags)
 
     def look(self) -> None:
-        """Notice what does not come: status messages, the end of a motion."""
+        """Notice that no status messages come."""
         self._looks += 1
-        motion = self.motion
         if self.age_ns > FAULT_AGE_NS and self._looks >= _LOOKS_LEAST:
             self._actions.fail(
                 DeviceGoneError(
                     f"the stage controller is silent for {FAULT_AGE_NS * 1e-9:g} s; check its "
                     "power and cable"
-                )
-            )
-        elif motion is not None and self._now_ns() > motion.deadline_ns:
-            self._actions.fail(
-                DeviceError(
-                    f"the stage's {motion.kind.value} does not end in time; check the travel "
-                    "for obstacles, then configure again"
                 )
             )
 
@@ -178,9 +170,7 @@ class Tracker:
         if motion is None and self.status is not None:
             expected = (self.status.position_mm, self.status.position_mm)
         elif motion is not None and motion.kind is not Kind.HOME:
-            expected = self.fit.expected_mm(
-                latest_ns - LATE_NS if earliest_ns is None else earliest_ns, latest_ns
-            )
+            expected = self.fit.expected_mm(status.not_before_ns, latest_ns)
         speed = 0.0 if motion is None else motion.speed_mm_s
         if self.status is None or self.failure is not None:
             self.judge.forget()
@@ -251,7 +241,8 @@ class Tracker:
         self, motion: Motion, before: Status | None, status: Status, verdict: Verdict
     ) -> None:
         what, at_mm = motion.kind.value, status.position_mm
-        match motion.follow(before, status, verdict, self._now_ns()):
+        assert self._offset_ns is not None
+        match motion.follow(before, status, verdict, self._offset_ns):
             case Outcome.MET_LIMIT:
                 self.blocked_sense = motion.sense
                 self._actions.stop()
@@ -262,6 +253,13 @@ class Tracker:
                     DeviceError(
                         f"the stage does not begin its {what} within {BEGIN_NS * 1e-9:g} s; check "
                         "its front panel, the interlock and the motor cable"
+                    )
+                )
+            case Outcome.LATE:
+                self._actions.fail(
+                    DeviceError(
+                        f"the stage's {what} does not end in time; check the travel for obstacles, "
+                        "then configure again"
                     )
                 )
             case Outcome.STUCK:

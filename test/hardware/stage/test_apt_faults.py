@@ -9,6 +9,7 @@ import pytest
 from apt_bench import AptBench
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.hardware.stage import apt_messages
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 
 STOP, ENABLE, STATUS_REQUEST, KEEP_ALIVE = 0x0465, 0x0210, 0x0490, 0x0492
@@ -173,6 +174,14 @@ def test_fault_s8_end_messages_missing() -> None:
     bench.until(lambda: not bench.stage.state().moving)
 
 
+def test_fault_s8_motion_without_end() -> None:
+    """driver: stops after the time it should take; user reads: does not end in time; look there."""
+    bench = AptBench()
+    bench.stage.move_to(30.0, 100.0)
+    bench.model.extra_bits = apt_messages.MOVING
+    assert "move does not end in time" in bench.failure(10.0)
+
+
 def test_fault_s9_keep_alive() -> None:
     """driver: keeps alive from the writer's thread twice a second; user reads: nothing."""
     bench = AptBench()
@@ -285,6 +294,20 @@ def test_fault_x1_host_stalls_in_a_move() -> None:
     for t_ns in range(before.t_ns, before.t_ns + 400_000_000, 10_000_000):
         true_mm = bench.model.axis.position_mm(t_ns)
         assert bench.stage.state(t_ns).position_mm == pytest.approx(true_mm, abs=0.02)
+
+
+def test_fault_x1_host_stalls_as_a_move_begins() -> None:
+    """driver: an answer from before the order says nothing about the move; user reads: nothing."""
+    bench = AptBench()
+    for turn, stall_s in itertools.product(range(12), (0.35, 0.8)):
+        bench.advance(0.007 * turn)
+        target_mm = 20.0 + 60.0 * ((turn + (stall_s > 0.5)) % 2)
+        bench.stage.move_to(target_mm, 50.0)
+        link, bench.link = bench.link, None
+        bench.advance(stall_s)
+        bench.link = link
+        bench.until(lambda: not bench.stage.state().moving, 20.0)
+        assert bench.stage.state().position_mm == pytest.approx(target_mm, abs=1e-4)
 
 
 def test_fault_x3_close_while_homing() -> None:

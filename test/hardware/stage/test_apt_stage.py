@@ -107,6 +107,38 @@ def test_profiled_stop_is_on_the_wire_at_once() -> None:
     bench.move(10.0)
 
 
+def test_a_stop_while_a_move_is_prepared_prevents_it() -> None:
+    """The speed is written before the move is ordered; that takes its time."""
+    bench = AptBench()
+    at_mm = bench.true_mm
+    bench.on_tick = lambda: bench.stage.stop() if bench.sent(0x0413)[before:] else None
+    before = len(bench.sent(0x0413))
+    with pytest.raises(DeviceError, match="stopped before the move began"):
+        bench.stage.move_to(100.0, 90.0)
+    bench.on_tick = lambda: None
+    bench.advance(0.5)
+    assert bench.true_mm == at_mm
+    bench.move(20.0)
+
+
+def test_a_move_that_a_stop_crosses_ends_too() -> None:
+    bench = AptBench()
+    before_mm = bench.true_mm
+    orders = len(bench.sent(0x0453))
+    send = bench.stage._send_stop
+
+    def crossed() -> None:
+        send()
+        bench.stage._send_stop = send
+        bench.stage.move_to(100.0, 90.0)
+
+    bench.stage._send_stop = crossed
+    bench.stage.stop()
+    assert len(bench.sent(0x0453)) == orders + 1
+    bench.until(lambda: not bench.stage.state().moving)
+    assert abs(bench.true_mm - before_mm) < 1.0
+
+
 def test_a_stage_left_moving_is_stopped_at_connect() -> None:
     bench = AptBench()
     bench.stage.move_to(200.0, 50.0)
