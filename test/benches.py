@@ -49,7 +49,12 @@ class TurnableBench:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self._answer()
+        try:
+            self._answer()
+        except BaseException:
+            self._process.kill()
+            self.close()
+            raise
 
     def look_at(self, scene: str) -> None:
         """Put another scene in front of the camera, for the next start of its stream."""

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from short_folder import short_folder
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
@@ -25,6 +26,8 @@ from eschorty_ros.hardware.protocols import DeviceIdentity, LaserOutput, LaserRe
 
 MAKE = "generator_double:GeneratorLaser"
 _INTERRUPTED = "the generator's settings: interrupted by switching off"
+# Said where a generator says nothing: a time-out without the time.
+_MUTE = "mute"
 
 
 class GeneratorLaser:
@@ -42,7 +45,7 @@ class GeneratorLaser:
         self._armed = False
         self._modulation = Modulation(70.0)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._socket.settimeout(1.0)
+        self._socket.settimeout(DEADLINE_S)
         try:
             self._socket.connect(path)
             if self._transfer("CLAIM") != "ok":
@@ -89,6 +92,9 @@ class GeneratorLaser:
     def close(self) -> None:
         with contextlib.suppress(DeviceError):
             self.disable()
+            # Answered: whoever opens it next finds it free.
+            with self._lock:
+                self._transfer("RELEASE")
         self._socket.close()
 
     def _wait_for_interruption(self) -> None:
@@ -114,7 +120,7 @@ class GeneratorLaser:
             answer = self._socket.recv(64).decode()
         except OSError as error:
             raise DeviceGoneError(f"the generator is gone ({error}); connect it") from error
-        if not answer:
+        if answer in ("", _MUTE):
             raise DeviceGoneError("the generator is gone; connect it")
         return answer
 
@@ -128,8 +134,11 @@ class Generator:
         self.log = folder / "generator.log"
         self.settings = {"path": str(self.path)}
         self.process = subprocess.Popen([sys.executable, __file__, str(self.path), str(self.log)])
-        while not self.path.exists():
-            time.sleep(0.005)
+        try:
+            wait_until(self._there, "the generator", poll_s=0.005)
+        except BaseException:
+            self.close()
+            raise
 
     def lines(self) -> list[tuple[int, str]]:
         """Times (CLOCK_MONOTONIC, ns) and ON or OFF."""
@@ -154,6 +163,10 @@ class Generator:
             panel.connect(str(self.path))
             panel.send(f"PANEL {command}".encode())
             panel.recv(64)
+
+    def _there(self) -> bool:
+        assert self.process.poll() is None, f"exit code {self.process.returncode}"
+        return self.path.exists()
 
     def close(self) -> None:
         self.process.kill()
@@ -187,7 +200,7 @@ def serve(path: str, log: str) -> None:
         panel = command.startswith("PANEL ")
         command = command.removeprefix("PANEL ")
         if not panel and state["mute"]:
-            return ""
+            return _MUTE
         if command in ("ON", "OFF"):
             change(command)
         elif command in ("MUTE", "SPEAK"):
@@ -196,6 +209,9 @@ def serve(path: str, log: str) -> None:
             if state["claimed"] is not None:
                 return "busy"
             state["claimed"] = client
+        elif command == "RELEASE":
+            if state["claimed"] is client:
+                state["claimed"] = None
         elif command == "READ":
             return str(state["output"])
         return "ok"
@@ -205,8 +221,7 @@ def serve(path: str, log: str) -> None:
             while command := client.recv(64).decode():
                 with lock:
                     answer = carry_out(client, command)
-                if answer:
-                    client.send(answer.encode())
+                client.send(answer.encode())
         with lock:
             if state["claimed"] is client:
                 state["claimed"] = None

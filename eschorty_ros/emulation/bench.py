@@ -7,7 +7,6 @@ import fcntl
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,7 +34,8 @@ class _Ending:
     def __init__(self) -> None:
         # Now: by the time the bench is made its parent may be gone.
         self._parent = os.getppid()
-        self._asked = threading.Event()
+        # No event: a signal handler that sets one while it is waited for may wait for ever.
+        self._asked = False
         self._serving = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._ask)
@@ -43,11 +43,11 @@ class _Ending:
     def wait(self) -> None:
         """Wait for a signal or for the end of the process that started this one."""
         self._serving = True
-        while not self._asked.wait(_POLL_S) and os.getppid() == self._parent:
-            pass
+        while not self._asked and os.getppid() == self._parent:
+            time.sleep(_POLL_S)
 
     def _ask(self, *_: object) -> None:
-        self._asked.set()
+        self._asked = True
         if not self._serving:
             sys.exit(0)
 

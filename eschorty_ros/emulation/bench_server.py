@@ -28,14 +28,13 @@ def serving(bench: Bench, folder: Path, faults: FaultPlan | None = None) -> Iter
     DeviceError
         When socket or port cannot be made there.
     """
-    # Answers are short and urgent beside the simulation's long turns.
-    sys.setswitchinterval(_SWITCH_S)
     plan = faults or FaultPlan(faults=[])
     ready = folder / READY_FILE
     with (
         FaultScript(plan, bench.by_name(), bench.physics.clock_ns) as script,
         UsbServer(folder / USB_SOCKET, bench.usb_devices) as usb,
         PtyPort(script.line(), folder / STAGE_PORT, lock=bench.physics.lock),
+        _short_turns(),
     ):
         try:
             ready.with_suffix(".new").write_text(f"{os.getpid()}\n")
@@ -43,3 +42,14 @@ def serving(bench: Bench, folder: Path, faults: FaultPlan | None = None) -> Iter
             yield usb
         finally:
             ready.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _short_turns() -> Iterator[None]:
+    """Within it answers, short and urgent, come soon beside the simulation's long turns."""
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval_s)

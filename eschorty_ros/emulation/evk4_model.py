@@ -29,10 +29,9 @@ from eschorty_ros.emulation.usb_device import (
     SPEED_SUPER,
     EmulatedUsbDevice,
     EndpointIdentity,
-    UsbFault,
     UsbIdentity,
-    Wait,
 )
+from eschorty_ros.emulation.usb_pipe import UsbFault, Wait
 
 CONTROL_OUT, CONTROL_IN, DATA_IN = 0x02, 0x82, 0x81
 PACKET_BYTES = 1024

@@ -223,12 +223,14 @@ class FaultScript:
             self._ending = [e for e in self._ending if e[1] not in over]
             for fault in due:
                 self.begun.append((now_ns, fault))
-                if fault.for_s is not None:
-                    self._ending.append((now_ns + round(fault.for_s * 1e9), fault))
         # Outside the lock: models have locks of their own and tell of transfers under them.
         model = self._devices[device]
         for fault in due:
             fault.kind.begin(model, Dose(fault.amount, fault.target, now_ns))
+            if fault.for_s is not None:
+                # Only now: another thread ends what is over.
+                with self._lock:
+                    self._ending.append((now_ns + round(fault.for_s * 1e9), fault))
         for fault in over:
             if fault.kind.end:
                 fault.kind.end(model, Dose(fault.amount, fault.target, now_ns))

@@ -14,9 +14,9 @@ from eschorty_ros.emulation.usb_descriptors import DescriptorBackend
 from eschorty_ros.emulation.usb_device import (
     DIRECTION_IN,
     EmulatedUsbDevice,
-    UsbFault,
     UsbIdentity,
 )
+from eschorty_ros.emulation.usb_pipe import UsbFault
 
 Buffer = array.array | bytearray | memoryview
 
@@ -132,6 +132,7 @@ class EmulatedBackend(DescriptorBackend):
 
     def bulk_read(self, dev_handle: Handle, ep: int, intf: int, buff: Buffer, timeout: int) -> int:
         """Receive a transfer into ``buff``; returns the bytes received."""
+        dev_handle.device.begin_read(ep)
         device = self._owned(dev_handle, intf)
         size = memoryview(buff).nbytes
 

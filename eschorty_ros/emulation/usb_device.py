@@ -11,9 +11,10 @@ from __future__ import annotations
 import errno
 import itertools
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from eschorty_ros.emulation.usb_pipe import InPipe, UsbFault, Wait
 
 BULK = 2
 DIRECTION_IN = 0x80
@@ -25,16 +26,7 @@ _ENGLISH = b"\x04\x03\x09\x04"
 
 _addresses = itertools.count(2)
 
-Wait = Callable[[threading.Condition, float | None], bool]
 OnTransfer = Callable[[int, bytes], None]
-
-
-class UsbFault(Exception):  # noqa: N818 -- the bus reports faults, the backend makes errors of them
-    """A transfer that failed, by the number the kernel would give."""
-
-    def __init__(self, code: int):
-        super().__init__(errno.errorcode[code])
-        self.errno = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,80 +52,6 @@ class UsbIdentity:
     product: str = ""
     bcd_device: int = 0x0100
     speed: int = SPEED_HIGH
-
-
-class InPipe:
-    """Data on its way to the host through one IN endpoint."""
-
-    def __init__(self, max_packet: int, wait: Wait):
-        self._max_packet = max_packet
-        self._wait = wait
-        self._queue: deque[memoryview] = deque()
-        self._changed = threading.Condition()
-        self._cancelled = 0
-
-    def __bool__(self) -> bool:
-        return bool(self._queue)
-
-    def put(self, data: bytes | memoryview, *, zero_length: bool = False) -> None:
-        """Send a transfer; ``zero_length`` ends one of whole packets with an empty packet."""
-        with self._changed:
-            self._queue.append(memoryview(data))
-            if zero_length and len(data):
-                self._queue.append(memoryview(b""))
-            self._changed.notify_all()
-
-    def clear(self) -> None:
-        """Forget what the host has not read."""
-        with self._changed:
-            self._queue.clear()
-
-    def wake(self) -> None:
-        """Let a waiting host look at the device again."""
-        with self._changed:
-            self._changed.notify_all()
-
-    def cancel(self) -> None:
-        """End the reads under way: whoever asked is no longer there to take the data."""
-        with self._changed:
-            self._cancelled += 1
-            self._changed.notify_all()
-
-    def take(self, size: int, timeout_s: float | None, check: Callable[[], None]) -> bytes:
-        """One transfer as the host controller gives it: at most ``size`` bytes.
-
-        ``check`` raises when the device can no longer deliver.
-        """
-        parts: list[memoryview] = []
-        room = size
-        with self._changed:
-            cancelled = self._cancelled
-            while True:
-                check()
-                if cancelled != self._cancelled:
-                    raise UsbFault(errno.ENODEV)
-                while self._queue:
-                    data = self._queue.popleft()
-                    if len(data) > room:
-                        parts.append(self._split(data, room))
-                        return b"".join(parts)
-                    parts.append(data)
-                    room -= len(data)
-                    if len(data) % self._max_packet or not len(data) or not room:
-                        return b"".join(parts)
-                if not self._wait(self._changed, timeout_s):
-                    # Whole packets that had arrived are gone with the cancelled transfer.
-                    raise UsbFault(errno.ETIMEDOUT)
-
-    def _split(self, data: memoryview, room: int) -> memoryview:
-        whole = room - room % self._max_packet
-        if whole < room or not room:
-            rest = data[whole + self._max_packet :]
-            if len(rest):
-                self._queue.appendleft(rest)
-            raise UsbFault(errno.EOVERFLOW)
-        self._queue.appendleft(data[whole:])
-        return data[:whole]
 
 
 class EmulatedUsbDevice:
@@ -217,11 +135,12 @@ class EmulatedUsbDevice:
         """Drop the claims of ``owner``; the reads it left behind end at once."""
         with self.mutex:
             held = [interface for interface, holder in self.claims.items() if holder is owner]
+            if held:
+                # Before somebody else may claim it and read.
+                for pipe in self._pipes.values():
+                    pipe.cancel()
             for interface in held:
-                del self.claims[interface]
-        if held:
-            for pipe in self._pipes.values():
-                pipe.cancel()
+                self.claims.pop(interface, None)
 
     def reply(self, endpoint: int, data: bytes, *, zero_length: bool = False) -> None:
         """Queue a transfer for the host on an IN endpoint."""
@@ -251,6 +170,13 @@ class EmulatedUsbDevice:
     def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
         """Take a transfer from the host; returns the bytes accepted."""
         raise UsbFault(errno.EPIPE)
+
+    def begin_read(self, endpoint: int) -> None:
+        """Begin a read in this thread, before its right to read is looked at.
+
+        From now on ``free`` ends it, also when it is to wait only later.
+        """
+        self._pipes[endpoint].begin()
 
     def bulk_in(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
         """Give the host a transfer of at most ``size`` bytes; the base takes what ``reply`` put."""

@@ -24,7 +24,7 @@ from eschorty_ros.emulation.usb_wire import (
     send_request,
 )
 
-_GRACE_S = 2.0
+_GRACE_S = 20.0
 """A server that is stopped or overloaded counts as a device that does not answer after this."""
 
 
@@ -59,9 +59,10 @@ class _Link:
                 view = memoryview(bytearray(size)) if into is None else into[:size]
                 receive_into(self._socket, view)
             except TimeoutError:
-                # A late answer would be taken for that of the next request.
+                # A late answer would be taken for that of the next request, and what a late read
+                # takes from the device would be missing unnoticed.
                 self._socket.close()
-                code = errno.ETIMEDOUT
+                code = errno.ENODEV if op is Op.READ else errno.ETIMEDOUT
             except (Closed, OSError):
                 self._socket.close()
                 code = errno.ENODEV

@@ -63,9 +63,13 @@ def test_a_signal_ends_it_without_a_word(folder: Path, number: int) -> None:
     process = subprocess.Popen(
         bench_command(folder, {}), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
-    wait_until((folder / READY_FILE).exists, "the bench ready")
-    process.send_signal(number)
-    _, said = process.communicate(timeout=DEADLINE_S)
+    try:
+        wait_until((folder / READY_FILE).exists, "the bench ready")
+        process.send_signal(number)
+        _, said = process.communicate(timeout=DEADLINE_S)
+    finally:
+        process.kill()
+        process.communicate()
     assert process.returncode == 0
     assert said == ""
     assert not (folder / READY_FILE).exists()
@@ -78,16 +82,18 @@ subprocess.Popen({bench_command(folder, {})!r}, stdout=subprocess.DEVNULL)
 time.sleep(600)
 """
     parent = subprocess.Popen([sys.executable, "-c", code])
-    wait_until((folder / READY_FILE).exists, "the bench ready")
-    bench = int((folder / READY_FILE).read_text())
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
+    try:
+        wait_until((folder / READY_FILE).exists, "the bench ready")
+        bench = int((folder / READY_FILE).read_text())
+    finally:
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
     wait_until(lambda: not (folder / READY_FILE).exists(), "the bench ended")
 
     def gone() -> bool:
         try:
             return "Z" in Path(f"/proc/{bench}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except FileNotFoundError:
+        except (FileNotFoundError, ProcessLookupError):
             return True
 
     wait_until(gone, "its process gone")

@@ -128,11 +128,13 @@ def test_a_client_that_is_killed_frees_its_claim_and_leaves_no_read_behind(path,
     with subprocess.Popen(
         [sys.executable, "-c", CLIENT, path], stdout=subprocess.PIPE, text=True
     ) as client:
-        assert client.stdout.readline() == "claimed\n"
-        device = opened(path)
-        with pytest.raises(usb.core.USBError):
-            usb.util.claim_interface(device, 0)
-        client.kill()
+        try:
+            assert client.stdout.readline() == "claimed\n"
+            device = opened(path)
+            with pytest.raises(usb.core.USBError):
+                usb.util.claim_interface(device, 0)
+        finally:
+            client.kill()
         claim_when_free(device)
     device.write(OUT, b"mine")
     assert device.read(IN, 64).tobytes() == b"mine"

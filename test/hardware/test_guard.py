@@ -18,10 +18,10 @@ import generator_double
 import pytest
 from generator_double import MAKE, Generator
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware import own_pauses
-from eschorty_ros.hardware.laser import guard, guard_wire
+from eschorty_ros.hardware.laser import guard, guard_wire, guarded
 from eschorty_ros.hardware.laser.guarded import GuardedLaser
 from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.protocols import LaserOutput
@@ -45,12 +45,23 @@ def device(tmp_path: Path) -> Iterator[Generator]:
         yield made
 
 
+@contextlib.contextmanager
+def opened(
+    device: Generator, silence_s: float = PATIENT_S, **settings: str
+) -> Iterator[GuardedLaser]:
+    """A laser that is closed whatever the test comes to."""
+    made = GuardedLaser(MAKE, {**device.settings, **settings}, silence_s=silence_s)
+    try:
+        yield made
+    finally:
+        with contextlib.suppress(DeviceError):
+            made.close()
+
+
 @pytest.fixture
 def laser(device: Generator) -> Iterator[GuardedLaser]:
-    made = GuardedLaser(MAKE, device.settings, silence_s=PATIENT_S)
-    yield made
-    with contextlib.suppress(DeviceError):
-        made.close()
+    with opened(device) as made:
+        yield made
     assert not device.lit()
 
 
@@ -82,12 +93,13 @@ def test_enable_needs_arming_each_time(laser: GuardedLaser, device: Generator) -
 
 
 def test_close_switches_off_and_releases(device: Generator) -> None:
-    laser = GuardedLaser(MAKE, device.settings)
-    light(laser)
-    laser.close()
-    laser.close()
-    assert not device.lit()
-    GuardedLaser(MAKE, device.settings).close()
+    with opened(device) as laser:
+        light(laser)
+        laser.close()
+        laser.close()
+        assert not device.lit()
+    with opened(device) as laser:
+        laser.close()
 
 
 def test_generator_that_is_absent_is_one_line(tmp_path: Path) -> None:
@@ -156,8 +168,12 @@ class Owner:
             stderr=stderr,
             text=True,
         )
-        self.guard_pid = int(self._line())
-        assert device.lit()
+        try:
+            self.guard_pid = int(self._line())
+            assert "ON" in [output for _, output in device.lines()]
+        except BaseException:
+            self.close()
+            raise
 
     def die(self, way: str) -> float:
         """Seconds from the order to darkness."""
@@ -258,20 +274,20 @@ def test_guard_runs_the_package_that_started_it(
 
 
 def test_silence_disarms_until_armed_again(device: Generator) -> None:
-    laser = GuardedLaser(MAKE, device.settings, silence_s=SILENCE_S)
-    light(laser)
-    began_ns = time.monotonic_ns()
-    ctypes.PyDLL(None).sleep(2)
-    assert device.off_after_s(began_ns) < SILENCE_S + OFF_LIMIT_S
-    state = laser.readback()
-    assert state.output is LaserOutput.OFF
-    assert "silent for 0.5 s" in state.reason
-    with pytest.raises(DeviceError, match="arm it again"):
-        laser.enable()
-    light(laser)
-    assert laser.readback().reason == ""
-    laser.close()
-    assert [output for _, output in device.lines()] == ["OFF", "ON", "OFF", "ON", "OFF"]
+    with opened(device, SILENCE_S) as laser:
+        light(laser)
+        began_ns = time.monotonic_ns()
+        ctypes.PyDLL(None).sleep(2)
+        assert device.off_after_s(began_ns) < SILENCE_S + OFF_LIMIT_S
+        state = laser.readback()
+        assert state.output is LaserOutput.OFF
+        assert "silent for 0.5 s" in state.reason
+        with pytest.raises(DeviceError, match="arm it again"):
+            laser.enable()
+        light(laser)
+        assert laser.readback().reason == ""
+        laser.close()
+        assert [output for _, output in device.lines()] == ["OFF", "ON", "OFF", "ON", "OFF"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])
@@ -291,12 +307,12 @@ def test_dark_when_the_guard_dies(laser: GuardedLaser, device: Generator, number
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_closing_when_the_guard_has_just_died_is_dark(device: Generator, number: int) -> None:
-    laser = GuardedLaser(MAKE, device.settings)
-    light(laser)
-    os.kill(laser.guard_pid, number)
-    with contextlib.suppress(DeviceError):
-        laser.close()
-    assert not device.lit()
+    with opened(device) as laser:
+        light(laser)
+        os.kill(laser.guard_pid, number)
+        with contextlib.suppress(DeviceError):
+            laser.close()
+        assert not device.lit()
 
 
 class Hours:
@@ -346,67 +362,71 @@ def test_a_guard_that_stood_still_itself_calls_nobody_silent(
 
 
 def test_guard_whose_driver_crashes(device: Generator) -> None:
-    laser = GuardedLaser(MAKE, {**device.settings, "crash": "readback"})
-    light(laser)
-    with pytest.raises(DeviceGoneError, match="exit code 7"):
-        laser.readback()
-    assert not device.lit()
-    laser.close()
+    with opened(device, crash="readback") as laser:
+        light(laser)
+        with pytest.raises(DeviceGoneError, match="exit code 7"):
+            laser.readback()
+        assert not device.lit()
+        laser.close()
 
 
 def test_switching_off_overtakes(device: Generator, tmp_path: Path) -> None:
     """Reading back does not end here; nobody waits for it in the light."""
     held = tmp_path / "held"
-    laser = GuardedLaser(MAKE, {**device.settings, "held": str(held)})
-    light(laser)
-    failures: list[Exception] = []
-    reader = _thread(lambda: laser.readback(), failures)
-    _wait_until(held.exists)
-    asked_ns = time.monotonic_ns()
-    laser.disable()
-    assert device.off_after_s(asked_ns) < OFF_LIMIT_S
-    reader()
-    assert "interrupted by switching off" in str(failures[0])
-    laser.close()
+    with opened(device, held=str(held)) as laser:
+        light(laser)
+        failures: list[Exception] = []
+        reader = _thread(lambda: laser.readback(), failures)
+        _wait_until(held.exists)
+        asked_ns = time.monotonic_ns()
+        laser.disable()
+        assert device.off_after_s(asked_ns) < OFF_LIMIT_S
+        reader()
+        assert "interrupted by switching off" in str(failures[0])
+        laser.close()
 
 
 def test_what_was_asked_before_switching_off_is_void(
     device: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held = tmp_path / "held"
-    laser = GuardedLaser(MAKE, {**device.settings, "held": str(held)})
-    light(laser)
-    asked: list[str] = []
-    send = laser._wire.send
-    monkeypatch.setattr(
-        laser._wire, "send", lambda message: (send(message), asked.append(message["do"]))
-    )
-    failures: list[Exception] = []
-    waits = [_thread(laser.readback, failures)]
-    _wait_until(held.exists)
-    waits += [_thread(step, failures) for step in (laser.arm, laser.enable)]
-    _wait_until(lambda: {"arm", "enable"} <= set(asked))
-    laser.disable()
-    for wait in waits:
-        wait()
-    assert len(failures) == 3, failures
-    assert not device.lit()
-    laser.close()
-
-
-def test_mute_generator_is_unknown_and_the_guard_insists(device: Generator) -> None:
-    laser = GuardedLaser(MAKE, device.settings)
-    light(laser)
-    device.press("MUTE")
-    with pytest.raises(DeviceError, match="gone"):
-        laser.readback()
-    with pytest.raises((DeviceGoneError, DeviceTimeoutError)):
+    with opened(device, held=str(held)) as laser:
+        light(laser)
+        asked: list[str] = []
+        send = laser._wire.send
+        monkeypatch.setattr(
+            laser._wire, "send", lambda message: (send(message), asked.append(message["do"]))
+        )
+        failures: list[Exception] = []
+        waits = [_thread(laser.readback, failures)]
+        _wait_until(held.exists)
+        waits += [_thread(step, failures) for step in (laser.arm, laser.enable)]
+        _wait_until(lambda: {"arm", "enable"} <= set(asked))
         laser.disable()
-    with contextlib.suppress(DeviceError):
+        for wait in waits:
+            wait()
+        assert len(failures) == 3, failures
+        assert not device.lit()
         laser.close()
-    assert device.lit()
-    device.press("SPEAK")
-    device.off_after_s(time.monotonic_ns())
+
+
+def test_mute_generator_is_unknown_and_the_guard_insists(
+    device: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A guard that is replaced for being slow does not insist.
+    monkeypatch.setattr(guarded, "OFF_S", PATIENT_S)
+    with opened(device) as laser:
+        light(laser)
+        device.press("MUTE")
+        with pytest.raises(DeviceError, match="gone"):
+            laser.readback()
+        with pytest.raises(DeviceGoneError):
+            laser.disable()
+        with contextlib.suppress(DeviceError):
+            laser.close()
+        assert device.lit()
+        device.press("SPEAK")
+        device.off_after_s(time.monotonic_ns())
 
 
 def test_switching_off_is_tried_again_when_it_failed_in_the_dark(

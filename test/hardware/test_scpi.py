@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.errors import DeviceError, DeviceTimeoutError
@@ -71,6 +71,7 @@ def test_what_is_no_number_is_refused(reply: bytes) -> None:
         scpi(Answering(reply, reply)).get("frequency", 1)
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=40), st.sampled_from(["output", "frequency", "waveform"]))
 def test_any_reply_is_a_value_or_a_typed_error(reply: bytes, name: str) -> None:
     link = Answering(reply, reply)

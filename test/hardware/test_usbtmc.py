@@ -44,7 +44,8 @@ def model() -> Echo:
 @pytest.fixture
 def link(model: Echo) -> Iterator[UsbTmc]:
     device = usb.core.find(backend=EmulatedBackend(lambda: [model]), custom_match=is_usbtmc)
-    link = UsbTmc(device, name="generator", timeout_s=0.05)
+    # Nothing is waited for here: every wait of the model is over at once.
+    link = UsbTmc(device, name="generator", timeout_s=60.0)
     yield link
     link.close()
 

@@ -161,7 +161,9 @@ def pty() -> Iterator[tuple[int, str]]:
 def test_real_file_without_the_kernels_ioctls(pty: tuple[int, str]) -> None:
     master, path = pty
     link = UsbTmcFile(path, name="generator", timeout_s=0.1)
-    answering = threading.Thread(target=lambda: (os.read(master, 100), os.write(master, b"70.5")))
+    answering = threading.Thread(
+        target=lambda: (os.read(master, 100), os.write(master, b"70.5")), daemon=True
+    )
     answering.start()
     with pytest.raises(DeviceError, match="in use; close the other program"):
         UsbTmcFile(path, name="generator", timeout_s=0.1)

@@ -17,7 +17,7 @@ from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.evk4_model import CONTROL_IN, CONTROL_OUT, DATA_IN, Evk4Model
 from eschorty_ros.emulation.evk4_sequences import Phase
 from eschorty_ros.emulation.evk4_treuzell import BoardIdentity
-from eschorty_ros.emulation.usb_device import UsbFault
+from eschorty_ros.emulation.usb_pipe import UsbFault
 
 Answer = Callable[[bytes], bytes]
 

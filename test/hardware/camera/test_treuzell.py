@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.errors import DeviceError, DeviceStallError, DeviceTimeoutError
@@ -120,6 +120,7 @@ FRAMES = st.builds(
 )
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=64) | FRAMES, st.sampled_from(ASKED))
 def test_any_bytes_are_an_answer_or_one_line(frame: bytes, asked: int) -> None:
     if frame[:4] == asked.to_bytes(4, "little") and frame[4:8] == (len(frame) - 8).to_bytes(

@@ -27,7 +27,7 @@ SLOW_MM_S = 10.0
 
 @pytest.fixture
 def model() -> AptModel:
-    return AptModel(time.time_ns, power_up_mm=1.0)
+    return AptModel(time.monotonic_ns, power_up_mm=1.0)
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def port(model: AptModel, tmp_path: Path) -> Iterator[str]:
 
 
 def opened(port: str) -> AptStage:
-    return open_stage(AptSettings(homing_mm_s=25.0), time.time_ns, port)
+    return open_stage(AptSettings(homing_mm_s=25.0), time.monotonic_ns, port)
 
 
 def failed(stage: AptStage) -> bool:
@@ -110,7 +110,7 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
         stage.home()
         wait_until(lambda: stage.state().homed and not stage.state().moving, "the reference")
         stage.move_to(200.0, SLOW_MM_S)
-        wait_until(lambda: model.axis.moving(time.time_ns()), "motion")
+        wait_until(lambda: model.axis.moving(time.monotonic_ns()), "motion")
         if thread == "apt reader":
             stage._tracker.hear = mistake  # type: ignore[method-assign]
         else:
@@ -120,8 +120,8 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
         for call in (stage.state, stage.home, lambda: stage.move_to(10.0, 10.0)):
             with pytest.raises(DeviceError, match=r"driver failed: Zero.*nobody thought of it.*;"):
                 call()
-        wait_until(lambda: not model.axis.moving(time.time_ns()), "rest")
-        assert model.axis.position_mm(time.time_ns()) < 150.0
+        wait_until(lambda: not model.axis.moving(time.monotonic_ns()), "rest")
+        assert model.axis.position_mm(time.monotonic_ns()) < 150.0
     finally:
         stage.close()
     assert not [t for t in stage._link._threads if t.is_alive()]
