@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -89,10 +90,17 @@ def plug(name: str, *models: Evk4Model) -> None:
     _BUSES[name] = list(models)
 
 
-class Rig:
-    """A model, a driver on it, what was read."""
+class _Tireless(Reconnection):
+    """Looks for its camera for ever."""
 
-    def __init__(self, *, attempts: int = 5, serial: int = SERIAL, **options: Any) -> None:
+    def wait_s(self, attempt: int) -> float:
+        return self.longest_s
+
+
+class Rig:
+    """A model, a driver on it, what was read; ``attempts`` None never gives the camera up."""
+
+    def __init__(self, *, attempts: int | None = 5, serial: int = SERIAL, **options: Any) -> None:
         self.source = OnDemand()
         self.model = Evk4Model(
             self.source, board=BoardIdentity(serial=serial), wait=lambda *_: False
@@ -104,11 +112,10 @@ class Rig:
         self.camera = self.driver(attempts=attempts, **options)
         self.chunks: list[EventChunk] = []
 
-    def driver(self, *, attempts: int = 5, **options: Any) -> Evk4:
+    def driver(self, *, attempts: int | None = 5, **options: Any) -> Evk4:
         options.setdefault("sleep", self._sleep)
-        camera = Evk4(
-            self.backend, time.monotonic_ns, reconnection=Reconnection(attempts), **options
-        )
+        reconnection = _Tireless(sys.maxsize) if attempts is None else Reconnection(attempts)
+        camera = Evk4(self.backend, time.monotonic_ns, reconnection=reconnection, **options)
         camera.on_loss = self.losses.append
         return camera
 

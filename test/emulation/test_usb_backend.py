@@ -145,6 +145,18 @@ def test_two_handles_cannot_claim_one_interface_until_the_first_closes(loop):
     usb.util.claim_interface(second, 0)
 
 
+def test_a_read_about_to_wait_when_its_handle_closes_takes_nothing(loop):
+    backend = EmulatedBackend(lambda: [loop])
+    handle = backend.open_device(next(backend.enumerate_devices()))
+    backend.claim_interface(handle, 0)
+    loop.reply(IN, b"for the next one")
+    loop.before_transfer = lambda *_: backend.close_device(handle)
+    with pytest.raises(usb.core.USBError) as caught:
+        backend.bulk_read(handle, IN, 0, array.array("B", bytes(64)), 0)
+    assert caught.value.errno == errno.ENODEV
+    assert loop.pending(IN)
+
+
 def test_a_kernel_driver_holds_the_interface_until_detached(loop):
     loop.kernel_driver = "usbtmc"
     device = opened(loop)

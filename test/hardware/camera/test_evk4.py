@@ -87,7 +87,7 @@ def test_events_arrive_in_order_and_start_at_zero() -> None:
         assert not any(chunk.gap or chunk.restarted for chunk in rig.chunks[1:])
         stamps = [chunk.arrival_ns for chunk in rig.chunks]
         assert stamps == sorted(stamps)
-        assert rig.camera.healthy
+        until(lambda: rig.camera.healthy, "health")
         rig.camera.stop()
         assert not rig.camera.healthy
         assert not rig.source.running
@@ -169,7 +169,7 @@ def test_darkness_is_no_failure() -> None:
         rig.exchange()
         asked = rig.count("control_requests")
         until(lambda: rig.count("control_requests") > asked + 3, "a question to the dark camera")
-        assert rig.camera.healthy
+        until(lambda: rig.camera.healthy, "health")
         rig.exchange()
         assert (rig.count("losses"), rig.count("gaps")) == (0, 0)
 
@@ -178,9 +178,8 @@ def test_packet_loss_in_a_full_queue_is_counted_and_told() -> None:
     with Rig(queue_bytes=400) as rig:
         rig.streaming()
         rig.source.give(200)
-        until(lambda: rig.count("bytes") == 1600, "the flood")
+        until(lambda: rig.count("dropped_bytes") + rig.count("queue_bytes") == 1600, "the flood")
         assert rig.count("dropped_bytes") >= 1200
-        assert rig.count("gaps") == 1
         kept = b""
         while chunk := rig.camera.read(0.0):
             kept += chunk.data
@@ -188,6 +187,7 @@ def test_packet_loss_in_a_full_queue_is_counted_and_told() -> None:
         assert len(kept) + rig.count("dropped_bytes") == 1600
         rig.exchange(1)
         assert rig.chunks[0].gap
+        assert rig.count("gaps") == 1
 
 
 def test_readers_wait_is_ended_by_stop() -> None:
@@ -202,6 +202,7 @@ def test_readers_wait_is_ended_by_stop() -> None:
 
 
 def test_a_receiving_thread_that_hangs_gets_no_second_one_beside_it() -> None:
+    before = set(threading.enumerate())
     with Rig() as rig:
         rig.streaming()
         released = threading.Event()
@@ -211,17 +212,17 @@ def test_a_receiving_thread_that_hangs_gets_no_second_one_beside_it() -> None:
 
         def hang(_timeout_s: float) -> tuple[bytes, int]:
             reading.set()
-            released.wait(20.0)
+            released.wait(PATIENCE_S)
             return b"", 0
 
         session.reader.read = hang  # type: ignore[method-assign]
-        assert reading.wait(5.0)
+        assert reading.wait(PATIENCE_S)
         with pytest.raises(DeviceError, match="do not end"):
             rig.camera.stop()
         with pytest.raises(DeviceError, match="have not ended"):
             rig.camera.start()
         released.set()
-        receiving = [t for t in threading.enumerate() if t.name == "EVK4 events"]
+        receiving = [t for t in set(threading.enumerate()) - before if t.name == "EVK4 events"]
         assert len(receiving) <= 1
 
 
