@@ -126,7 +126,7 @@ def test_unplugging_wakes_a_waiting_read(mute):
     device.write(OUT, b"x")
     device.read(IN, 64)
     loop.mute = mute
-    reader = threading.Thread(target=read)
+    reader = threading.Thread(target=read, daemon=True)
     reader.start()
     loop.gone = True
     reader.join(DEADLINE_S)

@@ -86,7 +86,9 @@ def test_a_write_goes_through_while_another_thread_waits_in_a_read(path, opened)
     device = opened(path)
     got = []
     usb.util.claim_interface(device, 0)
-    reader = threading.Thread(target=lambda: got.append(device.read(IN, 64, 0).tobytes()))
+    reader = threading.Thread(
+        target=lambda: got.append(device.read(IN, 64, 0).tobytes()), daemon=True
+    )
     reader.start()
     device.write(OUT, b"here")
     reader.join(DEADLINE_S)
@@ -157,6 +159,20 @@ def test_after_replug_or_a_dead_server_the_device_is_gone(folder, loop, opened):
             attempt()
         assert caught.value.errno == errno.ENODEV
     assert opened(path) is None
+
+
+def test_a_read_that_the_server_leaves_unanswered_loses_the_device(folder, opened, monkeypatch):
+    loop = Loop(wait=lambda condition, _: condition.wait(DEADLINE_S))
+    path = str(folder / "usb.sock")
+    with UsbServer(path, lambda: [loop]):
+        device = opened(path)
+        device.write(OUT, b"x")
+        assert device.read(IN, 64).tobytes() == b"x"
+        with monkeypatch.context() as patch:
+            patch.setattr(usb_remote, "_GRACE_S", 0.01)
+            with pytest.raises(usb.core.USBError) as caught:
+                device.read(IN, 64, timeout=1)
+        assert caught.value.errno == errno.ENODEV
 
 
 def test_no_server_is_an_empty_bus(folder, opened):

@@ -6,6 +6,7 @@ import errno
 import threading
 
 import pytest
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage.apt_link import AptLink
@@ -32,7 +33,7 @@ def test_whoever_hears_of_a_failure_may_use_the_link() -> None:
     def on_lost(error: DeviceError) -> None:
         reader = threading.Thread(target=link.write_at_once, args=(b"again",), daemon=True)
         reader.start()
-        reader.join(5.0)
+        reader.join(DEADLINE_S)
         assert not reader.is_alive()
         heard.append(error)
 
