@@ -8,11 +8,13 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from expected_scan import assert_accurate
 
 from eschorty_ros.cli import INTERRUPTED
-from eschorty_ros.core.cloud import read_cloud
+from eschorty_ros.core.cloud import POINT_DTYPE, read_cloud
+from eschorty_ros.core.errors import DeviceError
 from eschorty_ros.report.accuracy import Sweep
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
@@ -133,3 +135,14 @@ main(prog_name="eschorty")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "make scan" in done.stderr
+
+
+def test_a_scan_without_points_is_no_success(tmp_path):
+    from eschorty_ros.cli.scan import finish
+    from eschorty_ros.nodes.one_scan import OneScan, Outcome
+
+    request = OneScan("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper")
+    points = np.empty(0, POINT_DTYPE)
+    with pytest.raises(DeviceError, match="no points: no events came"):
+        finish(request, Outcome(True, "no points: no events came", points, 0, 0, 0, 0), tmp_path)
+    assert len(read_cloud(tmp_path / "scan.pcd")) == 0

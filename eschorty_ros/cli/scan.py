@@ -92,7 +92,7 @@ def _check(scene: str, calibration: str) -> None:
 
 
 def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
-    """Write cloud and picture, print the table; a failed scan keeps its cloud and raises."""
+    """Write cloud and picture, print the table; a scan that failed or is empty raises."""
     from eschorty_ros.core.calibration import load_calibration
     from eschorty_ros.core.cloud import write_cloud
     from eschorty_ros.report import accuracy, figures
@@ -100,7 +100,7 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
 
     if outcome.success or len(outcome.points):
         write_cloud(out / "scan.pcd", outcome.points)
-    if not outcome.success:
+    if not outcome.success or not len(outcome.points):
         kept = f" ({len(outcome.points):,} points kept in {out / 'scan.pcd'})"
         raise DeviceError(outcome.message + (kept if len(outcome.points) else ""))
     calibration = load_calibration(request.calibration)
@@ -127,11 +127,13 @@ def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
 
 
 def _counted(outcome: Outcome) -> dict[str, str]:
+    note = {"note": outcome.message} if outcome.message else {}
     return {
         "profiles": f"{outcome.profiles:,}",
         "points": f"{len(outcome.points):,}",
         "events": f"{outcome.events:,} ({outcome.events_dropped:,} dropped, "
         f"{outcome.packets_lost:,} packets lost)",
+        **note,
     }
 
 

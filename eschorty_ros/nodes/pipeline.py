@@ -27,6 +27,7 @@ class ScanReport:
     packets_lost: int
     events_dropped: int
     points_without_stage: int
+    points_outside: int
     points_over_limit: int
 
 
@@ -178,7 +179,9 @@ class Pipeline:
         self.stream.follow_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
         events, lost, dropped, without = np.subtract(self._losses(), self._at_begin).tolist()
-        return ScanReport(scan, events, lost, dropped, without, buffer.points_over_limit)
+        return ScanReport(
+            scan, events, lost, dropped, without, buffer.points_outside, buffer.points_over_limit
+        )
 
     def _receive(self, timed: list[TimedProfiles], now_s: float) -> None:
         for part in timed:

@@ -127,4 +127,20 @@ def fill_end_scan(response: Any, report: ScanReport) -> None:
         notes.append(f"{report.points_without_stage} points had no stage position")
     if report.points_over_limit:
         notes.append(f"{report.points_over_limit} points were over the scan's limit")
+    if not notes and not len(report.scan.points):
+        notes.append(_why_empty(report))
     response.message = "; ".join(notes)
+
+
+def _why_empty(report: ScanReport) -> str:
+    if not report.events:
+        return "no points: no events came; look at the camera, its lens cap and the laser"
+    if not report.points_outside:
+        return (
+            f"no points: nothing blinks with the laser in {report.events} events; look at the "
+            "laser's frequency, at the focus and at what the line falls on"
+        )
+    return (
+        f"no points: all {report.points_outside} lie outside start to stop; events and stage "
+        "positions are not of one time: look at the camera's and the stage's clock"
+    )

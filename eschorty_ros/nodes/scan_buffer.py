@@ -67,7 +67,12 @@ class ScanBuffer:
     start_mm, stop_mm : float
         Limits of the stage position, both included, in either order.
     points_max : int
-        Points above this number are counted in ``points_over_limit`` and left out.
+        Points above this number are left out.
+
+    Attributes
+    ----------
+    points_outside, points_over_limit : int
+        Points left out since they are not between the limits, or were too many.
 
     Raises
     ------
@@ -85,7 +90,7 @@ class ScanBuffer:
                 f"start {start_mm!r} mm or stop {stop_mm!r} mm is not finite; give both"
             )
         self.scan_id = scan_id
-        self.points_over_limit = 0
+        self.points_outside = self.points_over_limit = 0
         self._low_mm = min(start_mm, stop_mm) - _HALF_NM
         self._high_mm = max(start_mm, stop_mm) + _HALF_NM
         self._points_max = points_max
@@ -108,6 +113,7 @@ class ScanBuffer:
 
     def _inside(self, placed: PlacedPoints) -> PlacedPoints:
         inside = (placed.stage_mm >= self._low_mm) & (placed.stage_mm <= self._high_mm)
+        self.points_outside += int(np.count_nonzero(~inside))
         return placed if inside.all() else placed.select(inside)
 
     def assemble(

@@ -143,8 +143,8 @@ class ScannerNode(Node):
         outcome = run_scan(self._rig, request, self._limits)
         result = self._result(request, outcome)
         self._last = f"{request.scan_id}: {outcome.end.value}"
-        if outcome.message:
-            self._last += f": {outcome.message}"
+        if result.message:
+            self._last += f": {result.message}"
         if not self.context.ok():
             return result
         line = f"{self._last}; {result.points} points"

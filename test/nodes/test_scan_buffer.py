@@ -1,5 +1,7 @@
 """Placing profiles by time, and assembling a scan."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,8 @@ from eschorty_ros.core.cloud import REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
+from eschorty_ros.nodes.pipeline import ScanReport
+from eschorty_ros.nodes.reconstruction_reports import fill_end_scan
 from eschorty_ros.nodes.scan_buffer import PlacedPoints, ScanBuffer
 from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
 
@@ -55,6 +59,35 @@ def test_scan_is_sorted_by_period_then_column_and_limits_are_included():
 def test_empty_scan():
     scan = ScanBuffer("a", 0.0, 1.0).assemble()
     assert len(scan.points) == scan.profiles == 0
+
+
+def test_points_outside_the_limits_are_counted():
+    buffer = ScanBuffer("a", 0.0, 1.0)
+    buffer.add(placed([-0.1, 0.5, 1.1, 2.0], [T0_NS] * 4, [1, 2, 3, 4]))
+    assert len(buffer.assemble().points) == 1
+    assert buffer.points_outside == 3
+
+
+@pytest.mark.parametrize(
+    ("points", "events", "without", "outside", "says"),
+    [
+        (5, 100, 0, 3, ""),
+        (0, 0, 0, 0, "no points: no events came"),
+        (0, 100, 0, 0, "no points: nothing blinks with the laser in 100 events"),
+        (0, 100, 0, 3, "no points: all 3 lie outside start to stop"),
+        (0, 100, 7, 3, "7 points had no stage position"),
+    ],
+)
+def test_a_scan_without_points_says_why(points, events, without, outside, says):
+    buffer = ScanBuffer("a", 0.0, 1.0)
+    if points:
+        buffer.add(placed([0.5] * points, [T0_NS] * points, range(points)))
+    report = ScanReport(buffer.assemble(), events, 0, 0, without, outside, 0)
+    response = SimpleNamespace()
+    fill_end_scan(response, report)
+    assert response.message.startswith(says)
+    assert bool(response.message) == bool(says)
+    assert response.points == points
 
 
 def test_points_over_the_limit_are_counted():
