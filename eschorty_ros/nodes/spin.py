@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -53,18 +52,25 @@ def unless_shut_down(node: Node) -> Iterator[None]:
             raise
 
 
-def _interrupt_before(started: threading.Event) -> None:
-    """Let Ctrl-C interrupt what comes before ``started``; later it ends the context only.
+def _interrupt_at_first() -> Callable[[], None]:
+    """Let Ctrl-C interrupt what comes before a call of what is returned; later it ends the context.
 
     An exception in the middle of a callback would leave half-made objects to their finalizers.
     """
+    # No lock, as an event has: the signal may come while the main thread holds it.
+    starting = True
 
     def interrupt(*_: object) -> None:
-        if not started.is_set():
-            started.set()
+        if starting:
+            started()
             raise KeyboardInterrupt
 
+    def started() -> None:
+        nonlocal starting
+        starting = False
+
     signal.signal(signal.SIGINT, interrupt)
+    return started
 
 
 def _ignore_signals() -> dict[signal.Signals, Any]:
@@ -116,13 +122,12 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     nodes: list[Node] = []
     executor: Executor | None = None
     code = 0
-    started = threading.Event()
     use_profile()
     try:
-        _interrupt_before(started)
+        started = _interrupt_at_first()
         # Its own handler of SIGINT and SIGTERM ends the context and so the loop below.
         rclpy.init(args=list(args) if args is not None else None)
-        started.set()
+        started()
         signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
         executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
         for factory in factories:
