@@ -57,9 +57,9 @@ class Heartbeat:
         beat_s = 0.0
         own_pauses = OwnPauses(LOOK_S)
         while not pause.wait(LOOK_S) and self._node.context.ok():
+            healthy, now_s = self._asked(), time.monotonic()
             paused = own_pauses.look() > PAUSE_S
             recovering = RECOVERY_LOOKS if paused else max(recovering - 1, 0)
-            healthy, now_s = self._asked(), time.monotonic()
             healthy |= self.beating and recovering > 0
             if healthy:
                 last_beats = LAST_BEATS

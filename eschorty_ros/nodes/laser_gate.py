@@ -125,31 +125,35 @@ class LaserGate:
             return f"arming expired after {self._arm_timeout_s:g} s; call laser/arm again"
         return self._unsafe()
 
-    def must_end(self) -> str | None:
-        """Why an output that is on must go off now, ``None`` when it may stay."""
+    def must_end(self, at_s: float | None = None) -> str | None:
+        """Why an output that is on must go off, ``None`` when it may stay.
+
+        Beats are as old as they were at ``at_s`` of the clock, by default now.
+        """
         on_s = self._on_s
         if on_s is None:
             return None
         if self._now_s() - on_s > self._max_on_s:
             return f"on for max_on_time, {self._max_on_s:g} s"
-        return self._unsafe()
+        return self._unsafe(at_s)
 
-    def _unsafe(self) -> str | None:
+    def _unsafe(self, at_s: float | None = None) -> str | None:
         if self.interlock_open:
             return "interlock open; close it"
+        at_s = self._now_s() if at_s is None else at_s
         for topic, timeout_s in self._leases.items():
-            trouble = self._trouble(topic, timeout_s)
+            trouble = self._trouble(topic, timeout_s, at_s)
             if trouble:
                 return f"{trouble}; {_remedy(topic)}"
         return None
 
-    def _trouble(self, topic: str, timeout_s: float) -> str:
+    def _trouble(self, topic: str, timeout_s: float, at_s: float) -> str:
         beat_s = self._beat_s.get(topic)
         if beat_s is None:
             return f"no {topic}"
         if topic in self._stopped:
             return f"{topic} says stopped"
-        if self._now_s() - beat_s > timeout_s:
+        if at_s - beat_s > timeout_s:
             return f"{topic} older than {timeout_s:g} s"
         peer = self._peers.get(topic)
         trouble = peer.trouble() if peer is not None else ""

@@ -274,7 +274,7 @@ class LaserKeeper:
         with self._lock:
             if pause_s:
                 self.gate.forgive(pause_s)
-            reason = self.gate.must_end()
+            reason = self.gate.must_end(self._pauses.looked_s)
             if reason is None and not self._living() and self._record.requested is LaserOutput.ON:
                 reason = "the node is shutting down"
             if reason is not None:

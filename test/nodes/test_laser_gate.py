@@ -159,6 +159,17 @@ def test_a_pause_of_the_watcher_ages_no_beat(gate: LaserGate, clock: Clock) -> N
     assert "laser/heartbeat older than 1 s" in str(gate.must_end())
 
 
+def test_a_pause_that_begins_after_the_look_ages_no_beat_either(
+    gate: LaserGate, clock: Clock
+) -> None:
+    light(gate)
+    looked_s = clock.now_s
+    clock.now_s += 5.0
+    assert gate.must_end(looked_s) is None
+    gate.forgive(5.0)
+    assert gate.must_end(clock.now_s) is None
+
+
 def test_a_pause_of_the_watcher_lengthens_no_light(gate: LaserGate, clock: Clock) -> None:
     light(gate)
     clock.now_s += 601.0

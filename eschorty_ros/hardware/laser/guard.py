@@ -123,7 +123,7 @@ class Guard:
         if self._tripped:
             return
         why = standing_still(self._owner_pid)
-        if not why and time.monotonic() - self._heard_s > self._silence_s:
+        if not why and self._pauses.looked_s - self._heard_s > self._silence_s:
             why = f"silent for {self._silence_s:g} s"
         if why:
             self._tripped = f"laser guard: process {self._owner_pid} is {why}"
