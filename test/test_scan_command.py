@@ -146,3 +146,15 @@ def test_a_scan_without_points_is_no_success(tmp_path):
     with pytest.raises(DeviceError, match="no points: no events came"):
         finish(request, Outcome(True, "no points: no events came", points, 0, 0, 0, 0), tmp_path)
     assert len(read_cloud(tmp_path / "scan.pcd")) == 0
+
+
+def test_what_a_scan_lost_is_printed(tmp_path, capsys):
+    from eschorty_ros.cli.scan import finish
+    from eschorty_ros.nodes.one_scan import OneScan, Outcome
+
+    request = OneScan("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper", hardware={})
+    points = np.zeros(4, POINT_DTYPE)
+    points["x"] = points["t"] = points["y"] = points["column"] = [1, 2, 3, 4]
+    lost = "7 points had no stage position"
+    finish(request, Outcome(True, lost, points, 4, 100, 0, 0), tmp_path)
+    assert lost in capsys.readouterr().out

@@ -25,7 +25,7 @@ from eschorty_ros.emulation.usb_wire import (
 )
 
 _GRACE_S = 20.0
-"""A server that is stopped or overloaded counts as a device that does not answer after this."""
+"""A server that is stopped or overloaded counts as a device that is gone after this."""
 
 
 class _Link:

@@ -68,7 +68,7 @@ class LaserKeeper:
         # Counts switching off; what was asked for before it must not end in light.
         self._offs = 0
         self._lookouts: list[Lookout] = []
-        self._pauses = OwnPauses(WATCH_PERIOD_S)
+        self._pauses: OwnPauses
         self.switch_offs = 0
 
     @property

@@ -17,10 +17,11 @@ from pathlib import Path
 import generator_double
 import pytest
 from generator_double import MAKE, Generator
+from hours import Hours
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.hardware import own_pauses
 from eschorty_ros.hardware.laser import guard, guard_wire, guarded
 from eschorty_ros.hardware.laser.guarded import GuardedLaser
 from eschorty_ros.hardware.laser.opening import maker, open_again
@@ -315,31 +316,11 @@ def test_closing_when_the_guard_has_just_died_is_dark(device: Generator, number:
         assert not device.lit()
 
 
-class Hours:
-    """A steady clock that the guard reads and the test sets."""
-
-    def __init__(self) -> None:
-        self.now_s = time.monotonic()
-        self.looks = 0
-
-    def monotonic(self) -> float:
-        self.looks += 1
-        return self.now_s
-
-    def pass_by(self, seconds: float) -> None:
-        """Let the time pass at once, and the guard look at it twice."""
-        self.now_s += seconds
-        seen = self.looks
-        # A turn of the guard reads the clock three times at most.
-        _wait_until(lambda: self.looks > seen + 6)
-
-
 def test_a_guard_that_stood_still_itself_calls_nobody_silent(
     device: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hours = Hours()
+    hours = Hours(monkeypatch)
     monkeypatch.setattr(guard, "time", hours)
-    monkeypatch.setattr(own_pauses, "time", hours)
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     wire = guard_wire.Wire(here)
     serving = threading.Thread(target=guard.Guard(guard_wire.Wire(there), os.getpid()).run)
@@ -349,7 +330,7 @@ def test_a_guard_that_stood_still_itself_calls_nobody_silent(
                    "silence_s": SILENCE_S})  # fmt: skip
         for number, command in enumerate(("arm", "enable"), 1):
             wire.send({"id": number, "do": command})
-        _wait_until(device.lit)
+        wait_until(device.lit, "light")
         hours.pass_by(60.0)
         assert device.lit()
         for _ in range(int(SILENCE_S / 0.05) + 2):
@@ -377,13 +358,23 @@ def test_switching_off_overtakes(device: Generator, tmp_path: Path) -> None:
         light(laser)
         failures: list[Exception] = []
         reader = _thread(lambda: laser.readback(), failures)
-        _wait_until(held.exists)
+        wait_until(held.exists, "the read-back under way")
         asked_ns = time.monotonic_ns()
         laser.disable()
         assert device.off_after_s(asked_ns) < OFF_LIMIT_S
         reader()
         assert "interrupted by switching off" in str(failures[0])
         laser.close()
+
+
+def test_an_answer_that_comes_with_the_end_of_the_wait_counts(
+    device: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guarded, "_LATE_S", DEADLINE_S)
+    laser = GuardedLaser(MAKE, device.settings, silence_s=PATIENT_S, answer_s=1e-9)
+    with contextlib.closing(laser):
+        light(laser)
+        assert laser.readback().output is LaserOutput.ON
 
 
 def test_what_was_asked_before_switching_off_is_void(
@@ -399,9 +390,9 @@ def test_what_was_asked_before_switching_off_is_void(
         )
         failures: list[Exception] = []
         waits = [_thread(laser.readback, failures)]
-        _wait_until(held.exists)
+        wait_until(held.exists, "the read-back under way")
         waits += [_thread(step, failures) for step in (laser.arm, laser.enable)]
-        _wait_until(lambda: {"arm", "enable"} <= set(asked))
+        wait_until(lambda: {"arm", "enable"} <= set(asked), "both asked for")
         laser.disable()
         for wait in waits:
             wait()
@@ -459,13 +450,6 @@ def _thread(step: Callable[[], object], failures: list[Exception]) -> Callable[[
     return thread.join
 
 
-def _wait_until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.005)
-
-
 def _wait_for_end(pid: int) -> None:
     def ended() -> bool:
         try:
@@ -473,4 +457,4 @@ def _wait_for_end(pid: int) -> None:
         except (FileNotFoundError, ProcessLookupError):
             return True
 
-    _wait_until(ended)
+    wait_until(ended, f"the end of {pid}")

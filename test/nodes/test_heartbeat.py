@@ -13,6 +13,8 @@ from waiting import DEADLINE_S
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from rclpy.clock import Clock
+
 from eschorty_ros.nodes import heartbeat
 from eschorty_ros.nodes.heartbeat import RECOVERY_LOOKS, Heartbeat
 from eschorty_ros.nodes.peer import read_sign
@@ -42,8 +44,6 @@ class Script:
         return self
 
     def get_clock(self) -> Any:
-        from rclpy.clock import Clock
-
         return Clock()
 
     def run(self, healthy: Callable[[int], bool]) -> list[int]:

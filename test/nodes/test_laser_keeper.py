@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from held_laser import HeldLaser
+from hours import Hours
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.errors import DeviceError
@@ -138,6 +139,35 @@ def test_the_reason_is_that_of_whoever_switched_off(keeper: LaserKeeper) -> None
     snapshot = keeper.snapshot()
     assert snapshot is not None
     assert snapshot.reason == "interlock open"
+
+
+def test_a_pause_of_the_watcher_leaves_light_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    hours = Hours(monkeypatch)
+    laser = HeldLaser()
+    gate = LaserGate(10.0, 600.0, {LEASE: 1.0}, now_s=hours.monotonic)
+    keeper = LaserKeeper(
+        gate,
+        living=lambda: True,
+        changed=lambda snapshot: None,
+        alarm=print,
+        log=print,
+        readback_period_s=0.02,
+    )
+    gate.beat()
+    keeper.open(laser, Modulation(70.0))
+    try:
+        keeper.arm()
+        keeper.enable()
+        hours.pass_by(60.0)
+        assert laser.lit
+        for _ in range(22):
+            hours.pass_by(0.05)
+        assert not laser.lit
+        snapshot = keeper.snapshot()
+        assert snapshot is not None
+        assert "laser/heartbeat older than 1 s" in snapshot.reason
+    finally:
+        keeper.close()
 
 
 def test_opened_again_it_is_watched_once(keeper: LaserKeeper, laser: HeldLaser) -> None:

@@ -82,7 +82,8 @@ class Guard:
         try:
             while self._closing is None:
                 ready = dict(poller.poll(_LOOK_S * 1e3))
-                self._heard_s += self._pauses.look()
+                pause_s = self._pauses.look()
+                self._heard_s = min(self._heard_s + pause_s, self._pauses.looked_s)
                 if owner in ready:
                     break
                 messages = self._wire.receive()

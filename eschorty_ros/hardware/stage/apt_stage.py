@@ -293,8 +293,7 @@ class AptStage:
         if self._tracker.failure is not None:
             return
         self._tracker.failure = error
-        with contextlib.suppress(DeviceError):
-            self._send_now("stop", channel=apt.CHANNEL, mode=_PROFILED)
+        self._send_stop()
         if escalate:
             address, now_ns = self._settings.address, self._link.now_ns()
             self._stopping = [
