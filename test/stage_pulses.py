@@ -9,11 +9,11 @@ import numpy as np
 from eschorty_ros.core.clock import StageTrack
 from eschorty_ros.core.clock_line import ClockLine
 from eschorty_ros.core.motion import plan_move
-from eschorty_ros.core.pulses import PulseGrid
+from eschorty_ros.core.pulses import PulseTrain
 
 SEED = 21
 EPOCH_NS = 1_760_000_000_123_456_789
-GRID = PulseGrid(1.0, 2.0, 110)
+PULSES = PulseTrain(1.0, 2.0, 110)
 DRIFT = 50e-6
 
 
@@ -25,7 +25,7 @@ class StagePulses:
         targets=(10.0, 210.0),
         speed=300.0,
         acceleration=5000.0,
-        grid=GRID,
+        pulses=PULSES,
         missing=0.001,
         spurious=0,
         sampling_us=102.0,
@@ -47,9 +47,9 @@ class StagePulses:
             until = now + round(sum(plan.durations_s) * 1e9)
             t = now + np.arange(0, until - now, 20_000)
             x = plan.state(t)[0]
-            n = np.floor((x - grid.first_mm) / grid.interval_mm)
+            n = np.floor((x - pulses.first_mm) / pulses.interval_mm)
             for k in np.flatnonzero(np.diff(n)):
-                if 0 <= max(n[k], n[k + 1]) < grid.count:
+                if 0 <= max(n[k], n[k + 1]) < pulses.count:
                     crossings.append(int(t[k]) + 10_000)
             now = until + 300_000_000
         self.plans, self.until_ns = plans, now

@@ -10,7 +10,7 @@ from eschorty_ros.core.clock import StageTrack
 from eschorty_ros.core.clock_line import NS_PER_US, ClockLine
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.position_edges import EdgeFit, fit_edges
-from eschorty_ros.core.pulses import PulseGrid, leading_edges
+from eschorty_ros.core.pulses import PulseTrain, leading_edges
 
 _WINDOW_US = 60_000_000
 _EDGES_MAX = 8192
@@ -24,15 +24,15 @@ class EdgeClock:
     ----------
     fit : EdgeFit or None
         The last fit that held.
-    grid : PulseGrid or None
+    pulses : PulseTrain or None
         Where the stage gives its pulses; without it no edge means anything.
     edges_dropped : int
         Edges beyond what is kept: the input sees something faster than a stage.
     """
 
-    def __init__(self, grid: PulseGrid | None = None) -> None:
+    def __init__(self, pulses: PulseTrain | None = None) -> None:
         self.fit: EdgeFit | None = None
-        self.grid = grid
+        self.pulses = pulses
         self.edges_dropped = 0
         self._t_us = np.empty(0, np.int64)
         self._polarity = np.empty(0, np.uint8)
@@ -79,7 +79,7 @@ class EdgeClock:
             Fit every new edge, not only after 50 ms of them.
         """
         last_us = track.last_us
-        if self.grid is None or last_us is None or self._t_us.size == 0:
+        if self.pulses is None or last_us is None or self._t_us.size == 0:
             return False
         newest = int(np.searchsorted(self._t_us, arrivals.to_us(last_us * NS_PER_US), side="right"))
         if newest == 0:
@@ -90,7 +90,7 @@ class EdgeClock:
             return False
         self._fitted_us = newest_us
         leading_us = leading_edges(self._t_us[:newest], self._polarity[:newest])
-        fit = fit_edges(leading_us, track, self.grid, arrivals)
+        fit = fit_edges(leading_us, track, self.pulses, arrivals)
         if fit is not None:
             self.fit = fit
         return fit is not None

@@ -3,7 +3,7 @@
 Pulse ``n`` begins as the carriage passes ``first + n interval``. The odometry says when that was in
 ROS time, the camera's trigger input when it was in sensor time. Which pulse an edge is follows from
 the approximate clock and, where that is not good to a pulse, from the ramps: there the pulses are
-further apart in time, and only the right shift lays all edges onto the grid.
+further apart in time, and only the right shift lays all edges onto the pulses.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core._checks import TIME_LIMIT, whole_vector
 from eschorty_ros.core.clock import StageTrack
 from eschorty_ros.core.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
-from eschorty_ros.core.pulses import PulseGrid
+from eschorty_ros.core.pulses import PulseTrain
 
 EDGES_MIN = 8
 # KBD101 looks at its position every 102 us: an edge comes later than the position by a time evenly
@@ -73,7 +73,7 @@ class EdgeFit:
 
 
 def fit_edges(
-    t_us: NDArray[np.int64], track: StageTrack, grid: PulseGrid, arrivals: ClockLine
+    t_us: NDArray[np.int64], track: StageTrack, pulses: PulseTrain, arrivals: ClockLine
 ) -> EdgeFit | None:
     """Clock that lays the edges onto the pulses.
 
@@ -83,7 +83,7 @@ def fit_edges(
         Sensor times of the pulses' first edges, in time order.
     track : StageTrack
         Odometry over ROS time, us.
-    grid : PulseGrid
+    pulses : PulseTrain
     arrivals : ClockLine
         The clock as the packets' arrivals show it; late rather than early.
 
@@ -94,9 +94,9 @@ def fit_edges(
         leaves its bounds: the edges are then not those of this stage.
     """
     t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
-    if t_us.size < EDGES_MIN or grid.count == 0:
+    if t_us.size < EDGES_MIN or pulses.count == 0:
         return None
-    match = _Match(t_us, track, grid, arrivals)
+    match = _Match(t_us, track, pulses, arrivals)
     near = match.best(_NEAR_MS, _DOUBT_PER_MS)
     if near is not None and near.used >= _SHARE_GOOD * (near.used + near.spurious):
         return near
@@ -105,16 +105,16 @@ def fit_edges(
 
 
 class _Match:
-    """Edges against the grid under shifts of the clock.
+    """Edges against the pulses under shifts of the clock.
 
     ``late_ms`` is by how much the arrivals' clock is late.
     """
 
     def __init__(
-        self, t_us: NDArray[np.int64], track: StageTrack, grid: PulseGrid, arrivals: ClockLine
+        self, t_us: NDArray[np.int64], track: StageTrack, pulses: PulseTrain, arrivals: ClockLine
     ) -> None:
         self._track = track
-        self._grid = grid
+        self._pulses = pulses
         self._arrivals = arrivals
         # A position as it was when the controller looked, on average.
         self._all_us = arrivals.to_ns(t_us) // NS_PER_US - SAMPLING_US // 2
@@ -148,31 +148,31 @@ class _Match:
 
     def _refined(self, late_ms: float) -> float:
         for _ in range(3):
-            off_mm, speed = self._state(self._some_us - round(late_ms * 1e3))
-            near = np.abs(off_mm) < 0.25 * self._grid.interval_mm
+            offset_mm, speed = self._state(self._some_us - round(late_ms * 1e3))
+            near = np.abs(offset_mm) < 0.25 * self._pulses.interval_mm
             near &= np.abs(speed) > _SPEED_MIN_MM_S
             if not near.any():
                 return late_ms
-            late_ms += 1e3 * float(np.median(off_mm[near] / speed[near]))
+            late_ms += 1e3 * float(np.median(offset_mm[near] / speed[near]))
         return late_ms
 
     def _off(self, late_ms: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance from the pulses (share of the interval, at most 0.25) by shift and edge."""
         at = self._some_us[None, :] - np.rint(late_ms * 1e3).astype(np.int64)[:, None]
-        off = np.abs(self._grid.off_mm(self._track.position_mm(at))) / self._grid.interval_mm
+        off = np.abs(self._pulses.offset_mm(self._track.position_mm(at))) / self._pulses.interval_mm
         return np.where(off < 0.25, off, 0.25)
 
     def _step_ms(self) -> float:
         _, speed = self._state(self._some_us)
         fastest = max(float(np.nanmax(np.abs(speed), initial=0.0)), _SPEED_MIN_MM_S)
-        return min(_STEP_MS, 0.15e3 * self._grid.interval_mm / fastest)
+        return min(_STEP_MS, 0.15e3 * self._pulses.interval_mm / fastest)
 
     def _state(self, at_us: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Distance from the pulses (mm) and speed (mm/s) at ROS times."""
         position = self._track.position_mm(at_us)
         ahead = self._track.position_mm(at_us + 1000)
         behind = self._track.position_mm(at_us - 1000)
-        return self._grid.off_mm(position), (ahead - behind) / 2e-3
+        return self._pulses.offset_mm(position), (ahead - behind) / 2e-3
 
     def _steady(self, at_us: NDArray[np.int64], speed: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell where the speed hardly changes."""
@@ -187,31 +187,33 @@ class _Match:
         late_ns, slope = late_ms * 1e6, 0.0
         middle_us = int(self._t_us[self._t_us.size // 2])
         since_s: NDArray[np.float64] = (self._t_us - middle_us) / 1e6
-        limit_mm, noise_mm = 0.25 * self._grid.interval_mm, _NOISE_MM
+        limit_mm, noise_mm = 0.25 * self._pulses.interval_mm, _NOISE_MM
         for _ in range(_TURNS):
             late_us = np.rint((late_ns + slope * since_s * 1e9) * 1e-3).astype(np.int64)
-            off_mm, speed = self._state(self._all_us - late_us)
-            near = (np.abs(off_mm) < limit_mm) & (np.abs(speed) > _SPEED_MIN_MM_S)
+            offset_mm, speed = self._state(self._all_us - late_us)
+            near = (np.abs(offset_mm) < limit_mm) & (np.abs(speed) > _SPEED_MIN_MM_S)
             if np.count_nonzero(near) < EDGES_MIN:
                 return None
             steady = near & self._steady(self._all_us - late_us, speed)
             if np.count_nonzero(steady) < EDGES_MIN // 2:
                 steady = near
             by_ns, by_slope = _correction(
-                off_mm[steady], speed[steady], since_s[steady], slope, noise_mm
+                offset_mm[steady], speed[steady], since_s[steady], slope, noise_mm
             )
             late_ns += by_ns
             slope += by_slope
-            noise_mm = max(1.4826 * float(np.median(np.abs(off_mm[near]))), _NOISE_MM)
-            limit_mm = min(4.0 * noise_mm, 0.25 * self._grid.interval_mm)
+            noise_mm = max(1.4826 * float(np.median(np.abs(offset_mm[near]))), _NOISE_MM)
+            limit_mm = min(4.0 * noise_mm, 0.25 * self._pulses.interval_mm)
         drift_ppb = self._arrivals.drift_ppb - round(slope * 1e9)
-        known = ~np.isnan(off_mm)
-        residual_mm = float(np.sqrt(np.mean(off_mm[near] ** 2)))
-        near |= (np.abs(off_mm) < _OWN * self._grid.interval_mm) & (np.abs(speed) > _SPEED_MIN_MM_S)
+        known = ~np.isnan(offset_mm)
+        residual_mm = float(np.sqrt(np.mean(offset_mm[near] ** 2)))
+        near |= (np.abs(offset_mm) < _OWN * self._pulses.interval_mm) & (
+            np.abs(speed) > _SPEED_MIN_MM_S
+        )
         if abs(drift_ppb) > DRIFT_MAX_PPB or near.sum() < _SHARE_MIN * known.sum():
             return None
         origin_ns = self._arrivals.to_ns(middle_us) - round(late_ns)
-        used, missing = self._counted(self._all_us - late_us, off_mm, near)
+        used, missing = self._counted(self._all_us - late_us, offset_mm, near)
         return EdgeFit(
             ClockLine(middle_us, origin_ns, drift_ppb),
             int(used.size),
@@ -223,33 +225,33 @@ class _Match:
         )
 
     def _counted(
-        self, at_us: NDArray[np.int64], off_mm: NDArray[np.float64], near: NDArray[np.bool_]
+        self, at_us: NDArray[np.int64], offset_mm: NDArray[np.float64], near: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], int]:
         """Edges used, one for each pulse passed, and pulses passed without one."""
         index = np.flatnonzero(near)
         position = self._track.position_mm(at_us[index])
-        pulse = self._grid.pulse(position).astype(np.int64)
+        pulse = self._pulses.nearest(position).astype(np.int64)
         _, speed = self._state(at_us[index])
         # Between two passages of one pulse the carriage goes at least half an interval and back.
-        apart_us = 0.5e6 * self._grid.interval_mm / np.abs(speed)
+        apart_us = 0.5e6 * self._pulses.interval_mm / np.abs(speed)
         kept = [0]
         for k in range(1, index.size):
             before = kept[-1]
             soon = at_us[index[k]] - at_us[index[before]] < apart_us[k]
             if pulse[k] == pulse[before] and soon:
-                if abs(off_mm[index[k]]) < abs(off_mm[index[before]]):
+                if abs(offset_mm[index[k]]) < abs(offset_mm[index[before]]):
                     kept[-1] = k
             else:
                 kept.append(k)
         chosen = np.array(kept)
         steps = np.abs(np.diff(pulse[chosen]))
-        direct_us = steps * 1.5e6 * self._grid.interval_mm / np.abs(speed[chosen][1:])
+        direct_us = steps * 1.5e6 * self._pulses.interval_mm / np.abs(speed[chosen][1:])
         direct = np.diff(at_us[index[chosen]]) < direct_us
         return index[chosen], int(np.clip(steps[direct] - 1, 0, None).sum())
 
 
 def _correction(
-    off_mm: NDArray[np.float64],
+    offset_mm: NDArray[np.float64],
     speed_mm_s: NDArray[np.float64],
     since_s: NDArray[np.float64],
     slope: float,
@@ -260,7 +262,7 @@ def _correction(
     scale = np.array([1e-3, _DRIFT_SIGMA])
     normal = (rows * scale).T @ (rows * scale)
     normal[1, 1] += 1.0
-    right = (rows * scale).T @ (off_mm / noise_mm)
+    right = (rows * scale).T @ (offset_mm / noise_mm)
     right[1] -= slope / _DRIFT_SIGMA
     late_s, by_slope = np.linalg.solve(normal, right) * scale
     return float(late_s) * 1e9, float(by_slope)

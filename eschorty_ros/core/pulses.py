@@ -12,8 +12,8 @@ from eschorty_ros.core.errors import ArgumentError
 
 
 @dataclass(frozen=True, slots=True)
-class PulseGrid:
-    """Positions of the pulses: ``first_mm + n interval_mm`` for n from 0 up to ``count``.
+class PulseTrain:
+    """Pulses of a stage: number n, below ``count``, begins at ``first_mm + n interval_mm``.
 
     Raises
     ------
@@ -30,14 +30,14 @@ class PulseGrid:
         positive("interval_mm", self.interval_mm)
         whole("count", self.count, 0, 1 << 31)
 
-    def pulse(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Find the number of the pulse nearest to each position."""
+    def nearest(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the number of the pulse nearest to each position; NaN stays."""
         n = np.rint((reals("position_mm", position_mm) - self.first_mm) / self.interval_mm)
         return np.clip(n, 0, max(self.count - 1, 0))
 
-    def off_mm(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Measure the signed distance of each position from its pulse; NaN stays."""
-        pulse_mm = self.first_mm + self.pulse(position_mm) * self.interval_mm
+    def offset_mm(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distance of each position from its nearest pulse; NaN stays."""
+        pulse_mm = self.first_mm + self.nearest(position_mm) * self.interval_mm
         return reals("position_mm", position_mm) - pulse_mm
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     # Only names: the process that guards the laser starts without numpy.
     from eschorty_ros.core.modulation import Modulation
+    from eschorty_ros.core.pulses import PulseTrain
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,15 +137,6 @@ class StageState:
     homed: bool
     moving: bool
     flags: tuple[str, ...] = field(default=())
-
-
-@dataclass(frozen=True, slots=True)
-class PulseTrain:
-    """Pulses the stage gives: the i-th begins at ``first_mm + i * interval_mm``, i < count."""
-
-    first_mm: float
-    interval_mm: float
-    count: int
 
 
 class LinearStage(Protocol):

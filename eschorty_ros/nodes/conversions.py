@@ -5,7 +5,7 @@ from __future__ import annotations
 from builtin_interfaces.msg import Time
 
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.pulses import PulseGrid
+from eschorty_ros.core.pulses import PulseTrain
 
 _NS_PER_S = 1_000_000_000
 
@@ -63,7 +63,7 @@ def laser_settings(state: object) -> tuple[Modulation, int | None, int | None]:
     return modulation, epoch_ns, since_ns
 
 
-def pulse_grid(trigger: object) -> tuple[PulseGrid | None]:
+def pulse_train(trigger: object) -> tuple[PulseTrain | None]:
     """Where a ``PositionTrigger`` says that the stage gives pulses, ``None`` when nowhere.
 
     Raises
@@ -75,4 +75,4 @@ def pulse_grid(trigger: object) -> tuple[PulseGrid | None]:
     count = int(trigger.count)  # type: ignore[attr-defined]
     if interval_mm == 0.0 or count == 0:
         return (None,)
-    return (PulseGrid(mm_from_m(float(trigger.first)), interval_mm, count),)  # type: ignore[attr-defined]
+    return (PulseTrain(mm_from_m(float(trigger.first)), interval_mm, count),)  # type: ignore[attr-defined]

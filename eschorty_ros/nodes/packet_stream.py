@@ -8,7 +8,7 @@ from dataclasses import replace
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.clock import NS_PER_US, SensorClock, StageTrack
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.pulses import PulseGrid
+from eschorty_ros.core.pulses import PulseTrain
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.nodes.packet_times import (
     WRAP_US,
@@ -83,7 +83,7 @@ class PacketStream:
         self._held: deque[Packet] = deque()
         self._held_max = held_max
         self._held_since_s: float | None = None
-        self._grid: PulseGrid | None = None
+        self._pulses: PulseTrain | None = None
         self._epoch: SensorEpoch | None = None
         self._epoch_used = False
         self._laser: tuple[Modulation, int | None] | None = None
@@ -162,11 +162,11 @@ class PacketStream:
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
 
-    def set_grid(self, grid: PulseGrid | None) -> None:
+    def set_pulses(self, pulses: PulseTrain | None) -> None:
         """Expect pulses there, or none, where the trigger input is wired to the stage."""
-        self._grid = grid
+        self._pulses = pulses
         if self._epoch is not None:
-            self._epoch.set_grid(self._expected_grid())
+            self._epoch.set_pulses(self._expected_pulses())
 
     def follow_edges(self, track: StageTrack, *, now: bool = False) -> None:
         """Let the clock follow the stage's edges; with ``now`` up to the very newest."""
@@ -178,7 +178,7 @@ class PacketStream:
         if settings == self._settings:
             return
         self._settings = settings
-        self.set_grid(self._grid)
+        self.set_pulses(self._pulses)
         self._renew()
 
     def set_calibration(self, calibration: Calibration) -> None:
@@ -234,11 +234,11 @@ class PacketStream:
         return True
 
     def _begin_epoch(self, clock: SensorClock) -> None:
-        self._epoch = SensorEpoch(clock, self._expected_grid())
+        self._epoch = SensorEpoch(clock, self._expected_pulses())
         self._epoch_used = False
 
-    def _expected_grid(self) -> PulseGrid | None:
-        return self._grid if self._settings.trigger_source == "stage" else None
+    def _expected_pulses(self) -> PulseTrain | None:
+        return self._pulses if self._settings.trigger_source == "stage" else None
 
     def _push(self, packet: Packet) -> None:
         missing = 0 if self._next_seq is None else packet.seq - self._next_seq

@@ -28,7 +28,7 @@ from eschorty_ros.nodes import diagnostics, qos, transforms
 from eschorty_ros.nodes.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.auto_calibration import AutoCalibration
 from eschorty_ros.nodes.calibrator import Calibrator
-from eschorty_ros.nodes.conversions import laser_settings, mm_from_m, ns_from_stamp, pulse_grid
+from eschorty_ros.nodes.conversions import laser_settings, mm_from_m, ns_from_stamp, pulse_train
 from eschorty_ros.nodes.mailbox import Mailbox
 from eschorty_ros.nodes.packet_times import Packet
 from eschorty_ros.nodes.parameters import Parameters, from_settings
@@ -160,9 +160,9 @@ class ReconstructionNode(Node):
             self._mailbox.post(partial(self._pipeline.stream.set_laser, *read))
 
     def _on_trigger(self, message: PositionTrigger) -> None:
-        read = self._read("stage/trigger", pulse_grid, message)
+        read = self._read("stage/trigger", pulse_train, message)
         if read is not None:
-            self._mailbox.post(partial(self._pipeline.stream.set_grid, *read))
+            self._mailbox.post(partial(self._pipeline.stream.set_pulses, *read))
 
     def _read(self, topic: str, convert: Callable[[Any], tuple[Any, ...]], message: Any) -> Any:
         """Convert a message; ``None`` and a line in the log when it is bad."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.clock import SensorClock, StageTrack
 from eschorty_ros.core.edge_clock import EdgeClock
 from eschorty_ros.core.profiles import Profiles
-from eschorty_ros.core.pulses import PulseGrid
+from eschorty_ros.core.pulses import PulseTrain
 
 _UNSEEN_US = -(1 << 62)
 _PULSES_MISSING = 30
@@ -22,7 +22,7 @@ class SensorEpoch:
     Parameters
     ----------
     clock : SensorClock
-    grid : PulseGrid or None
+    pulses : PulseTrain or None
         Where the stage gives pulses to the camera's trigger input, if it is wired to the stage.
 
     Attributes
@@ -33,9 +33,9 @@ class SensorEpoch:
         Whether the stage has passed many pulses since the last edge that fits.
     """
 
-    def __init__(self, clock: SensorClock, grid: PulseGrid | None = None) -> None:
+    def __init__(self, clock: SensorClock, pulses: PulseTrain | None = None) -> None:
         self.clock = clock
-        self.edges = EdgeClock(grid)
+        self.edges = EdgeClock(pulses)
         self.edges_missing = False
         self._passed_mm = 0.0
         self._position_mm: float | None = None
@@ -43,12 +43,12 @@ class SensorEpoch:
     @property
     def expects_edges(self) -> bool:
         """Whether edges of the stage are to tell the time."""
-        return self.edges.grid is not None and not self.clock.exact
+        return self.edges.pulses is not None and not self.clock.exact
 
-    def set_grid(self, grid: PulseGrid | None) -> None:
+    def set_pulses(self, pulses: PulseTrain | None) -> None:
         """Take pulses at other places from now on, or none."""
-        if grid != self.edges.grid:
-            self.edges = EdgeClock(grid)
+        if pulses != self.edges.pulses:
+            self.edges = EdgeClock(pulses)
             self.clock.adopt(None)
 
     def follow(self, track: StageTrack, *, now: bool = False) -> None:
@@ -63,14 +63,14 @@ class SensorEpoch:
         self._count_pulses(track)
 
     def _count_pulses(self, track: StageTrack) -> None:
-        assert self.edges.grid is not None
+        assert self.edges.pulses is not None
         if track.last_us is None:
             return
         position_mm = float(track.position_mm(np.array([track.last_us]))[0])
         if self._position_mm is not None:
             self._passed_mm += abs(position_mm - self._position_mm)
         self._position_mm = position_mm
-        self.edges_missing = self._passed_mm > _PULSES_MISSING * self.edges.grid.interval_mm
+        self.edges_missing = self._passed_mm > _PULSES_MISSING * self.edges.pulses.interval_mm
 
     def settled(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Tell which sensor times edges cover, if edges are expected."""

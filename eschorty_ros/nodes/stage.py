@@ -14,11 +14,11 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 
 from eschorty_ros.action import MoveStage
 from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.pulses import PulseTrain
 from eschorty_ros.hardware.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger
 from eschorty_ros.nodes import diagnostics, drivers, qos
 from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
-from eschorty_ros.nodes.device_messages import trigger_message
 from eschorty_ros.nodes.heartbeat import Heartbeat
 from eschorty_ros.nodes.lifecycle import DeviceNode
 from eschorty_ros.nodes.odometry import new_states
@@ -82,9 +82,7 @@ class StageNode(DeviceNode):
         with self._lock:
             self._stage = drivers.make(drivers.STAGES, self.parameters, self.now_ns)
             identity, trigger = self._stage.identity, self._stage.trigger
-        message = trigger_message(trigger, self.now_ns())
-        message.header.frame_id = self.parameters["base_frame"]
-        self._trigger.publish(message)
+        self._trigger.publish(self._trigger_message(trigger))
         self.get_logger().info(f"{identity.model} {identity.serial}")
 
     def start_device(self) -> None:
@@ -230,6 +228,16 @@ class StageNode(DeviceNode):
         for state in states:
             self._told_ns = state.t_ns
             self._odom.publish(self._odometry(state))
+
+    def _trigger_message(self, pulses: PulseTrain | None) -> PositionTrigger:
+        message = PositionTrigger()
+        message.header.frame_id = self.parameters["base_frame"]
+        message.header.stamp = stamp_from_ns(self.now_ns())
+        if pulses is not None:
+            message.first = m_from_mm(pulses.first_mm)
+            message.interval = m_from_mm(pulses.interval_mm)
+            message.count = pulses.count
+        return message
 
     def _odometry(self, state: StageState) -> Odometry:
         message = Odometry(child_frame_id=self.parameters["stage_frame"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from stage_pulses import GRID, StagePulses
+from stage_pulses import PULSES, StagePulses
 
 from eschorty_ros.core.clock import StageTrack
 from eschorty_ros.core.edge_clock import EdgeClock
@@ -14,7 +14,7 @@ RISING = np.ones(1, np.uint8)
 def test_edges_count_once_the_odometry_covers_them():
     bench = StagePulses()
     arrivals = bench.arrivals(3.0)
-    clock = EdgeClock(GRID)
+    clock = EdgeClock(PULSES)
     track = StageTrack(max_gap_us=500_000)
     edges = bench.edges.tolist()
     fits = 0
@@ -39,13 +39,13 @@ def test_nothing_without_a_grid():
     clock = EdgeClock()
     clock.add(bench.edges, np.ones(bench.edges.size, np.uint8))
     assert not clock.update(bench.track, bench.arrivals(1.0), now=True)
-    clock.grid = GRID
+    clock.pulses = PULSES
     assert clock.update(bench.track, bench.arrivals(1.0), now=True)
     assert not clock.update(bench.track, bench.arrivals(1.0), now=True)
 
 
 def test_what_is_kept_is_bounded():
-    clock = EdgeClock(GRID)
+    clock = EdgeClock(PULSES)
     for begin in range(0, 100_000, 1000):
         clock.add(np.arange(begin, begin + 1000), np.ones(1000, np.uint8))
     assert len(clock) == 8192

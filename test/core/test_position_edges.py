@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stage_pulses import EPOCH_NS, GRID, SEED, StagePulses
+from stage_pulses import EPOCH_NS, PULSES, SEED, StagePulses
 
 from eschorty_ros.core.clock import StageTrack
 from eschorty_ros.core.position_edges import fit_edges
-from eschorty_ros.core.pulses import PulseGrid, leading_edges
+from eschorty_ros.core.pulses import PulseTrain, leading_edges
 
 
 @pytest.mark.parametrize("late_ms", [-2.0, 0.3, 4.0, 9.0, 25.0])
 def test_one_sweep_gives_the_clock_to_a_few_micrometres(late_ms):
     bench = StagePulses()
-    fit = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(late_ms, 45.0))
+    fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(late_ms, 45.0))
     print(f"seed {SEED}: {bench.error_um(fit):.1f} um, {fit}")
     assert bench.error_um(fit) < 10.0
     assert fit.used + fit.missing >= 99
@@ -23,7 +23,7 @@ def test_one_sweep_gives_the_clock_to_a_few_micrometres(late_ms):
 
 def test_several_sweeps_give_the_drift():
     bench = StagePulses((10.0, 210.0, 10.0, 210.0, 10.0))
-    fit = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(3.0, 0.0))
+    fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(3.0, 0.0))
     assert bench.error_um(fit) < 10.0
     assert fit.line.drift_ppb * 1e-3 == pytest.approx(50.0, abs=3.0)
 
@@ -31,7 +31,7 @@ def test_several_sweeps_give_the_drift():
 @pytest.mark.parametrize("seed", range(10))
 def test_missing_spurious_and_noisy(seed):
     bench = StagePulses(missing=0.03, spurious=8, odometry_mm=0.02, seed=seed)
-    fit = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(2.0))
+    fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(2.0))
     print(f"seed {seed}: {bench.error_um(fit):.1f} um, {fit}, {bench.missing} missing")
     assert bench.error_um(fit) < 20.0
     assert fit.spurious == pytest.approx(8, abs=3)
@@ -41,15 +41,15 @@ def test_missing_spurious_and_noisy(seed):
 @pytest.mark.parametrize("late_ms", [40.0, 800.0, 4000.0])
 def test_a_host_that_was_slow_from_the_start_is_found_out_by_the_ramps(late_ms):
     bench = StagePulses()
-    fit = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(late_ms))
+    fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(late_ms))
     assert bench.error_um(fit) < 10.0
 
 
 @pytest.mark.parametrize(("interval", "speed"), [(0.5, 300.0), (2.0, 20.0), (10.0, 100.0)])
 def test_other_intervals_and_speeds(interval, speed):
-    grid = PulseGrid(0.0, interval, round(220 / interval))
-    bench = StagePulses(speed=speed, grid=grid)
-    fit = fit_edges(bench.edges, bench.track, grid, bench.arrivals(1.5))
+    pulses = PulseTrain(0.0, interval, round(220 / interval))
+    bench = StagePulses(speed=speed, pulses=pulses)
+    fit = fit_edges(bench.edges, bench.track, pulses, bench.arrivals(1.5))
     # Positions are wrong by the error in time times the speed there is.
     assert bench.error_um(fit) * speed / 300.0 < 10.0
 
@@ -63,28 +63,28 @@ def test_a_slow_sweep_after_a_fast_way_to_its_start():
         t_ns = np.arange(part.plans[0].start_ns - 10**8, part.until_ns, 10**7)
         track.append(t_ns // 1000, part.position(t_ns))
     edges = np.concatenate([fast.edges, slow.edges])
-    fit = fit_edges(edges, track, GRID, slow.arrivals(3.0, 0.0))
+    fit = fit_edges(edges, track, PULSES, slow.arrivals(3.0, 0.0))
     assert fit.used >= edges.size - 1
     assert slow.error_um(fit) * 50.0 / 300.0 < 5.0
 
 
 def test_direction_back():
     bench = StagePulses((210.0, 10.0))
-    fit = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(3.0))
+    fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(3.0))
     assert bench.error_um(fit) < 10.0
 
 
 def test_edges_of_a_laser_are_refused():
     bench = StagePulses()
     laser = np.arange(int(bench.edges[0]) - 10**6, int(bench.edges[-1]) + 10**6, 14_286)
-    assert fit_edges(laser, bench.track, GRID, bench.arrivals(3.0)) is None
+    assert fit_edges(laser, bench.track, PULSES, bench.arrivals(3.0)) is None
 
 
 def test_too_few_edges_or_none_in_the_odometry_give_nothing():
     bench = StagePulses()
-    assert fit_edges(bench.edges[:7], bench.track, GRID, bench.arrivals(1.0)) is None
-    assert fit_edges(bench.edges + 10**9, bench.track, GRID, bench.arrivals(1.0)) is None
-    assert fit_edges(bench.edges, StageTrack(), GRID, bench.arrivals(1.0)) is None
+    assert fit_edges(bench.edges[:7], bench.track, PULSES, bench.arrivals(1.0)) is None
+    assert fit_edges(bench.edges + 10**9, bench.track, PULSES, bench.arrivals(1.0)) is None
+    assert fit_edges(bench.edges, StageTrack(), PULSES, bench.arrivals(1.0)) is None
 
 
 @pytest.mark.parametrize("flipped", [False, True])

@@ -62,7 +62,7 @@ def a_lock() -> phase_lock.PhaseLock:
     return lock
 
 
-GRID = pulses.PulseGrid(0.0, 2.0, 3)
+PULSES = pulses.PulseTrain(0.0, 2.0, 3)
 
 
 def a_fit() -> motion_fit.MotionFit:
@@ -144,7 +144,7 @@ CALLS: dict[str, Call] = {
         {"t_us": 5, "arrival_ns": 10},
         {"t_us": whole(T_MAX), "arrival_ns": whole(T_MAX + 1)},
     ),
-    "edge_clock.EdgeClock": Call(edge_clock.EdgeClock, {"grid": None}),
+    "edge_clock.EdgeClock": Call(edge_clock.EdgeClock, {"pulses": None}),
     "edge_clock.EdgeClock.add": Call(
         method(edge_clock.EdgeClock, "add"),
         {"t_us": TIMES, "polarity": SIGNS},
@@ -159,21 +159,21 @@ CALLS: dict[str, Call] = {
         {
             "t_us": np.arange(8),
             "track": a_track(),
-            "grid": GRID,
+            "pulses": PULSES,
             "arrivals": clock_line.ClockLine(0, 0),
         },
         {"t_us": integers(2**63, size=8)},
     ),
-    "pulses.PulseGrid": Call(
-        pulses.PulseGrid,
+    "pulses.PulseTrain": Call(
+        pulses.PulseTrain,
         {"first_mm": 0.0, "interval_mm": 2.0, "count": 3},
         {"first_mm": number(1e7, -1e7), "interval_mm": number(0.0, -1.0), "count": whole(-1)},
     ),
-    "pulses.PulseGrid.pulse": Call(
-        GRID.pulse, {"position_mm": np.zeros(2)}, {"position_mm": reals()}
+    "pulses.PulseTrain.nearest": Call(
+        PULSES.nearest, {"position_mm": np.zeros(2)}, {"position_mm": reals()}
     ),
-    "pulses.PulseGrid.off_mm": Call(
-        GRID.off_mm, {"position_mm": np.zeros(2)}, {"position_mm": reals()}
+    "pulses.PulseTrain.offset_mm": Call(
+        PULSES.offset_mm, {"position_mm": np.zeros(2)}, {"position_mm": reals()}
     ),
     "pulses.leading_edges": Call(
         pulses.leading_edges,

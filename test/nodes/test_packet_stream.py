@@ -10,7 +10,7 @@ from line_events import encoded, line_events
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.pulses import PulseGrid
+from eschorty_ros.core.pulses import PulseTrain
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.nodes.packet_stream import PacketStream
 from eschorty_ros.nodes.packet_times import WRAP_US, Packet, first_time_high_us, first_time_us
@@ -325,7 +325,7 @@ def test_edges_at_the_trigger_input_go_where_they_are_wired_to(source):
     edges = np.arange(2000, 110_000, 7000)
     data = encoded((t, x, y, p), edges)
     subject = unannounced(trigger_source=source)
-    subject.set_grid(PulseGrid(0.0, 2.0, 100))
+    subject.set_pulses(PulseTrain(0.0, 2.0, 100))
     run(subject, packets(data))
     triggered = subject.counters["triggers_used"] + subject.counters["triggers_spurious"]
     assert (triggered > 0) == (source == "laser")

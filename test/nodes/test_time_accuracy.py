@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from line_events import line_events
-from stage_pulses import EPOCH_NS, GRID, StagePulses
+from stage_pulses import EPOCH_NS, PULSES, StagePulses
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.evt3 import Encoder
@@ -60,11 +60,11 @@ class Run:
             last_ns = max(last_ns, sent_ns + delay)
             self.packets.append(Packet(seq, last_ns, data))
 
-    def scan(self, trigger_source, grid=GRID):
+    def scan(self, trigger_source, pulses=PULSES):
         settings = Settings(trigger_source=trigger_source)
         pipeline = Pipeline(CALIBRATION, settings, 2.0, 0.5, 6.0, PERIOD_US * 1e-6)
         pipeline.stream.announcement_expected = False
-        pipeline.stream.set_grid(grid)
+        pipeline.stream.set_pulses(pulses)
         pipeline.stream.set_laser(Modulation(FREQUENCY_HZ), None, None)
         pipeline.begin_scan("sweep", 0.0, 220.0)
         held, bench = self.packets[:], self.bench

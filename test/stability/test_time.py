@@ -9,7 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 from line_events import blank_profiles, encoded, line_events
-from stage_pulses import GRID, StagePulses
+from stage_pulses import PULSES, StagePulses
 
 from eschorty_ros.core import reconstructor as reconstructor_module
 from eschorty_ros.core import reference
@@ -92,10 +92,10 @@ def test_case_07_conversion_to_ros_time_is_exact_at_1e18_ns(measured):
 def test_case_07_a_clock_from_edges_is_the_same_after_any_uptime(uptime_us, measured):
     """ROS time of 54 years, sensor time up to as much: floats would round both."""
     bench = StagePulses((10.0, 210.0, 10.0))
-    near = fit_edges(bench.edges, bench.track, GRID, bench.arrivals(3.0))
+    near = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(3.0))
     arrivals = bench.arrivals(3.0)
     late = ClockLine(arrivals.origin_us + uptime_us, arrivals.origin_ns, arrivals.drift_ppb)
-    far = fit_edges(bench.edges + uptime_us, bench.track, GRID, late)
+    far = fit_edges(bench.edges + uptime_us, bench.track, PULSES, late)
     t_us = bench.edges[0] + np.arange(0, 2_000_000, 997)
     worst_ns = np.abs(far.line.to_ns(t_us + uptime_us) - near.line.to_ns(t_us)).max()
     measured("clock from edges after a long uptime, ns", worst_ns, 1)

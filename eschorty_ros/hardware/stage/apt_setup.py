@@ -10,7 +10,8 @@ import math
 from dataclasses import dataclass
 
 from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceTimeoutError
-from eschorty_ros.hardware.protocols import DeviceIdentity, PulseTrain
+from eschorty_ros.core.pulses import PulseTrain
+from eschorty_ros.hardware.protocols import DeviceIdentity
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_link import AptLink
 
