@@ -34,7 +34,9 @@ class Line:
             taken_ns = self.next_ns + int(self.request_ms * 1e6 * self.chance.exponential())
             late_ns = int(self.chance.uniform(0, self.jitter_ms) * 1e6)
             counts = round(float(true.state(taken_ns)[0]) / COUNT_MM)
-            fit.observe(counts * COUNT_MM, taken_ns + late_ns, self.next_ns if self.asked else None)
+            fit.add_reading(
+                counts * COUNT_MM, taken_ns + late_ns, self.next_ns if self.asked else None
+            )
             self.next_ns += int(1e9 / self.rate_hz)
 
 
@@ -43,7 +45,7 @@ def sweep(line: Line, speed: float, begins_ms: float = 2.0) -> tuple[MotionFit, 
     true = plan_move(ORDERED_NS + round(begins_ms * 1e6), 5.0, 215.0, speed, 2000.0)
     fit = MotionFit()
     line.read(fit, true, ORDERED_NS)
-    fit.follow(plan_move(ORDERED_NS, 5.0, 215.0, speed, 2000.0))
+    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, speed, 2000.0))
     line.read(fit, true, true.end_ns + 200_000_000)
     return fit, true
 
@@ -78,7 +80,7 @@ def test_odometry_of_the_past_is_as_good_once_the_delays_are_known() -> None:
         begin_ns = true.end_ns + 500_000_000
         back = plan_move(begin_ns + 1_500_000, 215.0, 5.0, 300.0, 2000.0)
         line.read(fit, back, begin_ns)
-        fit.follow(plan_move(begin_ns, 215.0, 5.0, 300.0, 2000.0))
+        fit.expect_move(plan_move(begin_ns, 215.0, 5.0, 300.0, 2000.0))
         for now_ns in range(begin_ns, back.end_ns + 200_000_000, 10_000_000):
             line.read(fit, back, now_ns)
             t_ns = now_ns - 100_000_000
@@ -92,7 +94,7 @@ def test_other_acceleration_and_speed_are_found() -> None:
     fit = MotionFit()
     line = Line(50.0, 1.0, 3)
     line.read(fit, true, ORDERED_NS)
-    fit.follow(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
+    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
     line.read(fit, true, true.end_ns + 200_000_000)
     assert worst_um(fit, true) < 100.0
     assert fit.residual_mm < 0.02
@@ -101,15 +103,15 @@ def test_other_acceleration_and_speed_are_found() -> None:
 def test_wrong_readings_do_no_harm() -> None:
     true = plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0)
     fit = MotionFit()
-    fit.follow(true)
+    fit.expect_move(true)
     line = Line(50.0, 1.0, 4)
     for k, until_ns in enumerate(range(ORDERED_NS, true.end_ns, 100_000_000)):
         line.read(fit, true, until_ns)
         if k in (3, 5):
             at_ns = line.next_ns - 10_000_000
-            fit.observe(float(true.state(at_ns)[0]) + 0.4, at_ns + 500_000, at_ns - 500_000)
+            fit.add_reading(float(true.state(at_ns)[0]) + 0.4, at_ns + 500_000, at_ns - 500_000)
     line.read(fit, true, true.end_ns + 100_000_000)
-    assert fit.strays == 2
+    assert fit.outliers == 2
     assert worst_um(fit, true) < 20.0
 
 
@@ -118,7 +120,7 @@ def test_a_motion_that_is_not_the_ordered_one_is_not_believed() -> None:
         plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0), ORDERED_NS + 300_000_000, 20_000.0
     )
     fit = MotionFit()
-    fit.follow(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
+    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
     moving = plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0)
     line = Line(50.0, 1.0, 5)
     line.read(fit, moving, ORDERED_NS + 300_000_000)
@@ -133,9 +135,9 @@ def test_profiled_stop_is_placed_by_where_it_ends() -> None:
     fit = MotionFit()
     line = Line(50.0, 1.0, 6)
     line.read(fit, moving, ORDERED_NS)
-    fit.follow(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
+    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
     line.read(fit, moving, ORDERED_NS + 350_000_000)
-    fit.stop(ORDERED_NS + 350_000_000, 2000.0)
+    fit.expect_stop(ORDERED_NS + 350_000_000, 2000.0)
     line.read(fit, stopped, stopped.end_ns + 200_000_000)
     t_ns = np.arange(stopped.start_ns, stopped.end_ns + 100_000_000, 1_000_000)
     assert np.abs(fit.state(t_ns)[0] - stopped.state(t_ns)[0]).max() < 0.02
@@ -143,9 +145,9 @@ def test_profiled_stop_is_placed_by_where_it_ends() -> None:
 
 def test_unknown_motion_is_interpolated_and_late_readings_counted() -> None:
     fit = MotionFit()
-    fit.observe(1.0, 1000)
-    fit.observe(3.0, 2000)
-    fit.observe(9.0, 1500)
+    fit.add_reading(1.0, 1000)
+    fit.add_reading(3.0, 2000)
+    fit.add_reading(9.0, 1500)
     position, velocity = fit.state([500, 1000, 1500, 2000, 9000])
     assert position.tolist() == [1.0, 1.0, 2.0, 3.0, 3.0]
     assert velocity.tolist() == pytest.approx([0.0, 2e6, 2e6, 2e6, 0.0])
@@ -158,6 +160,6 @@ def test_refusals() -> None:
     with pytest.raises(ArgumentError, match="position is unknown"):
         fit.state(0)
     with pytest.raises(ArgumentError, match="after latest_ns"):
-        fit.observe(0.0, 5, 6)
+        fit.add_reading(0.0, 5, 6)
     with pytest.raises(ArgumentError, match="tolerance_mm"):
         MotionFit(-1.0)

@@ -67,8 +67,8 @@ PULSES = pulses.PulseTrain(0.0, 2.0, 3)
 
 def a_fit() -> motion_fit.MotionFit:
     fit = motion_fit.MotionFit()
-    fit.observe(0.0, 10, 5)
-    fit.follow(motion.plan_move(20, 0.0, 5.0, 1.0, 1.0))
+    fit.add_reading(0.0, 10, 5)
+    fit.expect_move(motion.plan_move(20, 0.0, 5.0, 1.0, 1.0))
     return fit
 
 
@@ -221,8 +221,8 @@ CALLS: dict[str, Call] = {
     "motion_fit.MotionFit": Call(
         motion_fit.MotionFit, {"tolerance_mm": 1e-3}, {"tolerance_mm": number(0.0)}
     ),
-    "motion_fit.MotionFit.observe": Call(
-        method(a_fit, "observe"),
+    "motion_fit.MotionFit.add_reading": Call(
+        method(a_fit, "add_reading"),
         {"position_mm": 1.0, "latest_ns": 10**9, "earliest_ns": 10**9 - 5},
         {
             "position_mm": number(2e9, -2e9),
@@ -230,18 +230,18 @@ CALLS: dict[str, Call] = {
             "earliest_ns": whole(10**9 + 1, optional=True),
         },
     ),
-    "motion_fit.MotionFit.follow": Call(
-        method(a_fit, "follow"), {"plan": motion.plan_move(0, 0.0, 5.0, 1.0, 1.0)}, {}
+    "motion_fit.MotionFit.expect_move": Call(
+        method(a_fit, "expect_move"), {"plan": motion.plan_move(0, 0.0, 5.0, 1.0, 1.0)}, {}
     ),
-    "motion_fit.MotionFit.stop": Call(
-        method(a_fit, "stop"),
+    "motion_fit.MotionFit.expect_stop": Call(
+        method(a_fit, "expect_stop"),
         {"at_ns": 10**9, "deceleration_mm_s2": 1.0},
         {"at_ns": whole(), "deceleration_mm_s2": number(0.0)},
     ),
-    "motion_fit.MotionFit.wander": Call(
-        method(a_fit, "wander"), {"at_ns": 10**9}, {"at_ns": whole()}
+    "motion_fit.MotionFit.expect_unknown": Call(
+        method(a_fit, "expect_unknown"), {"at_ns": 10**9}, {"at_ns": whole()}
     ),
-    "motion_fit.MotionFit.doubt": Call(method(a_fit, "doubt"), {}, {}),
+    "motion_fit.MotionFit.discard_motion": Call(method(a_fit, "discard_motion"), {}, {}),
     "motion_fit.MotionFit.expected_mm": Call(
         method(a_fit, "expected_mm"),
         {"earliest_ns": 10**9, "latest_ns": 2 * 10**9},

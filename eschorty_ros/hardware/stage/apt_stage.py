@@ -120,7 +120,7 @@ class AptStage:
             limit_s = (high - low) / speed + 10.0
             self._orders += 1
             self._tracker.order(Kind.HOME, high, low, speed, limit_s)
-            self._tracker.fit.wander(self._clock_ns())
+            self._tracker.fit.expect_unknown(self._clock_ns())
             self._tracker.blocked_sense = 0
             self._send_now("home", channel=apt.CHANNEL)
 
@@ -147,7 +147,7 @@ class AptStage:
             self._tracker.order(Kind.MOVE, start, target, speed, limit_s)
             order_ns = self._clock_ns()
             self._send_now("move_absolute", channel=apt.CHANNEL, position=counts)
-            self._tracker.fit.follow(
+            self._tracker.fit.expect_move(
                 plan_move(order_ns + MOVE_NS, start, target, speed, acceleration)
             )
 
@@ -194,7 +194,7 @@ class AptStage:
         return {
             "fit_residual_um": fit.residual_mm * 1e3,
             "fit_sigma_um": fit.sigma_mm * 1e3,
-            "fit_strays": fit.strays,
+            "fit_outliers": fit.outliers,
             "status_age_s": self._tracker.age_ns * 1e-9,
             "statuses_rejected": self._tracker.judge.rejected,
             "late_statuses": fit.late_readings,

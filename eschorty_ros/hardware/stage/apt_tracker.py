@@ -113,7 +113,7 @@ class Tracker:
         if motion is None:
             return
         if motion.kind is Kind.MOVE:
-            self.fit.stop(self._clock_ns() + REQUEST_NS, deceleration_mm_s2)
+            self.fit.expect_stop(self._clock_ns() + REQUEST_NS, deceleration_mm_s2)
         motion.stop()
 
     def ask(self) -> bool:
@@ -196,7 +196,7 @@ class Tracker:
         self._poll = None
         self._rest_ns += offset_ns - before_ns
         self.fit = MotionFit(TOLERANCE_MM)
-        self.fit.observe(position_mm, latest_ns)
+        self.fit.add_reading(position_mm, latest_ns)
         self._known_from_ns = self.fit.until_ns or 0
         self.judge.forget()
 
@@ -233,7 +233,7 @@ class Tracker:
             )
             return
         if not (self.homing and status.bits & apt.HOMED):
-            self.fit.observe(status.position_mm, status.latest_ns, status.earliest_ns)
+            self.fit.add_reading(status.position_mm, status.latest_ns, status.earliest_ns)
         if self.motion is not None:
             self._follow(self.motion, before, status, verdict)
 
@@ -278,11 +278,11 @@ class Tracker:
         if status.bits & apt.HOMED and motion.kind is Kind.HOME:
             # Before, the encoder counted from somewhere else.
             self.fit = MotionFit(TOLERANCE_MM)
-            self.fit.observe(status.position_mm, status.latest_ns, status.earliest_ns)
+            self.fit.add_reading(status.position_mm, status.latest_ns, status.earliest_ns)
             self._known_from_ns = self.fit.until_ns or 0
             return
         planned_mm = float(self.fit.state(status.latest_ns)[0])
         if abs(planned_mm - status.position_mm) > TOLERANCE_MM:
-            self.fit.doubt()
+            self.fit.discard_motion()
         if self.blocked_sense and motion.sense == -self.blocked_sense:
             self.blocked_sense = 0
