@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -85,6 +85,25 @@ def test_a_resting_stage_has_no_steps_to_compensate():
     on, counts = case.reconstruct(reflectance_compensation="on", stage_speed_mm_s=0.0)
     np.testing.assert_array_equal(on.row, off.row)
     assert counts["columns_compensated"] == 0
+
+
+@pytest.mark.parametrize("bend", [{"b_prime_1_px": 8.0}, {"b_prime_2_px": -8.0}], ids=str)
+def test_a_compensated_row_becomes_a_range_in_its_own_column(bend):
+    case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=40, slanted=True, seed=SEED)
+    middle = (case.calibration.columns - 1) / 2
+    calibration = case.calibration.model_copy(update={"principal_column": middle, **bend})
+    model = calibration.model()
+    off, _ = replace(case, calibration=calibration).reconstruct(reflectance_compensation="off")
+    on, _ = replace(case, calibration=calibration).reconstruct(reflectance_compensation="on")
+    moved = on.row != off.row
+    assert moved.sum() > 500, f"seed {SEED}"
+    error_mm = on.range_mm - model.range_mm(case.line_row[on.column], on.column)
+    left_mm = np.abs(error_mm[moved]).max()
+    assert left_mm < 5.0, f"seed {SEED}: {left_mm} mm"
+    np.testing.assert_array_equal(on.range_mm, model.range_mm(on.row, on.column))
+    np.testing.assert_array_equal(
+        on.sigma_mm, model.range_sigma_mm(on.row, on.sigma_row, on.column)
+    )
 
 
 def assert_same(a: Profiles, b: Profiles):
