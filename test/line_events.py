@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,6 @@ def encoded(
 def blank_profiles(size: int, **values: NDArray[np.generic]) -> Profiles:
     """Points whose fields are 0 unless given."""
     blank = Profiles.empty()
-    kinds = {name: getattr(blank, name) for name in Profiles.__slots__}
+    kinds = {item.name: getattr(blank, item.name) for item in fields(Profiles)}
     zeros = {name: np.zeros(size, kind.dtype) for name, kind in kinds.items() if kind is not None}
     return Profiles(**{**zeros, **values})

@@ -14,7 +14,7 @@ from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.phase_gate import gate_parameters
-from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.profiles import LineRows
 from eschorty_ros.core.row_sigma import CLIPPED, OWN_PER_WIDTH2, noise_of
 from eschorty_ros.core.settings import Settings
 
@@ -22,7 +22,7 @@ _OUTPUT_PROFILES = 64
 
 
 class ProfileAssembler:
-    """Takes events and edges in time order, gives profiles.
+    """Takes events and edges in time order, gives the rows of profiles.
 
     All memory the compiled pass works on lives here and is reused from period to period.
 
@@ -42,12 +42,9 @@ class ProfileAssembler:
             raise ArgumentError(
                 f"rows is {model.rows}; the reconstruction takes {windows.ROW_LAST + 1} at most"
             )
-        self._model = model
-        self._done: list[Profiles] = []
+        self._done: list[LineRows] = []
         self._half_max = half_width_fixed(settings.line_width_px)
         self._gate_us = settings.phase_gate_us
-        self.points = 0
-        self.points_beyond_pole = 0
         self._counts = np.zeros(len(binning.COUNTERS), dtype=np.int64)
         columns = model.columns
         self._lists = np.empty(columns * (settings.column_limit + windows.BLOCK), dtype=np.uint32)
@@ -141,40 +138,33 @@ class ProfileAssembler:
             edge, index = self._state[[binning.S_EDGE]], self._state[[binning.S_INDEX]]
             self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, index, 0, True)
 
-    def take(self) -> Profiles:
-        """Points of the periods closed since the last call."""
+    def take(self) -> LineRows:
+        """Rows of the periods closed since the last call."""
         self._collect()
         done, self._done = self._done, []
-        return done[0] if len(done) == 1 else Profiles.concatenate(done)
+        return done[0] if len(done) == 1 else LineRows.concatenate(done)
 
     def _collect(self) -> None:
-        """Turn the output buffer's rows into ranges and empty it."""
+        """Copy the output buffer's rows and empty it."""
         n = int(self._state[binning.S_POINTS])
         self._state[binning.S_POINTS] = 0
         if n == 0:
             return
         period, edge, t_us = self._whole_out[:, :n].copy()
         row, sigma, width = self._row_out[:, :n].copy()
-        column = self._column_out[:n].copy()
-        profiles = Profiles(
-            period,
-            edge,
-            t_us,
-            column,
-            row,
-            sigma,
-            self._model.range_mm(row, column),
-            self._model.range_sigma_mm(row, sigma, column),
-            self._events_out[:n].copy(),
-            width,
-            self._return_out[:n].copy(),
+        self._done.append(
+            LineRows(
+                period=period,
+                edge_us=edge,
+                t_us=t_us,
+                column=self._column_out[:n].copy(),
+                row=row,
+                sigma_row=sigma,
+                events=self._events_out[:n].copy(),
+                width_px=width,
+                return_index=self._return_out[:n].copy(),
+            )
         )
-        valid = np.isfinite(profiles.range_mm)
-        if not valid.all():
-            self.points_beyond_pole += int(n - valid.sum())
-            profiles = profiles.select(valid)
-        self.points += len(profiles)
-        self._done.append(profiles)
 
 
 def _parameters(settings: Settings, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

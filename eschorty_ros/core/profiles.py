@@ -1,10 +1,10 @@
-"""Profiles as the reconstruction hands them out, and their place in space."""
+"""Rows of the line, the points they become, and the points' place in space."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,23 +21,22 @@ _DTYPES = {
     "column": np.uint16,
     "row": np.float64,
     "sigma_row": np.float64,
-    "range_mm": np.float64,
-    "sigma_mm": np.float64,
     "events": np.uint32,
     "width_px": np.float64,
     "return_index": np.uint8,
+    "range_mm": np.float64,
+    "sigma_mm": np.float64,
 }
-_REFLECTANCE = ("reflectance", "reflectance_sigma")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Profiles:
-    """Points of whole profiles as arrays of equal length, by period, column, return index.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LineRows:
+    """Rows of the line as arrays of equal length, by period, column, return index.
 
     Attributes
     ----------
     period : int64
-        Index of the modulation period the point's profile begins with.
+        Index of the modulation period the profile begins with.
     edge_us : int64
         Rising edge that begins it, sensor time.
     t_us : int64
@@ -45,16 +44,14 @@ class Profiles:
     column : uint16
     row, sigma_row : float64
         Row of the line and its standard deviation, px.
-    range_mm, sigma_mm : float64
-        Range along the sheet (Eq. 2) and its standard deviation.
     events : uint32
         Events used.
     width_px : float64
         Sample standard deviation of the rows used; 0 for a single event.
     return_index : uint8
-        Place among the points of the same profile and column, nearest range first.
+        Place among the rows of the same profile and column, nearest range first.
     reflectance, reflectance_sigma : float64, optional
-        Relative reflectance and its standard deviation; ``None`` where nobody asked for it.
+        Relative reflectance and its standard deviation; ``None`` where it is not estimated.
     """
 
     period: NDArray[np.int64]
@@ -63,8 +60,6 @@ class Profiles:
     column: NDArray[np.uint16]
     row: NDArray[np.float64]
     sigma_row: NDArray[np.float64]
-    range_mm: NDArray[np.float64]
-    sigma_mm: NDArray[np.float64]
     events: NDArray[np.uint32]
     width_px: NDArray[np.float64]
     return_index: NDArray[np.uint8]
@@ -75,36 +70,65 @@ class Profiles:
         return len(self.column)
 
     @classmethod
-    def empty(cls) -> Profiles:
-        """No points."""
-        return cls(**{name: np.empty(0, dtype) for name, dtype in _DTYPES.items()})
+    def empty(cls) -> Self:
+        """Return no rows."""
+        names = [item.name for item in fields(cls) if item.name in _DTYPES]
+        return cls(**{name: np.empty(0, _DTYPES[name]) for name in names})
 
     @classmethod
-    def concatenate(cls, parts: Iterable[Profiles]) -> Profiles:
-        """All points of ``parts`` in their order; NaN for a reflectance only some parts have."""
+    def concatenate(cls, parts: Iterable[Self]) -> Self:
+        """Return all rows of ``parts`` in their order.
+
+        A reflectance that only some parts have is NaN in the others.
+        """
         kept = [part for part in parts if len(part)]
         if not kept:
             return cls.empty()
-        names = list(_DTYPES)
         if any(part.reflectance is not None for part in kept):
-            names += _REFLECTANCE
             kept = [part if part.reflectance is not None else part._unknown() for part in kept]
-        return cls(
-            **{name: np.concatenate([getattr(part, name) for part in kept]) for name in names}
-        )
+        joined: dict[str, Any] = {}
+        for item in fields(cls):
+            values = [getattr(part, item.name) for part in kept]
+            joined[item.name] = None if values[0] is None else np.concatenate(values)
+        return cls(**joined)
 
-    def select(self, mask: ArrayLike | slice) -> Profiles:
-        """Pick points by a boolean mask, a slice or an index array."""
+    def select(self, mask: ArrayLike | slice) -> Self:
+        """Return the rows of a boolean mask, a slice or an index array."""
         picked = mask if isinstance(mask, slice) else selection("mask", mask, len(self))
-        chosen: dict[str, Any] = {item.name: getattr(self, item.name) for item in fields(self)}
-        for name, values in chosen.items():
-            chosen[name] = None if values is None else values[picked]
-        return Profiles(**chosen)
+        chosen = {name: None if v is None else v[picked] for name, v in self._values().items()}
+        return type(self)(**chosen)
 
-    def _unknown(self) -> Profiles:
-        """Give the points a reflectance of NaN."""
+    def _values(self) -> dict[str, Any]:
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def _unknown(self) -> Self:
+        """Return the rows with a reflectance of NaN."""
         nothing = np.full(len(self), np.nan)
         return replace(self, reflectance=nothing, reflectance_sigma=nothing)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Profiles(LineRows):
+    """Points of complete profiles: the line's rows and their ranges.
+
+    Attributes
+    ----------
+    range_mm, sigma_mm : float64
+        Range along the sheet (Eq. 2) and its standard deviation.
+    """
+
+    range_mm: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+
+    @classmethod
+    def from_rows(cls, rows: LineRows, model: RangeModel) -> Profiles:
+        """Return ``rows`` with their ranges; those at the pole and behind it are left out."""
+        range_mm = model.range_mm(rows.row, rows.column)
+        seen = np.isfinite(range_mm)
+        if not seen.all():
+            rows, range_mm = rows.select(seen), range_mm[seen]
+        sigma_mm = model.range_sigma_mm(rows.row, rows.sigma_row, rows.column)
+        return cls(**rows._values(), range_mm=range_mm, sigma_mm=sigma_mm)
 
     @property
     def profile_count(self) -> int:
@@ -180,17 +204,38 @@ def place(
             f"stage_position_mm has shape {position.shape}; give one position for each of the "
             f"{len(profiles)} points"
         )
-    direction = vector("stage_direction", stage_direction)
-    if direction.shape != (3,) or not abs(float(direction @ direction) - 1.0) < 1e-6:
-        raise ArgumentError(f"stage_direction is {stage_direction!r}; give a unit vector x, y, z")
     position = np.broadcast_to(position, (len(profiles),))
     known = np.isfinite(position)
     if not known.all():
         profiles = profiles.select(known)
         position = position[known]
     points = place_link(profiles, model, origin_us)
-    lateral_mm = model.lateral_mm(profiles.column, profiles.range_mm)
-    points["x"] = (profiles.range_mm + position * direction[0]) * 1e-3
-    points["y"] = position * direction[1] * 1e-3
-    points["z"] = (lateral_mm + position * direction[2]) * 1e-3
+    add_stage(points, position, stage_direction)
     return points
+
+
+def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction: ArrayLike) -> None:
+    """Move ``points`` in place by ``s t_hat``: ``P = P_link + s t_hat``.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
+    position_mm : array_like of float64, shape (n,) or scalar
+    stage_direction : array_like of float64, shape (3,)
+    """
+    for axis, offset_m in zip("xyz", stage_offset_m(position_mm, stage_direction), strict=True):
+        points[axis] += offset_m
+
+
+def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArray[np.float64]:
+    """Return ``s t_hat`` in metres, x, y and z along the first axis.
+
+    Raises
+    ------
+    ArgumentError
+        When the direction is not a unit vector.
+    """
+    direction = vector("stage_direction", stage_direction)
+    if direction.shape != (3,) or not abs(float(direction @ direction) - 1.0) < 1e-6:
+        raise ArgumentError(f"stage_direction is {stage_direction!r}; give a unit vector x, y, z")
+    return np.multiply.outer(direction, reals("position_mm", position_mm)) * 1e-3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eschorty_ros.core.offline import Result, reconstruct_recording
-from eschorty_ros.core.profiles import Profiles, place, place_link
+from eschorty_ros.core.profiles import Profiles, add_stage, place, place_link, stage_offset_m
 from eschorty_ros.core.reconstructor import Reconstructor
 from eschorty_ros.core.settings import Settings
 
@@ -12,7 +12,9 @@ __all__ = [
     "Reconstructor",
     "Result",
     "Settings",
+    "add_stage",
     "place",
     "place_link",
     "reconstruct_recording",
+    "stage_offset_m",
 ]

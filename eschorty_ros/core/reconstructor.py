@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from eschorty_ros.core._window_kernels import TIME_LIMIT_US
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Events, Triggers
-from eschorty_ros.core.finishing import Finisher
 from eschorty_ros.core.held_events import HeldEvents
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.noise import ActivityFilter
@@ -20,8 +19,10 @@ from eschorty_ros.core.phase import EDGES_MAX
 from eschorty_ros.core.phase_estimate import PhaseEstimate
 from eschorty_ros.core.phase_lock import FLUSH_US, PhaseLock
 from eschorty_ros.core.profile_assembler import ProfileAssembler
-from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.profiles import LineRows, Profiles
+from eschorty_ros.core.reflectance import relative_reflectance
 from eschorty_ros.core.settings import Settings
+from eschorty_ros.core.step_compensation import StepCompensator
 
 PIECE_BYTES = 1 << 17
 # Pieces with edges that nobody has taken; who reconstructs a file does not need them.
@@ -58,11 +59,16 @@ class Reconstructor:
             else None
         )
         self._assembler = ProfileAssembler(settings, self.model)
-        self._finisher = Finisher(settings, self.model)
+        self._compensator: StepCompensator | None = None
+        self._ready: list[Profiles] = []
         self._held = HeldEvents()
         self._counts: dict[str, int] = dict.fromkeys(
-            ("events", "events_filtered", "events_outside_phase"), 0
-        )
+            (
+                "events", "events_filtered", "events_outside_phase", "points",
+                "points_beyond_pole", "columns_compensated",
+            ),
+            0,
+        )  # fmt: skip
         self._schedule_counts: dict[str, int] = {}
         self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         self._settled_us = -TIME_LIMIT
@@ -81,8 +87,9 @@ class Reconstructor:
             )
         self._modulation = modulation
         self._lock = PhaseLock(modulation, self.settings.periods_per_profile)
-        self._finisher.restart(modulation, self._assembler.take())
         self._assembler.restart(modulation)
+        if self.settings.reflectance_compensation == "on" and self.settings.stage_speed_mm_s:
+            self._compensator = StepCompensator(self.settings, self.model, modulation)
 
     @property
     def modulation(self) -> Modulation:
@@ -123,9 +130,8 @@ class Reconstructor:
         bins = self._assembler.counters
         counts["events_outside_phase"] += bins.pop("events_before_first_edge") + self._lock.refused
         counts.update(bins)
-        counts["points"] = self._assembler.points
-        counts["points_beyond_pole"] = self._assembler.points_beyond_pole
-        counts["columns_compensated"] = self._finisher.columns_compensated
+        if self._compensator is not None:
+            counts["columns_compensated"] += self._compensator.columns_compensated
         counts["events_held"] = len(self._held)
         counts["events_dropped"] = (
             counts["events_over_column_limit"]
@@ -162,7 +168,7 @@ class Reconstructor:
                     np.maximum(events.t, self._settled_us, out=events.t)
                 self._settled_us = max(self._settled_us, now_us)
                 self._absorb(events, self._settled_us)
-        return self._finisher.push(self._assembler.take())
+        return self._finished()
 
     def flush(self) -> Profiles:
         """Close the open period; call at the end of the stream.
@@ -171,8 +177,32 @@ class Reconstructor:
         ``phase_missing`` is set.
         """
         self._drain()
-        last = self._assembler.take()
-        return Profiles.concatenate([self._finisher.push(last), self._finisher.flush()])
+        return self._finished(last=True)
+
+    def _finished(self, last: bool = False) -> Profiles:
+        """Return the points of the periods closed by now; with ``last`` of all."""
+        rows = self._with_reflectance(self._assembler.take())
+        if self._compensator is not None:
+            rows = self._compensator.push(rows)
+            if last:
+                rows = LineRows.concatenate([rows, self._compensator.flush()])
+        profiles = Profiles.from_rows(rows, self.model)
+        self._counts["points"] += len(profiles)
+        self._counts["points_beyond_pole"] += len(rows) - len(profiles)
+        ready, self._ready = self._ready, []
+        return Profiles.concatenate([*ready, profiles]) if ready else profiles
+
+    def _with_reflectance(self, rows: LineRows) -> LineRows:
+        if self.settings.reflectance == "off" or len(rows) == 0:
+            return rows
+        reflectance, sigma = relative_reflectance(
+            rows.edge_us,
+            rows.width_px,
+            rows.events,
+            self.settings.footprint_sigma_px,
+            self.settings.white_width_px,
+        )
+        return replace(rows, reflectance=reflectance, reflectance_sigma=sigma)
 
     def note_gap(self) -> None:
         """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""
@@ -184,7 +214,9 @@ class Reconstructor:
             self._restart(modulation)
 
     def _restart(self, modulation: Modulation) -> None:
-        self._drain()
+        self._ready = [self.flush()]
+        if self._compensator is not None:
+            self._counts["columns_compensated"] += self._compensator.columns_compensated
         self._counts["events_outside_phase"] += self._lock.refused
         counts = self._lock.counters
         counts["periods_jumped"] = self._lock.schedule.periods_jumped

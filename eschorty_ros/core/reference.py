@@ -17,7 +17,7 @@ from eschorty_ros.core._checks import TIME_LIMIT, octets, whole, whole_vector
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.profiles import LineRows, Profiles
 
 
 def decode_all(
@@ -146,16 +146,15 @@ def _window(
     variance = np.einsum("cr,cr->c", seen, (rows - mean[:, None]) ** 2) / n
     mean_dt = np.bincount(x, weights=t_us - edge_us, minlength=model.columns)[lit] / n
     sigma = np.sqrt(variance)
-    return Profiles(
-        np.full(lit.size, period, dtype=np.int64),
-        np.full(lit.size, edge_us, dtype=np.int64),
-        edge_us + np.rint(mean_dt).astype(np.int64),
-        lit.astype(np.uint16),
-        mean,
-        sigma,
-        model.range_mm(mean, lit),
-        model.range_sigma_mm(mean, sigma, lit),
-        n.astype(np.uint32),
-        sigma * np.sqrt(n / np.maximum(n - 1.0, 1.0)),
-        np.zeros(lit.size, dtype=np.uint8),
+    rows_found = LineRows(
+        period=np.full(lit.size, period, dtype=np.int64),
+        edge_us=np.full(lit.size, edge_us, dtype=np.int64),
+        t_us=edge_us + np.rint(mean_dt).astype(np.int64),
+        column=lit.astype(np.uint16),
+        row=mean,
+        sigma_row=sigma,
+        events=n.astype(np.uint32),
+        width_px=sigma * np.sqrt(n / np.maximum(n - 1.0, 1.0)),
+        return_index=np.zeros(lit.size, dtype=np.uint8),
     )
+    return Profiles.from_rows(rows_found, model)

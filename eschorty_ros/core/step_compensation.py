@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core._step_kernels import _middles, _step_shifts
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.core.profiles import Profiles
+from eschorty_ros.core.profiles import LineRows
 from eschorty_ros.core.reflectance import ROOT_12, events_per_row
 from eschorty_ros.core.settings import Settings
 
@@ -66,13 +66,13 @@ class StepCompensator:
         self._middles = np.zeros((size, model.columns))
         self._rows = np.full((size, model.columns), np.nan)
         self._per_row = np.full(size, np.nan)
-        self._held: list[tuple[int, Profiles]] = []
+        self._held: list[tuple[int, LineRows]] = []
         self._newest = -1
         self._last_index: int | None = None
         self._scratch = np.empty(5)
         self.columns_compensated = 0
 
-    def push(self, profiles: Profiles) -> Profiles:
+    def push(self, profiles: LineRows) -> LineRows:
         """Take whole profiles; returns the corrected ones whose neighbours are known by now."""
         starts = np.flatnonzero(np.diff(profiles.period, prepend=-1 - profiles.period[:1]))
         bounds = [*starts.tolist(), len(profiles)]
@@ -80,13 +80,13 @@ class StepCompensator:
         for begin, end in pairwise(bounds):
             self._enter(profiles.select(slice(begin, end)))
             done += self._release(self._newest - self.delay)
-        return Profiles.concatenate(done)
+        return LineRows.concatenate(done)
 
-    def flush(self) -> Profiles:
-        """Profiles still held back; a point whose later neighbours are missing stays as it is."""
-        return Profiles.concatenate(self._release(self._newest))
+    def flush(self) -> LineRows:
+        """LineRows still held back; a point whose later neighbours are missing stays as it is."""
+        return LineRows.concatenate(self._release(self._newest))
 
-    def _enter(self, profile: Profiles) -> None:
+    def _enter(self, profile: LineRows) -> None:
         """Store one profile's widths and rows at its place in time."""
         index = int(profile.period[0]) // self._every
         passed = 1 if self._last_index is None else index - self._last_index
@@ -109,7 +109,7 @@ class StepCompensator:
         _middles(widths, self._scratch, self._middles[slot])
         self._held.append((self._newest, profile))
 
-    def _full_width(self, profile: Profiles) -> NDArray[np.float64]:
+    def _full_width(self, profile: LineRows) -> NDArray[np.float64]:
         """Full widths of the lit rows: the smaller of what spread and counts say, 1 px at least.
 
         A gap between two lit parts widens the spread, and so does background; a refractory time
@@ -122,17 +122,17 @@ class StepCompensator:
             width = np.minimum(width, profile.events / np.median(known))
         return np.maximum(width, 1.0)
 
-    def _release(self, until: int) -> list[Profiles]:
+    def _release(self, until: int) -> list[LineRows]:
         done = []
         while self._held and self._held[0][0] <= until:
             done.append(self._corrected(*self._held.pop(0)))
         return done
 
-    def _corrected(self, place: int, profile: Profiles) -> Profiles:
+    def _corrected(self, place: int, profile: LineRows) -> LineRows:
         shift = np.empty(len(profile))
         _step_shifts(
             profile.column,
-            *self._lags(profile.range_mm),
+            *self._lags(self._model.range_mm(profile.row, profile.column)),
             self._widths,
             self._middles,
             self._rows,
@@ -149,19 +149,15 @@ class StepCompensator:
         if not moved.any():
             return profile
         self.columns_compensated += int(np.count_nonzero(moved))
-        row = profile.row - self._sign * shift
         added = np.where(moved, np.hypot(_SIGMA_PX, _SIGMA_SHARE * shift), 0.0)
-        sigma_row = np.hypot(profile.sigma_row, added)
         return replace(
             profile,
-            row=row,
-            sigma_row=sigma_row,
-            range_mm=np.where(moved, self._model.range_mm(row), profile.range_mm),
-            sigma_mm=np.where(moved, self._model.range_sigma_mm(row, sigma_row), profile.sigma_mm),
+            row=profile.row - self._sign * shift,
+            sigma_row=np.hypot(profile.sigma_row, added),
         )
 
     def _lags(self, range_mm: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Profiles back and ahead until a step at the middle of the line has left it."""
+        """LineRows back and ahead until a step at the middle of the line has left it."""
         rows_per_mm = self._model.rows_per_mm_off_sheet(range_mm)
         profiles = np.nan_to_num(self._crossing_mm_px / np.maximum(rows_per_mm, 1e-9), nan=1.0)
         back = np.clip(np.ceil(profiles), 1, LAG_MAX).astype(np.int64)

@@ -9,7 +9,6 @@ from line_events import blank_profiles
 
 from eschorty_ros.core import (
     centroid,
-    finishing,
     profile_assembler,
     profiles,
     reference,
@@ -37,6 +36,7 @@ from hostile.subjects import (
     EVENTS,
     LASER,
     MODEL,
+    POINTS,
     ROWS,
     TIMES,
     N,
@@ -119,17 +119,6 @@ CALLS: dict[str, Call] = {
         },
         {"method": "centroid"},
     ),
-    "finishing.Finisher": Call(
-        finishing.Finisher, {"settings": settings.Settings(), "model": MODEL}
-    ),
-    "finishing.Finisher.restart": Call(
-        finishing.Finisher(settings.Settings(), MODEL).restart,
-        {"modulation": LASER, "last": blank_profiles(3)},
-    ),
-    "finishing.Finisher.push": Call(
-        finishing.Finisher(settings.Settings(), MODEL).push, {"profiles": blank_profiles(3)}
-    ),
-    "finishing.Finisher.flush": Call(finishing.Finisher(settings.Settings(), MODEL).flush, {}),
     "step_compensation.StepCompensator.flush": Call(
         step_compensation.StepCompensator(settings.Settings(), MODEL, LASER).flush, {}
     ),
@@ -159,11 +148,16 @@ CALLS: dict[str, Call] = {
     ),
     "profile_assembler.ProfileAssembler.close": Call(method(an_assembler, "close"), {}),
     "profile_assembler.ProfileAssembler.take": Call(method(an_assembler, "take"), {}),
-    "profiles.Profiles.empty": Call(profiles.Profiles.empty, {}),
-    "profiles.Profiles.concatenate": Call(
+    "profiles.LineRows.empty": Call(profiles.LineRows.empty, {}),
+    "profiles.LineRows.concatenate": Call(
         profiles.Profiles.concatenate, {"parts": [blank_profiles(3)]}
     ),
-    "profiles.Profiles.select": Call(
+    "profiles.Profiles.from_rows": Call(
+        profiles.Profiles.from_rows,
+        {"rows": profiles.LineRows.empty(), "model": MODEL},
+        {"rows": Kind([])},
+    ),
+    "profiles.LineRows.select": Call(
         blank_profiles(N).select,
         {"mask": [0, 1]},
         {"mask": Kind(["abc", [0.5], [float("nan")], [N], [-N - 1], [True], [HUGE]])},
@@ -187,6 +181,20 @@ CALLS: dict[str, Call] = {
             "stage_direction": vector(0.0, 1.0, size=3),
             "origin_us": whole(2**63),
         },
+    ),
+    "profiles.add_stage": Call(
+        profiles.add_stage,
+        {"points": POINTS.copy(), "position_mm": np.zeros(N), "stage_direction": (0.0, 1.0, 0.0)},
+        {
+            "points": Kind([]),
+            "position_mm": Kind(["abc", None]),
+            "stage_direction": vector(0.0, 1.0, size=3),
+        },
+    ),
+    "profiles.stage_offset_m": Call(
+        profiles.stage_offset_m,
+        {"position_mm": np.zeros(N), "stage_direction": (0.0, 1.0, 0.0)},
+        {"position_mm": Kind(["abc", None]), "stage_direction": vector(0.0, 1.0, size=3)},
     ),
     "reference.decode_all": Call(reference.decode_all, {"data": b"\x00\x80"}, {"data": octets()}),
     "reference.reconstruct": Call(

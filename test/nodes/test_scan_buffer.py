@@ -4,12 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from line_events import blank_profiles
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.core.cloud import REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
 from eschorty_ros.nodes.pipeline import ScanReport
 from eschorty_ros.nodes.reconstruction_reports import fill_end_scan
@@ -29,9 +29,7 @@ def placed(stage_mm, edge_ns, columns, dtype=SCAN_DTYPE):
 
 def timed(t_ns):
     t_ns = np.asarray(t_ns, dtype=np.int64)
-    empty = {name: getattr(Profiles.empty(), name) for name in Profiles.__slots__}
-    fields = {k: np.zeros(len(t_ns), v.dtype) for k, v in empty.items() if v is not None}
-    return TimedProfiles(Profiles(**fields), t_ns, t_ns)
+    return TimedProfiles(blank_profiles(len(t_ns)), t_ns, t_ns)
 
 
 def test_reflectance_asked_for_in_the_middle_of_a_scan_is_nan_before():

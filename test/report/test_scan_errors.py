@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,7 @@ from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.core.cloud import POINT_DTYPE
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.offline import Result
-from eschorty_ros.core.profiles import Profiles
-from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
 from eschorty_ros.report.experiments._leaf_levels import level_residuals, level_steps
 from eschorty_ros.report.experiments._scan_errors import GROSS_PX, scan_errors
 from eschorty_ros.simulation.recorder import simulate_recording
@@ -40,14 +41,9 @@ def test_errors_gross_errors_and_gaps_are_told_apart(tmp_path):
     np.testing.assert_allclose(errors.error_mm, profiles.range_mm - 1320.0, atol=1e-9)
     # Move every tenth point away and leave every fourth period out.
     model = recording.calibration.model()
-    moved = profiles.select(slice(None))
-    row = moved.row.copy()
+    row = profiles.row.copy()
     row[::10] += GROSS_PX + 2.0
-    moved = Profiles(
-        **{name: getattr(moved, name) for name in moved.__slots__ if name not in _OF_ROW},
-        row=row,
-        range_mm=model.range_mm(row),
-    )
+    moved = replace(profiles, row=row, range_mm=model.range_mm(row))
     kept = moved.select(moved.period % 4 != 0)
     changed = scan_errors(kept, recording, scene)
     assert changed.gross_share == pytest.approx(0.1, abs=0.01)
@@ -58,9 +54,6 @@ def test_errors_gross_errors_and_gaps_are_told_apart(tmp_path):
     assert none.completeness == 0.0
     assert np.isnan(none.rmse_mm)
     assert np.isnan(none.gross_share)
-
-
-_OF_ROW = ("row", "range_mm")
 
 
 def test_the_leaf_levels_of_the_truth_are_2_2_mm_apart():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from fractions import Fraction
 
 import mpmath
@@ -219,7 +219,7 @@ def test_case_10_shuffled_events_give_the_same_points():
     modulation = Modulation(70.0, on_edge_us=1000)
     want = reconstructed(encoded((t, x, y, p)), modulation)
     got = reconstructed(encoded(sort_readout(t[order], x[order], y[order], p[order])), modulation)
-    for name in Profiles.__slots__:
+    for name in (item.name for item in fields(Profiles)):
         ours, expected = getattr(got, name), getattr(want, name)
         assert (ours is None) == (expected is None)
         if ours is not None:
