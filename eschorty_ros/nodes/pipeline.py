@@ -9,7 +9,7 @@ import numpy as np
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.clock import NS_PER_US
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.reconstruction import Settings, place
+from eschorty_ros.core.reconstruction import Settings, add_stage, place
 from eschorty_ros.nodes.calibration_capture import Capture
 from eschorty_ros.nodes.packet_stream import PacketStream
 from eschorty_ros.nodes.packet_times import Packet
@@ -201,10 +201,8 @@ class Pipeline:
         # The odometry is not kept for ever: what it has forgotten stays where it was.
         known = np.isfinite(stage_mm)
         stage_mm = np.where(known, stage_mm, part.stage_mm)
-        moved_mm = stage_mm - part.stage_mm
         points = part.points.copy()
-        for name, share in zip("xyz", self.calibration.stage_direction, strict=True):
-            points[name] += moved_mm * (share * 1e-3)
+        add_stage(points, stage_mm - part.stage_mm, self.calibration.stage_direction)
         return PlacedPoints(
             points,
             np.where(known, t_ns, part.t_ns),

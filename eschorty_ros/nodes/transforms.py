@@ -6,7 +6,8 @@ import math
 
 from geometry_msgs.msg import TransformStamped
 
-from eschorty_ros.nodes.conversions import m_from_mm, stamp_from_ns
+from eschorty_ros.core.reconstruction import stage_offset_m
+from eschorty_ros.nodes.conversions import stamp_from_ns
 
 BASE = "eschorty_base"
 STAGE = "eschorty_stage"
@@ -19,10 +20,8 @@ def carriage(
 ) -> TransformStamped:
     """Place the carriage in the base at ROS time ``t_ns``: along the unit vector ``direction``."""
     transform = _between(BASE, STAGE, t_ns)
-    position_m = m_from_mm(position_mm)
-    transform.transform.translation.x = position_m * direction[0]
-    transform.transform.translation.y = position_m * direction[1]
-    transform.transform.translation.z = position_m * direction[2]
+    offset_m = transform.transform.translation
+    offset_m.x, offset_m.y, offset_m.z = stage_offset_m(position_mm, direction).tolist()
     return transform
 
 
