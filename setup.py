@@ -37,7 +37,6 @@ setup(
         # LGPL: several transfers in flight; without it the camera is read one transfer at a time.
         "usb-async": ["libusb1>=3.1"],
         "usb-library": ["libusb-package"],
-        "neuromorphic": ["neuromorphic-drivers>=0.18"],
     },
     entry_points={
         "console_scripts": [

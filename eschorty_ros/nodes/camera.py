@@ -14,7 +14,6 @@ from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.core.evt3_count import WordCounter
 from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
 from eschorty_ros.hardware.camera.evk4 import Evk4
-from eschorty_ros.hardware.camera.neuromorphic import NeuromorphicEvk4
 from eschorty_ros.hardware.protocols import EventSource
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, drivers, qos
@@ -98,7 +97,7 @@ class CameraNode(DeviceNode):
         for line in (*getattr(self._source, "warnings", ()), missing_bias_file(self.parameters)):
             if line:
                 self.get_logger().warning(line)
-        if isinstance(self._source, Evk4 | NeuromorphicEvk4):
+        if isinstance(self._source, Evk4):
             self._read_biases_back(self._source.read_biases())
 
     def start_device(self) -> None:
@@ -171,7 +170,7 @@ class CameraNode(DeviceNode):
     def _on_change(self, proposed: dict[str, Any]) -> None:
         """Apply biases as they are set; what the camera kept becomes the parameter."""
         source = self._source
-        if not isinstance(source, Evk4 | NeuromorphicEvk4):
+        if not isinstance(source, Evk4):
             return
         for name in BIASES:
             offset = proposed[name]
@@ -198,7 +197,7 @@ class CameraNode(DeviceNode):
         try:
             if not path:
                 raise DeviceError("no file to save biases to; set the parameter bias_file")
-            if not isinstance(source, Evk4 | NeuromorphicEvk4):
+            if not isinstance(source, Evk4):
                 raise DeviceError("no biases to save; this camera has none or is not open")
             save_bias_file(path, source.read_biases())
         except EschortyError as error:

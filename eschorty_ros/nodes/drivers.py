@@ -22,7 +22,7 @@ Device = TypeVar("Device")
 Registry = dict[str, Callable[[Mapping[str, Any], ClockNs], Device]]
 
 DRIVER = (
-    Param("driver", "fake", "camera: evk4, neuromorphic; laser: awg; stage: apt; "
+    Param("driver", "fake", "camera: evk4; laser: awg; stage: apt; "
           "fake: the real driver at an emulated bench"),
     Param("bench", "", "folder of that bench; empty: the user's in this ROS domain"),
 )  # fmt: skip
@@ -72,13 +72,6 @@ def _evk4(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
     )
 
 
-def _neuromorphic(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
-    from eschorty_ros.hardware.camera.neuromorphic import NeuromorphicEvk4
-    from eschorty_ros.nodes.camera_parameters import camera_settings
-
-    return NeuromorphicEvk4(clock_ns, parameters["serial"], camera_settings(parameters))
-
-
 def _fake_laser(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
     return _awg({**parameters, "backend": usb_spec(_bench(parameters))}, clock_ns)
 
@@ -113,11 +106,7 @@ def _fake_stage(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage
     return _apt({**parameters, "port": stage_port(_bench(parameters))}, clock_ns)
 
 
-CAMERAS: Registry[EventSource] = {
-    "fake": _fake_camera,
-    "evk4": _evk4,
-    "neuromorphic": _neuromorphic,
-}
+CAMERAS: Registry[EventSource] = {"fake": _fake_camera, "evk4": _evk4}
 LASERS: Registry[LaserModulator] = {"fake": _fake_laser, "awg": _awg}
 STAGES: Registry[LinearStage] = {"fake": _fake_stage, "apt": _apt}
 

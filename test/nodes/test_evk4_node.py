@@ -260,12 +260,3 @@ def test_what_the_rate_control_drops_is_told(start: Start, tmp_path: Path) -> No
     statistics = run.observer.call(Trigger, "camera/dump_statistics")
     assert "erc_events_dropped" in statistics.message
     assert "erc_rate_hz 300000" in statistics.message
-
-
-def test_neuromorphic_driver_without_a_camera_waits_in_one_line(start: Start) -> None:
-    pytest.importorskip("neuromorphic_drivers", reason="neuromorphic-drivers is not installed")
-    run = start(driver="neuromorphic")
-    status = run.status(lambda s: "waiting" in s.message, "waiting in the diagnostics")
-    assert "neuromorphic-drivers" in status.message
-    assert "\n" not in status.message
-    assert "Traceback" not in status.message

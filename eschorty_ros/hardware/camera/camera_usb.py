@@ -201,7 +201,7 @@ def read_firmware(control: treuzell.Treuzell) -> int:
 
 
 def same_serial(one: str, other: str) -> bool:
-    """Whether two ways to write a serial (openeb's, neuromorphic's 8 digits) mean one camera."""
+    """Whether two ways to write a serial (openeb's, or its last 8 digits) mean one camera."""
     with suppress(ValueError):
         return int(one, 16) & 0xFFFF_FFFF == int(other, 16) & 0xFFFF_FFFF
     return one.lower() == other.lower()
