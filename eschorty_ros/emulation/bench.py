@@ -18,7 +18,6 @@ from eschorty_ros.emulation.bench_devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench_folder import default_folder, stage_port, usb_spec
 from eschorty_ros.emulation.bench_physics import TRIGGERS
 from eschorty_ros.emulation.bench_server import serving
-from eschorty_ros.emulation.faults import FaultPlan, load_fault_plan
 from eschorty_ros.emulation.imperfections import Imperfections
 from eschorty_ros.simulation.presets import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
@@ -52,7 +51,7 @@ class _Ending:
             sys.exit(0)
 
 
-def serve(folder: Path, settings: BenchSettings, faults: FaultPlan) -> None:
+def serve(folder: Path, settings: BenchSettings) -> None:
     """Make the bench and serve it in ``folder`` until a signal or the end of the parent process.
 
     Raises
@@ -63,7 +62,7 @@ def serve(folder: Path, settings: BenchSettings, faults: FaultPlan) -> None:
     ending = _Ending()
     with _folder_of_its_own(folder):
         bench = Bench(settings)
-        with serving(bench, folder, faults) as usb:
+        with serving(bench, folder) as usb:
             _announce(folder, settings)
             ending.wait()
             # Ctrl-C reaches the nodes, too: on their way out they need their devices.
@@ -126,8 +125,6 @@ def _folder_of_its_own(folder: Path) -> Iterator[None]:
 @click.option("--laser-log", type=click.Path(dir_okay=False, path_type=Path),
               help="File that gets a line '<ns> ON|OFF' at every change of the laser output, "
               "CLOCK_MONOTONIC.")  # fmt: skip
-@click.option("--fault-plan", type=click.Path(exists=True, dir_okay=False, path_type=Path),
-              help="YAML file of faults to come; docs/faults.md.")  # fmt: skip
 def command(
     folder: Path | None,
     scene: str,
@@ -141,7 +138,6 @@ def command(
     generator_ppm: float,
     usb_jitter: float,
     laser_log: Path | None,
-    fault_plan: Path | None,
 ) -> None:
     """Emulate camera, generator and stage at the far ends of their cables.
 
@@ -170,7 +166,6 @@ def command(
             Imperfections(sensor_ppm, generator_ppm, usb_jitter, missing_edges, seed),
             str(laser_log or ""),
         ),
-        load_fault_plan(fault_plan) if fault_plan else FaultPlan(faults=[]),
     )
 
 

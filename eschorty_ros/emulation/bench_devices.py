@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 from eschorty_ros.core.calibration import load_calibration
 from eschorty_ros.emulation.apt_model import AptModel
@@ -97,10 +96,6 @@ class Bench:
     def look_at(self, scene: str) -> None:
         """Put another scene in front of the camera, for the next start of its stream."""
         self._scene = named(scene)
-
-    def by_name(self) -> dict[str, Any]:
-        """Name the models as fault plans do."""
-        return {"camera": self.camera, "laser": self.laser, "stage": self.stage}
 
     def usb_devices(self) -> list[EmulatedUsbDevice]:
         """Give what is on the USB bus."""

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from eschorty_ros.emulation.bench_devices import Bench
 from eschorty_ros.emulation.bench_folder import READY_FILE, STAGE_PORT, USB_SOCKET
-from eschorty_ros.emulation.faults import FaultPlan, FaultScript
 from eschorty_ros.emulation.pty_port import PtyPort
 from eschorty_ros.emulation.usb_server import UsbServer
 
@@ -18,7 +17,7 @@ _SWITCH_S = 5e-4
 
 
 @contextlib.contextmanager
-def serving(bench: Bench, folder: Path, faults: FaultPlan | None = None) -> Iterator[UsbServer]:
+def serving(bench: Bench, folder: Path) -> Iterator[UsbServer]:
     """Serve a bench in an existing folder while inside.
 
     The file ``ready`` holds this process's id while everything is there.
@@ -28,12 +27,10 @@ def serving(bench: Bench, folder: Path, faults: FaultPlan | None = None) -> Iter
     DeviceError
         When socket or port cannot be made there.
     """
-    plan = faults or FaultPlan(faults=[])
     ready = folder / READY_FILE
     with (
-        FaultScript(plan, bench.by_name(), bench.physics.clock_ns) as script,
         UsbServer(folder / USB_SOCKET, bench.usb_devices) as usb,
-        PtyPort(script.line(), folder / STAGE_PORT, lock=bench.physics.lock),
+        PtyPort(bench.stage, folder / STAGE_PORT, lock=bench.physics.lock),
         _short_turns(),
     ):
         try:

@@ -122,11 +122,8 @@ class EmulatedBackend(DescriptorBackend):
 
         def transfer() -> int:
             device.before_transfer(ep, timeout)
-            sent = bytes(data)
             with device.mutex:
-                count = device.bulk_out(ep, sent, timeout)
-            device.after_transfer(ep, sent)
-            return count
+                return device.bulk_out(ep, bytes(data), timeout)
 
         return self._run(transfer)
 
@@ -138,9 +135,7 @@ class EmulatedBackend(DescriptorBackend):
 
         def transfer() -> bytes:
             device.before_transfer(ep, timeout)
-            received = device.bulk_in(ep, size, timeout)
-            device.after_transfer(ep, received)
-            return received
+            return device.bulk_in(ep, size, timeout)
 
         return _fill(buff, self._run(transfer))
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import errno
 import itertools
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from eschorty_ros.emulation.usb_pipe import InPipe, UsbFault, Wait
@@ -25,8 +24,6 @@ _STRING_DESCRIPTOR = 3
 _ENGLISH = b"\x04\x03\x09\x04"
 
 _addresses = itertools.count(2)
-
-OnTransfer = Callable[[int, bytes], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +75,6 @@ class EmulatedUsbDevice:
         Name of the driver that holds the interface until it is detached.
     address : int
         Address on the bus; a new one after every ``replug``.
-    on_transfer : callable or None
-        Told endpoint and data of every bulk transfer that went through.
     """
 
     def __init__(self, identity: UsbIdentity, *, wait: Wait = threading.Condition.wait):
@@ -91,7 +86,6 @@ class EmulatedUsbDevice:
         self.denied = False
         self.kernel_driver: str | None = None
         self.detached_driver: str | None = None
-        self.on_transfer: OnTransfer | None = None
         self.claims: dict[int, object] = {}
         self.mutex = threading.RLock()
         self._gone = False
@@ -200,11 +194,6 @@ class EmulatedUsbDevice:
             raise UsbFault(errno.ENODEV)
         if endpoint in self.stalled:
             raise UsbFault(errno.EPIPE)
-
-    def after_transfer(self, endpoint: int, data: bytes) -> None:
-        """Tell of a bulk transfer that went through."""
-        if self.on_transfer:
-            self.on_transfer(endpoint, data)
 
     def before_transfer(self, endpoint: int, timeout_ms: int) -> None:
         """Raise what the switches say of a transfer about to begin (endpoint 0 = control)."""

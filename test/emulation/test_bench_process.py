@@ -129,5 +129,5 @@ def test_help_teaches() -> None:
         timeout=DEADLINE_S,
     )
     assert done.returncode == 0
-    for word in ("FOLDER", "usb.sock", "--trigger", "--fault-plan", "Examples:", "Ctrl-C"):
+    for word in ("FOLDER", "usb.sock", "--trigger", "Examples:", "Ctrl-C"):
         assert word in done.stdout

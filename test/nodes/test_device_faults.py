@@ -72,7 +72,7 @@ def test_lost_device_is_closed_reported_and_left_alone(
     observer: Observer,
     emulated: tuple[Bench, Path],
 ) -> None:
-    device = emulated[0].by_name()[name]
+    device = getattr(emulated[0], name)
     node = run(kind)
     reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
     device.gone = True
