@@ -32,7 +32,8 @@ def states(log: Path) -> list[str]:
     return [state for _, state in truth(log)]
 
 
-def test_fault_u1_generator_unplugged_while_lit(bench: AwgBench, log: Path) -> None:
+@pytest.mark.fault("USB unplugged")
+def test_generator_unplugged_while_lit(bench: AwgBench, log: Path) -> None:
     """driver: counts as on, stays refused, off as soon as it is back; user reads: laser state unknown ... switch the generator off by hand."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.gone = True
@@ -60,7 +61,8 @@ def test_fault_u1_generator_unplugged_while_lit(bench: AwgBench, log: Path) -> N
     assert bench.model.lit
 
 
-def test_fault_u1_another_generator_comes_back(bench: AwgBench) -> None:
+@pytest.mark.fault("USB unplugged")
+def test_another_generator_comes_back(bench: AwgBench) -> None:
     """driver: refuses a generator with another serial; user reads: no such device with serial ... on the bus; there is ..."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.gone = True
@@ -72,7 +74,8 @@ def test_fault_u1_another_generator_comes_back(bench: AwgBench) -> None:
 
 
 @pytest.mark.parametrize("endpoint", [ENDPOINT_IN, ENDPOINT_OUT])
-def test_fault_u2_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None:
+@pytest.mark.fault("endpoint stalls")
+def test_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None:
     """driver: clears both endpoints, sends once more, counts; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.stalled.add(endpoint)
@@ -82,9 +85,8 @@ def test_fault_u2_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None
     assert (laser.readback().counters["faults"], laser.readback().counters["retries"]) == (1, 1)
 
 
-def test_fault_u2_second_stall_is_an_error(
-    bench: AwgBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.fault("endpoint stalls")
+def test_second_stall_is_an_error(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """driver: no third try, off, confirmed after opening anew; user reads: ... the device stalled the transfer."""  # noqa: E501
     laser = bench.lit_laser()
     stuck = [True]
@@ -108,7 +110,8 @@ def test_fault_u2_second_stall_is_an_error(
     assert laser.readback().output is LaserOutput.OFF
 
 
-def test_fault_u3_mute_generator(bench: AwgBench, log: Path) -> None:
+@pytest.mark.fault("no answer, time-out")
+def test_mute_generator(bench: AwgBench, log: Path) -> None:
     """driver: tries clear, reset, a new opening, then gives up within its bound; user reads: laser state unknown: ... no answer in time."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.mute = True
@@ -122,7 +125,8 @@ def test_fault_u3_mute_generator(bench: AwgBench, log: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", ["mute", "lost_replies"])
-def test_fault_u3_switching_off_waits_two_seconds_at_most(fault: str) -> None:
+@pytest.mark.fault("no answer, time-out")
+def test_switching_off_waits_two_seconds_at_most(fault: str) -> None:
     """driver: the sum of all waits of a vain switching off is bounded; user reads: laser state unknown within 2 s."""  # noqa: E501
     waits: list[float] = []
 
@@ -145,7 +149,8 @@ def test_fault_u3_switching_off_waits_two_seconds_at_most(fault: str) -> None:
     assert sum(waits) < 2.0
 
 
-def test_fault_u3_replies_lost(bench: AwgBench) -> None:
+@pytest.mark.fault("no answer, time-out")
+def test_replies_lost(bench: AwgBench) -> None:
     """driver: a setting asked for is not a setting made; dark when it cannot be read back; user reads: ... no answer in time."""  # noqa: E501
     laser = bench.ready_laser()
     bench.model.faults.lost_replies = 2
@@ -158,7 +163,8 @@ def test_fault_u3_replies_lost(bench: AwgBench) -> None:
 @pytest.mark.parametrize(
     "fault", ["wrong_tags", "wrong_kinds", "short_headers", "oversized", "empty_packets"]
 )
-def test_fault_u4_bad_reply_header(bench: AwgBench, fault: str) -> None:
+@pytest.mark.fault("malformed transfer")
+def test_bad_reply_header(bench: AwgBench, fault: str) -> None:
     """driver: drops the reply, clears, asks again; user reads: nothing, faults 1 in diagnostics."""
     laser = bench.lit_laser()
     setattr(bench.model.faults, fault, 1)
@@ -167,7 +173,8 @@ def test_fault_u4_bad_reply_header(bench: AwgBench, fault: str) -> None:
     assert laser.readback().counters["faults"] == (0 if fault == "empty_packets" else 1)
 
 
-def test_fault_u4_bad_reply_headers_without_end(bench: AwgBench) -> None:
+@pytest.mark.fault("malformed transfer")
+def test_bad_reply_headers_without_end(bench: AwgBench) -> None:
     """driver: never takes text that is out of step; dark; user reads: laser state unknown: ... a reply header has the wrong tag ..."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.faults.wrong_tags = 10**9
@@ -179,7 +186,8 @@ def test_fault_u4_bad_reply_headers_without_end(bench: AwgBench) -> None:
 
 @pytest.mark.parametrize("newline", [False, True])
 @pytest.mark.parametrize("size", [0, 1, 5])
-def test_fault_u5_reply_in_pieces(bench: AwgBench, size: int, newline: bool) -> None:
+@pytest.mark.fault("partial reply")
+def test_reply_in_pieces(bench: AwgBench, size: int, newline: bool) -> None:
     """driver: joins up to the end of message, strips line ends; user reads: nothing."""
     bench.model.faults.transfer_bytes = size
     bench.model.faults.newline = newline
@@ -188,7 +196,8 @@ def test_fault_u5_reply_in_pieces(bench: AwgBench, size: int, newline: bool) -> 
     assert laser.readback().counters["faults"] == 0
 
 
-def test_fault_u6_stale_reply_after_a_time_out(bench: AwgBench) -> None:
+@pytest.mark.fault("stale reply")
+def test_stale_reply_after_a_time_out(bench: AwgBench) -> None:
     """driver: flushes by CLEAR before it asks again, so no reply is taken for another; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.faults.late_replies = 1
@@ -197,7 +206,8 @@ def test_fault_u6_stale_reply_after_a_time_out(bench: AwgBench) -> None:
     assert not bench.model._replies
 
 
-def test_fault_u6_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
+@pytest.mark.fault("stale reply")
+def test_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
     """driver: the stale reply is no value of the kind asked for: asks again; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model._replies.append(b"SQUARE")
@@ -206,7 +216,8 @@ def test_fault_u6_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
 
 
 @pytest.mark.parametrize("errors", [None, [], ['-222,"Data out of range"', '-113,"Undefined"']])
-def test_fault_u7_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
+@pytest.mark.fault("error queue")
+def test_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
     """driver: asks once at opening, takes silence for absent, empties what is there; user reads: a warning per entry."""  # noqa: E501
     bench.model.errors = None if errors is None else type(bench.model.commands)(errors)
     laser = bench.laser()
@@ -218,7 +229,8 @@ def test_fault_u7_error_queue(bench: AwgBench, errors: list[str] | None) -> None
     assert len(asked) == 1 + len(errors or [])
 
 
-def test_fault_u7_error_queue_without_end(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.fault("error queue")
+def test_error_queue_without_end(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """driver: takes 32 entries, or none when they are garbage, and goes on; user reads: 32 warnings at most."""  # noqa: E501
     queried = bench.model._queried
     says = ['-350,"Queue overflow"']
@@ -248,9 +260,8 @@ def test_fault_u7_error_queue_without_end(bench: AwgBench, monkeypatch: pytest.M
         ("LOAD", "50", "load is 50 instead of 10000"),
     ],
 )
-def test_fault_u8_setting_ignored_or_clamped(
-    bench: AwgBench, path: str, shows: str, text: str
-) -> None:
+@pytest.mark.fault("setting clamped or ignored")
+def test_setting_ignored_or_clamped(bench: AwgBench, path: str, shows: str, text: str) -> None:
     """driver: compares with tolerance, refuses light; user reads: laser generator: frequency is 19999 instead of 20000; check its display ..."""  # noqa: E501
     bench.model.faults.changed = {path: shows}
     laser = bench.laser()
@@ -266,7 +277,8 @@ def test_fault_u8_setting_ignored_or_clamped(
     ("path", "value"),
     [("BASE:HIGH", "2.5"), ("LIMit:ENABle", "OFF"), ("BASE:FREQuency", "71"), ("LOAD", "50")],
 )
-def test_fault_u8_panel_touched_before_light(bench: AwgBench, path: str, value: str) -> None:
+@pytest.mark.fault("setting clamped or ignored")
+def test_panel_touched_before_light(bench: AwgBench, path: str, value: str) -> None:
     """driver: reads every setting back before it switches on, refuses; user reads: ... instead of ...; check its display ..."""  # noqa: E501
     laser = bench.ready_laser()
     assert bench.model.touch(path, value)
@@ -275,7 +287,8 @@ def test_fault_u8_panel_touched_before_light(bench: AwgBench, path: str, value: 
     assert not bench.model.output
 
 
-def test_fault_u8_panel_touched_while_lit(bench: AwgBench) -> None:
+@pytest.mark.fault("setting clamped or ignored")
+def test_panel_touched_while_lit(bench: AwgBench) -> None:
     """driver: sees it at the next read-back, goes dark; user reads: high is 3 instead of 5; check its display ..."""  # noqa: E501
     laser = bench.lit_laser()
     assert bench.model.touch("BASE:HIGH", "3")
@@ -285,7 +298,8 @@ def test_fault_u8_panel_touched_while_lit(bench: AwgBench) -> None:
     assert laser.readback().output is LaserOutput.OFF
 
 
-def test_fault_u8_switched_on_at_the_panel(bench: AwgBench) -> None:
+@pytest.mark.fault("setting clamped or ignored")
+def test_switched_on_at_the_panel(bench: AwgBench) -> None:
     """driver: an output that is on without a command is switched off; user reads: output found on; it was not switched on from here."""  # noqa: E501
     laser = bench.ready_laser()
     assert bench.model.touch("OUTPut", "ON")
@@ -294,7 +308,8 @@ def test_fault_u8_switched_on_at_the_panel(bench: AwgBench) -> None:
     assert not bench.model.output
 
 
-def test_fault_u9_rebooted_while_lit(bench: AwgBench) -> None:
+@pytest.mark.fault("generator rebooted")
+def test_rebooted_while_lit(bench: AwgBench) -> None:
     """driver: output reads OFF, light is refused until configured anew; user reads: output found off; restarted, or switched off by hand."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.reboot()
@@ -309,7 +324,8 @@ def test_fault_u9_rebooted_while_lit(bench: AwgBench) -> None:
     assert bench.model.lit
 
 
-def test_fault_u9_rebooted_before_light(bench: AwgBench) -> None:
+@pytest.mark.fault("generator rebooted")
+def test_rebooted_before_light(bench: AwgBench) -> None:
     """driver: reads back before each light, finds the maker's settings, refuses; user reads: load ... instead of ..."""  # noqa: E501
     laser = bench.ready_laser()
     bench.model.reboot()
@@ -318,7 +334,8 @@ def test_fault_u9_rebooted_before_light(bench: AwgBench) -> None:
     assert not bench.model.output
 
 
-def test_fault_u10_kernel_driver_and_second_program(bench: AwgBench) -> None:
+@pytest.mark.fault("no permission, busy")
+def test_kernel_driver_and_second_program(bench: AwgBench) -> None:
     """driver: detaches usbtmc and gives it back on close; a second program is refused; user reads: in use; close the other program ..."""  # noqa: E501
     bench.model.kernel_driver = "usbtmc"
     laser = bench.laser()
@@ -328,7 +345,8 @@ def test_fault_u10_kernel_driver_and_second_program(bench: AwgBench) -> None:
     assert bench.model.kernel_driver == "usbtmc"
 
 
-def test_fault_u10_no_permission(bench: AwgBench) -> None:
+@pytest.mark.fault("no permission, busy")
+def test_no_permission(bench: AwgBench) -> None:
     """driver: waits for permission, named; user reads: permission denied; install the udev rules of docs/hardware.md ..."""  # noqa: E501
     bench.model.denied = True
     with pytest.raises(DeviceError, match="permission denied; install the udev rules"):
@@ -337,7 +355,8 @@ def test_fault_u10_no_permission(bench: AwgBench) -> None:
     assert bench.laser().readback().output is LaserOutput.OFF
 
 
-def test_fault_u10_no_generator_and_two(bench: AwgBench) -> None:
+@pytest.mark.fault("no permission, busy")
+def test_no_generator_and_two(bench: AwgBench) -> None:
     """driver: refuses to guess; user reads: no such device on the bus; check cable ... / 2 devices match ...; give the serial."""  # noqa: E501
     bench.models = []
     with pytest.raises(DeviceGoneError, match="laser generator: no such device on the bus"):

@@ -56,7 +56,8 @@ def test_none_and_several_say_what_to_do():
 
 
 @pytest.mark.parametrize("serial", ["", "LOOP1"])
-def test_fault_u10_no_permission(serial):
+@pytest.mark.fault("no permission, busy")
+def test_no_permission(serial):
     """driver: does not open the device; user reads: permission denied, install the udev rules."""
     loop = Loop()
     loop.denied = True
@@ -65,7 +66,8 @@ def test_fault_u10_no_permission(serial):
     line(caught)
 
 
-def test_fault_u10_kernel_driver_holds_the_interface():
+@pytest.mark.fault("no permission, busy")
+def test_kernel_driver_holds_the_interface():
     """driver: detaches the kernel driver, gives it back on close; user reads: nothing."""
     loop = Loop()
     loop.kernel_driver = "usbtmc"
@@ -77,7 +79,8 @@ def test_fault_u10_kernel_driver_holds_the_interface():
     assert loop.kernel_driver == "usbtmc"
 
 
-def test_fault_x2_second_client_of_a_usb_device():
+@pytest.mark.fault("two clients")
+def test_second_client_of_a_usb_device():
     """driver: the second fails, the first goes on; user reads: in use, close the other program."""
     loop = Loop()
     first, second = find(loop), find(loop)

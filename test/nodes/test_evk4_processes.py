@@ -37,7 +37,8 @@ def end_well(camera: NodeProcess) -> None:
     assert "Traceback" not in camera.output, camera.output
 
 
-def test_fault_x3_ctrl_c_in_the_initialisation_and_while_streaming(socket: Path) -> None:
+@pytest.mark.fault("shutdown at any time")
+def test_ctrl_c_in_the_initialisation_and_while_streaming(socket: Path) -> None:
     """driver: cuts it short, camera released or powered down, exit 0; user reads: nothing."""
     model, domain = Evk4Model(source := OnDemand()), free_domain()
     backend = f"eschorty_ros.emulation.usb_remote:backend?{socket}"

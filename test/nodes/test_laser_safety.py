@@ -226,7 +226,8 @@ def test_interlock(lit: Bench) -> None:
     lit.light()
 
 
-def test_fault_u1_unplug_of_the_generator(lit: Bench) -> None:
+@pytest.mark.fault("USB unplugged")
+def test_unplug_of_the_generator(lit: Bench) -> None:
     """driver: alarm, tries again for 30 s, off on replug; user reads: laser state unknown"""
     lit.awg.do("gone")
     wait_until(lambda: lit.states[-1].output == LaserState.OUTPUT_UNKNOWN, "unknown")
@@ -245,7 +246,8 @@ def test_fault_u1_unplug_of_the_generator(lit: Bench) -> None:
     lit.light()
 
 
-def test_fault_u8_panel_touched_while_lit(lit: Bench) -> None:
+@pytest.mark.fault("setting clamped or ignored")
+def test_panel_touched_while_lit(lit: Bench) -> None:
     """driver: reads back five times a second, switches off; user reads: what differs"""
     lit.awg.do("touch BASE:FREQuency 90")
     wait_until(lambda: not lit.awg.lit(), "dark")
@@ -254,7 +256,8 @@ def test_fault_u8_panel_touched_while_lit(lit: Bench) -> None:
     lit.observer.wait_for_state("laser", "unconfigured")
 
 
-def test_fault_u9_generator_restarted(lit: Bench) -> None:
+@pytest.mark.fault("generator rebooted")
+def test_generator_restarted(lit: Bench) -> None:
     """driver: dark, refuses light until configured; user reads: output reads back OFF"""
     lit.awg.do("reboot")
     assert not lit.awg.lit()

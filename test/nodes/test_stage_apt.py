@@ -87,7 +87,8 @@ def test_moves_with_odometry_on_the_true_motion(
         assert "Traceback" not in process.output
 
 
-def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Observer) -> None:
+@pytest.mark.fault("serial unplugged, silent")
+def test_unplug_under_the_node(port: str, model: AptModel, observer: Observer) -> None:
     """driver: the node leaves the active state; user reads: stage lost: the stage's port failed."""
     with NodeProcess(
         "eschorty_ros.nodes.stage", {**SETTINGS, "port": port}, domain=observer.domain
@@ -103,7 +104,8 @@ def test_fault_s6_unplug_under_the_node(port: str, model: AptModel, observer: Ob
         assert "Traceback" not in process.output
 
 
-def test_fault_x3_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
+@pytest.mark.fault("shutdown at any time")
+def test_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
     """driver: stops the carriage, closes the port, within 2 s; user reads: nothing; exit code 0."""
     model = AptModel(time.time_ns, power_up_mm=150.0)
     with (

@@ -60,7 +60,8 @@ def one_line(error: BaseException | str) -> str:
     return text
 
 
-def test_fault_u1_unplug_in_a_scan() -> None:
+@pytest.mark.fault("USB unplugged")
+def test_unplug_in_a_scan() -> None:
     """driver: unhealthy at once, waits, finds the same serial, sets up, restarts the stream; user reads: 'the device is gone; check cable and power, then reconnect'."""
     with Rig(attempts=None) as rig:
         rig.streaming()
@@ -80,7 +81,8 @@ def test_fault_u1_unplug_in_a_scan() -> None:
         assert (rig.count("losses"), rig.count("restarts")) == (1, 2)
 
 
-def test_fault_u1_unplug_and_never_back() -> None:
+@pytest.mark.fault("USB unplugged")
+def test_unplug_and_never_back() -> None:
     """driver: bounded attempts with growing waits, then an error; user reads: 'lost, and not back after 4 attempts (...); check cable and power, then configure it again'."""
     with Rig(attempts=4) as rig:
         rig.streaming()
@@ -93,7 +95,8 @@ def test_fault_u1_unplug_and_never_back() -> None:
         assert not rig.camera.healthy
 
 
-def test_fault_u1_another_camera_is_plugged_in_instead() -> None:
+@pytest.mark.fault("USB unplugged")
+def test_another_camera_is_plugged_in_instead() -> None:
     """driver: leaves the other serial alone and keeps looking; user reads: 'none with serial 00051234 can be opened, but there is 00000099; check cable, power and serial'."""
     with Rig(attempts=2) as rig:
         rig.streaming()
@@ -106,7 +109,8 @@ def test_fault_u1_another_camera_is_plugged_in_instead() -> None:
         assert not stranger.claims
 
 
-def test_fault_u1_power_dip_leaves_a_camera_that_does_not_stream() -> None:
+@pytest.mark.fault("USB unplugged")
+def test_power_dip_leaves_a_camera_that_does_not_stream() -> None:
     """driver: asks a silent camera, finds it reset, initialises it again; user reads: 'it has stopped streaming by itself (reset or power dip); check its power'."""
     with Rig() as rig:
         rig.streaming()
@@ -119,7 +123,8 @@ def test_fault_u1_power_dip_leaves_a_camera_that_does_not_stream() -> None:
         assert rig.chunks[0].restarted
 
 
-def test_fault_u2_stalled_data_endpoint() -> None:
+@pytest.mark.fault("endpoint stalls")
+def test_stalled_data_endpoint() -> None:
     """driver: clears the halt once, reports a gap, goes on; user reads: failed_transfers and gaps in the diagnostics."""
     with Rig() as rig:
         rig.streaming()
@@ -132,7 +137,8 @@ def test_fault_u2_stalled_data_endpoint() -> None:
         assert (rig.count("gaps"), rig.count("losses")) == (1, 0)
 
 
-def test_fault_u2_data_endpoint_stalls_again() -> None:
+@pytest.mark.fault("endpoint stalls")
+def test_data_endpoint_stalls_again() -> None:
     """driver: a second stall in a row is a loss, it reconnects; user reads: 'the device stalled the transfer'."""
     with Rig() as rig:
         rig.streaming()
@@ -144,7 +150,8 @@ def test_fault_u2_data_endpoint_stalls_again() -> None:
 
 
 @pytest.mark.parametrize("endpoint", [CONTROL_IN, CONTROL_OUT])
-def test_fault_u2_stalled_control_endpoint(endpoint: int) -> None:
+@pytest.mark.fault("endpoint stalls")
+def test_stalled_control_endpoint(endpoint: int) -> None:
     """driver: clears both control endpoints and asks once more; user reads: control_recoveries in the diagnostics."""
     with Rig() as rig:
         rig.streaming()
@@ -155,7 +162,8 @@ def test_fault_u2_stalled_control_endpoint(endpoint: int) -> None:
         assert rig.count("losses") == 0
 
 
-def test_fault_u3_camera_goes_mute() -> None:
+@pytest.mark.fault("no answer, time-out")
+def test_camera_goes_mute() -> None:
     """driver: asks after 0.1 s of silence, unhealthy when no answer came for 0.5 s, reconnects when it answers again; user reads: 'no answer in time; check that the device is on'."""
     with Rig(attempts=None) as rig:
         rig.streaming()
@@ -184,7 +192,8 @@ SPOILT: dict[str, Answer] = {
 
 
 @pytest.mark.parametrize("name", SPOILT)
-def test_fault_u4_garbled_answer(name: str) -> None:
+@pytest.mark.fault("malformed transfer")
+def test_garbled_answer(name: str) -> None:
     """driver: takes no answer it does not recognise, clears the link, asks once more; user reads: control_recoveries in the diagnostics."""
     with Rig() as rig:
         rig.streaming()
@@ -195,7 +204,8 @@ def test_fault_u4_garbled_answer(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SPOILT)
-def test_fault_u4_garbled_answers_while_opening(name: str) -> None:
+@pytest.mark.fault("malformed transfer")
+def test_garbled_answers_while_opening(name: str) -> None:
     """driver: the second wrong answer ends the attempt and releases the camera; user reads: one line that names the answer."""
     with Rig() as rig:
         spoil(rig, *[SPOILT[name]] * 2)
@@ -206,7 +216,8 @@ def test_fault_u4_garbled_answers_while_opening(name: str) -> None:
         rig.camera.open()
 
 
-def test_fault_u4_overflow_on_the_data_endpoint() -> None:
+@pytest.mark.fault("malformed transfer")
+def test_overflow_on_the_data_endpoint() -> None:
     """driver: the transfer is lost: a gap is reported, the stream goes on; user reads: failed_transfers and gaps in the diagnostics."""
     with Rig() as rig:
         rig.streaming()
@@ -219,7 +230,8 @@ def test_fault_u4_overflow_on_the_data_endpoint() -> None:
         assert rig.count("losses") == 0
 
 
-def test_fault_u4_transfers_of_zero_length_and_of_whole_packets() -> None:
+@pytest.mark.fault("malformed transfer")
+def test_transfers_of_zero_length_and_of_whole_packets() -> None:
     """driver: an empty packet ends a transfer, not the stream; user reads: nothing."""
     with Rig() as rig:
         rig.streaming()
@@ -231,7 +243,8 @@ def test_fault_u4_transfers_of_zero_length_and_of_whole_packets() -> None:
         assert (rig.count("gaps"), rig.count("failed_transfers")) == (0, 0)
 
 
-def test_fault_u5_partial_answer() -> None:
+@pytest.mark.fault("partial reply")
+def test_partial_answer() -> None:
     """driver: an answer in two pieces is thrown away and asked for again; user reads: control_recoveries in the diagnostics."""
     with Rig() as rig:
         rig.camera.open()
@@ -245,7 +258,8 @@ def test_fault_u5_partial_answer() -> None:
         assert rig.count("control_recoveries") == 1
 
 
-def test_fault_u6_stale_answer_after_a_time_out() -> None:
+@pytest.mark.fault("stale reply")
+def test_stale_answer_after_a_time_out() -> None:
     """driver: an answer that came too late is flushed, never taken for another register; user reads: control_recoveries in the diagnostics."""
     with Rig() as rig:
         rig.camera.open()
@@ -265,7 +279,8 @@ def test_fault_u6_stale_answer_after_a_time_out() -> None:
         assert rig.count("control_recoveries") == 1
 
 
-def test_fault_u10_access_denied() -> None:
+@pytest.mark.fault("no permission, busy")
+def test_access_denied() -> None:
     """driver: one line, nothing claimed, tried again when asked; user reads: 'permission denied; install the udev rules of docs/hardware.md and plug in again'."""
     with Rig() as rig:
         rig.model.denied = True
@@ -278,7 +293,8 @@ def test_fault_u10_access_denied() -> None:
         rig.camera.open()
 
 
-def test_fault_u10_a_kernel_driver_holds_it() -> None:
+@pytest.mark.fault("no permission, busy")
+def test_a_kernel_driver_holds_it() -> None:
     """driver: detaches the kernel driver and gives it back on close; user reads: nothing."""
     with Rig() as rig:
         rig.model.kernel_driver = "uvcvideo"
@@ -288,7 +304,8 @@ def test_fault_u10_a_kernel_driver_holds_it() -> None:
         assert rig.model.kernel_driver == "uvcvideo"
 
 
-def test_fault_x1_host_stalls() -> None:
+@pytest.mark.fault("host stalls")
+def test_host_stalls() -> None:
     """driver: receives on in its own thread: stamps are those of the receipt, nothing is lost; user reads: queue_bytes in the diagnostics."""
     with Rig() as rig:
         rig.streaming()
@@ -308,7 +325,8 @@ def test_fault_x1_host_stalls() -> None:
         assert rig.count("drops") == 0
 
 
-def test_fault_x2_two_clients() -> None:
+@pytest.mark.fault("two clients")
+def test_two_clients() -> None:
     """driver: the second program fails in one line, the first streams on; user reads: 'in use; close the other program, or unload the kernel driver that holds it'."""
     with Rig() as rig:
         rig.streaming()
@@ -335,7 +353,8 @@ def in_the_background(action: Callable[[], Any]) -> tuple[threading.Thread, list
     return thread, errors
 
 
-def test_fault_x3_shutdown_in_the_initialisation() -> None:
+@pytest.mark.fault("shutdown at any time")
+def test_shutdown_in_the_initialisation() -> None:
     """driver: closing cuts the 2.5 s of the initialisation short and releases the camera; user reads: 'closed before it was ready'."""
     with Rig() as rig:
         camera = rig.driver(sleep=None)
@@ -348,7 +367,8 @@ def test_fault_x3_shutdown_in_the_initialisation() -> None:
         assert not rig.model.claims
 
 
-def test_fault_x3_shutdown_while_reconnecting() -> None:
+@pytest.mark.fault("shutdown at any time")
+def test_shutdown_while_reconnecting() -> None:
     """driver: closing ends the search at once; user reads: nothing more."""
     before = set(threading.enumerate())
     with Rig() as rig:
@@ -362,7 +382,8 @@ def test_fault_x3_shutdown_while_reconnecting() -> None:
         until(lambda: set(threading.enumerate()) <= before, "the end of its threads")
 
 
-def test_fault_x3_shutdown_in_a_scan_of_a_mute_camera() -> None:
+@pytest.mark.fault("shutdown at any time")
+def test_shutdown_in_a_scan_of_a_mute_camera() -> None:
     """driver: closes within 2 s though nothing answers any more; user reads: nothing more."""
     with Rig(attempts=0) as rig:
         rig.streaming()

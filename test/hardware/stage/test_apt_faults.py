@@ -28,7 +28,8 @@ def at_rest(bench: AptBench) -> bool:
     return not bench.model.axis.moving(bench.clock_ns())
 
 
-def test_fault_s1_garbage_in_a_move() -> None:
+@pytest.mark.fault("garbage between frames")
+def test_garbage_in_a_move() -> None:
     """driver: skips it and goes on; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
     bench = AptBench()
@@ -40,7 +41,8 @@ def test_fault_s1_garbage_in_a_move() -> None:
     assert bench.stage.statistics()["skipped_bytes"] > 20
 
 
-def test_fault_s2_lost_bytes_in_a_move() -> None:
+@pytest.mark.fault("bytes lost")
+def test_lost_bytes_in_a_move() -> None:
     """driver: asks again for what got lost; user reads: broken_frames and skipped_bytes."""
     bench = AptBench(seed=3)
     bench.model.disturbance.loss_share = 0.05
@@ -51,7 +53,8 @@ def test_fault_s2_lost_bytes_in_a_move() -> None:
 
 
 @pytest.mark.parametrize("rests", [True, False])
-def test_fault_s3_flipped_bits(rests: bool) -> None:
+@pytest.mark.fault("bit flips")
+def test_flipped_bits(rests: bool) -> None:
     """driver: believes no single odd message, asks again; user reads: statuses_rejected."""
     bench = AptBench()
     bench.move(100.0)
@@ -67,7 +70,8 @@ def test_fault_s3_flipped_bits(rests: bool) -> None:
     assert bench.stage.healthy
 
 
-def test_fault_s3_two_running() -> None:
+@pytest.mark.fault("bit flips")
+def test_two_running() -> None:
     """driver: stops; user reads: two status messages running make no sense; check the cable."""
     bench = moving()
     bench.model.disturbance.flips = 2
@@ -83,7 +87,8 @@ def test_fault_s3_two_running() -> None:
 
 
 @pytest.mark.parametrize("rests", [True, False])
-def test_fault_s4_encoder_jump(rests: bool) -> None:
+@pytest.mark.fault("encoder jumps")
+def test_encoder_jump(rests: bool) -> None:
     """driver: two readings stop it; user reads: the encoder jumped by ... mm; home again."""
     bench = AptBench()
     if not rests:
@@ -98,7 +103,8 @@ def test_fault_s4_encoder_jump(rests: bool) -> None:
     assert bench.sent(STOP)
 
 
-def test_fault_s5_stall() -> None:
+@pytest.mark.fault("carriage stalls")
+def test_stall() -> None:
     """driver: profiled stop, immediate stop, disable; user reads: stuck at ... on its move."""
     bench = moving()
     bench.model.axis.freeze(bench.clock_ns())
@@ -113,7 +119,8 @@ def test_fault_s5_stall() -> None:
     assert not bench.model.enabled
 
 
-def test_fault_s5_position_error() -> None:
+@pytest.mark.fault("carriage stalls")
+def test_position_error() -> None:
     """driver: the same as for a stall; user reads: the stage is stuck at ..."""
     bench = moving()
     bench.model.extra_bits = 0x4000
@@ -121,7 +128,8 @@ def test_fault_s5_position_error() -> None:
     assert at_rest(bench)
 
 
-def test_fault_s6_unplug() -> None:
+@pytest.mark.fault("serial unplugged, silent")
+def test_unplug() -> None:
     """driver: fails at once, every order after it, too; user reads: the stage's port failed: ..."""
     bench = moving()
     bench.model.gone = True
@@ -132,7 +140,8 @@ def test_fault_s6_unplug() -> None:
     bench.stage.close()
 
 
-def test_fault_s6_silent_link() -> None:
+@pytest.mark.fault("serial unplugged, silent")
+def test_silent_link() -> None:
     """driver: warns after 0.5 s, fails after 1.5 s; user reads: silent for 1.5 s; check power."""
     bench = AptBench()
     bench.model.mute = True
@@ -144,7 +153,8 @@ def test_fault_s6_silent_link() -> None:
     assert 1.4e9 < bench.stage._tracker.age_ns < 1.7e9
 
 
-def test_fault_s7_limit_in_a_move() -> None:
+@pytest.mark.fault("limit switch")
+def test_limit_in_a_move() -> None:
     """driver: stops, lets only back; user reads: met a limit at ... mm; move it back first."""
     bench = AptBench()
     bench.model.axis.obstacle_mm = 80.0
@@ -160,7 +170,8 @@ def test_fault_s7_limit_in_a_move() -> None:
     assert bench.stage.state().position_mm == pytest.approx(150.0, abs=1e-4)
 
 
-def test_fault_s8_end_messages_missing() -> None:
+@pytest.mark.fault("completion message missing")
+def test_end_messages_missing() -> None:
     """driver: finds the end of homing, move and stop in the status; user reads: nothing."""
     bench = AptBench(home=False)
     bench.model.withheld = {"moved", "stopped", "homed"}
@@ -174,7 +185,8 @@ def test_fault_s8_end_messages_missing() -> None:
     bench.until(lambda: not bench.stage.state().moving)
 
 
-def test_fault_s8_motion_without_end() -> None:
+@pytest.mark.fault("completion message missing")
+def test_motion_without_end() -> None:
     """driver: stops after the time it should take; user reads: does not end in time; look there."""
     bench = AptBench()
     bench.stage.move_to(30.0, 100.0)
@@ -182,7 +194,8 @@ def test_fault_s8_motion_without_end() -> None:
     assert "move does not end in time" in bench.failure(10.0)
 
 
-def test_fault_s9_keep_alive() -> None:
+@pytest.mark.fault("keep-alive missing")
+def test_keep_alive() -> None:
     """driver: keeps alive from the writer's thread twice a second; user reads: nothing."""
     bench = AptBench()
     bench.advance(5.0)
@@ -191,7 +204,8 @@ def test_fault_s9_keep_alive() -> None:
     assert bench.stage.healthy
 
 
-def test_fault_s9_keep_alive_lost() -> None:
+@pytest.mark.fault("keep-alive missing")
+def test_keep_alive_lost() -> None:
     """driver: takes the silence for a dead link; user reads: silent for 1.5 s; check its power."""
     bench = AptBench()
     for timer in bench.link._timers:
@@ -200,7 +214,8 @@ def test_fault_s9_keep_alive_lost() -> None:
     assert "silent for 1.5 s" in bench.failure(10.0)
 
 
-def test_fault_s10_not_enabled() -> None:
+@pytest.mark.fault("disabled, not homed, move ignored")
+def test_not_enabled() -> None:
     """driver: does not come up; user reads: does not enable the axis; check its front panel."""
     bench = AptBench(home=False)
     bench.model.panel_disabled, bench.model.enabled = True, False
@@ -208,14 +223,16 @@ def test_fault_s10_not_enabled() -> None:
         bench.open()
 
 
-def test_fault_s10_disabled_later() -> None:
+@pytest.mark.fault("disabled, not homed, move ignored")
+def test_disabled_later() -> None:
     """driver: stops; user reads: does not have the axis enabled any more; configure and home."""
     bench = moving()
     bench.model.enabled = False
     assert "axis enabled any more" in bench.failure()
 
 
-def test_fault_s10_ignored_move() -> None:
+@pytest.mark.fault("disabled, not homed, move ignored")
+def test_ignored_move() -> None:
     """driver: sees no motion within 0.3 s; user reads: does not begin its move within 0.3 s."""
     bench = AptBench()
     bench.model.ignores_moves = True
@@ -226,7 +243,8 @@ def test_fault_s10_ignored_move() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "Motor over temperature"])
-def test_fault_s11_error_message(text: str) -> None:
+@pytest.mark.fault("controller reports an error")
+def test_error_message(text: str) -> None:
     """driver: stops; user reads: the controller's code and words, or to look at its display."""
     bench = moving()
     bench.model.complain(17, text)
@@ -235,7 +253,8 @@ def test_fault_s11_error_message(text: str) -> None:
     assert at_rest(bench)
 
 
-def test_fault_s11_fault_bits() -> None:
+@pytest.mark.fault("controller reports an error")
+def test_fault_bits() -> None:
     """driver: stops when two messages say so; user reads: controller reports over_temperature."""
     bench = moving()
     bench.model.extra_bits = 0x20000
@@ -244,7 +263,8 @@ def test_fault_s11_fault_bits() -> None:
 
 
 @pytest.mark.parametrize("rests", [True, False])
-def test_fault_s12_controller_restarts(rests: bool) -> None:
+@pytest.mark.fault("controller rebooted")
+def test_controller_restarts(rests: bool) -> None:
     """driver: stops; user reads: does not have its reference any more; configure and home."""
     bench = AptBench()
     bench.move(60.0)
@@ -260,7 +280,8 @@ def test_fault_s12_controller_restarts(rests: bool) -> None:
         bench.stage.move_to(10.0, 10.0)
 
 
-def test_fault_s13_double_replies() -> None:
+@pytest.mark.fault("late or double reply")
+def test_double_replies() -> None:
     """driver: takes each answer once, by message and source; user reads: nothing."""
     bench = AptBench()
     bench.model.disturbance.repeats = 10_000
@@ -269,7 +290,8 @@ def test_fault_s13_double_replies() -> None:
     assert bench.stage.state().position_mm == pytest.approx(20.0, abs=1e-4)
 
 
-def test_fault_s13_late_reply() -> None:
+@pytest.mark.fault("late or double reply")
+def test_late_reply() -> None:
     """driver: asks again, and the late answer harms nobody; user reads: nothing."""
     late = {"ns": 0}
     bench = AptBench(late_ns=lambda: late["ns"])
@@ -280,7 +302,8 @@ def test_fault_s13_late_reply() -> None:
     assert bench.stage.state().position_mm == pytest.approx(100.0, abs=1e-4)
 
 
-def test_fault_x1_host_stalls_in_a_move() -> None:
+@pytest.mark.fault("host stalls")
+def test_host_stalls_in_a_move() -> None:
     """driver: positions stay interpolated, the pause is filled in later; user reads: nothing."""
     bench = AptBench()
     bench.stage.move_to(200.0, 100.0)
@@ -296,7 +319,8 @@ def test_fault_x1_host_stalls_in_a_move() -> None:
         assert bench.stage.state(t_ns).position_mm == pytest.approx(true_mm, abs=0.02)
 
 
-def test_fault_x1_host_stalls_as_a_move_begins() -> None:
+@pytest.mark.fault("host stalls")
+def test_host_stalls_as_a_move_begins() -> None:
     """driver: an answer from before the order says nothing about the move; user reads: nothing."""
     bench = AptBench()
     for turn, stall_s in itertools.product(range(12), (0.35, 0.8)):
@@ -310,7 +334,8 @@ def test_fault_x1_host_stalls_as_a_move_begins() -> None:
         assert bench.stage.state().position_mm == pytest.approx(target_mm, abs=1e-4)
 
 
-def test_fault_x3_close_while_homing() -> None:
+@pytest.mark.fault("shutdown at any time")
+def test_close_while_homing() -> None:
     """driver: stops and closes within 2 s, twice if need be; user reads: nothing."""
     bench = AptBench(AptSettings(homing_mm_s=10.0), home=False, power_up_mm=150.0)
     bench.stage.home()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import random
 import struct
 
+import pytest
+
 from eschorty_ros.hardware.stage.apt_framer import AptFramer
 
 MS = 1_000_000
@@ -31,7 +33,8 @@ def test_frames_in_any_pieces() -> None:
         assert framer.skipped_bytes == 0
 
 
-def test_fault_s1_garbage_between_frames() -> None:
+@pytest.mark.fault("garbage between frames")
+def test_garbage_between_frames() -> None:
     """driver: skips it byte by byte and counts; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
     for _ in range(200):
@@ -60,7 +63,8 @@ def test_nothing_but_known_frames_for_the_host_passes() -> None:
         assert framer.skipped_bytes == len(data), what
 
 
-def test_fault_s2_lost_bytes() -> None:
+@pytest.mark.fault("bytes lost")
+def test_lost_bytes() -> None:
     """driver: loses one or two frames a cut, never more; user reads: broken_frames counted."""
     chance = random.Random(2)
     framer = AptFramer()

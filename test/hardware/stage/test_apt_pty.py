@@ -67,7 +67,8 @@ def test_home_move_stop_and_close(port: str, model: AptModel) -> None:
         stage.close()
 
 
-def test_fault_x2_second_client(port: str) -> None:
+@pytest.mark.fault("two clients")
+def test_second_client(port: str) -> None:
     """driver: the port is opened exclusively; user reads: another program holds ...; close it."""
     stage = opened(port)
     try:
@@ -77,7 +78,8 @@ def test_fault_x2_second_client(port: str) -> None:
         stage.close()
 
 
-def test_fault_s6_unplug_on_the_port(port: str, model: AptModel) -> None:
+@pytest.mark.fault("serial unplugged, silent")
+def test_unplug_on_the_port(port: str, model: AptModel) -> None:
     """driver: its threads end, orders fail; user reads: the stage's port failed; check cable."""
     stage = opened(port)
     model.gone = True
@@ -127,7 +129,8 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
     assert not [t for t in stage._link._threads if t.is_alive()]
 
 
-def test_fault_s9_blocked_callback(port: str, model: AptModel) -> None:
+@pytest.mark.fault("keep-alive missing")
+def test_blocked_callback(port: str, model: AptModel) -> None:
     """driver: keeps alive while whoever listens to it hangs; user reads: nothing."""
     stage = opened(port)
     heard: list[float] = []
