@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     # Only names: the process that guards the laser starts without numpy.
     from eschorty_ros.core.modulation import Modulation
     from eschorty_ros.core.pulses import PulseTrain
+    from eschorty_ros.hardware.camera.settings import CameraSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,29 +46,64 @@ class EventChunk:
 
 
 class EventSource(Protocol):
-    """A camera that hands out raw EVT3 bytes."""
+    """A camera that streams raw EVT3 bytes.
+
+    Attributes
+    ----------
+    width, height : int
+        Columns and rows of the sensor.
+    on_loss : callable
+        Called with one line, from any thread, when a streaming camera is lost and searched for.
+    """
 
     width: int
     height: int
+    on_loss: Callable[[str], None]
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Who it is, as far as known before ``open``."""
+        """Model, serial and firmware; complete after ``open``."""
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Settings as requested, the trigger input among them."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line for each oddity that ``open`` found."""
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the camera streams and answers; never waits."""
+
+    @property
+    def loss(self) -> str:
+        """Why a streaming camera is being searched for, one line; empty while it is there."""
 
     def open(self) -> None:
         """Find, probe and initialise the camera; may take seconds, ``close`` interrupts it."""
 
     def start(self) -> None:
-        """Begin streaming."""
+        """Start streaming."""
 
     def stop(self) -> None:
         """End streaming; idempotent."""
 
     def read(self, timeout_s: float) -> EventChunk | None:
-        """Take what arrived next, ``None`` when nothing came in ``timeout_s``.
+        """Return the next chunk, ``None`` when none came in ``timeout_s``.
 
-        Raises ``DeviceError`` when the camera is gone for good.
+        Raises ``DeviceError`` when the camera is lost for good.
         """
+
+    def set_bias(self, name: str, offset: int) -> int:
+        """Set one bias, an offset from the factory trim; returns the offset read back.
+
+        Raises ``ArgumentError`` for an unknown bias or an offset outside its range,
+        ``DeviceError`` when the camera is not open or keeps another value.
+        """
+
+    def read_biases(self) -> dict[str, int]:
+        """Return the offsets in the camera; raises ``DeviceError`` when it is not open."""
 
     def statistics(self) -> dict[str, float]:
         """Counters for diagnostics, by name with unit."""

@@ -13,7 +13,6 @@ from std_srvs.srv import Trigger
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.core.evt3_count import WordCounter
 from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
-from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.protocols import EventSource
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes import diagnostics, drivers, qos
@@ -84,21 +83,20 @@ class CameraNode(DeviceNode):
     def open_device(self) -> None:
         """Open the camera."""
         self._source = drivers.make(drivers.CAMERAS, self.parameters, self.now_ns)
-        if isinstance(self._source, Evk4):
-            self._source.on_loss = self._on_loss
-            if not self.waiting:
-                self.get_logger().info("looking for the camera; its initialisation takes 3 s")
+        self._source.on_loss = self._on_loss
+        if not self.waiting:
+            self.get_logger().info("looking for the camera; its initialisation takes 3 s")
         self._source.open()
         identity = self._source.identity
         self.get_logger().info(
             f"{identity.model} {identity.serial} {identity.firmware}, "
             f"{self._source.width} x {self._source.height}"
         )
-        for line in (*getattr(self._source, "warnings", ()), missing_bias_file(self.parameters)):
+        for line in (*self._source.warnings, missing_bias_file(self.parameters)):
             if line:
                 self.get_logger().warning(line)
-        if isinstance(self._source, Evk4):
-            self._read_biases_back(self._source.read_biases())
+        self._kept = self._source.read_biases()
+        self._write_parameters()
 
     def start_device(self) -> None:
         """Stream."""
@@ -141,7 +139,7 @@ class CameraNode(DeviceNode):
         """Whether events can come right now."""
         thread, source = self._thread, self._source
         alive = thread is not None and thread.is_alive() and not self._ending.is_set()
-        return alive and bool(getattr(source, "healthy", True))
+        return alive and source is not None and source.healthy
 
     @property
     def words(self) -> WordCounter:
@@ -170,7 +168,7 @@ class CameraNode(DeviceNode):
     def _on_change(self, proposed: dict[str, Any]) -> None:
         """Apply biases as they are set; what the camera kept becomes the parameter."""
         source = self._source
-        if not isinstance(source, Evk4):
+        if source is None:
             return
         for name in BIASES:
             offset = proposed[name]
@@ -178,10 +176,6 @@ class CameraNode(DeviceNode):
                 kept = self._kept[name] = source.set_bias(name, offset)
                 if kept != offset:
                     self._read_back.trigger()
-
-    def _read_biases_back(self, kept: dict[str, int]) -> None:
-        self._kept = dict(kept)
-        self._write_parameters()
 
     def _write_parameters(self) -> None:
         changed = [
@@ -197,8 +191,8 @@ class CameraNode(DeviceNode):
         try:
             if not path:
                 raise DeviceError("no file to save biases to; set the parameter bias_file")
-            if not isinstance(source, Evk4):
-                raise DeviceError("no biases to save; this camera has none or is not open")
+            if source is None:
+                raise DeviceError("no biases to save; the camera is not open")
             save_bias_file(path, source.read_biases())
         except EschortyError as error:
             response.success, response.message = False, str(error)
@@ -239,10 +233,10 @@ class CameraNode(DeviceNode):
         lost, self._lost_told = lost - self._lost_told, lost
         if self.failure:
             return diagnostics.ERROR, self.failure, values
-        trouble = getattr(source, "trouble", "")
-        if trouble:
-            return diagnostics.ERROR, f"looking for the camera: {trouble}", values
-        band = source.settings.anti_flicker if isinstance(source, Evk4) else None
+        loss = source.loss if source is not None else ""
+        if loss:
+            return diagnostics.ERROR, f"looking for the camera: {loss}", values
+        band = source.settings.anti_flicker if source is not None else None
         if band is not None and self._laser_hz is not None and band.erases(self._laser_hz):
             line = (
                 f"the anti-flicker filter erases the laser's {self._laser_hz:g} Hz; switch it off"

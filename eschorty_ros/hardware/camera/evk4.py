@@ -107,8 +107,8 @@ class Evk4:
         return session.warnings if session is not None else ()
 
     @property
-    def trouble(self) -> str:
-        """Why the camera is being looked for; empty while it is there or nobody streams."""
+    def loss(self) -> str:
+        """Why a streaming camera is being searched for, one line; empty while it is there."""
         return self._keeper.loss if self._thread is not None else ""
 
     @property

@@ -73,7 +73,7 @@ def test_unplug_in_a_scan() -> None:
         assert not rig.camera.healthy
         rig.model.replug()
         until(lambda: rig.count("reconnects") == 1, "the reconnection")
-        assert rig.camera.trouble == ""
+        assert rig.camera.loss == ""
         rig.chunks.clear()
         rig.exchange(9)
         assert rig.chunks[0].restarted
@@ -376,7 +376,7 @@ def test_shutdown_while_reconnecting() -> None:
         camera.open()
         camera.start()
         rig.model.gone = True
-        until(lambda: camera.trouble, "the loss")
+        until(lambda: camera.loss, "the loss")
         camera.close()
         camera.close()
         until(lambda: set(threading.enumerate()) <= before, "the end of its threads")
