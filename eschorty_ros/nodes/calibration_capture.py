@@ -12,15 +12,42 @@ from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.calibration_fit import fit_targets
 from eschorty_ros.core.errors import EschortyError, FitError
 from eschorty_ros.core.evt3 import Decoder
-from eschorty_ros.core.posts import AggregateFrame, find_posts, match_posts, moving_target
+from eschorty_ros.core.posts import (
+    AggregateFrame,
+    KnownTarget,
+    find_posts,
+    match_posts,
+    moving_target,
+)
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.targets import Targets
-from eschorty_ros.nodes.calibration_sequence import CaptureRequest, Sweep
 from eschorty_ros.nodes.packet_times import Packet
 from eschorty_ros.nodes.sensor_epoch import TimedProfiles
 
 _TARGETS_LEAST = 3
 _REASONS_SHOWN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """The stage moves the one target from ``start_mm`` to ``stop_mm`` and back."""
+
+    start_mm: float
+    stop_mm: float
+    speed_mm_s: float
+    range_per_stage: float
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureRequest:
+    """What is lit and for how long; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+
+    targets: tuple[KnownTarget, ...]
+    method: str = "joint"
+    capture_s: float = 1.0
+    frequency_hz: float = 0.0
+    duty: float = 0.0
+    sweep: Sweep | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from eschorty_ros.core.calibrate import CalibrationReport
 from eschorty_ros.core.calibration import PARAMETERS, Calibration
 from eschorty_ros.core.posts import KnownTarget
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
-from eschorty_ros.nodes.calibration_sequence import CaptureRequest, Sweep
+from eschorty_ros.nodes.calibration_capture import CaptureRequest, Sweep
 from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
 
 

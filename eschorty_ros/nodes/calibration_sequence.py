@@ -9,34 +9,12 @@ from typing import Protocol
 
 from eschorty_ros.core.calibrate import METHODS
 from eschorty_ros.core.errors import ArgumentError, EschortyError
-from eschorty_ros.core.posts import KnownTarget
+from eschorty_ros.nodes.calibration_capture import CaptureRequest
 from eschorty_ros.nodes.scan_sequence import End, Hands, ScanCanceled, check_laser
 
 CAPTURE_MAX_S = 120.0
 _DRAIN_S = 10.0
 _SETTLE_MM_S = 100.0
-
-
-@dataclass(frozen=True, slots=True)
-class Sweep:
-    """The stage moves the one target from ``start_mm`` to ``stop_mm`` and back."""
-
-    start_mm: float
-    stop_mm: float
-    speed_mm_s: float
-    range_per_stage: float
-
-
-@dataclass(frozen=True, slots=True)
-class CaptureRequest:
-    """What is lit and for how long; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
-
-    targets: tuple[KnownTarget, ...]
-    method: str = "joint"
-    capture_s: float = 1.0
-    frequency_hz: float = 0.0
-    duty: float = 0.0
-    sweep: Sweep | None = None
 
 
 @dataclass(slots=True)

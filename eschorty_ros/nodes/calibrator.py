@@ -20,18 +20,15 @@ from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.nodes.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.calibration_capture import (
     Capture,
+    CaptureRequest,
     Findings,
     enough_targets,
     make_capture,
 )
 from eschorty_ros.nodes.calibration_messages import fill_result, request_from_goal
-from eschorty_ros.nodes.calibration_sequence import (
-    CaptureRequest,
-    check_request,
-    run_capture,
-)
+from eschorty_ros.nodes.calibration_sequence import check_request, run_capture
 from eschorty_ros.nodes.cloud_messages import image_message
-from eschorty_ros.nodes.rig import LaserStageRig
+from eschorty_ros.nodes.instrument_client import InstrumentClient
 from eschorty_ros.nodes.scan_sequence import End
 from eschorty_ros.nodes.spin import unless_shut_down
 from eschorty_ros.nodes.transforms import OPTICAL
@@ -64,7 +61,7 @@ class Calibrator:
     line_width_px : callable
         Reads the width of the line from the node's settings.
     timeouts_s : tuple of float
-        Those of ``LaserStageRig``.
+        Those of ``InstrumentClient``.
     """
 
     def __init__(
@@ -83,7 +80,7 @@ class Calibrator:
         self._tap = tap
         self._line_width_px = line_width_px
         self._timeouts_s = timeouts_s
-        self._rig: LaserStageRig | None = None
+        self._rig: InstrumentClient | None = None
         self._one = threading.Lock()
         self._idle = threading.Event()
         self._idle.set()
@@ -184,10 +181,10 @@ class Calibrator:
         if not done:
             raise DeviceError(f"reconstruction: {reason}")
 
-    def _made_rig(self) -> LaserStageRig:
+    def _made_rig(self) -> InstrumentClient:
         # Made for the first goal: until then its subscriptions would cost for nothing.
         if self._rig is None:
-            self._rig = LaserStageRig(self._node, *self._timeouts_s)
+            self._rig = InstrumentClient(self._node, *self._timeouts_s)
             if self._ending:
                 self._rig.end()
         return self._rig

@@ -20,12 +20,10 @@ def live_dtype(scan_dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 LIVE_DTYPE = live_dtype(POINT_DTYPE)
-"""Point of a live cloud: metres, events used, metres, ns since the header's stamp, column."""
+"""Point of a live cloud: metres, events used, metres, ns since the header's stamp, column.
 
-SCAN_DTYPE = POINT_DTYPE
-"""Point of an assembled scan: as the live one, but ``t`` is float64 seconds since the stamp.
-
-A uint32 of nanoseconds ends at 4.29 s, shorter than most scans.
+The points of an assembled scan (``POINT_DTYPE``) have ``t`` in seconds as float64: a uint32 of
+nanoseconds ends at 4.29 s, shorter than most scans.
 """
 
 LIVE_SPAN_NS = 4_000_000_000

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.cloud import join_points
+from eschorty_ros.core.cloud import POINT_DTYPE, join_points
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
 from eschorty_ros.nodes.sensor_epoch import SensorTimes
 
 _HALF_NM = 0.5e-6
@@ -127,7 +126,7 @@ class ScanBuffer:
             self._parts = [self._inside(placed_again(part)) for part in self._parts]
         self._parts = [part for part in self._parts if len(part)]
         if not self._parts:
-            return AssembledScan(np.empty(0, SCAN_DTYPE), 0, 0, float("nan"))
+            return AssembledScan(np.empty(0, POINT_DTYPE), 0, 0, float("nan"))
         points = join_points([part.points for part in self._parts])
         t_ns = np.concatenate([part.t_ns for part in self._parts])
         edge_ns = np.concatenate([part.edge_ns for part in self._parts])

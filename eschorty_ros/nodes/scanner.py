@@ -21,8 +21,8 @@ from eschorty_ros.core.errors import EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ
 from eschorty_ros.nodes import diagnostics
 from eschorty_ros.nodes.conversions import m_from_mm, mm_from_m, stamp_from_ns
+from eschorty_ros.nodes.instrument_client import ScanClient
 from eschorty_ros.nodes.parameters import Param, Parameters
-from eschorty_ros.nodes.scan_rig import RosRig
 from eschorty_ros.nodes.scan_sequence import (
     End,
     ScanLimits,
@@ -80,7 +80,7 @@ class ScannerNode(Node):
             approach_mm_s=mm_from_m(self.parameters["approach_speed"]),
             drain_timeout_s=self.parameters["drain_timeout"],
         )
-        self._rig = RosRig(
+        self._rig = ScanClient(
             self,
             self.parameters["node_timeout"],
             self.parameters["service_timeout"],

@@ -8,12 +8,8 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.posts import KnownTarget
-from eschorty_ros.nodes.calibration_sequence import (
-    CaptureRequest,
-    Sweep,
-    check_request,
-    run_capture,
-)
+from eschorty_ros.nodes.calibration_capture import CaptureRequest, Sweep
+from eschorty_ros.nodes.calibration_sequence import check_request, run_capture
 from eschorty_ros.nodes.scan_sequence import End, ScanCanceled, ScanFailure
 
 TWO = (KnownTarget(1000.0), KnownTarget(1500.0))

@@ -11,12 +11,11 @@ from eschorty_ros.msg import LaserState
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.cloud import REFLECTANCE_DTYPE
+from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.nodes import transforms
 from eschorty_ros.nodes.cloud_messages import (
     LIVE_DTYPE,
-    SCAN_DTYPE,
     cloud_message,
     image_message,
     live_points,
@@ -37,8 +36,8 @@ def test_stamps_are_exact(t_ns):
 
 def random_points(count):
     rng = np.random.default_rng(5)
-    points = np.zeros(count, SCAN_DTYPE)
-    for name in SCAN_DTYPE.names:
+    points = np.zeros(count, POINT_DTYPE)
+    for name in POINT_DTYPE.names:
         points[name] = rng.uniform(0, 1000, count)
     return points
 

@@ -8,9 +8,8 @@ from line_events import blank_profiles
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from eschorty_ros.core.cloud import REFLECTANCE_DTYPE
+from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.nodes.cloud_messages import SCAN_DTYPE
 from eschorty_ros.nodes.pipeline import ScanReport
 from eschorty_ros.nodes.reconstruction_reports import fill_end_scan
 from eschorty_ros.nodes.scan_buffer import PlacedPoints, ScanBuffer
@@ -19,7 +18,7 @@ from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
 T0_NS = 1_700_000_000_000_000_123
 
 
-def placed(stage_mm, edge_ns, columns, dtype=SCAN_DTYPE):
+def placed(stage_mm, edge_ns, columns, dtype=POINT_DTYPE):
     points = np.zeros(len(columns), dtype)
     points["column"] = columns
     points["sigma"] = 1e-3

@@ -1,7 +1,6 @@
 """The order of a scan: whatever fails, light off, stage at rest, points kept."""
 
 import math
-import threading
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +8,9 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.nodes.scan_rig import RosRig
+from eschorty_ros.nodes.instrument_client import ScanClient
+from eschorty_ros.nodes.instrument_monitor import InstrumentMonitor
+from eschorty_ros.nodes.paced_waiting import PacedWaiting
 from eschorty_ros.nodes.scan_sequence import (
     End,
     ScanCanceled,
@@ -108,30 +109,27 @@ class Answered:
         return self._answer
 
 
-class CanceledRig(RosRig):
-    """The rig of a goal that is canceled while the reconstruction's answer is on its way."""
+class CanceledClient(ScanClient):
+    """The client of a goal that is canceled while the reconstruction's answer is on its way."""
 
     def __init__(self):
-        self._node = SimpleNamespace(context=SimpleNamespace(ok=lambda: True))
-        self.monitor = SimpleNamespace(reconstruction=None)
-        self._ended = threading.Event()
+        monitor = InstrumentMonitor(lambda: True)
+        PacedWaiting.__init__(self, "scanner", monitor, lambda: 0, lambda: True, 3.0)
         self._service_timeout_s = 5.0
-        self._phase, self._feedback = "", lambda phase: None
-        self._watching = self._shielded = False
-        self._canceled = lambda: True
         answer = SimpleNamespace(success=True, message="")
         self._clients = {
             "reconstruction/begin_scan": SimpleNamespace(
                 call_async=lambda request: Answered(answer, 3)
             )
         }
+        PacedWaiting.prepare(self, lambda: True, lambda phase: None)
 
 
-def test_a_cancel_waits_until_the_reconstruction_has_said_that_it_collects():
-    rig = CanceledRig()
-    rig.begin_scan(REQUEST)
+def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects():
+    client = CanceledClient()
+    client.begin_scan(REQUEST)
     with pytest.raises(ScanCanceled):
-        rig._pause()
+        client.tick()
 
 
 def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():
