@@ -76,7 +76,7 @@ class NodeProcess:
     ) -> None:
         self.module = module
         self._log = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed in kill()
-            prefix=f"{module.rsplit('.', 1)[-1]}_", suffix=".log"
+            prefix=f"{node_name(module)}_", suffix=".log"
         )
         command = [*_ENDING_WITH_PARENT, sys.executable, "-m", module]
         command += ["--ros-args", "-r", f"__ns:={namespace}"]
@@ -149,6 +149,11 @@ class NodeProcess:
             self._process.kill()
         self._process.wait()
         self._log.close()
+
+
+def node_name(module: str) -> str:
+    """Name of the node that ``module`` of the package runs."""
+    return module.removeprefix("eschorty_ros.nodes.").split(".")[0]
 
 
 def domain_environment(domain: int) -> dict[str, str]:
@@ -275,9 +280,9 @@ class Observer:
 def processes(
     nodes: Mapping[str, Mapping[str, Any]], domain: int
 ) -> Iterator[dict[str, NodeProcess]]:
-    """Run ``{module: parameters}`` side by side, keyed by last module name; killed at the end."""
+    """Run ``{module: parameters}`` side by side, keyed by the node's name; killed at the end."""
     running = {
-        module.rsplit(".", 1)[-1]: NodeProcess(module, parameters, domain=domain)
+        node_name(module): NodeProcess(module, parameters, domain=domain)
         for module, parameters in nodes.items()
     }
     try:
