@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import pairwise
 from typing import Protocol
 
 from eschorty_ros.core.errors import ArgumentError, EschortyError
@@ -161,6 +162,27 @@ def sweep_ends_mm(request: ScanRequest, limits: ScanLimits) -> tuple[float, floa
         min(max(request.start_mm - run_up, low), high),
         min(max(request.stop_mm + run_up, low), high),
     )
+
+
+def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | None:
+    """Time of the first crossing of ``level_mm``, linear between samples (ns, mm).
+
+    ``None`` when the samples do not cross it.
+    """
+    for (t0_ns, p0_mm), (t1_ns, p1_mm) in pairwise(samples):
+        if p0_mm != p1_mm and min(p0_mm, p1_mm) <= level_mm <= max(p0_mm, p1_mm):
+            return t0_ns + round((t1_ns - t0_ns) * (level_mm - p0_mm) / (p1_mm - p0_mm))
+    return None
+
+
+def sweep_progress(phase: str, position_mm: float, request: ScanRequest) -> float:
+    """Return the share of the sweep that is done in ``phase``, 0 to 1."""
+    if phase == "finishing":
+        return 1.0
+    if phase != "sweeping" or math.isnan(position_mm):
+        return 0.0
+    share = (position_mm - request.start_mm) / (request.stop_mm - request.start_mm)
+    return min(max(share, 0.0), 1.0)
 
 
 def run_scan(rig: Rig, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:

@@ -6,8 +6,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -29,7 +28,9 @@ from eschorty_ros.nodes.scan_sequence import (
     ScanOutcome,
     ScanRequest,
     check_request,
+    crossing_ns,
     run_scan,
+    sweep_progress,
 )
 from eschorty_ros.nodes.spin import run, unless_shut_down
 
@@ -177,7 +178,9 @@ class ScannerNode(Node):
                 return
             sent_s, sent_phase = now_s, phase
             position_mm = self._rig.monitor.position_mm
-            feedback = Scan.Feedback(phase=phase, progress=_progress(phase, position_mm, request))
+            feedback = Scan.Feedback(
+                phase=phase, progress=sweep_progress(phase, position_mm, request)
+            )
             feedback.position = m_from_mm(position_mm)
             state = self._rig.monitor.reconstruction
             if state is not None:
@@ -234,26 +237,6 @@ class ScannerNode(Node):
         failed = not scanning and End.ABORTED.value in self._last
         level = diagnostics.WARN if failed else diagnostics.OK
         return level, "scanning" if scanning else self._last, values
-
-
-def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | None:
-    """Time of the first crossing of ``level_mm``, linear between samples (ns, mm).
-
-    ``None`` when the samples do not cross it.
-    """
-    for (t0_ns, p0_mm), (t1_ns, p1_mm) in pairwise(samples):
-        if p0_mm != p1_mm and min(p0_mm, p1_mm) <= level_mm <= max(p0_mm, p1_mm):
-            return t0_ns + round((t1_ns - t0_ns) * (level_mm - p0_mm) / (p1_mm - p0_mm))
-    return None
-
-
-def _progress(phase: str, position_mm: float, request: ScanRequest) -> float:
-    if phase == "finishing":
-        return 1.0
-    if phase != "sweeping" or math.isnan(position_mm):
-        return 0.0
-    share = (position_mm - request.start_mm) / (request.stop_mm - request.start_mm)
-    return min(max(share, 0.0), 1.0)
 
 
 def _close(goal: Any, end: End) -> None:

@@ -19,10 +19,10 @@ from eschorty_ros.nodes.scan_sequence import (
     ScanRequest,
     ScanSummary,
     check_request,
+    crossing_ns,
     run_scan,
     sweep_ends_mm,
 )
-from eschorty_ros.nodes.scanner import crossing_ns
 
 LIMITS = ScanLimits((0.0, 220.0), 250.0, 2000.0, 100.0, 10.0)
 REQUEST = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
