@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import replace
+from typing import Any
 
 from eschorty_ros.core.calibration import Calibration
 from eschorty_ros.core.clock import NS_PER_US, SensorClock, StageTrack
@@ -321,3 +322,30 @@ class PacketStream:
     def _take(self) -> list[TimedProfiles]:
         out, self._out = self._out, []
         return out
+
+
+def clock_statistics(stream: PacketStream) -> dict[str, Any]:
+    """Return offset age, drift and residual of the sensor's clock, and its use of stage edges."""
+    epoch = stream.epoch
+    if epoch is None:
+        return {"clock": "unknown", "clock_restarts": stream.clock_restarts}
+    clock, fit = epoch.clock, epoch.edges.fit
+    source = "stage edges" if clock.from_edges else "packet stamps"
+    residual_ns = clock.residual_ns
+    values: dict[str, Any] = {
+        "clock": "announced" if clock.exact else f"from {source}",
+        "clock_drift_ppm": clock.drift_ppm,
+        "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
+        "clock_offset_age_s": clock.offset_age_us * 1e-6,
+        "clock_restarts": stream.clock_restarts,
+    }
+    if epoch.expects_edges:
+        values |= {
+            "stage_edges_kept": len(epoch.edges),
+            "stage_edges_dropped": epoch.edges.edges_dropped,
+            "stage_edges_used": fit.used if fit is not None else 0,
+            "stage_edges_missing": fit.missing if fit is not None else 0,
+            "stage_edges_spurious": fit.spurious if fit is not None else 0,
+            "stage_edges_residual_um": fit.residual_mm * 1e3 if fit is not None else float("nan"),
+        }
+    return values

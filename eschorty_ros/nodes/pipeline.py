@@ -30,6 +30,31 @@ class ScanReport:
     points_outside: int
     points_over_limit: int
 
+    @property
+    def message(self) -> str:
+        """What was lost, and why a scan without points is empty; ``""`` when all is well."""
+        notes = []
+        if self.points_without_stage:
+            notes.append(f"{self.points_without_stage} points had no stage position")
+        if self.points_over_limit:
+            notes.append(f"{self.points_over_limit} points were over the scan's limit")
+        if not notes and not len(self.scan.points):
+            notes.append(self._why_empty())
+        return "; ".join(notes)
+
+    def _why_empty(self) -> str:
+        if not self.events:
+            return "no points: no events came; look at the camera, its lens cap and the laser"
+        if not self.points_outside:
+            return (
+                f"no points: nothing blinks with the laser in {self.events} events; look at the "
+                "laser's frequency, at the focus and at what the line falls on"
+            )
+        return (
+            f"no points: all {self.points_outside} lie outside start to stop; events and stage "
+            "positions are not of one time: look at the camera's and the stage's clock"
+        )
+
 
 class Pipeline:
     """Packets, laser settings and stage samples in; live profiles, points and scans out.

@@ -10,7 +10,7 @@ from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.nodes import diagnostics
 from eschorty_ros.nodes.conversions import stamp_from_ns
 from eschorty_ros.nodes.mailbox import Mailbox
-from eschorty_ros.nodes.packet_stream import PacketStream
+from eschorty_ros.nodes.packet_stream import clock_statistics
 from eschorty_ros.nodes.pipeline import Pipeline, ScanReport
 
 
@@ -66,7 +66,7 @@ class Reports:
             "stream_restarts": stream.restarts,
             "queue": len(self._mailbox),
             "events_per_second": self._diagnostics_rate.read(counters["events"]),
-            **clock_values(stream),
+            **clock_statistics(stream),
             "profiles": self._pipeline.profiles,
             "points": self._pipeline.points,
             "points_waiting_for_stage": placer.waiting,
@@ -87,33 +87,6 @@ class Reports:
         return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
 
 
-def clock_values(stream: PacketStream) -> dict[str, Any]:
-    """Offset, drift and residual of the sensor's clock, and what the stage's edges say of it."""
-    epoch = stream.epoch
-    if epoch is None:
-        return {"clock": "unknown", "clock_restarts": stream.clock_restarts}
-    clock, fit = epoch.clock, epoch.edges.fit
-    source = "stage edges" if clock.from_edges else "packet stamps"
-    residual_ns = clock.residual_ns
-    values: dict[str, Any] = {
-        "clock": "announced" if clock.exact else f"from {source}",
-        "clock_drift_ppm": clock.drift_ppm,
-        "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
-        "clock_offset_age_s": clock.offset_age_us * 1e-6,
-        "clock_restarts": stream.clock_restarts,
-    }
-    if epoch.expects_edges:
-        values |= {
-            "stage_edges_kept": len(epoch.edges),
-            "stage_edges_dropped": epoch.edges.edges_dropped,
-            "stage_edges_used": fit.used if fit is not None else 0,
-            "stage_edges_missing": fit.missing if fit is not None else 0,
-            "stage_edges_spurious": fit.spurious if fit is not None else 0,
-            "stage_edges_residual_um": fit.residual_mm * 1e3 if fit is not None else float("nan"),
-        }
-    return values
-
-
 def fill_end_scan(response: Any, report: ScanReport) -> None:
     """Put a scan's figures, and what was lost, into an ``EndScan`` response."""
     response.profiles = report.scan.profiles
@@ -122,25 +95,4 @@ def fill_end_scan(response: Any, report: ScanReport) -> None:
     response.packets_lost = report.packets_lost
     response.events_dropped = report.events_dropped
     response.sigma_median = report.scan.sigma_median_m
-    notes = []
-    if report.points_without_stage:
-        notes.append(f"{report.points_without_stage} points had no stage position")
-    if report.points_over_limit:
-        notes.append(f"{report.points_over_limit} points were over the scan's limit")
-    if not notes and not len(report.scan.points):
-        notes.append(_why_empty(report))
-    response.message = "; ".join(notes)
-
-
-def _why_empty(report: ScanReport) -> str:
-    if not report.events:
-        return "no points: no events came; look at the camera, its lens cap and the laser"
-    if not report.points_outside:
-        return (
-            f"no points: nothing blinks with the laser in {report.events} events; look at the "
-            "laser's frequency, at the focus and at what the line falls on"
-        )
-    return (
-        f"no points: all {report.points_outside} lie outside start to stop; events and stage "
-        "positions are not of one time: look at the camera's and the stage's clock"
-    )
+    response.message = report.message

@@ -15,9 +15,9 @@ from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.profiles import Profiles
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.nodes.packet_stream import clock_statistics
 from eschorty_ros.nodes.packet_times import Packet
 from eschorty_ros.nodes.pipeline import Pipeline
-from eschorty_ros.nodes.reconstruction_reports import clock_values
 
 SEED = 21
 CALIBRATION = load_calibration("config_3")
@@ -126,7 +126,7 @@ def test_with_edges_of_the_stage_points_are_within_30_um(drift, delay):
     # The odometry's straight lines cut the corners of the ramps: a dt^2 / 8.
     assert np.abs(error_mm).max() < 0.030 + 5000.0 * 0.010**2 / 8
     assert report.points_without_stage == 0
-    values = clock_values(pipeline.stream)
+    values = clock_statistics(pipeline.stream)
     assert values["clock"] == "from stage edges"
     assert abs(values["clock_drift_ppm"] - drift * 1e6) < 60.0
     assert values["clock_offset_age_s"] < 5.0
@@ -143,7 +143,7 @@ def test_without_edges_points_are_within_1_mm(drift, delay):
     print(f"seed {SEED}: {error_mm.min() * 1e3:.1f} to {error_mm.max() * 1e3:.1f} um")
     assert np.abs(error_mm).max() < 1.0
     assert report.points_without_stage == 0
-    values = clock_values(pipeline.stream)
+    values = clock_statistics(pipeline.stream)
     assert values["clock"] == "from packet stamps"
     assert abs(values["clock_drift_ppm"] - drift * 1e6) < 60.0
     assert values["clock_residual_ms"] > 0.0
