@@ -10,7 +10,7 @@ from typing import Protocol
 from eschorty_ros.core.calibrate import METHODS
 from eschorty_ros.core.errors import ArgumentError, EschortyError
 from eschorty_ros.nodes.calibration_capture import CaptureRequest
-from eschorty_ros.nodes.scan_sequence import End, Hands, ScanCanceled, check_laser
+from eschorty_ros.nodes.scan_sequence import End, Instrument, ScanCanceled, check_laser
 
 CAPTURE_MAX_S = 120.0
 _DRAIN_S = 10.0
@@ -25,7 +25,7 @@ class CaptureOutcome:
     message: str = ""
 
 
-class CaptureRig(Hands, Protocol):
+class CaptureInstrument(Instrument, Protocol):
     """What a capture needs beyond a scan's hands."""
 
     def hold(self, duration_s: float) -> None:
@@ -68,7 +68,7 @@ def check_request(request: CaptureRequest) -> None:
 
 
 def run_capture(
-    rig: CaptureRig,
+    instrument: CaptureInstrument,
     request: CaptureRequest,
     begin: Callable[[], None],
     finish: Callable[[], None],
@@ -82,42 +82,44 @@ def run_capture(
     collecting = False
     sweep = request.sweep
     try:
-        rig.report("preparing")
+        instrument.report("preparing")
         # Before anything is waited for or touched: it is refused while a scan is under way.
         begin()
         collecting = True
-        rig.check_nodes()
-        rig.configure_laser(request.frequency_hz, request.duty)
+        instrument.check_nodes()
+        instrument.configure_laser(request.frequency_hz, request.duty)
         if sweep is not None:
-            rig.move(sweep.start_mm, _SETTLE_MM_S)
-        rig.laser_on()
-        rig.watch(True)
-        rig.report("capturing")
+            instrument.move(sweep.start_mm, _SETTLE_MM_S)
+        instrument.laser_on()
+        instrument.watch(True)
+        instrument.report("capturing")
         if sweep is None:
-            rig.hold(request.capture_s)
+            instrument.hold(request.capture_s)
         else:
-            rig.move(sweep.stop_mm, sweep.speed_mm_s)
-            rig.move(sweep.start_mm, sweep.speed_mm_s)
+            instrument.move(sweep.stop_mm, sweep.speed_mm_s)
+            instrument.move(sweep.start_mm, sweep.speed_mm_s)
         outcome.end = End.SUCCEEDED
     except ScanCanceled:
         outcome.end, outcome.message = End.CANCELED, "canceled"
     except EschortyError as error:
         outcome.message = str(error)
     finally:
-        _finish(rig, outcome, finish if collecting else None)
+        _finish(instrument, outcome, finish if collecting else None)
     return outcome
 
 
-def _finish(rig: CaptureRig, outcome: CaptureOutcome, finish: Callable[[], None] | None) -> None:
+def _finish(
+    instrument: CaptureInstrument, outcome: CaptureOutcome, finish: Callable[[], None] | None
+) -> None:
     """Leave every capture the same way: light off first."""
-    rig.shield()
-    rig.watch(False)
-    steps: list[Callable[[], None]] = [rig.laser_off]
+    instrument.shield()
+    instrument.watch(False)
+    steps: list[Callable[[], None]] = [instrument.laser_off]
     if outcome.end is not End.SUCCEEDED:
-        steps.append(rig.stop_stage)
+        steps.append(instrument.stop_stage)
     elif finish is not None:
-        rig.report("finishing")
-        steps.append(lambda: rig.drain(_DRAIN_S))
+        instrument.report("finishing")
+        steps.append(lambda: instrument.drain(_DRAIN_S))
     if finish is not None:
         steps.append(finish)
     for step in steps:

@@ -80,7 +80,7 @@ class Calibrator:
         self._tap = tap
         self._line_width_px = line_width_px
         self._timeouts_s = timeouts_s
-        self._rig: InstrumentClient | None = None
+        self._client: InstrumentClient | None = None
         self._one = threading.Lock()
         self._idle = threading.Event()
         self._idle.set()
@@ -102,8 +102,8 @@ class Calibrator:
     def safe_state(self) -> None:
         """End a capture under way: its way out switches the laser off, its heartbeat stops."""
         self._ending = True
-        if self._rig is not None:
-            self._rig.end()
+        if self._client is not None:
+            self._client.end()
         self._idle.wait(2.0)
 
     def _execute(self, goal: Any) -> Any:
@@ -125,9 +125,11 @@ class Calibrator:
     def _calibrate(self, goal: Any, request: CaptureRequest) -> Any:
         capture = make_capture(request, self._nominal, self._line_width_px())
         feedback = _Feedback(goal, request, capture, self._in_worker)
-        rig = self._made_rig()
-        rig.prepare(lambda: bool(goal.is_cancel_requested), feedback.send)
-        outcome = run_capture(rig, request, lambda: self._hand(capture), lambda: self._hand(None))
+        client = self._made_client()
+        client.prepare(lambda: bool(goal.is_cancel_requested), feedback.send)
+        outcome = run_capture(
+            client, request, lambda: self._hand(capture), lambda: self._hand(None)
+        )
         result = Calibrate.Result(message=outcome.message)
         if not self._node.context.ok():
             return result
@@ -181,13 +183,13 @@ class Calibrator:
         if not done:
             raise DeviceError(f"reconstruction: {reason}")
 
-    def _made_rig(self) -> InstrumentClient:
+    def _made_client(self) -> InstrumentClient:
         # Made for the first goal: until then its subscriptions would cost for nothing.
-        if self._rig is None:
-            self._rig = InstrumentClient(self._node, *self._timeouts_s)
+        if self._client is None:
+            self._client = InstrumentClient(self._node, *self._timeouts_s)
             if self._ending:
-                self._rig.end()
-        return self._rig
+                self._client.end()
+        return self._client
 
 
 class _Feedback:

@@ -98,7 +98,7 @@ class InstrumentClient(PacedWaiting):
         super().prepare(canceled, guarded)
 
     def check_nodes(self) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         begun_ns = self.monitor.until_ns
         for there, failure in self._needed(begun_ns):
             self.wait(there, self._node_timeout_s, failure)
@@ -127,7 +127,7 @@ class InstrumentClient(PacedWaiting):
         ]
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         wanted = {
             name: float(value)
             for name, value in (("frequency", frequency_hz), ("duty", duty))
@@ -153,7 +153,7 @@ class InstrumentClient(PacedWaiting):
                   f"laser: its state does not show {wanted}")  # fmt: skip
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         self.monitor.samples.clear()
         goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
         # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
@@ -174,7 +174,7 @@ class InstrumentClient(PacedWaiting):
             raise ScanFailure(f"stage: {answer.result.message or 'the move did not succeed'}")
 
     def stop_stage(self) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         sent, self._sent = self._sent, None
         if sent is None:
             return
@@ -187,7 +187,7 @@ class InstrumentClient(PacedWaiting):
             self._answer(future, "stage/move")
 
     def laser_on(self) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         self.tick()
         self._beating = True
         self.wait(lambda: self._heartbeat.beating, self._service_timeout_s,
@@ -213,7 +213,7 @@ class InstrumentClient(PacedWaiting):
         return ""
 
     def laser_off(self) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         try:
             if self._beating:
                 answer = self._call("laser/enable", SetBool.Request(data=False))
@@ -285,7 +285,7 @@ class ScanClient(InstrumentClient):
         super().__init__(node, node_timeout_s, service_timeout_s, events_timeout_s, services)
 
     def begin_scan(self, request: ScanRequest) -> None:
-        """See ``Rig``. A scan that a former scanner left open is ended and published first."""
+        """See ``ScanInstrument``; a scan that is still open is ended and published first."""
         state = self.monitor.reconstruction
         if state is not None and state.scan_id:
             self._node.get_logger().warning(f"ending {state.scan_id}, which nobody ended")
@@ -302,7 +302,7 @@ class ScanClient(InstrumentClient):
             raise ScanFailure(f"reconstruction: {answer.message}")
 
     def end_scan(self, scan_id: str) -> ScanSummary:
-        """See ``Rig``."""
+        """See ``ScanInstrument``."""
         request = EndScan.Request(scan_id=scan_id)
         answer = self._call("reconstruction/end_scan", request, once_within_s=_ASSEMBLE_S)
         if not answer.success:

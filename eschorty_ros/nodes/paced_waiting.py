@@ -68,12 +68,12 @@ class PacedWaiting:
         return time.monotonic() - self._tick_s < limit_s
 
     def watch(self, enabled: bool) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         self.monitor.restart_progress()
         self._watching = enabled
 
     def shield(self) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         self._shielded = True
 
     @contextlib.contextmanager
@@ -86,7 +86,7 @@ class PacedWaiting:
             self._shielded = before
 
     def drain(self, no_progress_s: float) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         target_ns = self._now_ns()
         self.monitor.restart_progress()
         while self.monitor.until_ns < target_ns:
@@ -101,7 +101,7 @@ class PacedWaiting:
             self.tick()
 
     def report(self, phase: str) -> None:
-        """See ``Hands``."""
+        """See ``Instrument``."""
         self._phase = phase
         # After a signal feedback can no longer be sent.
         with contextlib.suppress(ScanFailure):

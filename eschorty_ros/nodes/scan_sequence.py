@@ -74,7 +74,7 @@ class ScanOutcome:
     summary: ScanSummary = field(default_factory=ScanSummary)
 
 
-class Hands(Protocol):
+class Instrument(Protocol):
     """What a sequence asks of laser, stage and reconstruction. Waiting calls ``pause``."""
 
     def check_nodes(self) -> None:
@@ -108,7 +108,7 @@ class Hands(Protocol):
         """Name the phase in the feedback."""
 
 
-class Rig(Hands, Protocol):
+class ScanInstrument(Instrument, Protocol):
     """What a scan needs beyond that."""
 
     def begin_scan(self, request: ScanRequest) -> None:
@@ -185,51 +185,55 @@ def sweep_progress(phase: str, position_mm: float, request: ScanRequest) -> floa
     return min(max(share, 0.0), 1.0)
 
 
-def run_scan(rig: Rig, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
+def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
     """Do one scan; never raises an ``EschortyError``, and leaves laser off and stage at rest."""
     outcome = ScanOutcome()
     collecting = False
     begin_mm, end_mm = sweep_ends_mm(request, limits)
     try:
-        rig.report("preparing")
-        rig.check_nodes()
-        rig.configure_laser(request.frequency_hz, request.duty)
-        rig.report("to_start")
-        rig.move(begin_mm, limits.approach_mm_s)
-        rig.begin_scan(request)
+        instrument.report("preparing")
+        instrument.check_nodes()
+        instrument.configure_laser(request.frequency_hz, request.duty)
+        instrument.report("to_start")
+        instrument.move(begin_mm, limits.approach_mm_s)
+        instrument.begin_scan(request)
         collecting = True
-        rig.laser_on()
-        rig.watch(True)
-        rig.report("sweeping")
-        rig.move(end_mm, request.speed_mm_s)
+        instrument.laser_on()
+        instrument.watch(True)
+        instrument.report("sweeping")
+        instrument.move(end_mm, request.speed_mm_s)
         outcome.end = End.SUCCEEDED
     except ScanCanceled:
         outcome.end, outcome.message = End.CANCELED, "canceled"
     except EschortyError as error:
         outcome.message = str(error)
     finally:
-        _finish(rig, request, limits, outcome, collecting)
+        _finish(instrument, request, limits, outcome, collecting)
     return outcome
 
 
 def _finish(
-    rig: Rig, request: ScanRequest, limits: ScanLimits, outcome: ScanOutcome, collecting: bool
+    instrument: ScanInstrument,
+    request: ScanRequest,
+    limits: ScanLimits,
+    outcome: ScanOutcome,
+    collecting: bool,
 ) -> None:
     """Leave every scan the same way: light off first."""
-    rig.shield()
-    rig.watch(False)
-    _attempt(outcome, rig.laser_off)
+    instrument.shield()
+    instrument.watch(False)
+    _attempt(outcome, instrument.laser_off)
     if outcome.end is not End.SUCCEEDED:
-        _attempt(outcome, rig.stop_stage)
+        _attempt(outcome, instrument.stop_stage)
     if not collecting:
         return
-    rig.report("finishing")
+    instrument.report("finishing")
     # After a failure whatever is still on the way is kept, but a dead camera is not waited for.
     patience_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
-    _attempt(outcome, lambda: rig.drain(patience_s))
+    _attempt(outcome, lambda: instrument.drain(patience_s))
 
     def end_scan() -> None:
-        outcome.summary = rig.end_scan(request.scan_id)
+        outcome.summary = instrument.end_scan(request.scan_id)
 
     _attempt(outcome, end_scan)
 

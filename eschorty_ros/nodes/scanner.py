@@ -81,7 +81,7 @@ class ScannerNode(Node):
             approach_mm_s=mm_from_m(self.parameters["approach_speed"]),
             drain_timeout_s=self.parameters["drain_timeout"],
         )
-        self._rig = ScanClient(
+        self._client = ScanClient(
             self,
             self.parameters["node_timeout"],
             self.parameters["service_timeout"],
@@ -112,7 +112,7 @@ class ScannerNode(Node):
 
     def safe_state(self) -> None:
         """End a scan under way: its way out switches the laser off, and its heartbeat stops."""
-        self._rig.end()
+        self._client.end()
         self._idle.wait(2.0)
 
     def _execute(self, goal: Any) -> Any:
@@ -140,8 +140,8 @@ class ScannerNode(Node):
         except EschortyError as error:
             return self._refuse(goal, str(error))
         self._scans += 1
-        self._rig.prepare(lambda: bool(goal.is_cancel_requested), self._feedback(goal, request))
-        outcome = run_scan(self._rig, request, self._limits)
+        self._client.prepare(lambda: bool(goal.is_cancel_requested), self._feedback(goal, request))
+        outcome = run_scan(self._client, request, self._limits)
         result = self._result(request, outcome)
         self._last = f"{request.scan_id}: {outcome.end.value}"
         if result.message:
@@ -167,7 +167,7 @@ class ScannerNode(Node):
     def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:
         sent_s = -math.inf
         sent_phase = ""
-        before = self._rig.monitor.reconstruction
+        before = self._client.monitor.reconstruction
         points_before = before.points if before is not None else 0
         profiles_before = before.profiles if before is not None else 0
 
@@ -177,12 +177,12 @@ class ScannerNode(Node):
             if phase == sent_phase and now_s - sent_s < _FEEDBACK_S:
                 return
             sent_s, sent_phase = now_s, phase
-            position_mm = self._rig.monitor.position_mm
+            position_mm = self._client.monitor.position_mm
             feedback = Scan.Feedback(
                 phase=phase, progress=sweep_progress(phase, position_mm, request)
             )
             feedback.position = m_from_mm(position_mm)
-            state = self._rig.monitor.reconstruction
+            state = self._client.monitor.reconstruction
             if state is not None:
                 feedback.points = max(state.points - points_before, 0)
                 feedback.profiles = max(state.profiles - profiles_before, 0)
@@ -205,7 +205,7 @@ class ScannerNode(Node):
             events_dropped=summary.events_dropped,
             sigma_median=summary.sigma_median_m,
         )
-        samples = list(self._rig.monitor.samples)
+        samples = list(self._client.monitor.samples)
         if samples:
             start_ns = crossing_ns(samples, request.start_mm)
             stop_ns = crossing_ns(samples, request.stop_mm)
@@ -214,7 +214,7 @@ class ScannerNode(Node):
         return result
 
     def _auto_scan(self) -> None:
-        missing = self._rig.missing()
+        missing = self._client.missing()
         if missing or not self._self_client.server_is_ready():
             self._wait_for(missing or "scanner: no scan")
             return

@@ -17,7 +17,7 @@ RESTING = CaptureRequest(TWO, "joint", 0.5, 70.0)
 MOVING = CaptureRequest(TWO[:1], "joint", sweep=Sweep(10.0, 60.0, 20.0, 1.0))
 
 
-class RecordingRig:
+class RecordingInstrument:
     """Notes every call; the ``failing`` one raises ``error``."""
 
     def __init__(self, failing=None, error=None):
@@ -48,22 +48,22 @@ class RecordingRig:
     ],
 )
 def test_order_of_a_capture(request_, steps):
-    rig = RecordingRig()
-    outcome = rig.capture(request_)
+    instrument = RecordingInstrument()
+    outcome = instrument.capture(request_)
     assert (outcome.end, outcome.message) == (End.SUCCEEDED, "")
-    assert rig.done() == [*steps, "laser_off", "drain", "finish"]
+    assert instrument.done() == [*steps, "laser_off", "drain", "finish"]
 
 
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("begin", 1),
                                   ("laser_on", 1), *(("move", k) for k in (1, 2, 3))])  # fmt: skip
 @pytest.mark.parametrize("error", [ScanFailure("camera: gone"), ScanCanceled()])
 def test_every_interruption_ends_dark_and_at_rest(step, error):
-    rig = RecordingRig(step, error)
-    outcome = rig.capture(MOVING)
+    instrument = RecordingInstrument(step, error)
+    outcome = instrument.capture(MOVING)
     canceled = isinstance(error, ScanCanceled)
     assert outcome.end is (End.CANCELED if canceled else End.ABORTED)
     assert outcome.message == ("canceled" if canceled else "camera: gone")
-    after = rig.calls[rig.calls.index("shield") :]
+    after = instrument.calls[instrument.calls.index("shield") :]
     assert [n for n in after if n in ("laser_off", "stop_stage")] == ["laser_off", "stop_stage"]
     assert ("finish" in after) == (step[0] != "begin")
     assert "laser_on" not in after
@@ -72,10 +72,10 @@ def test_every_interruption_ends_dark_and_at_rest(step, error):
 
 @pytest.mark.parametrize("step", ["laser_off", "drain", "finish"])
 def test_a_failure_on_the_way_out_fails_the_capture_and_the_rest_still_runs(step):
-    rig = RecordingRig((step, 1), ScanFailure("laser: no answer"))
-    outcome = rig.capture(RESTING)
+    instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
+    outcome = instrument.capture(RESTING)
     assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
-    assert rig.done()[-3:] == ["laser_off", "drain", "finish"]
+    assert instrument.done()[-3:] == ["laser_off", "drain", "finish"]
 
 
 @pytest.mark.parametrize(

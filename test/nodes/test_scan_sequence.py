@@ -29,7 +29,7 @@ REQUEST = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
 STEPS = ("check_nodes", "configure_laser", "move", "begin_scan", "laser_on", "move")
 
 
-class RecordingRig:
+class RecordingInstrument:
     """Notes every call; the ``failing`` one raises ``error``."""
 
     def __init__(self, failing=None, error=None):
@@ -49,10 +49,10 @@ class RecordingRig:
 
 
 def test_order_of_a_scan():
-    rig = RecordingRig()
-    outcome = run_scan(rig, REQUEST, LIMITS)
+    instrument = RecordingInstrument()
+    outcome = run_scan(instrument, REQUEST, LIMITS)
     assert (outcome.end, outcome.message, outcome.summary.points) == (End.SUCCEEDED, "", 5)
-    done = [name for name in rig.calls if name not in ("report", "watch", "shield")]
+    done = [name for name in instrument.calls if name not in ("report", "watch", "shield")]
     assert done == [*STEPS, "laser_off", "drain", "end_scan"]
 
 
@@ -60,12 +60,12 @@ def test_order_of_a_scan():
                                   ("begin_scan", 1), ("laser_on", 1), ("move", 2)])  # fmt: skip
 @pytest.mark.parametrize("error", [ScanFailure("stage: stuck"), ScanCanceled()])
 def test_every_interruption_ends_dark_and_at_rest(step, error):
-    rig = RecordingRig(step, error)
-    outcome = run_scan(rig, REQUEST, LIMITS)
+    instrument = RecordingInstrument(step, error)
+    outcome = run_scan(instrument, REQUEST, LIMITS)
     canceled = isinstance(error, ScanCanceled)
     assert outcome.end is (End.CANCELED if canceled else End.ABORTED)
     assert outcome.message == ("canceled" if canceled else "stage: stuck")
-    after = rig.calls[rig.calls.index("shield") :]
+    after = instrument.calls[instrument.calls.index("shield") :]
     assert [n for n in after if n in ("laser_off", "stop_stage")] == ["laser_off", "stop_stage"]
     assert "move" not in after
     begun = step in (("laser_on", 1), ("move", 2))
@@ -75,10 +75,10 @@ def test_every_interruption_ends_dark_and_at_rest(step, error):
 
 @pytest.mark.parametrize("step", ["laser_off", "drain", "end_scan"])
 def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
-    rig = RecordingRig((step, 1), ScanFailure("laser: no answer"))
-    outcome = run_scan(rig, REQUEST, LIMITS)
+    instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
+    outcome = run_scan(instrument, REQUEST, LIMITS)
     assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
-    assert [n for n in rig.calls if n in ("laser_off", "drain", "end_scan")] == [
+    assert [n for n in instrument.calls if n in ("laser_off", "drain", "end_scan")] == [
         "laser_off",
         "drain",
         "end_scan",
@@ -86,13 +86,13 @@ def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
 
 
 def test_the_first_reason_stays():
-    rig = RecordingRig(("move", 2), ScanFailure("camera: gone"))
+    instrument = RecordingInstrument(("move", 2), ScanFailure("camera: gone"))
 
     def end_scan(scan_id):
         raise ScanFailure("reconstruction: gone")
 
-    rig.end_scan = end_scan
-    assert run_scan(rig, REQUEST, LIMITS).message == "camera: gone"
+    instrument.end_scan = end_scan
+    assert run_scan(instrument, REQUEST, LIMITS).message == "camera: gone"
 
 
 class Answered:
