@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 from eschorty_ros.core.errors import DeviceError, EschortyError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 from eschorty_ros.hardware.own_pauses import OwnPauses
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput, LaserReadback
 from eschorty_ros.nodes.laser_gate import LaserGate
@@ -58,15 +59,12 @@ class LaserKeeper:
         self._readback_period_s = readback_period_s
         # Held briefly: by whoever tells the state and by whoever switches off.
         self._lock = threading.RLock()
-        # Held as long as a command takes.
+        # Held as long as a command or a read-back takes; taken before ``_lock``, if both are.
         self._commands = threading.Lock()
         self._commanding = False
-        # Counts what may have changed the output; a read-back that began before is void.
-        self._generation = 0
+        self._in_flight = CommandsInFlight()
         self._laser: LaserModulator | None = None
         self._record = LaserRecord()
-        # Counts switching off; what was asked for before it must not end in light.
-        self._offs = 0
         self._lookouts: list[Lookout] = []
         self._pauses: OwnPauses
         self.switch_offs = 0
@@ -103,9 +101,8 @@ class LaserKeeper:
         """Switch off and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
         for lookout in self._lookouts:
             lookout.end(_PATIENCE_S)
-        with self._lock:
+        with self._in_flight.disabling("closed"), self._lock:
             laser, self._laser = self._laser, None
-            self._generation += 1
             if laser is None:
                 return
             try:
@@ -138,18 +135,18 @@ class LaserKeeper:
         """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be."""
         if self.gate.interlock_open:
             raise DeviceError("laser refused: interlock open; close it")
-        with self._command() as (laser, offs):
+        with self._command() as (laser, ticket):
             laser.arm()
             with self._lock:
-                self._refuse_void(offs)
+                self._in_flight.refuse_void(ticket)
                 self.gate.arm()
                 self._record.reason = "armed"
 
     def enable(self) -> None:
         """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
-        with self._command() as (laser, offs):
+        with self._command() as (laser, ticket):
             with self._lock:
-                self._refuse_void(offs)
+                self._in_flight.refuse_void(ticket)
                 if self._record.requested is LaserOutput.ON:
                     return
                 refusal = self.gate.refusal()
@@ -165,15 +162,17 @@ class LaserKeeper:
                 self._end_light(error)
                 raise
             with self._lock:
-                if self._record.requested is not LaserOutput.ON:
+                try:
+                    self._in_flight.refuse_void(ticket)
+                except VoidedError:
                     laser.disable()
-                    raise DeviceError(f"laser refused: {self._record.reason}")
+                    raise
                 self._record.reason = "switched on by request"
                 self._hear(told)
 
     def switch_off(self, reason: str) -> None:
         """Switch off before anything else; raises ``DeviceError`` when it is not confirmed."""
-        with self._lock:
+        with self._in_flight.disabling(reason), self._lock:
             laser = self._laser
             if laser is None:
                 return
@@ -184,8 +183,6 @@ class LaserKeeper:
                 self.tell()
                 raise DeviceError(self.unknown) from error
             finally:
-                self._generation += 1
-                self._offs += 1
                 self.switch_offs += self._record.requested is LaserOutput.ON
                 self.gate.switched_off()
                 self._record.requested, self._record.reason = LaserOutput.OFF, reason
@@ -216,26 +213,20 @@ class LaserKeeper:
 
     @contextlib.contextmanager
     def _command(self) -> Iterator[tuple[LaserModulator, int]]:
-        """Wait for a turn; gives the laser, and the count of offs when the turn was asked for."""
-        offs = self._offs
+        """Wait for a turn; gives the laser and the command's ticket."""
+        ticket = self._in_flight.ticket()
         with self._commands:
             with self._lock:
                 laser = self._laser
                 if laser is None:
                     raise DeviceError("laser refused: not open; configure it first")
-                self._generation += 1
                 self._commanding = True
             try:
-                yield laser, offs
+                yield laser, ticket
             finally:
                 with self._lock:
-                    self._generation += 1
                     self._commanding = False
                     self.tell()
-
-    def _refuse_void(self, offs: int) -> None:
-        if offs != self._offs:
-            raise DeviceError(f"laser refused: {self._record.reason}")
 
     def _end_light(self, error: EschortyError) -> None:
         """Switch off after a command that failed, unless somebody's switching off made it fail."""
@@ -281,27 +272,28 @@ class LaserKeeper:
                 self.darken(reason)
 
     def _read(self) -> None:
-        with self._lock:
-            laser, generation = self._laser, self._generation
-            if laser is None or self._commanding:
-                return
+        if not self._commands.acquire(blocking=False):
+            return  # A command is under way; it reads back itself.
+        try:
+            self._read_and_compare()
+        finally:
+            self._commands.release()
+
+    def _read_and_compare(self) -> None:
+        ticket, laser = self._in_flight.ticket(), self._laser
+        if laser is None:
+            return
         try:
             told = laser.readback()
         except EschortyError as error:
-            self._lost(generation, error)
+            # Disabling may be what interrupted the read-back.
+            if not self._in_flight.is_void(ticket) and self.darken(f"not read back: {error}"):
+                self._alarm(f"laser off: {error}")
             return
         with self._lock:
-            if generation != self._generation:
+            if self._in_flight.is_void(ticket):
                 return
             self._hear(told)
             wrong = self._record.calls_for_darkness(told)
             if wrong:
                 self.darken(wrong)
-
-    def _lost(self, generation: int, error: EschortyError) -> None:
-        """Give the laser up unless switching off is what interrupted the read-back."""
-        with self._lock:
-            if generation != self._generation:
-                return
-        if self.darken(f"not read back: {error}"):
-            self._alarm(f"laser off: {error}")

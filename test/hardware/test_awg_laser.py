@@ -257,13 +257,13 @@ def test_off_interrupts_what_is_under_way(bench: AwgBench, monkeypatch: pytest.M
         execute(text)
         if "BASE:FREQuency 500" in text:
             meddler.start()
-            while not laser._offs_waiting:
+            while not laser._in_flight.disabling_now:
                 pass
         elif meddler.ident is not None:
             after.append(text.strip())
 
     monkeypatch.setattr(bench.model, "_execute", slow)
-    with pytest.raises(DeviceError, match="interrupted by switching off"):
+    with pytest.raises(DeviceError, match="switched off meanwhile"):
         laser.configure(Modulation(500.0))
     meddler.join()
     assert after[0] == ":CHANnel1:OUTPut OFF"
@@ -286,11 +286,11 @@ def test_interrupted_light_can_be_switched_on_again(
         execute(text)
         if "BASE:FREQuency?" in text and meddler.ident is None:
             meddler.start()
-            while not laser._offs_waiting:
+            while not laser._in_flight.disabling_now:
                 pass
 
     monkeypatch.setattr(bench.model, "_execute", slow)
-    with pytest.raises(DeviceError, match="interrupted by switching off"):
+    with pytest.raises(DeviceError, match="switched off meanwhile"):
         getattr(laser, operation)()
     meddler.join()
     assert not bench.model.lit

@@ -14,7 +14,7 @@ from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_set
 from eschorty_ros.hardware.laser.awg_connection import AwgConnection
 from eschorty_ros.hardware.laser.awg_profile import load_profile
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
-from eschorty_ros.hardware.laser.scpi import InterruptedByOffError
+from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 from eschorty_ros.hardware.protocols import (
     DeviceIdentity,
     LaserModulator,
@@ -57,10 +57,10 @@ class AwgLaser:
                 f"channel is {settings.channel}; the generator has {self._profile.channels}"
             )
         self._clock_ns = clock_ns
-        self._lock = threading.RLock()
-        self._counting = threading.Lock()
-        self._offs_waiting = 0
-        self._darkening = False
+        self._lock = threading.Lock()
+        self._in_flight = CommandsInFlight()
+        # Of the command that holds the lock; none while it disables the output.
+        self._ticket: int | None = None
         self._closed = False
         self._armed = False
         self._modulation = Modulation(FREQUENCY_DEFAULT_HZ)
@@ -91,8 +91,7 @@ class AwgLaser:
         DeviceError
             When the generator fails, or reads back something else; it is dark then.
         """
-        with self._lock:
-            self._refuse_closed()
+        with self._command():
             wanted = wanted_settings(self._settings, self._profile, modulation)
             lit = self._output is LaserOutput.ON
             with self._dark_on_failure():
@@ -108,8 +107,7 @@ class AwgLaser:
 
     def arm(self) -> None:
         """Allow the next ``enable``; raises ``DeviceError`` when closed."""
-        with self._lock:
-            self._refuse_closed()
+        with self._command():
             self._armed = True
 
     def enable(self) -> None:
@@ -120,8 +118,7 @@ class AwgLaser:
         DeviceError
             Not armed, not configured, a setting that is not as set, a failure: it is dark then.
         """
-        with self._lock:
-            self._refuse_closed()
+        with self._command():
             if not self._armed:
                 raise DeviceError(f"{NAME}: not armed; arm it before switching on")
             if not self._ready:
@@ -141,17 +138,11 @@ class AwgLaser:
         DeviceError
             ``laser state unknown``: the generator did not confirm; ``readback`` says UNKNOWN.
         """
-        with self._counting:
-            self._offs_waiting += 1
-        try:
-            with self._lock:
-                self._armed = False
-                if not self._closed:
-                    self._darken()
-                    self._reason = ""
-        finally:
-            with self._counting:
-                self._offs_waiting -= 1
+        with self._in_flight.disabling("switched off meanwhile"), self._lock:
+            self._armed = False
+            if not self._closed:
+                self._darken()
+                self._reason = ""
 
     def readback(self) -> LaserReadback:
         """Read output and, while it is lit, levels and waveform back; UNKNOWN counts as on.
@@ -161,8 +152,7 @@ class AwgLaser:
         DeviceError
             The generator does not answer, or a lit output is not as it was set: dark then.
         """
-        with self._lock:
-            self._refuse_closed()
+        with self._command():
             if self._connection.is_open and self._output is not LaserOutput.UNKNOWN:
                 with self._dark_on_failure():
                     self._look(self._connection.channel)
@@ -237,12 +227,24 @@ class AwgLaser:
             self._output, self._since_ns = output, self._clock_ns()
 
     @contextmanager
+    def _command(self) -> Iterator[None]:
+        """Wait for a turn; the block gives up at its next transfer when ``disable`` is called."""
+        with self._lock:
+            if self._closed:
+                raise DeviceError(f"{NAME}: closed; open it again")
+            self._ticket = self._in_flight.ticket()
+            try:
+                yield
+            finally:
+                self._ticket = None
+
+    @contextmanager
     def _dark_on_failure(self) -> Iterator[None]:
         try:
             yield
         except BaseException as error:
             self._armed = False
-            if not isinstance(error, InterruptedByOffError):
+            if not isinstance(error, VoidedError):
                 # Who interrupts has no quarrel with the settings: they may be lit again.
                 self._ready = False
                 self._reason = str(error)
@@ -253,9 +255,9 @@ class AwgLaser:
             raise
 
     def _darken(self, *, keep_armed: bool = False) -> None:
-        """Off by all means, also while somebody else waits to switch off."""
+        """Off by all means, also when the command that calls it is void."""
         self._armed = self._armed and keep_armed
-        before, self._darkening = self._darkening, True
+        ticket, self._ticket = self._ticket, None
         openings = self._connection.openings
         try:
             self._connection.darken()
@@ -266,17 +268,13 @@ class AwgLaser:
             self._believe(LaserOutput.UNKNOWN)
             raise
         finally:
-            self._darkening = before
+            self._ticket = ticket
             self._ready = self._ready and openings == self._connection.openings
         self._believe(LaserOutput.OFF)
 
     def _may_go_on(self) -> None:
-        if self._offs_waiting and not self._darkening:
-            raise InterruptedByOffError(f"{NAME}: interrupted by switching off")
-
-    def _refuse_closed(self) -> None:
-        if self._closed:
-            raise DeviceError(f"{NAME}: closed; open it again")
+        if self._ticket is not None:
+            self._in_flight.refuse_void(self._ticket)
 
 
 def open_laser(**settings: Any) -> LaserModulator:

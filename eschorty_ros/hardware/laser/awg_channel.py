@@ -10,7 +10,8 @@ from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
-from eschorty_ros.hardware.laser.scpi import InterruptedByOffError, Scpi
+from eschorty_ros.hardware.laser.in_flight import VoidedError
+from eschorty_ros.hardware.laser.scpi import Scpi
 from eschorty_ros.hardware.laser.usbtmc import MessageLink
 from eschorty_ros.hardware.protocols import DeviceIdentity
 
@@ -239,7 +240,7 @@ class AwgChannel:
             return None
         try:
             return query()
-        except (DeviceGoneError, InterruptedByOffError):
+        except (DeviceGoneError, VoidedError):
             raise
         except DeviceError as error:
             if self._settings.readback == "required":

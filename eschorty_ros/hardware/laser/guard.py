@@ -30,6 +30,7 @@ from eschorty_ros.hardware.laser.guard_wire import (
     readback_message,
     standing_still,
 )
+from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.own_pauses import OwnPauses
 from eschorty_ros.hardware.protocols import LaserModulator, LaserOutput
@@ -60,8 +61,7 @@ class Guard:
         self._make: Callable[[], LaserModulator] | None = None
         self._laser: LaserModulator | None = None
         self._jobs: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
-        # Jobs from before the last switching off are void.
-        self._epoch = 0
+        self._in_flight = CommandsInFlight()
         self._lit = False
         self._tripped = ""
         # Why the output may be on although it was switched off, and who tries again.
@@ -117,7 +117,7 @@ class Guard:
         else:
             if command == "open":
                 self._silence_s = message["silence_s"]
-            self._jobs.put((self._epoch, message))
+            self._jobs.put((self._in_flight.ticket(), message))
 
     def _watch(self) -> None:
         """Switch off for an owner that stands still or is silent; once, until armed again."""
@@ -131,26 +131,26 @@ class Guard:
             self._try_to_switch_off(self._tripped)
 
     def _switch_off(self) -> None:
-        self._epoch += 1
-        if self._laser is None:
-            return
-        unknown, insisting = self._unknown, self._insisting
-        if unknown and insisting is not None and insisting.is_alive():
-            raise DeviceError(unknown)
-        try:
-            if unknown and insisting is not None:
-                # Whoever insisted has closed it.
-                self._open_again()
-            else:
-                self._laser.disable()
-        except Exception as error:
-            self._unknown = str(error)
-            if self._lit:
-                self._unknown = f"{error}; trying again"
-                self._insisting = threading.Thread(target=self._insist, name="laser off")
-                self._insisting.start()
-            raise
-        self._lit, self._unknown = False, ""
+        with self._in_flight.disabling("switched off meanwhile; arm it again"):
+            if self._laser is None:
+                return
+            unknown, insisting = self._unknown, self._insisting
+            if unknown and insisting is not None and insisting.is_alive():
+                raise DeviceError(unknown)
+            try:
+                if unknown and insisting is not None:
+                    # Whoever insisted has closed it.
+                    self._open_again()
+                else:
+                    self._laser.disable()
+            except Exception as error:
+                self._unknown = str(error)
+                if self._lit:
+                    self._unknown = f"{error}; trying again"
+                    self._insisting = threading.Thread(target=self._insist, name="laser off")
+                    self._insisting.start()
+                raise
+            self._lit, self._unknown = False, ""
 
     def _insist(self) -> None:
         """Open the generator anew until it is off; the means at hand have failed."""
@@ -209,10 +209,10 @@ class Guard:
 
     def _work(self) -> None:
         while True:
-            epoch, message = self._jobs.get()
-            self._answer(message, lambda: self._carry_out(epoch, message))  # noqa: B023
+            ticket, message = self._jobs.get()
+            self._answer(message, lambda: self._carry_out(ticket, message))  # noqa: B023
 
-    def _carry_out(self, epoch: int, message: Message) -> Any:
+    def _carry_out(self, ticket: int, message: Message) -> Any:
         command = message["do"]
         if command == "open":
             return self._open(message)
@@ -227,13 +227,12 @@ class Guard:
             state = laser.readback()
             self._lit |= state.output is not LaserOutput.OFF
             return readback_message(replace(state, reason=state.reason or self._tripped))
-        if epoch != self._epoch:
-            raise DeviceError(f"laser {command} refused: switched off meanwhile; arm it again")
+        self._in_flight.refuse_void(ticket)
         if command == "arm":
             laser.arm()
             self._tripped = ""
             return None
-        return self._enable(laser, epoch)
+        return self._enable(laser, ticket)
 
     def _open(self, message: Message) -> Message:
         self._make = maker(message["make"], message["settings"])
@@ -246,14 +245,16 @@ class Guard:
             "firmware": identity.firmware,
         }
 
-    def _enable(self, laser: LaserModulator, epoch: int) -> None:
+    def _enable(self, laser: LaserModulator, ticket: int) -> None:
         if self._tripped:
             raise DeviceError(f"laser refused: {self._tripped}; arm it again")
         self._lit = True
         laser.enable()
-        if epoch != self._epoch:
+        try:
+            self._in_flight.refuse_void(ticket)
+        except VoidedError:
             laser.disable()
-            raise DeviceError("laser enable refused: switched off meanwhile; arm it again")
+            raise
 
 
 def _say(text: str) -> None:

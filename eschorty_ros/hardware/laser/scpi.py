@@ -8,16 +8,13 @@ from typing import TypeVar
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
+from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser.usbtmc import MessageLink
 
 Result = TypeVar("Result")
 
 _ERRORS_DRAINED = 32
 _NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([A-Za-z%]*)", re.ASCII)
-
-
-class InterruptedByOffError(DeviceError):
-    """Given up because the laser is being switched off."""
 
 
 class Scpi:
@@ -92,7 +89,7 @@ class Scpi:
             self._may_go_on()
             try:
                 reply = self._ask(query)
-            except (DeviceGoneError, InterruptedByOffError):
+            except (DeviceGoneError, VoidedError):
                 raise
             except DeviceError:
                 self.link.clear()
@@ -114,7 +111,7 @@ class Scpi:
         self._may_go_on()
         try:
             return step()
-        except (DeviceGoneError, InterruptedByOffError):
+        except (DeviceGoneError, VoidedError):
             raise
         except DeviceError:
             self.faults += 1
@@ -124,7 +121,7 @@ class Scpi:
         self.retries += 1
         try:
             return step()
-        except (DeviceGoneError, InterruptedByOffError):
+        except (DeviceGoneError, VoidedError):
             raise
         except DeviceError:
             self.faults += 1
