@@ -12,7 +12,7 @@ from awg_bench import SQUARE, AwgBench
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg_model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
-from eschorty_ros.hardware.laser import awg_connection
+from eschorty_ros.hardware.laser import awg
 from eschorty_ros.hardware.protocols import LaserOutput
 
 
@@ -24,7 +24,7 @@ def log(tmp_path: Path) -> Path:
 @pytest.fixture
 def bench(log: Path, monkeypatch: pytest.MonkeyPatch) -> AwgBench:
     # No wait takes time here: a host that stands still must not keep a remedy from its turn.
-    monkeypatch.setattr(awg_connection, "OFF_LIMIT_S", 600.0)
+    monkeypatch.setattr(awg, "OFF_LIMIT_S", 600.0)
     return AwgBench(log)
 
 

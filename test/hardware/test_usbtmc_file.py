@@ -16,7 +16,7 @@ from awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
 from eschorty_ros.emulation.awg_model import AwgModel
-from eschorty_ros.hardware.laser import awg_link
+from eschorty_ros.hardware.laser import awg
 from eschorty_ros.hardware.laser.awg import AwgLaser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.usbtmc_file import RawFile, UsbTmcFile
@@ -79,7 +79,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> type[KernelFile]:
     def opened(path: str, *, name: str, timeout_s: float) -> UsbTmcFile:
         return UsbTmcFile(path, name=name, timeout_s=timeout_s, opener=Kernel)
 
-    monkeypatch.setattr(awg_link, "UsbTmcFile", opened)
+    monkeypatch.setattr(awg, "UsbTmcFile", opened)
     return Kernel
 
 

@@ -5,25 +5,32 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
+
+import usb.core
 
 from eschorty_ros.core.errors import ArgumentError, DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_settings
-from eschorty_ros.hardware.laser.awg_connection import AwgConnection
-from eschorty_ros.hardware.laser.awg_profile import load_profile
+from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
+from eschorty_ros.hardware.laser.usbtmc import MessageLink, UsbTmc, is_usbtmc
+from eschorty_ros.hardware.laser.usbtmc_file import UsbTmcFile
 from eschorty_ros.hardware.protocols import (
     DeviceIdentity,
     LaserModulator,
     LaserOutput,
     LaserReadback,
 )
+from eschorty_ros.hardware.usb import find_device, open_backend
 
 FREQUENCY_DEFAULT_HZ = 70.0
-"""Told before the first ``configure``."""
+"""Reported before the first ``configure``."""
+OFF_LIMIT_S = 1.0
+"""Time after which disabling begins no further try: the state is unknown then."""
+_WARNINGS_KEPT = 32
 
 
 class AwgLaser:
@@ -67,18 +74,22 @@ class AwgLaser:
         self._ready = False
         self._output = LaserOutput.UNKNOWN
         self._since_ns = clock_ns()
-        self._connection = AwgConnection(settings, self._profile, self._may_go_on)
-        self._introduced = 0
-        self._failed_offs = 0
-        self.identity = DeviceIdentity(self._profile.name, settings.serial)
         self._reason = ""
+        self._warnings: list[str] = []
+        self._counters = dict.fromkeys(("openings", "faults", "retries", "switch_off_failures"), 0)
+        self._open_channel: AwgChannel | None = None
+        # What the open generator is known by: its link's serial number, and the opening at which
+        # it was last asked for its identity.
+        self._link_serial = ""
+        self._identified = 0
+        self.identity = DeviceIdentity(self._profile.name, settings.serial)
         with self._lock:
-            self._connection.open()
+            self._open()
             try:
-                self._darken()
-                self._introduce()
-            except DeviceError:
-                self._connection.drop()
+                self._disable()
+                self._identify()
+            except BaseException:
+                self._drop()
                 raise
 
     def configure(self, modulation: Modulation) -> None:
@@ -94,11 +105,11 @@ class AwgLaser:
         with self._command():
             wanted = wanted_settings(self._settings, self._profile, modulation)
             lit = self._output is LaserOutput.ON
-            with self._dark_on_failure():
+            with self._disabled_on_failure():
                 self._ready = False
-                self._darken(keep_armed=True)
-                self._introduce()
-                channel = self._connection.channel
+                self._disable(keep_armed=True)
+                self._identify()
+                channel = self._channel
                 channel.apply(wanted)
                 channel.unlock()
                 self._modulation, self._ready = modulation, True
@@ -123,7 +134,7 @@ class AwgLaser:
                 raise DeviceError(f"{NAME}: not armed; arm it before switching on")
             if not self._ready:
                 raise DeviceError(f"{NAME}: not configured since it was lost; configure it again")
-            with self._dark_on_failure():
+            with self._disabled_on_failure():
                 self._armed = False
                 self._light()
 
@@ -141,7 +152,7 @@ class AwgLaser:
         with self._in_flight.disabling("switched off meanwhile"), self._lock:
             self._armed = False
             if not self._closed:
-                self._darken()
+                self._disable()
                 self._reason = ""
 
     def readback(self) -> LaserReadback:
@@ -153,17 +164,17 @@ class AwgLaser:
             The generator does not answer, or a lit output is not as it was set: dark then.
         """
         with self._command():
-            if self._connection.is_open and self._output is not LaserOutput.UNKNOWN:
-                with self._dark_on_failure():
-                    self._look(self._connection.channel)
+            if self._open_channel is not None and self._output is not LaserOutput.UNKNOWN:
+                with self._disabled_on_failure():
+                    self._compare_output()
             return LaserReadback(
                 self._output,
                 self._modulation,
                 None,
                 self._since_ns,
                 self._reason,
-                tuple(self._connection.warnings),
-                {**self._connection.statistics(), "switch_off_failures": self._failed_offs},
+                tuple(self._warnings),
+                {**self._counters, "write_only": float(self._is_write_only())},
             )
 
     def close(self) -> None:
@@ -174,19 +185,106 @@ class AwgLaser:
         DeviceError
             ``laser state unknown``; the generator is released all the same.
         """
-        try:
-            self.disable()
-        finally:
-            with self._lock:
-                self._closed = True
-                self._connection.drop()
+        with self._in_flight.disabling("closed"), self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            try:
+                self._disable()
+            finally:
+                self._drop()
 
-    def _introduce(self) -> None:
-        """Ask who it is, once per opening; a kernel file may lead to another one than before."""
-        if self._introduced == self._connection.openings:
+    def _disable(self, *, keep_armed: bool = False) -> None:
+        """Disable the output and confirm it, also on behalf of a command that is void.
+
+        Raises ``DeviceError`` when three tries fail: on the open link, after clearing it, after
+        opening the generator again. After ``OFF_LIMIT_S`` none is begun.
+        """
+        self._armed = self._armed and keep_armed
+        ticket, self._ticket = self._ticket, None
+        openings = self._counters["openings"]
+        failures: list[DeviceError] = []
+        ends_s = time.monotonic() + OFF_LIMIT_S
+        try:
+            for prepare in (self._open_if_lost, self._clear, self._open_again):
+                if failures and time.monotonic() > ends_s:
+                    break
+                try:
+                    prepare()
+                    self._channel.disable()
+                except DeviceError as error:
+                    failures.append(error)
+                else:
+                    self._note(LaserOutput.OFF)
+                    return
+            self._lose(failures)
+        finally:
+            self._ticket = ticket
+            self._ready = self._ready and openings == self._counters["openings"]
+
+    def _open_if_lost(self) -> None:
+        if self._open_channel is None:
+            self._open()
+
+    def _clear(self) -> None:
+        self._channel.link.clear()
+
+    def _open_again(self) -> None:
+        if self._open_channel is not None:
+            with suppress(DeviceError):
+                self._open_channel.link.reset()
+        self._drop()
+        self._open()
+
+    def _lose(self, failures: list[DeviceError]) -> None:
+        """Note that the output may be on; raises ``DeviceError`` with the first, last failure."""
+        if self._open_channel is not None:
+            # A locked front panel could not be used to switch off by hand.
+            with suppress(DeviceError):
+                self._open_channel.link.clear()
+            with suppress(DeviceError):
+                self._open_channel.unlock_at_once()
+        first, last = str(failures[0]), str(failures[-1])
+        both = first if first == last else f"{first}; opened anew: {last}"
+        self._reason = f"{both}; treat the laser as on and switch the generator off by hand"
+        self._counters["switch_off_failures"] += 1
+        self._ready = False
+        self._note(LaserOutput.UNKNOWN)
+        raise DeviceError(f"laser state unknown: {self._reason}") from failures[0]
+
+    @property
+    def _channel(self) -> AwgChannel:
+        if self._open_channel is None:
+            raise DeviceError(f"{NAME}: lost; check cable and power")
+        return self._open_channel
+
+    def _open(self) -> None:
+        link = _open_link(self._settings, self._profile, self._link_serial)
+        self._link_serial = link.serial
+        self._counters["openings"] += 1
+        self._open_channel = AwgChannel(
+            link, self._settings, self._profile, self._refuse_void, self._warn, self._counters
+        )
+
+    def _drop(self) -> None:
+        """Release the generator; idempotent, never raises."""
+        channel, self._open_channel = self._open_channel, None
+        if channel is not None:
+            channel.link.close()
+
+    def _is_write_only(self) -> bool:
+        return self._open_channel is not None and not self._open_channel.asks
+
+    def _warn(self, text: str) -> None:
+        if text not in self._warnings and len(self._warnings) < _WARNINGS_KEPT:
+            self._warnings.append(text)
+
+    def _identify(self) -> None:
+        """Ask for the identity once per opening; a kernel device may have become another one."""
+        if self._identified == self._counters["openings"]:
             return
-        channel = self._connection.channel
-        identity = channel.introduce()
+        channel = self._channel
+        identity = channel.identify()
         channel.unlock()
         expected = self.identity.serial
         if self._settings.device and expected and identity.serial not in ("", expected):
@@ -194,15 +292,16 @@ class AwgLaser:
                 f"{NAME} at {self._settings.device}: its serial is {identity.serial}, {expected} "
                 "was expected; give the right device or serial"
             )
-        self.identity, self._introduced = identity, self._connection.openings
+        self.identity, self._identified = identity, self._counters["openings"]
 
-    def _look(self, channel: AwgChannel) -> None:
-        """Compare belief and generator."""
+    def _compare_output(self) -> None:
+        """Compare what was commanded with what the generator reads back."""
+        channel = self._channel
         on = channel.output()
         if on is not None and on != (self._output is LaserOutput.ON):
             if on:
                 raise DeviceError(f"{NAME}: output found on; it was not switched on from here")
-            self._believe(LaserOutput.OFF)
+            self._note(LaserOutput.OFF)
             self._ready = False
             self._reason = f"{NAME}: output found off; restarted, or switched off by hand"
         elif self._output is LaserOutput.ON:
@@ -210,19 +309,19 @@ class AwgLaser:
         channel.unlock()
 
     def _light(self) -> None:
-        channel = self._connection.channel
+        channel = self._channel
         channel.raise_levels()
         channel.verify()
         channel.unlock()
         self._output = LaserOutput.UNKNOWN
-        channel.set_output(True)
-        self._believe(LaserOutput.ON)
+        channel.enable()
+        self._note(LaserOutput.ON)
         self._reason = ""
         if channel.output() is False:
             raise DeviceError(f"{NAME}: output stays off; check the generator's display")
         channel.unlock()
 
-    def _believe(self, output: LaserOutput) -> None:
+    def _note(self, output: LaserOutput) -> None:
         if output is not self._output:
             self._output, self._since_ns = output, self._clock_ns()
 
@@ -239,42 +338,43 @@ class AwgLaser:
                 self._ticket = None
 
     @contextmanager
-    def _dark_on_failure(self) -> Iterator[None]:
+    def _disabled_on_failure(self) -> Iterator[None]:
         try:
             yield
         except BaseException as error:
             self._armed = False
             if not isinstance(error, VoidedError):
-                # Who interrupts has no quarrel with the settings: they may be lit again.
+                # A void command leaves the settings valid: they may be enabled again.
                 self._ready = False
                 self._reason = str(error)
             try:
-                self._darken()
+                self._disable()
             except DeviceError as second:
                 raise DeviceError(f"{second} (after: {error})") from error
             raise
 
-    def _darken(self, *, keep_armed: bool = False) -> None:
-        """Off by all means, also when the command that calls it is void."""
-        self._armed = self._armed and keep_armed
-        ticket, self._ticket = self._ticket, None
-        openings = self._connection.openings
-        try:
-            self._connection.darken()
-        except DeviceError as error:
-            self._reason = str(error).removeprefix("laser state unknown: ")
-            self._failed_offs += 1
-            self._ready = False
-            self._believe(LaserOutput.UNKNOWN)
-            raise
-        finally:
-            self._ticket = ticket
-            self._ready = self._ready and openings == self._connection.openings
-        self._believe(LaserOutput.OFF)
-
-    def _may_go_on(self) -> None:
+    def _refuse_void(self) -> None:
         if self._ticket is not None:
             self._in_flight.refuse_void(self._ticket)
+
+
+def _open_link(settings: AwgSettings, profile: AwgProfile, serial: str) -> MessageLink:
+    """Find the generator and claim it; ``serial`` counts where the settings name none.
+
+    Raises ``DeviceError`` when there is none, or several, without permission, or when another
+    program holds it.
+    """
+    if settings.device:
+        return UsbTmcFile(settings.device, name=NAME, timeout_s=settings.usb_timeout)
+    vendors = settings.vendors() or profile.usb.vendor_ids
+
+    def matches(device: usb.core.Device) -> bool:
+        known = device.idProduct in profile.usb.product_ids and device.idVendor in vendors
+        return known and is_usbtmc(device)
+
+    backend = open_backend(settings.backend)
+    device = find_device(backend, name=NAME, matches=matches, serial=settings.serial or serial)
+    return UsbTmc(device, name=NAME, timeout_s=settings.usb_timeout)
 
 
 def open_laser(**settings: Any) -> LaserModulator:

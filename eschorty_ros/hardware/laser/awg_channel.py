@@ -69,10 +69,12 @@ class AwgChannel:
     link : MessageLink
     settings : AwgSettings
     profile : AwgProfile
-    may_go_on : callable
-        Called before every transfer; raises to give up.
+    refuse_void : callable
+        Called before every transfer but those of ``disable``; raises to give up.
     warn : callable
         Called with one line for what is odd but no failure.
+    counters : dict
+        See ``Scpi``.
     """
 
     def __init__(
@@ -80,38 +82,39 @@ class AwgChannel:
         link: MessageLink,
         settings: AwgSettings,
         profile: AwgProfile,
-        may_go_on: Callable[[], None],
+        refuse_void: Callable[[], None],
         warn: Callable[[str], None],
+        counters: dict[str, int],
     ) -> None:
-        self._link = link
-        self._scpi = Scpi(link, profile, may_go_on)
+        self.link = link
+        self._scpi = Scpi(link, profile, refuse_void, counters)
         self._settings = settings
         self._profile = profile
         self._wanted: Wanted = {}
         self._lowered = False
         self._silent = False
         self._warn = warn
+        own = settings.channel
+        # This channel first.
+        self._channels = (own, *(n for n in range(1, profile.channels + 1) if n != own))
+        # Spelt now, so that disabling only writes.
+        outputs_off = [self._scpi.spelt("output", False, n) for n in self._channels]
+        levels_down = [
+            self._scpi.spelt("low", 0.0, own),
+            self._scpi.spelt("high", profile.dark_high_v, own),
+        ]
+        self._disabling = [self._scpi.message(text) for text in outputs_off + levels_down]
 
     @property
     def asks(self) -> bool:
         """Whether replies are to be expected."""
         return self._settings.readback != "off" and not self._silent
 
-    @property
-    def faults(self) -> int:
-        """Transfers that failed."""
-        return self._scpi.faults
-
-    @property
-    def retries(self) -> int:
-        """Commands sent once more."""
-        return self._scpi.retries
-
-    def introduce(self) -> DeviceIdentity:
+    def identify(self) -> DeviceIdentity:
         """Ask for maker, model, serial and firmware; empty the error queue if there is one."""
         reply = self._asked(lambda: self._scpi.ask(self._profile.identify))
         if reply is None:
-            return DeviceIdentity(self._profile.name, self._link.serial)
+            return DeviceIdentity(self._profile.name, self.link.serial)
         if re.search(self._profile.model, reply) is None:
             self._warn(
                 f"{NAME}: it says {reply[:60]!r}, profile {self._profile.name} was asked for; "
@@ -121,7 +124,7 @@ class AwgChannel:
             self._warn(f"{NAME}: its error queue held {error[:60]!r}")
         parts = [part.strip() for part in reply.split(",")] + [""] * 4
         return DeviceIdentity(
-            f"{parts[0]} {parts[1]}".strip(), parts[2] or self._link.serial, parts[3]
+            f"{parts[0]} {parts[1]}".strip(), parts[2] or self.link.serial, parts[3]
         )
 
     def apply(self, wanted: Wanted) -> None:
@@ -154,34 +157,30 @@ class AwgChannel:
         light = ("waveform", "frequency", "high", "low", "duty")
         self._compare({name: self._wanted[name] for name in light if name in self._wanted})
 
-    def set_output(self, on: bool) -> None:
-        """Switch the output; raises ``DeviceError``."""
-        self._set("output", on)
+    def enable(self) -> None:
+        """Switch the output on; raises ``DeviceError``."""
+        self._set("output", True)
 
     def output(self) -> bool | None:
         """Whether the output is on; ``None`` where replies are not to be expected."""
         found = self._get("output", self._settings.channel)
         return None if found is None else bool(found)
 
-    def darken(self) -> None:
-        """OUTPut OFF on all channels, levels down, read back.
+    def disable(self) -> None:
+        """OUTPut OFF on all channels, levels down, without a retry; then read back.
 
         Raises
         ------
         DeviceError
-            A failure, or an output that says it is on.
+            A failure, or an output that reads back as on.
         """
-        own = self._settings.channel
-        others = [n for n in range(1, self._profile.channels + 1) if n != own]
-        for channel in (own, *others):
-            self._scpi.set_at_once("output", False, channel)
         self._lowered = True
-        self._scpi.set_at_once("low", 0.0, own)
-        self._scpi.set_at_once("high", self._profile.dark_high_v, own)
-        for channel in (own, *others):
+        for message in self._disabling:
+            self.link.write(message)
+        for channel in self._channels:
             if self._get("output", channel):
                 raise DeviceError(f"{NAME}: output {channel} stays on")
-        high = self._get("high", own)
+        high = self._get("high", self._settings.channel)
         if high is not None and float(high) > self._profile.dark_limit_v:
             self._warn(f"{NAME}: output off, but its level stayed at {float(high):g} V")
         self.unlock()
@@ -194,19 +193,7 @@ class AwgChannel:
     def unlock_at_once(self) -> None:
         """Free the front panel without a retry; raises ``DeviceError``."""
         if self._profile.unlock is not None:
-            self._scpi.command_at_once(self._profile.unlock)
-
-    def clear(self) -> None:
-        """Make both sides of the link forget what is under way; raises ``DeviceError``."""
-        self._link.clear()
-
-    def reset(self) -> None:
-        """Reset the link's port; raises ``DeviceError``."""
-        self._link.reset()
-
-    def close(self) -> None:
-        """Release the generator; never raises."""
-        self._link.close()
+            self.link.write(self._scpi.message(self._profile.unlock))
 
     def _set(self, name: str, value: Value) -> None:
         self._scpi.set(name, value, self._settings.channel)

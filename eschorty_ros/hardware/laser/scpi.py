@@ -27,35 +27,27 @@ class Scpi:
     ----------
     link : MessageLink
     profile : AwgProfile
-    may_go_on : callable
+    refuse_void : callable
         Called before every transfer; raises to give up.
-
-    Attributes
-    ----------
-    faults, retries : int
-        Transfers that failed, and those sent once more.
+    counters : dict
+        ``faults`` counts transfers that failed, ``retries`` those sent once more.
     """
 
     def __init__(
-        self, link: MessageLink, profile: AwgProfile, may_go_on: Callable[[], None]
+        self,
+        link: MessageLink,
+        profile: AwgProfile,
+        refuse_void: Callable[[], None],
+        counters: dict[str, int],
     ) -> None:
-        self.link = link
+        self._link = link
         self._profile = profile
-        self._may_go_on = may_go_on
-        self.faults = 0
-        self.retries = 0
+        self._refuse_void = refuse_void
+        self._counters = counters
 
     def set(self, name: str, value: Value, channel: int) -> None:
         """Set ``name`` (a key of the profile's ``settings``); raises ``DeviceError``."""
-        self.command(self._spelt(name, value, channel))
-
-    def set_at_once(self, name: str, value: Value, channel: int) -> None:
-        """Set without asking whether to go on and without a retry: for switching off."""
-        self._write(self._spelt(name, value, channel))
-
-    def command_at_once(self, text: str) -> None:
-        """Send a command as ``set_at_once`` does."""
-        self._write(text)
+        self.command(self.spelt(name, value, channel))
 
     def get(self, name: str, channel: int) -> Value:
         """Read ``name`` back: bool, float or keyword, as its kind says.
@@ -76,6 +68,10 @@ class Scpi:
         """Send a query, return its reply without line ends; raises ``DeviceError``."""
         return self._attempt(lambda: self._ask(text))
 
+    def message(self, text: str) -> bytes:
+        """Return the message of one command."""
+        return (text + self._profile.terminator).encode("ascii")
+
     def drain_errors(self) -> list[str] | None:
         """Empty the error queue, 32 entries at most; ``None`` when the generator has none.
 
@@ -86,13 +82,13 @@ class Scpi:
             return None
         found: list[str] = []
         for _ in range(_ERRORS_DRAINED):
-            self._may_go_on()
+            self._refuse_void()
             try:
                 reply = self._ask(query)
             except (DeviceGoneError, VoidedError):
                 raise
             except DeviceError:
-                self.link.clear()
+                self._link.clear()
                 return None
             match = re.match(r"\s*([-+]?\d+)\s*(,.*)?$", reply)
             if match is None:
@@ -102,40 +98,41 @@ class Scpi:
             found.append(reply)
         return found
 
-    def _spelt(self, name: str, value: Value, channel: int) -> str:
+    def spelt(self, name: str, value: Value, channel: int) -> str:
+        """Return the command that sets ``name``."""
         setting = self._profile.settings[name]
         setting.check(name, value)
         return f"{setting.command.format(channel=channel)} {_text(value)}"
 
     def _attempt(self, step: Callable[[], Result]) -> Result:
-        self._may_go_on()
+        self._refuse_void()
         try:
             return step()
         except (DeviceGoneError, VoidedError):
             raise
         except DeviceError:
-            self.faults += 1
-            self._may_go_on()
-            self.link.clear()
-        self._may_go_on()
-        self.retries += 1
+            self._counters["faults"] += 1
+            self._refuse_void()
+            self._link.clear()
+        self._refuse_void()
+        self._counters["retries"] += 1
         try:
             return step()
         except (DeviceGoneError, VoidedError):
             raise
         except DeviceError:
-            self.faults += 1
-            self._may_go_on()
-            self.link.clear()
+            self._counters["faults"] += 1
+            self._refuse_void()
+            self._link.clear()
             raise
 
     def _write(self, text: str) -> None:
-        self.link.write((text + self._profile.terminator).encode("ascii"))
+        self._link.write(self.message(text))
 
     def _ask(self, text: str) -> str:
         self._write(text)
-        self._may_go_on()
-        reply = self.link.read()
+        self._refuse_void()
+        reply = self._link.read()
         try:
             return reply.decode("ascii").strip("\r\n \0")
         except UnicodeDecodeError:
