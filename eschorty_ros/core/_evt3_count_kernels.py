@@ -4,22 +4,8 @@ from __future__ import annotations
 
 from numba import int64, njit, types, uint16
 
+from eschorty_ros.core import _evt3_words as w3
 from eschorty_ros.core._bits import popcount64
-from eschorty_ros.core._evt3_words import (
-    ADDR_X,
-    CONTINUED_4,
-    CONTINUED_12,
-    DROPPED_EVENTS,
-    DROPPED_TIME_HIGH,
-    DROPPED_TIME_LOW,
-    ERC_EVENTS_IN,
-    ERC_EVENTS_OUT,
-    EXT_TRIGGER,
-    OTHERS,
-    VECT_8,
-    VECT_12,
-    VECT_BASE_X,
-)
 
 # The last three are state: polarity of vectors, which count a payload belongs to (0 for none), and
 # the bits of it that have come.
@@ -35,37 +21,37 @@ def count_words(words, counts):
     polarity = counts[POLARITY]
     for word in words:
         kind = word >> 12
-        if kind == VECT_12:
+        if kind == w3.VECT_12:
             counts[polarity] += int64(popcount64(word & 0xFFF))
-        elif kind == VECT_8:
+        elif kind == w3.VECT_8:
             counts[polarity] += int64(popcount64(word & 0xFF))
-        elif kind == ADDR_X:
+        elif kind == w3.ADDR_X:
             counts[word >> 11 & 1] += 1
-        elif kind == VECT_BASE_X:
+        elif kind == w3.VECT_BASE_X:
             polarity = int64(word >> 11 & 1)
-        elif kind == EXT_TRIGGER:
+        elif kind == w3.EXT_TRIGGER:
             counts[TRIGGERS] += 1
-        elif kind == OTHERS:
+        elif kind == w3.OTHERS:
             subtype = word & 0xFFF
             if (
-                subtype == DROPPED_TIME_LOW
-                or subtype == DROPPED_TIME_HIGH
-                or subtype == DROPPED_EVENTS
+                subtype == w3.DROPPED_TIME_LOW
+                or subtype == w3.DROPPED_TIME_HIGH
+                or subtype == w3.DROPPED_EVENTS
             ):
                 counts[DROP_WORDS] += 1
             counts[PAYLOAD_BITS] = 0
             counts[PAYLOAD_OF] = 0
-            if subtype == ERC_EVENTS_IN:
+            if subtype == w3.ERC_EVENTS_IN:
                 counts[PAYLOAD_OF] = ERC_IN
-            elif subtype == ERC_EVENTS_OUT:
+            elif subtype == w3.ERC_EVENTS_OUT:
                 counts[PAYLOAD_OF] = ERC_OUT
-        elif (kind == CONTINUED_12 or kind == CONTINUED_4) and counts[PAYLOAD_OF] > 0:
+        elif (kind == w3.CONTINUED_12 or kind == w3.CONTINUED_4) and counts[PAYLOAD_OF] > 0:
             bits = counts[PAYLOAD_BITS]
-            if kind == CONTINUED_12 and bits < 24:
+            if kind == w3.CONTINUED_12 and bits < 24:
                 counts[counts[PAYLOAD_OF]] += int64(word & 0xFFF) << bits
                 counts[PAYLOAD_BITS] = bits + 12
             else:
-                if kind == CONTINUED_4 and bits == 24:
+                if kind == w3.CONTINUED_4 and bits == 24:
                     counts[counts[PAYLOAD_OF]] += int64(word & 0xF) << 24
                 counts[PAYLOAD_OF] = 0
     counts[POLARITY] = polarity

@@ -43,7 +43,7 @@ class Encoder:
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
         for name, size in (("width", width), ("height", height)):
-            whole(name, size, 1, 2048)
+            whole(name, size, 1, w3.ADDRESSES)
         self.width = int(width)
         self.height = int(height)
         self._state = np.full(6, NONE, dtype=np.int64)
@@ -253,8 +253,8 @@ def sort_readout(
         When the times span more, or a value lies outside its range.
     """
     times = _checked("t", t, np.int64, 1 << 62)
-    columns = _checked("x", x, np.uint16, 2048)
-    rows = _checked("y", y, np.uint16, 2048)
+    columns = _checked("x", x, np.uint16, w3.ADDRESSES)
+    rows = _checked("y", y, np.uint16, w3.ADDRESSES)
     polarities = _checked("p", p, np.uint8, 2)
     if times.size == 0:
         return times, columns, rows, polarities

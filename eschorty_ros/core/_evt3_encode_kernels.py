@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import int64, njit, types, uint8, uint16, uint64
 
+from eschorty_ros.core import _evt3_words as w3
+
 # Encoder state, one int64 each.
 _HIGH, _LOW, T_US, _Y, _BASE, _VPOL = range(6)
 NONE = -1
@@ -29,13 +31,13 @@ def _put_time(t, idle, s, words, n):
         s[_HIGH] = high - 1
     while s[_HIGH] < high:
         s[_HIGH] += 1
-        words[n] = np.uint16(0x8000 | (s[_HIGH] & 0xFFF))
+        words[n] = np.uint16(w3.TIME_HIGH << 12 | (s[_HIGH] & 0xFFF))
         n += np.uint64(1)
         s[_LOW] = NONE
     low = t & 0xFFF
     if low != s[_LOW] and not (idle and low == 0):
         s[_LOW] = low
-        words[n] = np.uint16(0x6000 | low)
+        words[n] = np.uint16(w3.TIME_LOW << 12 | low)
         n += np.uint64(1)
     if t != s[T_US]:
         # A readout begins: name the row again, as the sensor does.
@@ -72,7 +74,7 @@ def _group(x, k, end, base):
 def _put_row(k, end, x, y, p, width, s, words, n):
     """Events ``k`` to ``end``, of one time, row, polarity; as vectors where shorter."""
     if s[_Y] != y:
-        words[n] = np.uint16(y)
+        words[n] = np.uint16(w3.ADDR_Y << 12 | y)
         n += np.uint64(1)
         s[_Y] = y
         s[_BASE] = NONE
@@ -85,17 +87,19 @@ def _put_row(k, end, x, y, p, width, s, words, n):
         if base >= 0 and base + 32 <= width:
             count, mask = _group(x, k, end, base)
         if count <= np.uint64(_SINGLES_MAX if chained else _SINGLES_MAX + 1):
-            words[n] = np.uint16(0x2000 | (p << 11) | first)
+            words[n] = np.uint16(w3.ADDR_X << 12 | (p << 11) | first)
             n += np.uint64(1)
             k += np.uint64(1)
             continue
         if not chained:
-            words[n] = np.uint16(0x3000 | (p << 11) | base)
+            words[n] = np.uint16(w3.VECT_BASE_X << 12 | (p << 11) | base)
             n += np.uint64(1)
             s[_VPOL] = p
-        words[n] = np.uint16(0x4000 | (mask & np.uint32(0xFFF)))
-        words[n + np.uint64(1)] = np.uint16(0x4000 | (mask >> np.uint32(12) & np.uint32(0xFFF)))
-        words[n + np.uint64(2)] = np.uint16(0x5000 | mask >> np.uint32(24))
+        words[n] = np.uint16(w3.VECT_12 << 12 | (mask & np.uint32(0xFFF)))
+        words[n + np.uint64(1)] = np.uint16(
+            w3.VECT_12 << 12 | (mask >> np.uint32(12) & np.uint32(0xFFF))
+        )
+        words[n + np.uint64(2)] = np.uint16(w3.VECT_8 << 12 | mask >> np.uint32(24))
         n += np.uint64(3)
         s[_BASE] = base + 32
         k += count
@@ -130,10 +134,10 @@ def _encode(t, x, y, p, mark_t, marks, width, s, words):
         if s[_Y] != np.int64(y[k]):
             s[_Y] = np.int64(y[k])
             s[_BASE] = NONE
-            words[n] = y[k]
+            words[n] = np.uint16(w3.ADDR_Y << 12 | y[k])
             n += np.uint64(1)
         while k < last:
-            words[n] = np.uint16(0x2000 | np.int64(p[k]) << 11 | np.int64(x[k]))
+            words[n] = np.uint16(w3.ADDR_X << 12 | np.int64(p[k]) << 11 | np.int64(x[k]))
             n += np.uint64(1)
             k += np.uint64(1)
     return n

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import int32, int64, njit, types, uint8, uint16, uint64
 
+from eschorty_ros.core._evt3_decode import EVENT_ARRAYS
+
 COLUMN_BITS = 3
 ROW_BITS = 2
 _PIXEL_BITS = COLUMN_BITS + ROW_BITS
@@ -19,7 +21,6 @@ ORIGIN_US, STARTED = range(2)
 _I8 = types.Array(int64, 1, "C", readonly=True)
 _U2 = types.Array(uint16, 1, "C", readonly=True)
 _U1 = types.Array(uint8, 1, "C", readonly=True)
-_OUT = types.Tuple((int64[::1], uint16[::1], uint16[::1], uint8[::1]))
 
 
 @njit((int32[::1], int64[::1], int64), cache=True, nogil=True)
@@ -52,14 +53,13 @@ def _neighbours_fresh(cells, cell, pitch, oldest):
 
 @njit(
     types.Tuple((uint64, uint64))(
-        _I8, _U2, _U2, _U1, _OUT, int32[::1], int64[::1], int64, int64, int64, int64
+        _I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], int64[::1], int64, int64, int64, int64
     ),
     cache=True,
     nogil=True,
 )
 def _filter(t_in, x_in, y_in, p_in, out, cells, s, window, width, height, pitch_cells):
     """Compact the supported events into ``out``; returns kept and outside counts."""
-    t_out, x_out, y_out, p_out = out
     n = np.uint64(0)
     outside = np.uint64(0)
     pitch = np.uint64(pitch_cells)
@@ -85,9 +85,9 @@ def _filter(t_in, x_in, y_in, p_in, out, cells, s, window, width, height, pitch_
             cells, cell, pitch, oldest
         )
         cells[cell] = np.int32(stamp)
-        t_out[n] = t
-        x_out[n] = np.uint16(x)
-        y_out[n] = np.uint16(y)
-        p_out[n] = p_in[k]
+        out.t[n] = t
+        out.x[n] = np.uint16(x)
+        out.y[n] = np.uint16(y)
+        out.p[n] = p_in[k]
         n += np.uint64(kept)
     return n, outside

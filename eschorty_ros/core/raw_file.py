@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
+from eschorty_ros.core import _evt3_words as w3
 from eschorty_ros.core._checks import file_path, octets, whole
 from eschorty_ros.core.errors import ArgumentError, FormatError
 
@@ -145,7 +146,7 @@ class RawReader:
     def _looks_like_evt3(head: bytes) -> bool:
         """Whether a file without header begins with a stream: types known, TIME_HIGH among them."""
         kinds = [octet >> 4 for octet in head[1:4096:2]]
-        return 8 in kinds and not any(kind in (0x9, 0xB, 0xC, 0xD) for kind in kinds)
+        return w3.TIME_HIGH in kinds and not any(kind in w3.UNUSED for kind in kinds)
 
     def _meaning(self, values: dict[str, str]) -> tuple[int, int]:
         name, *options = values.get("format", "").split(";")

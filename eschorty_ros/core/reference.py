@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core import _evt3_words as w3
 from eschorty_ros.core._checks import TIME_LIMIT, octets, whole, whole_vector
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
@@ -36,7 +37,7 @@ def decode_all(
     def latest(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
         return np.maximum.accumulate(np.where(marked, index, -1))
 
-    high_at = np.flatnonzero(kind == 0x8)
+    high_at = np.flatnonzero(kind == w3.TIME_HIGH)
     high = payload[high_at]
     step = np.diff(high, prepend=high[:1])
     unwrapped = high + 4096 * np.cumsum(step < -2048)
@@ -44,23 +45,25 @@ def decode_all(
     changed[high_at[(step != 0) | (high_at == high_at[:1])]] = True
     time_high = np.zeros(words.size, np.int64)
     time_high[high_at] = unwrapped
-    last_low = latest(kind == 0x6)
+    last_low = latest(kind == w3.TIME_LOW)
     low = np.where(last_low > latest(changed), payload[last_low], 0)
 
-    pixels = np.select([kind == 0x4, kind == 0x5], [12, 8], 0)
+    pixels = np.select([kind == w3.VECT_12, kind == w3.VECT_8], [12, 8], 0)
     before = np.cumsum(pixels) - pixels
-    base_at = latest(kind == 0x3)
+    base_at = latest(kind == w3.VECT_BASE_X)
     base = (payload[base_at] & 0x7FF) + before - before[base_at]
     mask = np.select(
-        [kind == 0x2, kind == 0x4, kind == 0x5], [np.int64(1), payload, payload & 0xFF], 0
+        [kind == w3.ADDR_X, kind == w3.VECT_12, kind == w3.VECT_8],
+        [np.int64(1), payload, payload & 0xFF],
+        0,
     )
     mask[: high_at[0] if high_at.size else words.size] = 0
     senders = np.flatnonzero(mask)
     which, bit = np.nonzero(mask[senders, None] >> np.arange(12) & 1)
     sender = senders[which]
-    t_us = (time_high[latest(kind == 0x8)[sender]] << 12) + low[sender]
-    column = np.where(kind[sender] == 0x2, payload[sender] & 0x7FF, base[sender] + bit)
-    row = payload[latest(kind == 0x0)[sender]] & 0x7FF
+    t_us = (time_high[latest(kind == w3.TIME_HIGH)[sender]] << 12) + low[sender]
+    column = np.where(kind[sender] == w3.ADDR_X, payload[sender] & 0x7FF, base[sender] + bit)
+    row = payload[latest(kind == w3.ADDR_Y)[sender]] & 0x7FF
     return t_us, column, row
 
 

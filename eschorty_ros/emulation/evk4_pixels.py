@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-_ADDR_Y, _ADDR_X, _BASE, _VECT_12, _VECT_8 = 0x0, 0x2, 0x3, 0x4, 0x5
-_ADDRESSES = 2048
+from eschorty_ros.core import _evt3_words as w3
+
 _VECTOR_BITS = 12
 
 
@@ -29,14 +29,14 @@ class PixelMask:
         rows_off: Iterable[int],
         pixels_off: Iterable[tuple[int, int]],
     ):
-        self._columns = np.zeros(_ADDRESSES + _VECTOR_BITS, bool)
+        self._columns = np.zeros(w3.ADDRESSES + _VECTOR_BITS, bool)
         self._columns[list(columns_off)] = True
-        self._rows = np.zeros(_ADDRESSES, bool)
+        self._rows = np.zeros(w3.ADDRESSES, bool)
         self._rows[list(rows_off)] = True
         self._pixels = tuple(pixels_off)
         # Bit i of entry x: column x + i is on.
-        shifted = [~self._columns[i : i + _ADDRESSES] for i in range(_VECTOR_BITS)]
-        self._on_bits = np.zeros(_ADDRESSES, np.uint16)
+        shifted = [~self._columns[i : i + w3.ADDRESSES] for i in range(_VECTOR_BITS)]
+        self._on_bits = np.zeros(w3.ADDRESSES, np.uint16)
         for bit, on in enumerate(shifted):
             self._on_bits |= on.astype(np.uint16) << bit
         self._row = 0
@@ -49,14 +49,14 @@ class PixelMask:
         """Give the stream without the events of masked pixels; every other word stays."""
         words = np.frombuffer(data, np.dtype("<u2")).copy()
         kinds, payload = words >> 12, words & 0x7FF
-        rows = self._filled(kinds == _ADDR_Y, payload, self._row)
+        rows = self._filled(kinds == w3.ADDR_Y, payload, self._row)
         bases = self._vector_bases(kinds, payload)
-        vectors = (kinds == _VECT_12) | (kinds == _VECT_8)
-        singles = kinds == _ADDR_X
+        vectors = (kinds == w3.VECT_12) | (kinds == w3.VECT_8)
+        singles = kinds == w3.ADDR_X
         off = self._rows[rows]
         lost = singles & (off | self._columns[payload])
         words[vectors & off] &= 0xF000
-        words[vectors] &= 0xF000 | self._on_bits[bases[vectors] % _ADDRESSES]
+        words[vectors] &= 0xF000 | self._on_bits[bases[vectors] % w3.ADDRESSES]
         for column, row in self._pixels:
             here = rows == row
             lost |= singles & here & (payload == column)
@@ -79,9 +79,9 @@ class PixelMask:
         self, kinds: NDArray[np.integer], payload: NDArray[np.integer]
     ) -> NDArray[np.int64]:
         """Column of bit 0 at each word; a vector moves it on by its own width."""
-        steps = np.where(kinds == _VECT_12, 12, np.where(kinds == _VECT_8, 8, 0))
+        steps = np.where(kinds == w3.VECT_12, 12, np.where(kinds == w3.VECT_8, 8, 0))
         moved = np.cumsum(steps) - steps
-        given = kinds == _BASE
+        given = kinds == w3.VECT_BASE_X
         last = np.maximum.accumulate(np.where(given, np.arange(len(kinds)), -1))
         start = np.where(last >= 0, payload[last].astype(np.int64) - moved[last], self._base)
         bases = start + moved

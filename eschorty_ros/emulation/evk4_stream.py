@@ -7,10 +7,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Words = NDArray[np.uint16]
+from eschorty_ros.core import _evt3_words as w3
 
-_TIME_LOW, _TIME_HIGH, _TRIGGER, _OTHERS, _MORE, _LAST = 0x6, 0x8, 0xA, 0xE, 0xF, 0x7
-_DROPPED_EVENTS = 0xEDA
+Words = NDArray[np.uint16]
 
 
 class SensorSource(Protocol):
@@ -59,11 +58,11 @@ class Packetiser:
 
     def _cuts(self, words: Words, period_us: int) -> list[int]:
         kinds = words >> 12
-        at = np.flatnonzero((kinds == _TIME_LOW) | (kinds == _TIME_HIGH))
+        at = np.flatnonzero((kinds == w3.TIME_LOW) | (kinds == w3.TIME_HIGH))
         if not len(at):
             return []
         payload = (words[at] & 0xFFF).astype(np.int64)
-        is_high = kinds[at] == _TIME_HIGH
+        is_high = kinds[at] == w3.TIME_HIGH
         last_high = np.maximum.accumulate(np.where(is_high, np.arange(len(at)), -1))
         high = np.where(last_high >= 0, payload[last_high], self._high)
         self._high = int(high[-1])
@@ -78,23 +77,23 @@ class Packetiser:
     @staticmethod
     def _before_high(kinds: NDArray[np.integer], cuts: NDArray[np.intp]) -> NDArray[np.intp]:
         """Keep a TIME_HIGH with the TIME_LOW that follows it."""
-        follows = (cuts > 0) & (kinds[cuts - 1] == _TIME_HIGH)
+        follows = (cuts > 0) & (kinds[cuts - 1] == w3.TIME_HIGH)
         return cuts - follows
 
 
 def without_triggers(data: bytes) -> bytes:
     """Take the trigger words out."""
     words = np.frombuffer(data, np.dtype("<u2"))
-    return words[words >> 12 != _TRIGGER].tobytes()
+    return words[words >> 12 != w3.EXT_TRIGGER].tobytes()
 
 
 def dropped(words: int) -> bytes:
     """Mark the place where the sensor dropped that many words, as its readout does."""
     count = min(words, (1 << 28) - 1)
     mark = (
-        _OTHERS << 12 | _DROPPED_EVENTS,
-        _MORE << 12 | count & 0xFFF,
-        _MORE << 12 | count >> 12 & 0xFFF,
-        _LAST << 12 | count >> 24,
+        w3.OTHERS << 12 | w3.DROPPED_EVENTS,
+        w3.CONTINUED_12 << 12 | count & 0xFFF,
+        w3.CONTINUED_12 << 12 | count >> 12 & 0xFFF,
+        w3.CONTINUED_4 << 12 | count >> 24,
     )
     return np.array(mark, np.dtype("<u2")).tobytes()

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from eschorty_ros.core import _evt3_words as w3
+
 WRAP_US = 1 << 24
-_TIME_LOW, _TIME_HIGH = 0x6, 0x8
 # A stream repeats its time far more often than this.
 _WORDS_SEARCHED = 8192
 # A stream that goes on skips no more of its own time than this from one packet to the next.
@@ -29,7 +30,7 @@ class Packet:
 def first_time_high_us(data: Any) -> int | None:
     """Sensor time (us, modulo 2^24) of the first TIME_HIGH word, ``None`` when there is none."""
     words = _words(data)
-    found = np.flatnonzero(words >> 12 == _TIME_HIGH)
+    found = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
     return int(words[found[0]] & 0xFFF) << 12 if found.size else None
 
 
@@ -74,8 +75,8 @@ def skips_time(data: Any, before_us: int | None) -> bool:
 
 def _first_word_us(data: Any, before_us: int | None) -> int | None:
     words = _words(data)[:_WORDS_SEARCHED]
-    low = np.flatnonzero(words >> 12 == _TIME_LOW)
-    high = np.flatnonzero(words >> 12 == _TIME_HIGH)
+    low = np.flatnonzero(words >> 12 == w3.TIME_LOW)
+    high = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
     if high.size and (low.size == 0 or high[0] < low[0]):
         until = low[0] if low.size else words.size
         t_us = int(words[high[high < until][-1]] & 0xFFF) << 12

@@ -18,9 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from evt3_oracle import SlowDecoder
 from streams import RECORDING_SHARES, recording_like_words, words_of
 
-from eschorty_ros.core import _evt3_words as w3
 from eschorty_ros.core import evt3
-from eschorty_ros.core._evt3_decode import _decode
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.raw_file import RawReader
 
@@ -229,19 +227,18 @@ def test_any_split_gives_the_same(words: list[int], cuts: list[int]) -> None:
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.binary(max_size=400))
 def test_random_bytes_stay_inside_the_buffers(data: bytes) -> None:
-    words = np.frombuffer(data[: len(data) & ~1], dtype="<u2")
-    size, guard = w3.WORST_EVENTS_PER_WORD * words.size, 64
-    out = tuple(np.full(size + guard, 77, dtype) for dtype in (np.int64, "u2", "u2", "u1"))
-    trig = tuple(np.full(words.size + guard, 77, dtype) for dtype in (np.int64, "u1", "u1"))
-    state, counts = w3.initial_state(), np.zeros(len(w3.COUNTER_NAMES), np.int64)
-    n, m = _decode(words, 1280, 720, state, counts, out, trig)
-    assert n <= size
-    assert m <= words.size
-    assert all((array[n:] == 77).all() for array in out)
-    assert all((array[m:] == 77).all() for array in trig)
-    assert (out[1][:n] < 1280).all()
-    assert (out[2][:n] < 720).all()
-    assert (np.diff(out[0][:n]) >= 0).all()
+    decoder, words, guard = evt3.Decoder(), len(data) // 2, 64
+    buffers = decoder._events, decoder._triggers = tuple(
+        type(arrays)(*(np.full(size + guard, 77, array.dtype) for array in arrays))
+        for arrays, size in ((decoder._events, 12 * words), (decoder._triggers, words))
+    )
+    events = decoder.decode(data)
+    for arrays, written in zip(buffers, (len(events), len(events.triggers)), strict=True):
+        assert all((array[written:] == 77).all() for array in arrays)
+        assert all(array.size >= written + guard for array in arrays)
+    assert (events.x < 1280).all()
+    assert (events.y < 720).all()
+    assert (np.diff(events.t) >= 0).all()
 
 
 def test_recording_like_stream() -> None:
