@@ -7,7 +7,7 @@ import numpy as np
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.footprint import footprint
 from eschorty_ros.simulation.pixel import PixelArray
-from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.scene_base import Scene
 
 _ROW_STEP = 0.02
 _REFLECTANCE_STEP = 0.01

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.scene_base import Scene
 
 Array = NDArray[np.float64]
 

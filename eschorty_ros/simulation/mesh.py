@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.errors import FormatError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.open3d_module import load_open3d
-from eschorty_ros.simulation.scene import Array, UniformReflectance, sheet
+from eschorty_ros.simulation.scene_base import Array, UniformReflectance, sheet
 
 
 class Mesh(UniformReflectance):
@@ -56,7 +56,7 @@ class Mesh(UniformReflectance):
         return cls(np.asarray(mesh.vertices), np.asarray(mesh.triangles), f"mesh {str(path)!r}")
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`eschorty_ros.simulation.scene.Scene`."""
+        """See :class:`eschorty_ros.simulation.scene_base.Scene`."""
         y, slope = sheet(stage_mm, columns, model)
         rays = np.zeros((y.size, slope.size, 6), dtype=np.float32)
         rays[..., 0] = -model.b_mm * 1e-3

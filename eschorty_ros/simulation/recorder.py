@@ -28,7 +28,7 @@ from eschorty_ros.core.recording import (
     write_truth_csv,
 )
 from eschorty_ros.simulation.pixel import PixelParameters
-from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.scene_base import Scene
 from eschorty_ros.simulation.world import BACKGROUND_HZ, World
 
 ACCELERATION_MM_S2 = 2000.0

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scene import Array, RecentRays, sheet
+from eschorty_ros.simulation.scene_base import Array, RecentRays, sheet
 
 HEAD_HALF_WIDTH_MM = 72.0
 HEAD_HALF_HEIGHT_MM = 112.0
@@ -73,7 +73,7 @@ class Face:
             raise ArgumentError(f"centre_mm is {self.centre_mm!r}; choose a positive range")
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`eschorty_ros.simulation.scene.Scene`; NaN beside the face."""
+        """See :class:`eschorty_ros.simulation.scene_base.Scene`; NaN beside the face."""
         return self._recent.get(self._meet, stage_mm, columns, model)[0]
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:

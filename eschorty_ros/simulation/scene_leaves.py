@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scene import Array, RecentRays, sheet
+from eschorty_ros.simulation.scene_base import Array, RecentRays, sheet
 
 SEPARATION_MM = 2.2
 """Between neighbouring levels of a layer: the paper's leaves at 1.32 m (Fig. 8)."""
@@ -184,7 +184,7 @@ class Leaves:
         ]
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`eschorty_ros.simulation.scene.Scene`; NaN between the leaves."""
+        """See :class:`eschorty_ros.simulation.scene_base.Scene`; NaN between the leaves."""
         return self._hits(stage_mm, columns, model)[0]
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.simulation.scene import UniformReflectance, sheet
+from eschorty_ros.simulation.scene_base import UniformReflectance, sheet
 
 Array = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ class Posts(UniformReflectance):
         return np.array([post.range_mm for post in self.posts])
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`~eschorty_ros.simulation.scene.Scene`; NaN between the posts."""
+        """See :class:`~eschorty_ros.simulation.scene_base.Scene`; NaN between the posts."""
         stage, slope = sheet(stage_mm, columns, model)
         nearest = np.full(slope.shape, np.nan if self.backdrop_mm is None else self.backdrop_mm)
         for post in self.posts:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.recording import TRUTH_DTYPE
-from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.scene_base import Scene
 
 _PHASES_KEPT = 1_000_000
 _AT_ONCE = 256

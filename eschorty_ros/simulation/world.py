@@ -18,7 +18,7 @@ from eschorty_ros.simulation.biases import parameters_from_biases
 from eschorty_ros.simulation.drawn_line import DrawnLine
 from eschorty_ros.simulation.pixel import PixelArray, PixelParameters, unpack
 from eschorty_ros.simulation.readout import Readout, ReadoutParameters
-from eschorty_ros.simulation.scene import Scene
+from eschorty_ros.simulation.scene_base import Scene
 from eschorty_ros.simulation.sensor_control import ControlTimeline, SensorControl
 from eschorty_ros.simulation.timeline import LaserTimeline, StageTimeline
 from eschorty_ros.simulation.truth_log import TruthLog
