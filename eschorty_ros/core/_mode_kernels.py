@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -11,6 +13,7 @@ from eschorty_ros.core._window_kernels import (
     ROW_BITS,
     ROW_LAST,
     ROW_MASK,
+    Window,
     _limits,
     _mean_shift,
     _window_count,
@@ -27,31 +30,51 @@ _NOWHERE = -(1 << 40)
 _FALSE_SECOND = 1000.0
 
 
+class Densest(NamedTuple):
+    """Most events in a box, and the lowest and the highest row whose box holds so many."""
+
+    events: int
+    lowest: int
+    highest: int
+
+
+class Returns(NamedTuple):
+    """The window of a column's strongest return and, if there is a ``second``, the other's.
+
+    Where the status is ``AMBIGUOUS`` the two are equally strong.
+    """
+
+    status: int
+    second: bool
+    window: Window
+    other: Window
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _densest_pairwise(packed, start, n, blocks, radius, avoid, gap):
+def _densest_pairwise(column, radius, avoid, gap):
     best = np.int64(0)
     lowest = np.int64(ROW_LAST)
     highest = np.int64(0)
-    for i in range(n):
-        row = np.int64(packed[start + i] & ROW_MASK)
+    for i in range(column.start, column.start + column.events):
+        row = np.int64(column.packed[i] & ROW_MASK)
         if abs(row * FRACTION - avoid) < gap:
             continue
         low, high = max(row - radius, 0), min(row + radius, ROW_LAST)
-        support = _window_count(packed, start, blocks, low, high)
+        support = _window_count(column, low, high)
         if support > best:
             best, lowest, highest = support, row, row
         elif support == best:
             lowest = min(lowest, row)
             highest = max(highest, row)
-    return best, lowest, highest
+    return Densest(best, lowest, highest)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _densest_histogram(packed, start, n, radius, avoid, gap):
+def _densest_histogram(column, radius, avoid, gap):
     size = 1 << ROW_BITS
     below = np.zeros(size + 1, np.int64)
-    for i in range(n):
-        below[(packed[start + i] & ROW_MASK) + np.uint32(1)] += 1
+    for i in range(column.start, column.start + column.events):
+        below[(column.packed[i] & ROW_MASK) + np.uint32(1)] += 1
     for row in range(size):
         below[row + 1] += below[row]
     best = np.int64(0)
@@ -65,20 +88,19 @@ def _densest_histogram(packed, start, n, radius, avoid, gap):
             best, lowest, highest = support, np.int64(row), np.int64(row)
         elif support == best:
             highest = np.int64(row)
-    return best, lowest, highest
+    return Densest(best, lowest, highest)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _densest(packed, start, n, blocks, half, avoid, gap):
+def _densest(column, half, avoid, gap):
     """Most events in a box of half the window's width around one of them.
 
-    Events nearer than ``gap`` to ``avoid`` (fixed point) are no centres. Returns that number and
-    the lowest and the highest row that reach it.
+    Events nearer than ``gap`` to ``avoid`` (fixed point) are no centres.
     """
     radius = max(half >> (FRACTION_BITS + 1), 1)
-    if n <= _PAIRWISE_MAX:
-        return _densest_pairwise(packed, start, n, blocks, radius, avoid, gap)
-    return _densest_histogram(packed, start, n, radius, avoid, gap)
+    if column.events <= _PAIRWISE_MAX:
+        return _densest_pairwise(column, radius, avoid, gap)
+    return _densest_histogram(column, radius, avoid, gap)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -91,43 +113,42 @@ def _side(centre, other):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _follow(packed, start, blocks, half, seed, avoid):
+def _follow(column, half, seed, avoid):
     """Mean shift from ``seed`` that keeps to its side of ``avoid`` (both fixed point)."""
     first, last = _side(seed, avoid)
-    return _mean_shift(packed, start, blocks, seed, half, first, last)
+    return _mean_shift(column, seed, half, first, last)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _settle(packed, start, blocks, half, lowest, highest, avoid):
+def _settle(column, half, densest, avoid):
     """Follow two equally dense rows and choose without preferring a direction.
 
     The window with more events wins, then the one with the smaller spread; windows that overlap
     are restarted from their common mean; two separate windows without any difference leave the
-    column undecided. Returns the status, the window and the one from the highest row.
+    column undecided.
     """
-    a = _follow(packed, start, blocks, half, lowest * FRACTION, avoid)
-    if lowest == highest:
-        return FOUND, a, a
-    b = _follow(packed, start, blocks, half, highest * FRACTION, avoid)
-    if a[0] != b[0]:
-        return FOUND, (a if a[0] > b[0] else b), b
-    spread_a = a[0] * a[4] - a[3] * a[3]
-    spread_b = b[0] * b[4] - b[3] * b[3]
+    a = _follow(column, half, densest.lowest * FRACTION, avoid)
+    if densest.lowest == densest.highest:
+        return Returns(FOUND, False, a, a)
+    b = _follow(column, half, densest.highest * FRACTION, avoid)
+    if a.sums.events != b.sums.events:
+        return Returns(FOUND, False, a if a.sums.events > b.sums.events else b, b)
+    spread_a = a.sums.events * a.sums.d2 - a.sums.d * a.sums.d
+    spread_b = b.sums.events * b.sums.d2 - b.sums.d * b.sums.d
     if spread_a != spread_b:
-        return FOUND, (a if spread_a < spread_b else b), b
-    if a[6] == b[6]:
-        return FOUND, a, b
-    if abs(a[6] - b[6]) <= 2 * half:
-        middle = np.int64(np.rint((a[6] + b[6]) / 2.0))
-        return FOUND, _follow(packed, start, blocks, half, middle, avoid), b
-    return AMBIGUOUS, a, b
+        return Returns(FOUND, False, a if spread_a < spread_b else b, b)
+    if a.centre == b.centre:
+        return Returns(FOUND, False, a, b)
+    if abs(a.centre - b.centre) <= 2 * half:
+        middle = np.int64(np.rint((a.centre + b.centre) / 2.0))
+        return Returns(FOUND, False, _follow(column, half, middle, avoid), b)
+    return Returns(AMBIGUOUS, True, a, b)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mode_search(packed, start, n, blocks, half):
-    """Densest window, then mean shift; the status, the window, its rival when undecided."""
-    _, lowest, highest = _densest(packed, start, n, blocks, half, _NOWHERE, 0)
-    return _settle(packed, start, blocks, half, lowest, highest, _NOWHERE)
+def _mode_search(column, half):
+    """Densest window, then mean shift."""
+    return _settle(column, half, _densest(column, half, _NOWHERE, 0), _NOWHERE)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -160,41 +181,47 @@ def _beyond_chance(count, others, half, rows):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _box_count(packed, start, blocks, centre, half):
+def _box_count(column, centre, half):
     low, high = _limits(centre, half >> 1, 0, ROW_LAST)
-    return _window_count(packed, start, blocks, low, high)
+    return _window_count(column, low, high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _apart(packed, start, blocks, half, a, b):
+def _apart(column, half, a, b):
     """Both windows again, each kept to its side of the middle, where they would overlap."""
-    if abs(a[6] - b[6]) > 2 * half:
+    if abs(a.centre - b.centre) > 2 * half:
         return a, b
-    own = _follow(packed, start, blocks, half, a[6], b[6])
-    return own, _follow(packed, start, blocks, half, b[6], a[6])
+    own = _follow(column, half, a.centre, b.centre)
+    return own, _follow(column, half, b.centre, a.centre)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _second_return(packed, start, n, blocks, half, rows, events_min, a):
-    """Look for another surface than that of window ``a``; whether there is one, and both windows.
+def _second_return(column, half, rows, events_min, a):
+    """Look for another surface than that of window ``a``.
 
     It lies 2 full widths at half maximum away or more (the half width of a window is 1.3 of them),
     the box around it holds at least half as many events as that around ``a``, and background does
     not explain it.
     """
+    alone = Returns(FOUND, False, a, a)
     gap = half * 20 // 13
-    if n - a[0] < events_min or 3 * (n - a[0]) < a[0]:
-        return False, a, a
-    strength = _box_count(packed, start, blocks, a[6], half)
-    best, lowest, highest = _densest(packed, start, n, blocks, half, a[6], gap)
-    if 3 * best < strength:
-        return False, a, a
-    status, b, _ = _settle(packed, start, blocks, half, lowest, highest, a[6])
-    if status != FOUND or abs(a[6] - b[6]) < gap:
-        return False, a, a
-    if 2 * _box_count(packed, start, blocks, b[6], half) < strength:
-        return False, a, a
-    own, b = _apart(packed, start, blocks, half, a, b)
-    if own[0] < events_min or b[0] < events_min:
-        return False, a, a
-    return _beyond_chance(b[0], n - own[0] - b[0], half, rows), own, b
+    rest = column.events - a.sums.events
+    if rest < events_min or 3 * rest < a.sums.events:
+        return alone
+    strength = _box_count(column, a.centre, half)
+    densest = _densest(column, half, a.centre, gap)
+    if 3 * densest.events < strength:
+        return alone
+    second = _settle(column, half, densest, a.centre)
+    b = second.window
+    if second.status != FOUND or abs(a.centre - b.centre) < gap:
+        return alone
+    if 2 * _box_count(column, b.centre, half) < strength:
+        return alone
+    a, b = _apart(column, half, a, b)
+    count_a, count_b = a.sums.events, b.sums.events
+    if count_a < events_min or count_b < events_min:
+        return alone
+    if not _beyond_chance(count_b, column.events - count_a - count_b, half, rows):
+        return Returns(FOUND, False, a, b)
+    return Returns(FOUND, True, a, b)

@@ -1,22 +1,32 @@
-"""Compiled error model of a row: how far the estimate of a column is off.
-
-``noise`` holds what `row_sigma.noise_of` makes of a method and the settings.
-"""
+"""Compiled error model of a row: how far the estimate of a column is off."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from eschorty_ros.core._window_kernels import FRACTION
 
-N_FACTOR, N_FLOOR, N_COMMON, N_MOTION, N_BACKGROUND, N_CLIPPED, N_MEDIAN, NOISE_SIZE = range(8)
 # A line that jumps further lies on another surface: its last place says nothing any more.
 _MOTION_MAX_PX = 8.0
 # Standard deviation over the way of a line that jumps.
 _JUMP = 0.2
 # Scatter of the full width of an unclipped footprint, rows.
 _WIDTH_SCATTER_PX = 0.7
+
+
+class Noise(NamedTuple):
+    """Coefficients of an estimator's error model, see `row_sigma`."""
+
+    factor: float
+    floor: float
+    common: float
+    motion: float
+    background: float
+    clipped: float
+    median: bool
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -39,18 +49,18 @@ def _sigma2(variance, own, count, row, rows, noise):
     that do not repeat from pixel to pixel and scatter independently. Rows quantise to a twelfth
     when there is no spread to judge by.
     """
-    floor2 = noise[N_FLOOR] ** 2
-    sigma2 = noise[N_FACTOR] ** 2 * min(variance, own) / count + floor2
+    floor2 = noise.floor**2
+    sigma2 = noise.factor**2 * min(variance, own) / count + floor2
     excess = variance - own
     if excess > 0.0:
         strays, shared = _excess_events(excess, count, row, rows)
         coherent = 1.0 + max(strays - 1.0, 0.0) * shared
-        if noise[N_MEDIAN] > 0.0:
+        if noise.median:
             # A stray event moves the median by half the distance of two of the line's events.
             step2 = 3.0 * own / (count * count)
-            sigma2 += noise[N_BACKGROUND] ** 2 * strays * coherent * step2
+            sigma2 += noise.background**2 * strays * coherent * step2
         else:
-            sigma2 += noise[N_BACKGROUND] ** 2 * excess / count * coherent
+            sigma2 += noise.background**2 * excess / count * coherent
     if count < 2 or variance == 0.0:
         sigma2 = max(sigma2, 1.0 / 12.0 + floor2)
     return sigma2
@@ -66,7 +76,7 @@ def _common2(centre, last, noise):
     moved = 0.0
     if last >= 0:
         moved = min(abs(centre - last) / FRACTION, _MOTION_MAX_PX)
-    return noise[N_COMMON] ** 2 + noise[N_MOTION] ** 2 * moved + (_JUMP * moved) ** 2
+    return noise.common**2 + noise.motion**2 * moved + (_JUMP * moved) ** 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -77,4 +87,4 @@ def _clipped2(variance, own, noise):
     middle of that part lies off the line by up to half of what is missing.
     """
     missing = np.sqrt(12.0) * (np.sqrt(own) - np.sqrt(variance)) - _WIDTH_SCATTER_PX
-    return (noise[N_CLIPPED] * max(missing, 0.0)) ** 2
+    return (noise.clipped * max(missing, 0.0)) ** 2

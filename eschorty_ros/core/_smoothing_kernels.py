@@ -2,8 +2,28 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+ISOLATION_REACH = 2
+
+
+class Smoothing(NamedTuple):
+    """Settings of a profile's smoothing and of its lone points, and what the smoothing gives.
+
+    Arrays have shape (returns, columns).
+    """
+
+    half_width: int
+    gate_px: float
+    isolation_gate_px: float
+    isolation_events: int
+    isolated: NDArray[np.bool_]
+    row: NDArray[np.float64]
+    sigma2: NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -29,13 +49,15 @@ def _partner(row, k, c, other):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
+def _smooth(row, sigma2, common2, smoothing):
     """Mean over symmetric pairs of columns; returns how many points were averaged.
 
     ``sigma2`` is the columns' own variance, which the mean lessens, ``common2`` what they share.
     Arrays have one plane per return and one entry per column. The pairs grow outwards and end at
     the first one that is incomplete or beyond the gate.
     """
+    half_width, gate = smoothing.half_width, smoothing.gate_px
+    out_row, out_sigma2 = smoothing.row, smoothing.sigma2
     planes, columns = row.shape
     smoothed = 0
     for k in range(planes):
@@ -70,9 +92,9 @@ def _smooth(row, sigma2, common2, half_width, gate, out_row, out_sigma2):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _is_isolated(row, k, c, reach, gate):
+def _is_isolated(row, k, c, gate):
     planes, columns = row.shape
-    for other in range(max(c - reach, 0), min(c + reach + 1, columns)):
+    for other in range(max(c - ISOLATION_REACH, 0), min(c + ISOLATION_REACH + 1, columns)):
         for plane in range(planes):
             if other != c and abs(row[plane, other] - row[k, c]) <= gate:
                 return False
@@ -80,21 +102,22 @@ def _is_isolated(row, k, c, reach, gate):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _reject_isolated(row, events, reach, gate, events_weak, rejected):
+def _reject_isolated(row, events, smoothing):
     """Make weak points without a neighbour near in rows NaN; returns their number."""
+    isolated = smoothing.isolated
     planes, columns = row.shape
     count = 0
     for k in range(planes):
         for c in range(columns):
-            rejected[k, c] = (
+            isolated[k, c] = (
                 not np.isnan(row[k, c])
-                and events[k, c] < events_weak
-                and _is_isolated(row, k, c, reach, gate)
+                and events[k, c] < smoothing.isolation_events
+                and _is_isolated(row, k, c, smoothing.isolation_gate_px)
             )
-            count += rejected[k, c]
+            count += isolated[k, c]
     if count > 0:
         for k in range(planes):
             for c in range(columns):
-                if rejected[k, c]:
+                if isolated[k, c]:
                     row[k, c] = np.nan
     return count

@@ -1,22 +1,21 @@
 """Compiled sums over windows of rows, on packed events.
 
-A column's events are the ``n`` entries of ``packed`` from ``start`` on, each one uint32: the row in
-the low 10 bits, the time within the window (microseconds) in the upper 22. They are padded with
-``PAD`` to a multiple of ``BLOCK`` entries, so that the inner loops run on whole vector registers
-without a remainder.
+An event is one uint32: the row in the low 10 bits, the time within the window (microseconds) in the
+upper 22. A column's events are padded with ``PAD`` to a multiple of ``BLOCK`` entries, so that the
+inner loops run on whole vector registers without a remainder.
 
 All sums are integers, hence exact, independent of the events' order and of the row they are counted
 from. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places, rounded half to
 even: mirroring the rows mirrors every window exactly.
-
-A window is the tuple (count, first row, last row, sum of d, sum of d squared, sum of times,
-fixed-point mean) of its events, with d = row - first row.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 ROW_BITS = 10
 ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
@@ -33,29 +32,57 @@ _ONE = np.uint32(1 << 20)
 _CHUNK = np.uintp(512)
 
 
+class Column(NamedTuple):
+    """One column: ``events`` entries of ``packed`` from ``start`` on, padded to blocks."""
+
+    packed: NDArray[np.uint32]
+    start: int
+    events: int
+    blocks: int
+
+
+class Sums(NamedTuple):
+    """Sums over the events of a range of rows; d is the row less the range's first."""
+
+    events: int
+    d: int
+    d2: int
+    time_us: int
+
+
+class Window(NamedTuple):
+    """Sums over the events of rows first..last, and their mean in fixed point."""
+
+    first: int
+    last: int
+    sums: Sums
+    centre: int
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pad(packed, start, n):
-    """Fill the last block behind ``n`` entries; returns the number of blocks."""
-    blocks = (n + BLOCK - 1) // BLOCK
-    for i in range(n, blocks * BLOCK):
+def _padded(packed, start, count):
+    """Fill the last block behind ``count`` entries; returns the column."""
+    blocks = (count + BLOCK - 1) // BLOCK
+    for i in range(count, blocks * BLOCK):
         packed[start + i] = PAD
-    return blocks
+    return Column(packed, start, count, blocks)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _window_sums(packed, start, blocks, low, high):
+def _window_sums(column, low, high):
     """Count, sum of d, of d squared (d = row - low) and of times over rows low..high.
 
     Count and sum of d grow in one register lane: a chunk's sum of d stays below ``_ONE``.
     """
+    packed = column.packed
     base = np.uint32(low)
     span = np.uint32(high - low)
     count = np.int64(0)
     sum_d = np.int64(0)
     sum_d2 = np.int64(0)
     sum_time = np.int64(0)
-    begin = np.uintp(start)
-    padded = begin + np.uintp(blocks) * np.uintp(BLOCK)
+    begin = np.uintp(column.start)
+    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
     while begin < padded:
         end = min(begin + _CHUNK, padded)
         both = np.uint32(0)
@@ -73,16 +100,17 @@ def _window_sums(packed, start, blocks, low, high):
         sum_d2 += np.int64(d2)
         sum_time += np.int64(ts)
         begin = end
-    return count, sum_d, sum_d2, sum_time
+    return Sums(count, sum_d, sum_d2, sum_time)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _window_count(packed, start, blocks, low, high):
+def _window_count(column, low, high):
+    packed = column.packed
     base = np.uint32(low)
     span = np.uint32(high - low)
     count = np.int64(0)
-    begin = np.uintp(start)
-    padded = begin + np.uintp(blocks) * np.uintp(BLOCK)
+    begin = np.uintp(column.start)
+    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
     while begin < padded:
         end = min(begin + _CHUNK, padded)
         c = np.uint32(0)
@@ -103,14 +131,13 @@ def _limits(centre, half, first, last):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _whole_column(packed, start, blocks):
+def _whole_column(column):
     """Window over all rows; its mean is not a window's centre and given as -1."""
-    count, sum_d, sum_d2, sum_time = _window_sums(packed, start, blocks, 0, ROW_LAST)
-    return count, np.int64(0), np.int64(ROW_LAST), sum_d, sum_d2, sum_time, np.int64(-1)
+    return Window(np.int64(0), np.int64(ROW_LAST), _window_sums(column, 0, ROW_LAST), np.int64(-1))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mean_shift(packed, start, blocks, centre, half, first, last):
+def _mean_shift(column, centre, half, first, last):
     """Move a window to the mean of its events, ``ITERATIONS_MAX`` times at most.
 
     It has arrived when the mean lies within a sixteenth of the half width: what a window of three
@@ -118,15 +145,15 @@ def _mean_shift(packed, start, blocks, centre, half, first, last):
     first..last.
     """
     low, high = _limits(centre, half, first, last)
-    count, sum_d, sum_d2, sum_time = _window_sums(packed, start, blocks, low, high)
+    sums = _window_sums(column, low, high)
     for _ in range(ITERATIONS_MAX - 1):
-        if count == 0:
+        if sums.events == 0:
             break
-        moved = np.int64(np.rint((count * low + sum_d) * FRACTION / count))
+        moved = np.int64(np.rint((sums.events * low + sums.d) * FRACTION / sums.events))
         step = abs(moved - centre)
         centre = moved
         if step * 16 <= half:
             break
         low, high = _limits(centre, half, first, last)
-        count, sum_d, sum_d2, sum_time = _window_sums(packed, start, blocks, low, high)
-    return count, low, high, sum_d, sum_d2, sum_time, centre
+        sums = _window_sums(column, low, high)
+    return Window(low, high, sums, centre)

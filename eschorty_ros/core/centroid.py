@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core import _centroid_kernels as kernels
 from eschorty_ros.core._checks import number, positive, whole
-from eschorty_ros.core._mode_kernels import AMBIGUOUS
 from eschorty_ros.core._row_kernels import likelihood_size
-from eschorty_ros.core._window_kernels import BLOCK, FRACTION, ROW_LAST
+from eschorty_ros.core._window_kernels import BLOCK, FRACTION, ROW_BITS, ROW_LAST
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.row_sigma import (
     OWN_PER_WIDTH2,
@@ -164,25 +163,39 @@ def estimate(
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
     whole("events_min", events_min, 1, 1 << 31)
     noise = noise_of(method, sigma_factor, sigma_floor_px, sigma_common_px)
-    columns = offset_array.size - 1
-    longest = int(np.diff(offset_array).max(initial=0))
     half = half_width_fixed(line_width_px)
-    shape = (columns, 2 if returns == "all" else 1)
-    row, sigma, variance = np.empty((3, *shape))
-    events = np.empty(shape, dtype=np.int64)
-    cut = np.empty(shape, dtype=np.bool_)
-    status = np.empty(columns, dtype=np.uint8)
-    kernels._estimate_lists(
-        row_array, offset_array, code, policy, half, OWN_PER_WIDTH2 * line_width_px**2,
-        float(height), events_min, noise,
-        np.empty(longest + BLOCK, dtype=np.uint32), np.empty(likelihood_size(half)),
-        row, sigma, variance, events, cut, status,
-    )  # fmt: skip
+    estimator = kernels.Estimator(
+        code, policy, False, events_min, height, half, OWN_PER_WIDTH2 * line_width_px**2, noise
+    )
+    columns = _padded_columns(row_array, offset_array)
+    found = kernels.empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
+    scratch = kernels.Scratch(np.zeros(1 << ROW_BITS, np.int64), np.empty(likelihood_size(half)))
+    counters = np.zeros(1, kernels.COUNTERS)[0]
+    kernels._estimate_columns(columns, half, estimator, found, scratch, counters)
     one = slice(None) if returns == "all" else 0
-    return Centroids(
-        row[:, one], sigma[:, one], np.sqrt(variance[:, one]), events[:, one],
-        status == AMBIGUOUS, cut[:, one],
-    )  # fmt: skip
+    row, sigma, variance, events, cut = (
+        np.ascontiguousarray(values.T[:, one])
+        for values in (
+            found.row,
+            np.sqrt(found.sigma2 + found.common2),
+            found.variance,
+            found.events,
+            found.cut,
+        )
+    )
+    return Centroids(row, sigma, np.sqrt(variance), events, found.ambiguous, cut)
+
+
+def _padded_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> kernels.Columns:
+    """Return the columns of a CSR layout with room to pad each to whole blocks."""
+    counts = np.diff(offsets)
+    sizes = -(-counts // BLOCK) * BLOCK
+    starts = np.cumsum(sizes) - sizes
+    packed = np.empty(int(sizes.sum()), np.uint32)
+    packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
+    return kernels.Columns(
+        packed, starts, counts.astype(np.uint32), np.full(counts.size, -1, np.int64)
+    )
 
 
 def _checked_rows(rows: ArrayLike, height: int) -> NDArray[np.uint32]:

@@ -6,9 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core import _binning as binning
-from eschorty_ros.core import _window_kernels as windows
+from eschorty_ros.core._centroid_kernels import (
+    COUNTERS,
+    Columns,
+    Estimator,
+    Scratch,
+    empty_rows,
+)
 from eschorty_ros.core._checks import exact, whole
 from eschorty_ros.core._row_kernels import likelihood_size
+from eschorty_ros.core._smoothing_kernels import Smoothing
+from eschorty_ros.core._window_kernels import BLOCK, ROW_BITS, ROW_LAST
 from eschorty_ros.core.centroid import check_method, half_width_fixed
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
@@ -38,50 +46,28 @@ class ProfileAssembler:
     """
 
     def __init__(self, settings: Settings, model: RangeModel) -> None:
-        if model.rows > windows.ROW_LAST + 1:
+        if model.rows > ROW_LAST + 1:
             raise ArgumentError(
-                f"rows is {model.rows}; the reconstruction takes {windows.ROW_LAST + 1} at most"
+                f"rows is {model.rows}; the reconstruction takes {ROW_LAST + 1} at most"
             )
         self._done: list[LineRows] = []
-        self._half_max = half_width_fixed(settings.line_width_px)
         self._gate_us = settings.phase_gate_us
-        self._counts = np.zeros(len(binning.COUNTERS), dtype=np.int64)
-        columns = model.columns
-        self._lists = np.empty(columns * (settings.column_limit + windows.BLOCK), dtype=np.uint32)
-        self._column_counts = np.zeros(columns, dtype=np.uint32)
-        self._seeds = np.full(columns, -1, dtype=np.int64)
-        self._state = np.zeros(binning.S_SIZE, dtype=np.int64)
-        planes = 2 if settings.returns == "all" else 1
-        self._work = np.zeros((binning.W_SIZE, planes, columns))
-        self._work_int = np.zeros((binning.N_SIZE, planes, columns), dtype=np.int64)
-        self._scratch = np.zeros(1 << windows.ROW_BITS, dtype=np.int64)
-        self._likelihood = np.empty(likelihood_size(self._half_max))
-        self._whole, self._fractional = _parameters(settings, model.rows)
-        self._noise = noise_of(
-            settings.centroid, settings.sigma_factor, settings.sigma_floor_px,
-            settings.sigma_common_px,
-            # What an edge of reflectance does is compensated, what one of range does is not.
-            0.5 * CLIPPED if settings.reflectance_compensation == "on" else CLIPPED,
-        )  # fmt: skip
-        size = _OUTPUT_PROFILES * planes * columns
-        self._whole_out = np.empty((3, size), dtype=np.int64)
-        self._column_out = np.empty(size, dtype=np.uint16)
-        self._row_out = np.empty((3, size))
-        self._events_out = np.empty(size, dtype=np.uint32)
-        self._return_out = np.empty(size, dtype=np.uint8)
+        self._counters = np.zeros(1, COUNTERS)[0]
+        self._state = np.zeros(1, binning.STATE)[0]
+        self._assembly = _assembly(settings, model)
 
     def restart(self, modulation: Modulation) -> None:
         """Forget the open period, the seeds and the line's width; gate by ``modulation``."""
         self._gate = gate_parameters(modulation, self._gate_us)
-        self._state[binning.S_OPEN] = 0
-        self._state[binning.S_HALF] = self._half_max
-        self._column_counts[:] = 0
-        self._seeds[:] = -1
+        self._state["open"] = binning.CLOSED
+        self._state["half"] = self._assembly.estimator.half_max
+        self._assembly.columns.counts[:] = 0
+        self._assembly.columns.seeds[:] = -1
 
     @property
     def counters(self) -> dict[str, int]:
         """Counts by name."""
-        return dict(zip(binning.COUNTERS, self._counts.tolist(), strict=True))
+        return dict(zip(COUNTERS.names or (), self._counters.item(), strict=True))
 
     def merge(
         self,
@@ -110,33 +96,32 @@ class ProfileAssembler:
         int
             First edge not dealt with.
         """
-        out = (
-            *self._whole_out, self._column_out, *self._row_out, self._events_out, self._return_out,
-        )  # fmt: skip
-        stop = exact("t", t, np.int64).size
-        t, x = np.ascontiguousarray(t), exact("x", x, np.uint16, stop)
-        y, p = exact("y", y, np.uint16, stop), exact("p", p, np.uint8, stop)
-        edges = exact("edges", edges, np.int64)
-        indices = exact("indices", indices, np.int64, edges.size)
-        first, edge = 0, whole("first_edge", first_edge, 0, edges.size)
+        size = exact("t", t, np.int64).size
+        events = binning.EventArrays(
+            np.ascontiguousarray(t),
+            exact("x", x, np.uint16, size),
+            exact("y", y, np.uint16, size),
+            exact("p", p, np.uint8, size),
+        )
+        times = exact("edges", edges, np.int64)
+        beginnings = binning.Edges(times, exact("indices", indices, np.int64, times.size))
+        progress = binning.Progress(0, whole("first_edge", first_edge, 0, times.size))
         while True:
-            first, edge = binning._bin(
-                t, x, y, p, first, stop, edges, indices, edge, len(edges), drain, self._gate,
-                self._lists, self._column_counts, self._seeds, self._state, self._whole,
-                self._fractional, self._noise, self._work, self._work_int, self._scratch,
-                self._likelihood, self._counts, out,
+            progress = binning._bin(
+                events, beginnings, progress, drain, self._gate, self._assembly, self._state,
+                self._counters,
             )  # fmt: skip
-            if first == stop and (edge == len(edges) or not drain):
-                return int(edge)
+            if progress.event == size and (progress.edge == times.size or not drain):
+                return int(progress.edge)
             self._collect()
 
     def close(self) -> None:
         """Close the open period if it holds events; it stays open for further ones."""
-        if self._state[binning.S_OPEN] == 2:
+        if self._state["open"] == binning.FILLED:
             none = np.empty(0, dtype=np.int64)
             nowhere = np.empty(0, dtype=np.uint16)
-            edge, index = self._state[[binning.S_EDGE]], self._state[[binning.S_INDEX]]
-            self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, index, 0, True)
+            edge, period = (np.array([self._state[name]]) for name in ("edge_us", "period"))
+            self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, period, 0, True)
 
     def take(self) -> LineRows:
         """Rows of the periods closed since the last call."""
@@ -146,39 +131,60 @@ class ProfileAssembler:
 
     def _collect(self) -> None:
         """Copy the output buffer's rows and empty it."""
-        n = int(self._state[binning.S_POINTS])
-        self._state[binning.S_POINTS] = 0
+        n = int(self._state["points"])
+        self._state["points"] = 0
         if n == 0:
             return
-        period, edge, t_us = self._whole_out[:, :n].copy()
-        row, sigma, width = self._row_out[:, :n].copy()
-        self._done.append(
-            LineRows(
-                period=period,
-                edge_us=edge,
-                t_us=t_us,
-                column=self._column_out[:n].copy(),
-                row=row,
-                sigma_row=sigma,
-                events=self._events_out[:n].copy(),
-                width_px=width,
-                return_index=self._return_out[:n].copy(),
-            )
-        )
+        points = self._assembly.points._asdict()
+        self._done.append(LineRows(**{name: values[:n].copy() for name, values in points.items()}))
 
 
-def _parameters(settings: Settings, rows: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    whole = np.zeros(binning.P_SIZE, dtype=np.int64)
-    whole[binning.P_METHOD], whole[binning.P_RETURNS] = check_method(
-        settings.centroid, settings.returns
+def _assembly(settings: Settings, model: RangeModel) -> binning.Assembly:
+    columns = model.columns
+    stride = settings.column_limit + BLOCK
+    method, returns = check_method(settings.centroid, settings.returns)
+    half_max = half_width_fixed(settings.line_width_px)
+    noise = noise_of(
+        settings.centroid, settings.sigma_factor, settings.sigma_floor_px,
+        settings.sigma_common_px,
+        # What an edge of reflectance does is compensated, what one of range does is not.
+        0.5 * CLIPPED if settings.reflectance_compensation == "on" else CLIPPED,
+    )  # fmt: skip
+    planes = 2 if settings.returns == "all" else 1
+    size = _OUTPUT_PROFILES * planes * columns
+    return binning.Assembly(
+        columns=Columns(
+            packed=np.empty(columns * stride, np.uint32),
+            starts=np.arange(columns) * stride,
+            counts=np.zeros(columns, np.uint32),
+            seeds=np.full(columns, -1, np.int64),
+        ),
+        estimator=Estimator(
+            method=method,
+            returns=returns,
+            seeded=True,
+            events_min=settings.events_min,
+            rows=model.rows,
+            half_max=half_max,
+            line_variance=OWN_PER_WIDTH2 * settings.line_width_px**2,
+            noise=noise,
+        ),
+        smoothing=Smoothing(
+            half_width=settings.smoothing_half_width,
+            gate_px=float(settings.smoothing_gate_px),
+            isolation_gate_px=float(settings.isolation_gate_px),
+            isolation_events=settings.isolation_events,
+            isolated=np.zeros((planes, columns), np.bool_),
+            row=np.zeros((planes, columns)),
+            sigma2=np.zeros((planes, columns)),
+        ),
+        rows=empty_rows(planes, columns),
+        scratch=Scratch(np.zeros(1 << ROW_BITS, np.int64), np.empty(likelihood_size(half_max))),
+        points=binning.Points(
+            *np.empty((3, size), np.int64),
+            np.empty(size, np.uint16),
+            *np.empty((3, size)),
+            np.empty(size, np.uint32),
+            np.empty(size, np.uint8),
+        ),
     )
-    whole[binning.P_EVENTS_MIN] = settings.events_min
-    whole[binning.P_HALF_MAX] = half_width_fixed(settings.line_width_px)
-    whole[binning.P_ROWS] = rows
-    whole[binning.P_SMOOTH] = settings.smoothing_half_width
-    whole[binning.P_WEAK] = settings.isolation_events
-    fractional = np.zeros(binning.F_SIZE)
-    fractional[binning.F_OWN] = OWN_PER_WIDTH2 * settings.line_width_px**2
-    fractional[binning.F_GATE] = settings.smoothing_gate_px
-    fractional[binning.F_ISOLATION] = settings.isolation_gate_px
-    return whole, fractional

@@ -23,11 +23,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from eschorty_ros.core import _sigma_kernels as kernels
 from eschorty_ros.core._checks import number
+from eschorty_ros.core._sigma_kernels import Noise
 from eschorty_ros.core.errors import ArgumentError
 
 SIGMA_FACTOR = 0.05
@@ -65,7 +62,7 @@ def noise_of(
     sigma_floor_px: float = SIGMA_FLOOR_PX,
     sigma_common_px: float = SIGMA_COMMON_PX,
     clipped: float = CLIPPED,
-) -> NDArray[np.float64]:
+) -> Noise:
     """Error model of an estimator for the kernels.
 
     Parameters
@@ -90,12 +87,12 @@ def noise_of(
     if not isinstance(method, str) or method not in METHOD_NOISE:
         raise ArgumentError(f"method is {method!r}; choose one of {', '.join(METHOD_NOISE)}")
     own = METHOD_NOISE[method]
-    noise = np.zeros(kernels.NOISE_SIZE)
-    noise[kernels.N_FACTOR] = own.factor * number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT)
-    noise[kernels.N_FLOOR] = own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT)
-    noise[kernels.N_COMMON] = number("sigma_common_px", sigma_common_px, 0.0, SIGMA_LIMIT)
-    noise[kernels.N_BACKGROUND] = own.background
-    noise[kernels.N_MOTION] = own.motion
-    noise[kernels.N_CLIPPED] = number("clipped", clipped, 0.0, SIGMA_LIMIT)
-    noise[kernels.N_MEDIAN] = method == "median"
-    return noise
+    return Noise(
+        factor=own.factor * number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT),
+        floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT),
+        common=number("sigma_common_px", sigma_common_px, 0.0, SIGMA_LIMIT),
+        motion=own.motion,
+        background=own.background,
+        clipped=number("clipped", clipped, 0.0, SIGMA_LIMIT),
+        median=method == "median",
+    )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core._checks import number, reals, whole
-from eschorty_ros.core._smoothing_kernels import _smooth
+from eschorty_ros.core._smoothing_kernels import Smoothing, _smooth
 from eschorty_ros.core.errors import ArgumentError
 
 
@@ -61,5 +61,7 @@ def smooth(
     out_row, out_sigma2 = np.empty((2, 1, rows.size))
     own2 = np.maximum(sigma * sigma - common_px * common_px, 0.0)
     common2 = sigma * sigma - own2
-    _smooth(rows[None], own2[None], common2[None], half_width, gate_px, out_row, out_sigma2)
+    none = np.zeros((1, rows.size), np.bool_)
+    settings = Smoothing(half_width, float(gate_px), 0.0, 0, none, out_row, out_sigma2)
+    _smooth(rows[None], own2[None], common2[None], settings)
     return out_row[0], np.sqrt(out_sigma2[0])
