@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 from eschorty_ros.core.errors import DeviceError, DeviceTimeoutError
 from eschorty_ros.hardware.laser.awg_profile import load_profile
 from eschorty_ros.hardware.laser.scpi import Scpi
+from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 
 PROFILE = load_profile("utg900e")
 
 
-class Answering:
+class Answering(UsbTmc):
     """A link that gives prepared replies and remembers what it was asked to do."""
-
-    serial = ""
 
     def __init__(self, *replies: bytes | DeviceError) -> None:
         self.replies = list(replies)
@@ -35,10 +34,6 @@ class Answering:
 
     def clear(self) -> None:
         self.clears += 1
-
-    def reset(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 def scpi(link: Answering) -> Scpi:

@@ -16,8 +16,7 @@ from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_set
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
-from eschorty_ros.hardware.laser.usbtmc import MessageLink, UsbTmc, is_usbtmc
-from eschorty_ros.hardware.laser.usbtmc_file import UsbTmcFile
+from eschorty_ros.hardware.laser.usbtmc import UsbTmc, is_usbtmc
 from eschorty_ros.hardware.protocols import (
     DeviceIdentity,
     LaserModulator,
@@ -280,19 +279,12 @@ class AwgLaser:
             self._warnings.append(text)
 
     def _identify(self) -> None:
-        """Ask for the identity once per opening; a kernel device may have become another one."""
+        """Ask for the identity once per opening."""
         if self._identified == self._counters["openings"]:
             return
-        channel = self._channel
-        identity = channel.identify()
-        channel.unlock()
-        expected = self.identity.serial
-        if self._settings.device and expected and identity.serial not in ("", expected):
-            raise DeviceError(
-                f"{NAME} at {self._settings.device}: its serial is {identity.serial}, {expected} "
-                "was expected; give the right device or serial"
-            )
-        self.identity, self._identified = identity, self._counters["openings"]
+        self.identity = self._channel.identify()
+        self._channel.unlock()
+        self._identified = self._counters["openings"]
 
     def _compare_output(self) -> None:
         """Compare what was commanded with what the generator reads back."""
@@ -358,14 +350,12 @@ class AwgLaser:
             self._in_flight.refuse_void(self._ticket)
 
 
-def _open_link(settings: AwgSettings, profile: AwgProfile, serial: str) -> MessageLink:
+def _open_link(settings: AwgSettings, profile: AwgProfile, serial: str) -> UsbTmc:
     """Find the generator and claim it; ``serial`` counts where the settings name none.
 
     Raises ``DeviceError`` when there is none, or several, without permission, or when another
     program holds it.
     """
-    if settings.device:
-        return UsbTmcFile(settings.device, name=NAME, timeout_s=settings.usb_timeout)
     vendors = settings.vendors() or profile.usb.vendor_ids
 
     def matches(device: usb.core.Device) -> bool:

@@ -12,7 +12,7 @@ from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser.scpi import Scpi
-from eschorty_ros.hardware.laser.usbtmc import MessageLink
+from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 from eschorty_ros.hardware.protocols import DeviceIdentity
 
 NAME = "laser generator"
@@ -66,7 +66,7 @@ class AwgChannel:
 
     Parameters
     ----------
-    link : MessageLink
+    link : UsbTmc
     settings : AwgSettings
     profile : AwgProfile
     refuse_void : callable
@@ -79,7 +79,7 @@ class AwgChannel:
 
     def __init__(
         self,
-        link: MessageLink,
+        link: UsbTmc,
         settings: AwgSettings,
         profile: AwgProfile,
         refuse_void: Callable[[], None],

@@ -30,7 +30,6 @@ class AwgSettings:
 
     profile: str = _field("utg900e", "command set: config/awg_<name>.yaml, or a path")
     backend: str = _field("libusb", "USB library: libusb, or module:callable[?argument]")
-    device: str = _field("", "kernel device such as /dev/usbtmc0 instead of libusb; empty = libusb")
     serial: str = _field("", "serial number of the generator; empty = the only one there is")
     vendor_ids: str = _field(
         "", "USB vendor ids in hex, with blanks between; empty = the profile's"

@@ -9,7 +9,7 @@ from typing import TypeVar
 from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
 from eschorty_ros.hardware.laser.in_flight import VoidedError
-from eschorty_ros.hardware.laser.usbtmc import MessageLink
+from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 
 Result = TypeVar("Result")
 
@@ -25,7 +25,7 @@ class Scpi:
 
     Parameters
     ----------
-    link : MessageLink
+    link : UsbTmc
     profile : AwgProfile
     refuse_void : callable
         Called before every transfer; raises to give up.
@@ -35,7 +35,7 @@ class Scpi:
 
     def __init__(
         self,
-        link: MessageLink,
+        link: UsbTmc,
         profile: AwgProfile,
         refuse_void: Callable[[], None],
         counters: dict[str, int],

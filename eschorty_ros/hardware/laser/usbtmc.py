@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import time
-from typing import Any, Protocol
+from typing import Any
 
 import usb.core
 import usb.util
@@ -29,27 +29,6 @@ _INITIATE_CLEAR, _CHECK_CLEAR = 5, 6
 _CLASS_INTERFACE_IN = 0xA1
 _STATUS_SUCCESS, _STATUS_PENDING = 0x01, 0x02
 _CLEAR_TRIES = 32
-
-
-class MessageLink(Protocol):
-    """Whole messages to and from one instrument."""
-
-    serial: str
-
-    def write(self, message: bytes) -> None:
-        """Send one message; raises ``DeviceError``."""
-
-    def read(self) -> bytes:
-        """Take one whole reply; raises ``DeviceError``."""
-
-    def clear(self) -> None:
-        """Make both sides forget what is under way; raises ``DeviceError``."""
-
-    def reset(self) -> None:
-        """Reset the instrument's port; the link is to be closed and made anew afterwards."""
-
-    def close(self) -> None:
-        """Release the instrument; never raises."""
 
 
 def is_usbtmc(device: usb.core.Device) -> bool:
