@@ -95,7 +95,9 @@ class LineRows:
     def select(self, mask: ArrayLike | slice) -> Self:
         """Return the rows of a boolean mask, a slice or an index array."""
         picked = mask if isinstance(mask, slice) else selection("mask", mask, len(self))
-        chosen = {name: None if v is None else v[picked] for name, v in self._values().items()}
+        chosen = self._values()
+        for name, values in chosen.items():
+            chosen[name] = None if values is None else values[picked]
         return type(self)(**chosen)
 
     def _values(self) -> dict[str, Any]:
