@@ -24,7 +24,7 @@ from eschorty_ros.emulation.evk4_stream import (
     dropped,
     without_triggers,
 )
-from eschorty_ros.emulation.evk4_treuzell import AnswerFaults, BoardIdentity, TreuzellBoard
+from eschorty_ros.emulation.evk4_treuzell import BoardIdentity, TreuzellBoard
 from eschorty_ros.emulation.usb_device import (
     SPEED_SUPER,
     EmulatedUsbDevice,
@@ -60,10 +60,8 @@ class Evk4Model(EmulatedUsbDevice):
         Phase and violations.
     writes : deque of (address, value)
         The latest register writes.
-    answer_faults : AnswerFaults
-        What is to go wrong with the answers to requests.
-    cut_packets : int
-        Packets of events still to lose their last byte.
+    board : TreuzellBoard
+        Answers requests.
     buffer_bytes : int or None
         Space of the device's own buffer. None: nothing is lost however late the host reads.
         Otherwise what came about since the last read and does not fit is dropped with the
@@ -104,12 +102,10 @@ class Evk4Model(EmulatedUsbDevice):
         self.registers = Registers(factory_dacs)
         self.watch = SequenceWatch(clock_ns)
         self.writes: deque[tuple[int, int]] = deque(maxlen=4096)
-        self.answer_faults = AnswerFaults()
-        self.cut_packets = 0
         self.buffer_bytes: int | None = None
         self.configure: Callable[[SensorSettings], None] | None = None
         self._source = source
-        self._board = TreuzellBoard(board, self)
+        self.board = TreuzellBoard(board, self)
         self._packets = Packetiser()
         self._mask = PixelMask((), (), ())
         # Between the reader's thread and the one that starts and stops.
@@ -126,8 +122,7 @@ class Evk4Model(EmulatedUsbDevice):
         """Take a control request and queue its answer."""
         if endpoint != CONTROL_OUT:
             raise UsbFault(errno.EPIPE)
-        for answer in self.answer_faults.apply(self._board.answer(data)):
-            self.reply(CONTROL_IN, answer)
+        self.reply(CONTROL_IN, self.board.answer(data))
         return len(data)
 
     def bulk_in(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
@@ -225,8 +220,5 @@ class Evk4Model(EmulatedUsbDevice):
         return True
 
     def _send(self, packet: bytes) -> None:
-        if self.cut_packets and packet:
-            self.cut_packets -= 1
-            packet = packet[:-1]
         if packet:
             self.reply(DATA_IN, packet, zero_length=len(packet) % PACKET_BYTES == 0)

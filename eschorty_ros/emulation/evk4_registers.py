@@ -6,9 +6,7 @@ drivers rely on; the rest reads 0. *Unconfirmed on hardware.*
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 CHIP_ID = 0xA0401806
 FACTORY_DACS = {
@@ -47,19 +45,9 @@ _RESET = {
 }
 
 ADC_CONTROL, ADC_STATUS, ADC_MISC, TEMPERATURE_CONTROL = 0x4C, 0x50, 0x54, 0x5C
-LIGHT_COUNT, LIGHT_ENABLE, LIGHT_CONTROL = 0x10, 0x74, 0x0C
-DEAD_TIME, WINDOW_CONTROL = 0x20, 0x34
+WINDOW_CONTROL = 0x34
 AFK_FLAGS, STC_FLAGS = 0xC0C4, 0xD0C4
 SENSOR_RESET = 0x400004
-
-
-@dataclass
-class Surroundings:
-    """What the monitors of the sensor measure."""
-
-    temperature_c: float = 35.0
-    illumination_lux: float = 300.0
-    dead_time_us: float = 12.0
 
 
 class Registers:
@@ -72,18 +60,15 @@ class Registers:
 
     Attributes
     ----------
-    surroundings : Surroundings
-    busy_polls : int
-        How often temperature and dead time read "not ready" before they read ready; more than a
-        driver's patience makes a monitor that never answers.
+    temperature_c : float
+        What the sensor measures of itself.
     """
 
     def __init__(self, factory_dacs: Mapping[str, int] | None = None):
         self.factory_dacs = {**FACTORY_DACS, **(factory_dacs or {})}
-        self.surroundings = Surroundings()
-        self.busy_polls = 1
+        self.temperature_c = 35.0
         self._values: dict[int, int] = {}
-        self._polls = 0
+        self._temperature_ready = False
         self.reset()
 
     def reset(self) -> None:
@@ -96,14 +81,8 @@ class Registers:
         return self._values.get(address, 0)
 
     def read(self, address: int) -> int:
-        """Read over the bus: monitors are polled by reading."""
-        if address == ADC_STATUS:
-            return self._temperature()
-        if address == DEAD_TIME:
-            return self._dead_time()
-        if address == LIGHT_COUNT:
-            return self._light()
-        return self[address]
+        """Read over the bus: the temperature is polled by reading."""
+        return self._temperature() if address == ADC_STATUS else self[address]
 
     def write(self, address: int, value: int) -> None:
         """Write over the bus."""
@@ -114,32 +93,20 @@ class Registers:
             value = (value & ~1) | 2 if value & 1 else value
         elif address in (AFK_FLAGS, STC_FLAGS):
             value = self._flags(address, value)
-        elif address in (ADC_CONTROL, DEAD_TIME):
-            self._polls = 0
+        elif address == ADC_CONTROL:
+            self._temperature_ready = False
         self._values[address] = value
 
     def _flags(self, address: int, value: int) -> int:
         """Bit 2 is set by the sensor when ready and cleared by writing 1; bit 0 asks for it."""
         return (value & ~4) | (4 if value & 1 else self[address] & 4 & ~value)
 
-    def _ready(self) -> bool:
-        self._polls += 1
-        return self._polls > self.busy_polls
-
     def _temperature(self) -> int:
         running = self[ADC_CONTROL] & 0b110 == 0b110 and self[TEMPERATURE_CONTROL] & 0b11 == 0b11
-        if not (running and self[ADC_MISC] & 1 << 12 and self._ready()):
+        if not (running and self[ADC_MISC] & 1 << 12):
             return 0
-        return 1 << 11 | round((self.surroundings.temperature_c + 56.0) / 0.190) & 0x3FF
-
-    def _dead_time(self) -> int:
-        value = self[DEAD_TIME]
-        if value >> 30 != 0b11 or not self._ready():
-            return value
-        return value | 1 << 28 | round(self.surroundings.dead_time_us * 200)
-
-    def _light(self) -> int:
-        if self[LIGHT_ENABLE] & 0b11 != 0b11 or self[LIGHT_CONTROL] & 0b111 != 0b111:
+        if not self._temperature_ready:
+            # The conversion takes longer than the first poll.
+            self._temperature_ready = True
             return 0
-        count = 100 / 0.37 * 10 ** (3.5 - math.log10(self.surroundings.illumination_lux))
-        return 1 << 29 | round(count)
+        return 1 << 11 | round((self.temperature_c + 56.0) / 0.190) & 0x3FF

@@ -41,32 +41,6 @@ class BoardIdentity:
     interface_hz: int = 100_000_000
 
 
-@dataclass
-class AnswerFaults:
-    """How many of the next answers go wrong, and how; each count runs down."""
-
-    lost: int = 0
-    short: int = 0
-    garbled: int = 0
-    doubled: int = 0
-
-    def apply(self, answer: bytes) -> list[bytes]:
-        """Frames that leave instead of ``answer``."""
-        if self.lost:
-            self.lost -= 1
-            return []
-        if self.short:
-            self.short -= 1
-            return [answer[:6]]
-        if self.garbled:
-            self.garbled -= 1
-            return [bytes(byte ^ 0x5A for byte in answer[:4]) + answer[4:]]
-        if self.doubled:
-            self.doubled -= 1
-            return [answer, answer]
-        return [answer]
-
-
 def frame(property_: int, payload: bytes = b"") -> bytes:
     """Build a frame."""
     return struct.pack("<II", property_, len(payload)) + payload

@@ -153,7 +153,7 @@ def test_bias_is_set_and_read_back_while_streaming() -> None:
 
 def test_temperature_is_read_while_streaming() -> None:
     with Rig() as rig:
-        rig.model.registers.surroundings.temperature_c = 41.0
+        rig.model.registers.temperature_c = 41.0
         rig.streaming()
 
         def measured() -> bool:

@@ -25,13 +25,13 @@ Answer = Callable[[bytes], bytes]
 def spoil(rig: Rig, *changes: Answer) -> None:
     """Let the model's next answers go through ``changes``, one each."""
     pending = list(changes)
-    whole = rig.model._board.answer
+    whole = rig.model.board.answer
 
     def answer(request: bytes) -> bytes:
         reply = whole(request)
         return pending.pop(0)(reply) if pending else reply
 
-    rig.model._board.answer = answer  # type: ignore[method-assign]
+    rig.model.board.answer = answer  # type: ignore[method-assign]
 
 
 def fail_data(rig: Rig, *codes: int) -> None:
@@ -264,7 +264,7 @@ def test_stale_answer_after_a_time_out() -> None:
     with Rig() as rig:
         rig.camera.open()
         rig.camera.set_bias("bias_fo", 9)
-        late = rig.model._board.answer(
+        late = rig.model.board.answer(
             b"\x02\x01\x01\0" + b"\x0c\0\0\0" + bytes(4) + b"\x14\0\0\0\x01\0\0\0"
         )
         rig.model.reply(CONTROL_IN, late)
