@@ -78,7 +78,7 @@ Start = Callable[..., Run]
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     # The initialisation's waits are the sensor's; tested in the driver's own tests.
-    monkeypatch.setattr(evk4.Evk4, "_pause", lambda self, seconds: time.sleep(seconds / 100.0))
+    monkeypatch.setattr(evk4.Evk4, "_wait", lambda self, seconds: time.sleep(seconds / 100.0))
     context = rclpy.Context()
     with Observer(free_domain(), "evk4_observer") as observer:
         rclpy.init(context=context, domain_id=observer.domain)

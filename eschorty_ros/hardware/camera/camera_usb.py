@@ -1,4 +1,4 @@
-"""The EVK4 on the bus: found by the shape of its interface, opened, its three endpoints.
+"""The EVK4 on the USB bus: found by its interface's descriptors, claimed, its three endpoints.
 
 Source: openeb 5.1.1 ``tz_libusb_board_command.cpp``, ``psee_universal.cpp``. Unconfirmed on
 hardware.
@@ -26,12 +26,12 @@ VENDOR = 0x04B4
 PRODUCT = 0x00F5
 
 _INTERFACE = 0
-_SHAPE = (0xFF, 0x19, 0x00)
+_INTERFACE_CLASS = (0xFF, 0x19, 0x00)
 _DIRECTIONS = (usb.util.ENDPOINT_IN, usb.util.ENDPOINT_OUT, usb.util.ENDPOINT_IN)
 _ALTSETTING_SINCE = 0x0307
 _ANSWER_BYTES = 1024
 _TIMEOUT_MS = 1000
-_HURRY_MS = 200
+_CLOSING_TIMEOUT_MS = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class Endpoints:
 
 
 def endpoints_of(device: usb.core.Device) -> Endpoints | None:
-    """Endpoints of a camera, ``None`` when the device has another shape."""
+    """Return a camera's endpoints, ``None`` when the device has other descriptors."""
     try:
         interface = device[0][(_INTERFACE, 0)]
     except (usb.core.USBError, IndexError, KeyError, NotImplementedError):
         return None
-    shape = (
+    classes = (
         interface.bInterfaceClass,
         interface.bInterfaceSubClass,
         interface.bInterfaceProtocol,
@@ -60,13 +60,13 @@ def endpoints_of(device: usb.core.Device) -> Endpoints | None:
     )
     addresses = [e.bEndpointAddress for e in endpoints]
     directions = tuple(usb.util.endpoint_direction(address) for address in addresses)
-    if shape != _SHAPE or not bulk or directions != _DIRECTIONS:
+    if classes != _INTERFACE_CLASS or not bulk or directions != _DIRECTIONS:
         return None
     return Endpoints(*addresses)
 
 
 def is_camera(device: usb.core.Device) -> bool:
-    """Whether descriptors are those of an EVK4."""
+    """Return whether the descriptors are those of an EVK4."""
     return (
         device.idVendor == VENDOR
         and device.idProduct == PRODUCT
@@ -122,7 +122,7 @@ class CameraUsb:
         return self._answer[:count].tobytes()
 
     def recover(self) -> None:
-        """Clear halts of both control endpoints and throw waiting answers away."""
+        """Clear halts of both control endpoints and discard waiting answers."""
         for endpoint in (self.endpoints.control_out, self.endpoints.control_in):
             try:
                 self.device.clear_halt(endpoint)
@@ -130,9 +130,9 @@ class CameraUsb:
                 raise bus.translate(error, f"{NAME}: clearing endpoint {endpoint:#x}") from error
         drain(self.device, self.endpoints.control_in, self._answer)
 
-    def hurry(self) -> None:
-        """Wait less for answers from now on: the camera is being closed."""
-        self._timeout_ms = _HURRY_MS
+    def shorten_timeouts(self) -> None:
+        """Wait less for answers from now on, because the camera is being closed."""
+        self._timeout_ms = _CLOSING_TIMEOUT_MS
 
     def close(self) -> None:
         """Give the interface back; never raises."""
@@ -140,16 +140,16 @@ class CameraUsb:
 
 
 def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
-    """Claim the camera with that serial (hex, upper or lower case), or the only one there is.
+    """Claim the camera with that serial (hex, upper or lower case), or the only one on the bus.
 
-    The serial is asked of the camera itself, as its USB descriptors need not carry it.
+    The serial is read over the control protocol, because USB descriptors need not hold it.
 
     Raises
     ------
     DeviceGoneError
         When none is there, or none with that serial.
     DeviceError
-        When several are there, or it may not be opened.
+        When several are there and no serial is given, or it cannot be opened.
     """
     if not serial:
         return CameraUsb(bus.find_device(backend, name=NAME, matches=is_camera))
@@ -166,7 +166,7 @@ def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
             camera.close()
             seen.append(str(error))
             continue
-        if same_serial(found, serial):
+        if _same_serial(found, serial):
             return camera
         camera.close()
         seen.append(found)
@@ -181,7 +181,7 @@ def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
 
 
 def read_serial(control: treuzell.Treuzell) -> str:
-    """Ask the camera's serial number: lower-case hex, at least 8 digits, as openeb prints it."""
+    """Read the camera's serial number: lower-case hex, at least 8 digits, as openeb prints it."""
     payload = control.request(treuzell.SERIAL)
     if len(payload) not in (4, 8):
         raise DeviceError(
@@ -191,7 +191,7 @@ def read_serial(control: treuzell.Treuzell) -> str:
 
 
 def read_firmware(control: treuzell.Treuzell) -> int:
-    """Ask the firmware version: 0xMMmmpp."""
+    """Read the firmware version, 0xMMmmpp."""
     payload = control.request(treuzell.FIRMWARE)
     if len(payload) < 4:
         raise DeviceError(
@@ -200,8 +200,8 @@ def read_firmware(control: treuzell.Treuzell) -> int:
     return int(struct.unpack_from("<I", payload)[0])
 
 
-def same_serial(one: str, other: str) -> bool:
-    """Whether two ways to write a serial (openeb's, or its last 8 digits) mean one camera."""
+def _same_serial(one: str, other: str) -> bool:
+    """Return whether two serials are equal; openeb prints up to 16 digits, labels the last 8."""
     with suppress(ValueError):
         return int(one, 16) & 0xFFFF_FFFF == int(other, 16) & 0xFFFF_FFFF
     return one.lower() == other.lower()

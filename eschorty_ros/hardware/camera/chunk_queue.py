@@ -1,4 +1,4 @@
-"""Bounded queue between the thread that receives and the one that publishes; losses are marked."""
+"""Bounded queue between the receiving and the publishing thread; losses are marked."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ BYTES_MAX = 64 << 20
 
 
 class ChunkQueue:
-    """Chunks in order, whole words each, with gaps and restarts attached to the next chunk.
+    """Chunks of complete 16-bit words in order; a gap or restart marks the next chunk.
 
     Parameters
     ----------
     bytes_max : int
-        Bytes that may wait; what comes on top is dropped and counted.
+        Bytes that may wait; more is dropped and counted.
 
     Attributes
     ----------
     received_bytes, dropped_bytes, drops, gaps, restarts : int
-        Bytes that came in, bytes and chunks dropped because the queue was full, gaps of any
-        origin, and new starts of the stream.
+        Bytes put in, bytes and chunks dropped because the queue was full, gaps of any origin,
+        and starts of the stream.
     """
 
     def __init__(self, bytes_max: int = BYTES_MAX) -> None:
@@ -45,68 +45,68 @@ class ChunkQueue:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes not taken yet."""
+        """Bytes in the queue."""
         return self._waiting_bytes
 
     def open(self) -> None:
-        """Begin a stream: forget what waits, mark the next chunk as a restart."""
+        """Start a stream: empty the queue, mark the next chunk as a restart."""
         with self._changed:
             self._chunks.clear()
             self._waiting_bytes = 0
             self._failure = None
             self._closed = False
-            self._begin_anew()
+            self._restart()
 
     def close(self) -> None:
-        """Wake who waits; what waits can still be taken."""
+        """Wake waiting readers; chunks in the queue can still be read."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def put(self, data: bytes, arrival_ns: int) -> None:
-        """Add bytes; a lone last byte waits for its word's other half."""
+        """Add bytes; an odd last byte waits for the second half of its word."""
         with self._changed:
             self.received_bytes += len(data)
             data = self._odd + data
-            whole = len(data) & ~1
-            self._odd = data[whole:]
-            if not whole:
+            size = len(data) & ~1
+            self._odd = data[size:]
+            if not size:
                 return
-            if self._waiting_bytes + whole > self._bytes_max:
+            if self._waiting_bytes + size > self._bytes_max:
                 self.drops += 1
-                self.dropped_bytes += whole
-                self._lose()
+                self.dropped_bytes += size
+                self._mark_gap()
                 return
-            chunk = EventChunk(data[:whole], arrival_ns, self._gap, self._restarted)
+            chunk = EventChunk(data[:size], arrival_ns, self._gap, self._restarted)
             self._gap = self._restarted = False
             self._chunks.append(chunk)
-            self._waiting_bytes += whole
+            self._waiting_bytes += size
             self._changed.notify_all()
 
     def mark_gap(self) -> None:
-        """Tell that bytes were lost before the next ones."""
+        """Mark that bytes were lost before the next ones."""
         with self._changed:
             self._odd = b""
-            self._lose()
+            self._mark_gap()
 
     def mark_restart(self) -> None:
-        """Tell that the next bytes begin a new stream."""
+        """Mark that the next bytes start a new stream."""
         with self._changed:
-            self._begin_anew()
+            self._restart()
 
     def fail(self, error: DeviceError) -> None:
-        """Let ``get`` raise ``error`` once everything has been taken."""
+        """Make ``get`` raise ``error`` once the queue is empty."""
         with self._changed:
             self._failure = error
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> EventChunk | None:
-        """Take the oldest chunk, ``None`` when none comes within ``timeout_s`` or after ``close``.
+        """Return the oldest chunk, ``None`` after ``timeout_s`` without one or after ``close``.
 
         Raises
         ------
         DeviceError
-            What ``fail`` was told.
+            The error that was given to ``fail``.
         """
         end_s = time.monotonic() + timeout_s
         with self._changed:
@@ -121,14 +121,14 @@ class ChunkQueue:
             self._waiting_bytes -= len(chunk.data)
             return chunk
 
-    def _begin_anew(self) -> None:
+    def _restart(self) -> None:
         self._odd = b""
         self._gap = False
         self._restarted = True
         self.restarts += 1
 
-    def _lose(self) -> None:
-        # A gap right before a restart is none: nothing of the new stream is missing.
+    def _mark_gap(self) -> None:
+        # A gap before a restart does not count: nothing of the new stream is missing.
         if not self._gap and not self._restarted:
             self._gap = True
             self.gaps += 1

@@ -1,6 +1,6 @@
-"""Prophesee EVK4: events, settings, and a stream that comes back after the cable did.
+"""Prophesee EVK4: events, settings, and a stream that restarts after the cable was unplugged.
 
-Two threads while streaming: one receives (and reconnects), one looks after the camera's health.
+Two threads while streaming: one receives and reconnects, one polls the camera's health.
 Unconfirmed on hardware.
 """
 
@@ -16,9 +16,9 @@ from eschorty_ros.core.errors import DeviceError, DeviceGoneError, EschortyError
 from eschorty_ros.hardware.camera.bulk_reader import ClockNs
 from eschorty_ros.hardware.camera.camera_usb import NAME
 from eschorty_ros.hardware.camera.chunk_queue import BYTES_MAX, ChunkQueue
-from eschorty_ros.hardware.camera.health import Health
+from eschorty_ros.hardware.camera.health import HealthMonitor
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
-from eschorty_ros.hardware.camera.keeper import EndedError, Keeper, Reconnection
+from eschorty_ros.hardware.camera.keeper import Connection, EndedError, Reconnection
 from eschorty_ros.hardware.camera.registers import Sleep
 from eschorty_ros.hardware.camera.session import Session
 from eschorty_ros.hardware.camera.settings import CameraSettings
@@ -32,10 +32,10 @@ _JOIN_S = 1.0
 class Evk4:
     """Event source over one EVK4; thread-safe.
 
-    A failed transfer (a stall, an overflow) is cleared once and a gap reported. A second one in a
-    row, silence of both endpoints, and an unplugged cable make it reconnect: release, wait, look
-    for the same serial, initialise, set up, stream. The stream then begins anew
-    (``EventChunk.restarted``).
+    A failed transfer (a stall, an overflow) is cleared once and reported as a gap. The driver
+    reconnects after a second one in a row, after a time-out of both endpoints and after an
+    unplugged cable: it releases the camera, waits, searches for the same serial, initialises it,
+    writes its settings and streams. The stream then restarts (``EventChunk.restarted``).
 
     Parameters
     ----------
@@ -43,18 +43,13 @@ class Evk4:
     clock_ns : callable
         Clock of the arrival times.
     serial : str
-        Hex serial; ``""`` takes the only camera there is, and sticks to it.
+        Hex serial; ``""`` takes the only camera there is; only that one is opened again.
     settings : CameraSettings, optional
     reconnection : Reconnection, optional
     queue_bytes : int
         Bytes that may wait to be read; more is dropped, counted and reported as a gap.
     sleep : callable, optional
-        Waits some seconds in place of real time, for tests.
-
-    Attributes
-    ----------
-    on_loss : callable
-        Called with one line from the receiving thread when the camera was lost.
+        Replaces waits of some seconds, for tests.
     """
 
     width = WIDTH
@@ -71,73 +66,73 @@ class Evk4:
         sleep: Sleep | None = None,
     ) -> None:
         self.on_loss: Callable[[str], None] = lambda _line: None
-        self._keeper = Keeper(
+        self._connection = Connection(
             backend,
             clock_ns,
             serial,
             settings or CameraSettings(),
             reconnection or Reconnection(),
-            self._pause,
+            self._wait,
             sleep or time.sleep,
         )
         self._sleep = sleep
         self._queue = ChunkQueue(queue_bytes)
-        self._health = Health(self._streaming_session)
+        self._health = HealthMonitor(self._streaming_session)
         self._ending = threading.Event()
         self._closed = False
         self._thread: threading.Thread | None = None
         self._hung: threading.Thread | None = None
-        self._turned_s = 0.0
+        self._last_loop_s = 0.0
         self._failed_transfers = 0
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Model, serial, firmware; the last two known after ``open``."""
-        return self._keeper.identity
+        """Model, serial and firmware; complete after ``open``."""
+        return self._connection.identity
 
     @property
     def settings(self) -> CameraSettings:
-        """Settings as asked for."""
-        return self._keeper.settings
+        """Settings as requested."""
+        return self._connection.settings
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line each about the camera as it was opened."""
-        session = self._keeper.session
+        """One line for each oddity that ``open`` found."""
+        session = self._connection.session
         return session.warnings if session is not None else ()
 
     @property
     def loss(self) -> str:
         """Why a streaming camera is being searched for, one line; empty while it is there."""
-        return self._keeper.loss if self._thread is not None else ""
+        return self._connection.loss if self._thread is not None else ""
 
     @property
     def healthy(self) -> bool:
-        """Whether events can come right now: the thread turns, the camera answers."""
+        """Whether the receiving thread runs and the camera answers."""
         thread = self._thread
         return (
             thread is not None
             and thread.is_alive()
             and not self._ending.is_set()
-            and self._keeper.session is not None
-            and time.monotonic() - self._turned_s < _STUCK_S
-            and self._health.alive
+            and self._connection.session is not None
+            and time.monotonic() - self._last_loop_s < _STUCK_S
+            and self._health.answering
         )
 
     def open(self) -> None:
-        """Find, initialise and set up the camera: 2.6 s; ``close`` cuts it short.
+        """Find, initialise and set up the camera: 2.6 s; ``close`` interrupts it.
 
         Raises
         ------
         DeviceError
-            In one line.
+            When no camera, or not the one with this serial, can be opened.
         """
         self._refuse_closed()
         self._ending.clear()
-        self._keeper.open()
+        self._connection.open()
 
     def start(self) -> None:
-        """Begin streaming; sensor time starts at 0.
+        """Start streaming; sensor time starts at 0.
 
         Raises
         ------
@@ -153,14 +148,14 @@ class Evk4:
             )
         self.open()
         self._queue.open()
-        self._keeper.require("start").start()
-        self._turned_s = time.monotonic()
+        self._connection.require("start").start()
+        self._last_loop_s = time.monotonic()
         self._thread = threading.Thread(target=self._receive, name="EVK4 events", daemon=True)
         self._thread.start()
         self._health.start()
 
     def read(self, timeout_s: float) -> EventChunk | None:
-        """Take what arrived next, ``None`` when nothing came in ``timeout_s``.
+        """Return the next chunk, ``None`` when none came in ``timeout_s``.
 
         Raises
         ------
@@ -176,7 +171,7 @@ class Evk4:
         Raises
         ------
         DeviceError
-            When the camera fails, or the receiving thread hangs: ``close`` it then.
+            When the camera fails, or the receiving thread hangs; ``close`` is then needed.
         """
         self._ending.set()
         self._health.stop()
@@ -185,16 +180,16 @@ class Evk4:
         if thread is None:
             return
         try:
-            session = self._keeper.session
+            session = self._connection.session
             if session is not None:
                 session.stop_sensor()
         finally:
             thread.join(_JOIN_S)
-            session = self._keeper.session
+            session = self._connection.session
             if session is not None:
                 session.stop_reads()
         if thread.is_alive():
-            # Another one beside it would share its reads.
+            # A second thread would share its reads.
             self._hung = thread
             raise DeviceError(
                 f"{NAME} {self.identity.serial}: its reads do not end; configure it again"
@@ -203,14 +198,14 @@ class Evk4:
     def close(self) -> None:
         """Stop, power down, release; idempotent, never raises."""
         self._closed = True
-        session = self._keeper.session
+        session = self._connection.session
         if session is not None:
-            session.hurry()
+            session.shorten_timeouts()
         try:
             self.stop()
         except EschortyError as error:
-            self._keeper.lose(DeviceError(f"closing: {error}"))
-        self._keeper.close()
+            self._connection.drop(DeviceError(f"closing: {error}"))
+        self._connection.close()
 
     def set_bias(self, name: str, offset: int) -> int:
         """Set one bias; returns the offset the camera reads back.
@@ -220,20 +215,21 @@ class Evk4:
         ArgumentError
             For an unknown bias or an offset outside its range.
         DeviceError
-            When the camera is not there or keeps another value.
+            When the camera is not open or keeps another value.
         """
-        settings = self._keeper.settings.with_bias(name, offset)
-        kept = self._keeper.require(name).set_bias(name, offset)
-        self._keeper.settings = settings
+        settings = self._connection.settings.with_bias(name, offset)
+        kept = self._connection.require(name).set_bias(name, offset)
+        self._connection.settings = settings
         return kept
 
     def read_biases(self) -> dict[str, int]:
-        """Offsets the camera has now; raises ``DeviceError`` when it is not there."""
-        return self._keeper.require("biases").read_biases()
+        """Return the offsets in the camera; raises ``DeviceError`` when it is not open."""
+        return self._connection.require("biases").read_biases()
 
     def statistics(self) -> dict[str, float]:
-        """Counters and readings for diagnostics, by name with unit."""
-        session, queue, keeper = self._keeper.session, self._queue, self._keeper
+        """Return counters and readings for diagnostics, by name with unit."""
+        connection, queue = self._connection, self._queue
+        session = connection.session
         values: dict[str, float] = {
             "bytes": queue.received_bytes,
             "queue_bytes": queue.waiting_bytes,
@@ -242,9 +238,9 @@ class Evk4:
             "gaps": queue.gaps,
             "restarts": queue.restarts,
             "failed_transfers": self._failed_transfers,
-            "losses": keeper.losses,
-            "reconnects": keeper.reconnects,
-            "reconnect_attempts": keeper.attempts,
+            "losses": connection.losses,
+            "reconnects": connection.reconnects,
+            "reconnect_attempts": connection.attempts,
             "temperature_c": self._health.temperature_c,
             "health_failures": self._health.failures,
         }
@@ -259,11 +255,11 @@ class Evk4:
             raise DeviceError(f"{NAME} {self.identity.serial} is closed; open it again")
 
     def _streaming_session(self) -> Session | None:
-        session = self._keeper.session
+        session = self._connection.session
         return session if session is not None and session.streaming else None
 
-    def _pause(self, seconds: float) -> None:
-        """Wait; ``stop`` and ``close`` cut it short."""
+    def _wait(self, seconds: float) -> None:
+        """Wait; raises ``EndedError`` on ``stop`` and ``close``."""
         if self._sleep is not None and not self._ending.is_set():
             self._sleep(seconds)
         elif self._ending.wait(seconds):
@@ -273,7 +269,7 @@ class Evk4:
         failed_before = False
         try:
             while not self._ending.is_set():
-                self._turned_s = time.monotonic()
+                self._last_loop_s = time.monotonic()
                 try:
                     failed_before = self._receive_once(failed_before)
                 except DeviceError as error:
@@ -285,9 +281,9 @@ class Evk4:
             self._queue.fail(error)
 
     def _receive_once(self, failed_before: bool) -> bool:
-        """Take one transfer; returns whether it failed. Raises when the camera is lost."""
-        session = self._keeper.require("events")
-        self._health.check()
+        """Receive one transfer; returns whether it failed, raises when the camera is lost."""
+        session = self._connection.require("events")
+        self._health.raise_failure()
         try:
             data, arrival_ns = session.reader.read(_READ_S)
         except DeviceError as error:
@@ -299,16 +295,16 @@ class Evk4:
             return True
         if not data:
             return failed_before
-        self._health.heard()
+        self._health.note_alive()
         self._queue.put(data, arrival_ns)
         return False
 
     def _reconnect(self, error: DeviceError) -> None:
-        self._keeper.lose(error)
-        self.on_loss(self._keeper.loss)
-        self._keeper.regain(self._begin_anew)
-        self._health.heard()
+        self._connection.drop(error)
+        self.on_loss(self._connection.loss)
+        self._connection.reopen(self._restart)
+        self._health.note_alive()
 
-    def _begin_anew(self, session: Session) -> None:
+    def _restart(self, session: Session) -> None:
         self._queue.mark_restart()
         session.start()

@@ -1,4 +1,4 @@
-"""Looking after a camera while it streams: its temperature, and whether silence is darkness."""
+"""Health of a streaming camera: whether it streams while no events come, and its temperature."""
 
 from __future__ import annotations
 
@@ -6,127 +6,116 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.hardware.camera.session import Session
 
-SILENCE_S = 0.1
-PATIENCE_S = 0.5
-TEMPERATURE_EVERY_S = 5.0
-_TURN_S = 0.03
+_QUIET_S = 0.1
+_ANSWER_TIMEOUT_S = 0.5
+_TEMPERATURE_EVERY_S = 5.0
+_TICK_S = 0.03
 _JOIN_S = 0.5
 
 
-class Patient(Protocol):
-    """What can be asked of a camera beside its stream."""
-
-    def temperature_c(self) -> float:
-        """Temperature (C)."""
-
-    def is_streaming(self) -> bool:
-        """Whether the sensor runs."""
-
-
-class Health:
-    """Asks a camera how it is, in a thread of its own: an answer that is late delays no events.
+class HealthMonitor:
+    """Polls the camera in a thread of its own, so that a late answer delays no events.
 
     Parameters
     ----------
-    patient : callable
-        The camera, ``None`` while there is none.
+    session : callable
+        Returns the streaming session, ``None`` without one.
 
     Attributes
     ----------
     temperature_c : float
-        Last reading; NaN before the first and when it failed.
+        Last reading; NaN before the first and after a failed one.
     failures : int
-        Questions without an answer.
+        Requests without an answer.
     """
 
-    def __init__(self, patient: Callable[[], Patient | None]) -> None:
+    def __init__(self, session: Callable[[], Session | None]) -> None:
         self.temperature_c = math.nan
         self.failures = 0
-        self._patient = patient
+        self._session = session
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._heard_s = time.monotonic()
+        self._alive_s = time.monotonic()
         self._asked_s: float | None = None
-        self._finding: DeviceError | None = None
+        self._failure: DeviceError | None = None
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start polling."""
         self._ending.clear()
-        self.heard()
-        self._thread = threading.Thread(target=self._look, name="EVK4 health", daemon=True)
+        self.note_alive()
+        self._thread = threading.Thread(target=self._run, name="EVK4 health", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End it; idempotent."""
+        """Stop polling; idempotent."""
         self._ending.set()
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join(_JOIN_S)
 
     @property
-    def alive(self) -> bool:
-        """Whether no question has been waiting for its answer for 0.5 s.
+    def answering(self) -> bool:
+        """Whether no request has waited for its answer for 0.5 s.
 
-        A busy host that asks late is no dead camera; one that does not answer is.
+        A request that a busy host sends late does not count against the camera.
         """
         asked_s = self._asked_s
-        return asked_s is None or time.monotonic() - asked_s < PATIENCE_S
+        return asked_s is None or time.monotonic() - asked_s < _ANSWER_TIMEOUT_S
 
-    def heard(self) -> None:
-        """Take note that events came: the camera lives."""
-        self._heard_s = time.monotonic()
-        self._finding = None
+    def note_alive(self) -> None:
+        """Record that the camera sent events or was opened."""
+        self._alive_s = time.monotonic()
+        self._failure = None
 
-    def check(self) -> None:
-        """Raise the ``DeviceError`` that was found, once."""
-        finding, self._finding = self._finding, None
-        if finding is not None:
-            raise finding
+    def raise_failure(self) -> None:
+        """Raise the ``DeviceError`` of the last check, once."""
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
 
-    def examine(self) -> None:
-        """Ask a silent camera whether it still streams: in the dark it is silent too."""
-        patient = self._patient()
-        if patient is None:
+    def _check_streaming(self) -> None:
+        """Ask a camera without events whether it streams: in the dark it sends none."""
+        session = self._session()
+        if session is None:
             return
         self._asked_s = time.monotonic()
         try:
-            if patient.is_streaming():
-                self._heard_s = time.monotonic()
+            if session.is_streaming():
+                self._alive_s = time.monotonic()
                 return
-            finding = DeviceError(
+            failure = DeviceError(
                 "camera: it has stopped streaming by itself (reset or power dip); check its power"
             )
         except DeviceError as error:
             self.failures += 1
-            finding = error
+            failure = error
         finally:
             self._asked_s = None
-        # Not about a camera that was replaced while it was asked.
-        if self._patient() is patient:
-            self._finding = finding
+        # The answer says nothing about a camera that was opened in the meantime.
+        if self._session() is session:
+            self._failure = failure
 
-    def measure(self) -> None:
-        """Read the temperature."""
-        patient = self._patient()
-        if patient is None:
+    def _read_temperature(self) -> None:
+        session = self._session()
+        if session is None:
             self.temperature_c = math.nan
             return
         try:
-            self.temperature_c = patient.temperature_c()
+            self.temperature_c = session.temperature_c()
         except DeviceError:
             self.temperature_c = math.nan
             self.failures += 1
 
-    def _look(self) -> None:
+    def _run(self) -> None:
         measured_s = -math.inf
-        while not self._ending.wait(_TURN_S):
+        while not self._ending.wait(_TICK_S):
             now_s = time.monotonic()
-            if now_s - self._heard_s > SILENCE_S:
-                self.examine()
-            elif now_s - measured_s > TEMPERATURE_EVERY_S:
+            if now_s - self._alive_s > _QUIET_S:
+                self._check_streaming()
+            elif now_s - measured_s > _TEMPERATURE_EVERY_S:
                 measured_s = now_s
-                self.measure()
+                self._read_temperature()

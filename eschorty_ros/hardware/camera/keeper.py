@@ -1,4 +1,4 @@
-"""Keeping one camera open: the first time, and again after it was lost."""
+"""The connection to one camera: opened, and opened again after a loss."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class EndedError(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class Reconnection:
-    """How often and how patiently a lost camera is looked for.
+    """How often a lost camera is searched for, and how long to wait before.
 
     Parameters
     ----------
@@ -38,33 +38,35 @@ class Reconnection:
     longest_s: float = 8.0
 
     def wait_s(self, attempt: int) -> float:
-        """Wait before that attempt, counted from 0."""
+        """Return the wait before that attempt, counted from 0."""
         return min(self.first_s * 2.0**attempt, self.longest_s)
 
 
-class Keeper:
-    """Holds the session of one camera; thread-safe.
+class Connection:
+    """Session of one camera; thread-safe.
 
     Parameters
     ----------
     backend : usb.backend.IBackend
     clock_ns : callable
     serial : str
-        ``""`` takes the only camera there is, and sticks to it.
+        ``""`` takes the only camera there is; after the first opening only that one is taken.
     settings : CameraSettings
-        What every new session is set up with.
+        Written in every new session.
     reconnection : Reconnection
-    pause : callable
-        Waits some seconds; raises :class:`EndedError` to give up.
+    sleep : callable
+        Waits some seconds; raises :class:`EndedError` when the stream ends.
     settle : callable
-        Waits milliseconds to the end.
+        Waits milliseconds, always to the end.
 
     Attributes
     ----------
+    session : Session or None
+        The open camera.
     identity : DeviceIdentity
     settings : CameraSettings
     loss : str
-        Why there is no session after one was lost, one line; empty otherwise.
+        Why the session was lost, one line; empty while there is one.
     losses, reconnects, attempts : int
     """
 
@@ -75,9 +77,10 @@ class Keeper:
         serial: str,
         settings: CameraSettings,
         reconnection: Reconnection,
-        pause: Sleep,
+        sleep: Sleep,
         settle: Sleep,
     ) -> None:
+        self.session: Session | None = None
         self.identity = DeviceIdentity("Prophesee EVK4", serial)
         self.settings = settings
         self.loss = ""
@@ -85,80 +88,62 @@ class Keeper:
         self._backend = backend
         self._clock_ns = clock_ns
         self._reconnection = reconnection
-        self._pause = pause
+        self._sleep = sleep
         self._settle = settle
-        self._session: Session | None = None
         self._lock = threading.Lock()
         self._closed = False
 
-    @property
-    def session(self) -> Session | None:
-        """The open camera, ``None`` while there is none."""
-        return self._session
-
     def require(self, what: str) -> Session:
-        """Return the open camera.
-
-        Raises
-        ------
-        DeviceError
-            While there is none; names ``what`` was wanted.
-        """
-        session = self._session
+        """Return the session; raises ``DeviceError``, which names ``what``, without one."""
+        session = self.session
         if session is None:
             raise DeviceError(f"{what}: the camera is not open; try again when it is back")
         return session
 
     def open(self) -> None:
-        """Open a session unless there is one.
-
-        Raises
-        ------
-        DeviceError
-            In one line.
-        """
-        if self._session is not None:
+        """Open a session unless there is one; raises ``DeviceError``."""
+        if self.session is not None:
             return
         session = Session(
             self._backend,
             self.identity.serial,
             self.settings,
             self._clock_ns,
-            self._pause,
+            self._sleep,
             self._settle,
         )
         with self._lock:
             if not self._closed:
-                self._session = session
+                self.session = session
                 self.identity = session.identity
                 self.loss = ""
                 return
         session.close()
         raise EndedError(f"{NAME} was closed before it was ready")
 
-    def lose(self, error: DeviceError) -> None:
+    def drop(self, error: DeviceError) -> None:
         """Release a camera that failed."""
         self.losses += 1
         self.loss = str(error)
         self._release(gone=True)
 
-    def regain(self, begin: Callable[[Session], None]) -> None:
-        """Get the same camera back and ``begin`` with it.
+    def reopen(self, start: Callable[[Session], None]) -> None:
+        """Open the same camera again and ``start`` it.
 
         Raises
         ------
         EndedError
-            When the pause gives up.
+            When the stream ends before.
         DeviceGoneError
             After the last attempt.
         """
         last = self.loss
         for attempt in range(self._reconnection.attempts):
-            self._pause(self._reconnection.wait_s(attempt))
+            self._sleep(self._reconnection.wait_s(attempt))
             self.attempts += 1
             try:
                 self.open()
-                begin(self.require("stream"))
+                start(self.require("stream"))
             except EndedError:
                 raise
             except DeviceError as error:
@@ -181,6 +166,6 @@ class Keeper:
 
     def _release(self, gone: bool) -> None:
         with self._lock:
-            session, self._session = self._session, None
+            session, self.session = self.session, None
         if session is not None:
             session.close(gone=gone)

@@ -1,4 +1,4 @@
-"""One opened EVK4, from claim to release: no reconnection, no threads.
+"""One opened EVK4, from claim to release, without reconnection and without threads.
 
 The order of the steps is openeb 5.1.1's. Unconfirmed on hardware.
 """
@@ -30,7 +30,7 @@ FIRMWARE_OLDEST = 0x030800
 
 
 class Session:
-    """A camera that has been initialised and set up; stopped until ``start``.
+    """A camera, initialised and set up; stopped until ``start``.
 
     Parameters
     ----------
@@ -41,27 +41,27 @@ class Session:
     clock_ns : callable
         Clock of the arrival times.
     sleep : callable
-        Waits some seconds; may raise to give up.
+        Waits some seconds; may raise to end the opening.
     settle : callable
-        Waits the milliseconds of the way down, to the end.
+        Waits milliseconds, always to the end.
 
     Attributes
     ----------
     identity : DeviceIdentity
     warnings : tuple of str
-        One line each, for the user.
+        One line each.
     applied : dict of str to float
-        Settings as the camera has them.
+        Settings as read back.
     control : Treuzell
     reader : BulkReader
         For one thread.
     streaming : bool
-        Whether it was told to stream.
+        Whether ``start`` was called last.
 
     Raises
     ------
     DeviceError
-        When it cannot be opened, is no IMX636, or does not take its settings. Nothing stays open.
+        When it cannot be opened, is no IMX636 or refuses its settings; nothing stays open then.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Session:
         self._usb = open_camera(backend, serial)
         self.control = treuzell.Treuzell(self._usb)
         self.streaming = False
-        # A sequence, and a value that is read, changed and written, must not be interleaved.
+        # Sequences and read-modify-write accesses must not be interleaved.
         self._sequence = threading.RLock()
         self.warnings: tuple[str, ...] = ()
         try:
@@ -90,34 +90,34 @@ class Session:
                 backend, self._usb.device, self._usb.endpoints.data_in, clock_ns
             )
         except BaseException:
-            # Ctrl-C may come in the 2.5 s of the initialisation.
+            # Ctrl-C may arrive in the 2.5 s of the initialisation.
             self._usb.close()
             raise
 
     def start(self) -> None:
-        """Queue the reads, then let the sensor stream; its time starts at 0."""
+        """Queue the reads, then start the sensor; its time starts at 0."""
         self.reader.start()
         with self._sequence:
             run_sequence(self.control, imx636.START, self._sleep)
             self.streaming = True
 
     def stop_sensor(self) -> None:
-        """End streaming; the reads are still to be stopped."""
+        """Stop the sensor; the reads go on."""
         with self._sequence:
             if self.streaming:
                 self.streaming = False
                 run_sequence(self.control, imx636.STOP, self._settle)
 
     def stop_reads(self) -> None:
-        """Stop the reads, once nobody reads any more; idempotent."""
+        """Stop the reads, after the last ``reader.read``; idempotent."""
         self.reader.stop()
 
     def is_streaming(self) -> bool:
-        """Ask the sensor whether its time runs."""
+        """Return whether the sensor's time base runs."""
         return imx636.is_streaming(self.control)
 
     def temperature_c(self) -> float:
-        """Temperature of the sensor (C)."""
+        """Return the temperature of the sensor (C)."""
         with self._sequence:
             return monitors.read_temperature_c(self.control, self._settle)
 
@@ -129,17 +129,17 @@ class Session:
         return kept
 
     def read_biases(self) -> dict[str, int]:
-        """Offsets the camera has now."""
+        """Return the offsets in the camera."""
         return self._biases.read()
 
-    def hurry(self) -> None:
-        """Wait less for answers from now on: the camera is being closed."""
-        self.control.hurry()
-        self._usb.hurry()
+    def shorten_timeouts(self) -> None:
+        """Wait less for answers from now on, because the camera is being closed."""
+        self.control.retries = False
+        self._usb.shorten_timeouts()
 
     def close(self, *, gone: bool = False) -> None:
-        """Power the sensor down and release it, or only release it when ``gone``; never raises."""
-        self.hurry()
+        """Power the sensor down unless it is ``gone``, and release it; never raises."""
+        self.shorten_timeouts()
         with suppress(EschortyError):
             if not gone:
                 self.stop_sensor()

@@ -14,10 +14,7 @@ from eschorty_ros.core.errors import DeviceError, DeviceStallError, DeviceTimeou
 
 SERIAL = 0x72
 FIRMWARE = 0x79
-BUILD_DATE = 0x7A
 DEVICE_COUNT = 0x10000
-DEVICE_NAME = 0x10001
-COMPATIBLE = 0x10003
 REGISTERS = 0x10102
 WRITE = 0x4000_0000
 FAILED = 0x8000_0000
@@ -27,34 +24,34 @@ _DEVICE = 0
 
 
 class FrameError(DeviceError):
-    """An answer that is no answer to the request."""
+    """An answer that does not belong to the request."""
 
 
 class ControlLink(Protocol):
     """One request out, one answer in; raises ``DeviceError`` subclasses."""
 
     def send(self, frame: bytes) -> None:
-        """Write a whole request."""
+        """Write a request."""
 
     def receive(self) -> bytes:
         """Read one answer."""
 
     def recover(self) -> None:
-        """Clear stalls and throw away answers that wait."""
+        """Clear stalls and discard waiting answers."""
 
 
 def request_frame(property_id: int, payload: bytes = b"") -> bytes:
-    """Frame a request."""
+    """Return the frame of a request."""
     return _HEADER.pack(property_id, len(payload)) + payload
 
 
 def answer_payload(property_id: int, frame: bytes) -> bytes:
-    """Check an answer and take its payload.
+    """Check an answer and return its payload.
 
     Raises
     ------
     FrameError
-        When it is short, has another size than it says, or answers another request.
+        When it is short, has another size than its header says, or answers another request.
     DeviceError
         When the camera refused.
     """
@@ -91,28 +88,26 @@ def answer_payload(property_id: int, frame: bytes) -> bytes:
 class Treuzell:
     """Request and answer over a :class:`ControlLink`, one at a time; thread-safe.
 
-    A time-out, a stall or an answer to something else clears the link and asks once more: every
-    request here is idempotent. The second failure is the caller's.
+    After a time-out, a stall or an answer to another request the link is cleared and the request
+    sent once more: every request here is idempotent. A second failure is raised.
 
     Attributes
     ----------
     requests, recoveries : int
         Requests answered, and times the link was cleared.
+    retries : bool
+        Whether a failed request is sent once more.
     """
 
     def __init__(self, link: ControlLink) -> None:
         self._link = link
         self._lock = threading.Lock()
-        self._retries = True
+        self.retries = True
         self.requests = 0
         self.recoveries = 0
 
-    def hurry(self) -> None:
-        """Ask once only from now on: the camera is being closed."""
-        self._retries = False
-
     def request(self, property_id: int, payload: bytes = b"") -> bytes:
-        """Ask and return the answer's payload.
+        """Send a request and return the answer's payload.
 
         Raises
         ------
@@ -141,7 +136,7 @@ class Treuzell:
         try:
             return self._once(property_id, frame, payload)
         except (DeviceTimeoutError, DeviceStallError, FrameError):
-            if not self._retries:
+            if not self.retries:
                 raise
             self.recoveries += 1
             self._link.recover()
@@ -151,7 +146,7 @@ class Treuzell:
         self._link.send(frame)
         answer = answer_payload(property_id, self._link.receive())
         if property_id & ~WRITE == REGISTERS:
-            # Device and address come back: a late answer belongs to another register.
+            # The answer repeats device and address, so a late one is recognised.
             needed = 8 if property_id & WRITE else 12
             if answer[:8] != payload[:8] or len(answer) < needed:
                 raise FrameError(

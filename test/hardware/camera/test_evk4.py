@@ -206,7 +206,7 @@ def test_a_receiving_thread_that_hangs_gets_no_second_one_beside_it() -> None:
     with Rig() as rig:
         rig.streaming()
         released = threading.Event()
-        session = rig.camera._keeper.session
+        session = rig.camera._connection.session
         assert session is not None
         reading = threading.Event()
 
