@@ -1,4 +1,4 @@
-"""What the nodes ask of a camera, a laser and a stage, real or simulated."""
+"""The interfaces of a camera, a laser and a stage, real or emulated, towards the nodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DeviceIdentity:
-    """Who answers at the other end: goes into logs, diagnostics and file headers."""
+    """Model, serial and firmware, for logs, diagnostics and file headers."""
 
     model: str
     serial: str
@@ -25,18 +25,18 @@ class DeviceIdentity:
 
 @dataclass(frozen=True, slots=True)
 class EventChunk:
-    """Bytes of one arrival.
+    """Bytes that arrived together.
 
     Parameters
     ----------
     data : bytes
-        Whole 16-bit EVT3 words.
+        Complete 16-bit EVT3 words.
     arrival_ns : int
         Host time at which they were received.
     gap : bool
         Bytes were lost between the previous chunk and this one.
     restarted : bool
-        The stream begins anew here: sensor time and decoder state of before are void.
+        The stream restarts here: earlier sensor time and decoder state are void.
     """
 
     data: bytes
@@ -106,7 +106,7 @@ class EventSource(Protocol):
         """Return the offsets in the camera; raises ``DeviceError`` when it is not open."""
 
     def statistics(self) -> dict[str, float]:
-        """Counters for diagnostics, by name with unit."""
+        """Return counters for diagnostics, by name with unit."""
 
     def close(self) -> None:
         """Release the device; idempotent."""

@@ -1,7 +1,7 @@
-"""USB as the drivers use it: a backend by name, one device found or one line why not.
+"""USB access of the drivers: a backend by name, one device found, its interface claimed.
 
-A backend named ``module:callable`` or ``module:callable?argument`` is imported at run time:
-that is how a device in memory takes the place of one on the bus, with the driver unchanged.
+A backend named ``module:callable`` or ``module:callable?argument`` is imported at run time, so that
+an emulated device replaces a real one with the driver unchanged.
 """
 
 from __future__ import annotations
@@ -43,18 +43,13 @@ _KINDS: dict[int, tuple[type[DeviceError], str]] = {
 
 
 def translate(error: usb.core.USBError, what: str) -> DeviceError:
-    """Make the package's error of one of pyusb's, by its ``errno`` (texts differ by platform).
+    """Return the ``DeviceError`` for pyusb's error, by ``errno``: texts differ by platform.
 
     Parameters
     ----------
     error : usb.core.USBError
     what : str
-        Thing and operation, such as ``"EVK4 00051234: reading register 0x0014"``.
-
-    Returns
-    -------
-    DeviceError
-        One of its kinds for gone, timed out and stalled; the message is one line.
+        Device and operation, such as ``"EVK4 00051234: reading register 0x0014"``.
     """
     code = error.errno if error.errno is not None else 0
     kind, remedy = _KINDS.get(code, (DeviceError, str(error.strerror or error)))
@@ -62,21 +57,21 @@ def translate(error: usb.core.USBError, what: str) -> DeviceError:
 
 
 def open_backend(spec: str) -> usb.backend.IBackend:
-    """Open the pyusb backend ``spec`` names.
+    """Return the pyusb backend that ``spec`` names.
 
     Parameters
     ----------
     spec : str
-        ``libusb``: the system's libusb, else the one of the package ``libusb-package``.
-        ``module:callable`` or ``module:callable?argument``: what ``callable()`` or
-        ``callable(argument)`` returns.
+        ``libusb``: the system's libusb, else that of the package ``libusb-package``.
+        ``module:callable`` or ``module:callable?argument``: the result of ``callable()`` or
+        ``callable(argument)``.
 
     Raises
     ------
     ArgumentError
         For a name that cannot be imported.
     DeviceError
-        Without any libusb.
+        Without libusb.
     """
     if spec == "libusb":
         return _libusb()
@@ -110,24 +105,24 @@ def find_device(
     matches: Callable[[usb.core.Device], bool],
     serial: str = "",
 ) -> usb.core.Device:
-    """Find the one device that matches and may be opened; a fresh ``Device`` on every call.
+    """Find and open the one device that matches; returns a new ``Device`` on every call.
 
     Parameters
     ----------
     backend : usb.backend.IBackend
     name : str
-        What is looked for, for the messages.
+        Name of the device in messages.
     matches : callable
-        Judges descriptors only: the device is not open yet.
+        May read descriptors only: the device is not open yet.
     serial : str
-        Serial string to look for (upper or lower case); ``""`` takes the only match there is.
+        Serial string, upper or lower case; ``""`` takes the only match.
 
     Raises
     ------
     DeviceGoneError
-        None is there.
+        None matches.
     DeviceError
-        Several match, or it may not be opened.
+        Several match, or opening is refused.
     """
     try:
         found = list(usb.core.find(find_all=True, backend=backend, custom_match=matches))
@@ -162,7 +157,7 @@ def _place(device: usb.core.Device) -> str:
 def _with_serial(
     devices: list[usb.core.Device], serial: str, name: str
 ) -> tuple[list[usb.core.Device], list[str]]:
-    """Devices with that serial, and the serials of all others."""
+    """Return the devices with that serial, and the serials of all others."""
     kept, seen = [], []
     for device in devices:
         text = _serial(device, name)
@@ -176,7 +171,7 @@ def _with_serial(
 
 def _serial(device: usb.core.Device, name: str) -> str:
     try:
-        # pyusb turns a refused open into "no language"; opening first keeps the reason.
+        # pyusb reports a refused open as "no language"; opening first keeps the reason.
         device.get_active_configuration()
         return device.serial_number or ""
     except usb.core.USBError as error:
@@ -187,7 +182,7 @@ def _serial(device: usb.core.Device, name: str) -> str:
 
 
 def claim(device: usb.core.Device, interface: int, name: str) -> bool:
-    """Take the interface for this process alone; tells whether a kernel driver was detached.
+    """Claim the interface for this process; returns whether a kernel driver was detached.
 
     Raises
     ------
@@ -207,7 +202,7 @@ def claim(device: usb.core.Device, interface: int, name: str) -> bool:
 
 
 def release(device: usb.core.Device, interface: int, *, reattach: bool) -> None:
-    """Give the interface back, with its kernel driver if ``reattach``, and close; never raises."""
+    """Release the interface, reattach the kernel driver if asked, and close; never raises."""
     with suppress(usb.core.USBError):
         usb.util.release_interface(device, interface)
     if reattach:

@@ -52,7 +52,7 @@ class CameraNode(DeviceNode):
     """Topic ``camera/events``; biases as parameters.
 
     A packet's stamp is the host time at which its first byte arrived. While a lost camera is
-    looked for the node stays active and reports an error; the stream then restarts at ``seq`` 0.
+    searched for, the node stays active and reports an error; the stream then restarts at ``seq`` 0.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -61,8 +61,8 @@ class CameraNode(DeviceNode):
         self._ending = threading.Event()
         self._laser_hz: float | None = None
         self._rates = {name: diagnostics.Rate() for name in ("packets", "bytes", "on", "off")}
-        self._kept: dict[str, int] = {}
-        self._lost_told = 0.0
+        self._biases: dict[str, int] = {}
+        self._lost_reported = 0.0
         super().__init__("camera", TABLE, self._on_change, **kwargs)
         events = self.create_lifecycle_publisher(
             EventPacket,
@@ -76,7 +76,7 @@ class CameraNode(DeviceNode):
         )
         self.create_service(Trigger, "~/save_biases", self._save_biases)
         self.create_service(Trigger, "~/dump_statistics", self._dump_statistics)
-        self._read_back = self.create_guard_condition(self._write_parameters)
+        self._biases_changed = self.create_guard_condition(self._write_parameters)
         self._diagnostics = diagnostics.Diagnostics(self, self._report)
         Heartbeat(self, "camera/heartbeat", lambda: self.healthy)
 
@@ -95,7 +95,7 @@ class CameraNode(DeviceNode):
         for line in (*self._source.warnings, missing_bias_file(self.parameters)):
             if line:
                 self.get_logger().warning(line)
-        self._kept = self._source.read_biases()
+        self._biases = self._source.read_biases()
         self._write_parameters()
 
     def start_device(self) -> None:
@@ -103,12 +103,12 @@ class CameraNode(DeviceNode):
         source = self._source
         if source is None:
             raise DeviceError("camera refused: not open; configure it first")
-        self._packets.cut_by(
+        self._packets.set_thresholds(
             round(self.parameters["event_message_time_threshold"] * 1e9),
             self.parameters["event_message_size_threshold"],
         )
         source.start()
-        # One for each thread: a thread that hung must not come to life again with the next.
+        # One event per thread: a hung thread must not resume when the next one starts.
         ending = self._ending = threading.Event()
         self._thread = threading.Thread(
             target=self._stream, args=(source, ending), name="camera stream", daemon=True
@@ -116,7 +116,7 @@ class CameraNode(DeviceNode):
         self._thread.start()
 
     def stop_device(self) -> None:
-        """End streaming; what has been read is still published."""
+        """Stop streaming; data already read is still published."""
         self._ending.set()
         try:
             if self._source is not None:
@@ -136,20 +136,20 @@ class CameraNode(DeviceNode):
 
     @property
     def healthy(self) -> bool:
-        """Whether events can come right now."""
+        """Whether the stream runs and the camera answers."""
         thread, source = self._thread, self._source
         alive = thread is not None and thread.is_alive() and not self._ending.is_set()
         return alive and source is not None and source.healthy
 
     @property
     def words(self) -> WordCounter:
-        """What was in the stream so far, listened to or not."""
+        """Counts of the words in the stream, published or not."""
         return self._packets.words
 
     def _stream(self, source: EventSource, ending: threading.Event) -> None:
         try:
             while not ending.is_set():
-                self._packets.take(source.read(READ_TIMEOUT_S), self.now_ns())
+                self._packets.push(source.read(READ_TIMEOUT_S), self.now_ns())
             self._packets.flush()
         except EschortyError as error:
             if not ending.is_set():
@@ -160,27 +160,27 @@ class CameraNode(DeviceNode):
                 self.fault(f"camera stream failed: {error!r}")
 
     def _on_loss(self, line: str) -> None:
-        """Say at once that the camera is looked for; from its receiving thread."""
+        """Report a lost camera at once; runs in the driver's receiving thread."""
         if self.context.ok() and not self._ending.is_set():
             self.get_logger().error(f"camera lost, looking for it: {line}")
             self._diagnostics.publish()
 
     def _on_change(self, proposed: dict[str, Any]) -> None:
-        """Apply biases as they are set; what the camera kept becomes the parameter."""
+        """Set changed biases; the offset read back becomes the parameter."""
         source = self._source
         if source is None:
             return
         for name in BIASES:
             offset = proposed[name]
-            if offset != self._kept.get(name):
-                kept = self._kept[name] = source.set_bias(name, offset)
-                if kept != offset:
-                    self._read_back.trigger()
+            if offset != self._biases.get(name):
+                self._biases[name] = source.set_bias(name, offset)
+                if self._biases[name] != offset:
+                    self._biases_changed.trigger()
 
     def _write_parameters(self) -> None:
         changed = [
             Parameter(name, value=offset)
-            for name, offset in self._kept.items()
+            for name, offset in self._biases.items()
             if self.parameters[name] != offset
         ]
         if changed:
@@ -225,12 +225,12 @@ class CameraNode(DeviceNode):
             "off_events_per_s": self._rates["off"].read(words.off),
             "trigger_edges": words.triggers,
             **packets.losses,
-            "bytes_without_subscriber": packets.unheard_bytes,
+            "bytes_without_subscriber": packets.unsubscribed_bytes,
         }
         if source is not None:
             values |= source.statistics()
         lost = sum(values.get(name, 0) for name in _LOSSES)
-        lost, self._lost_told = lost - self._lost_told, lost
+        lost, self._lost_reported = lost - self._lost_reported, lost
         if self.failure:
             return diagnostics.ERROR, self.failure, values
         loss = source.loss if source is not None else ""

@@ -1,4 +1,4 @@
-"""From a camera's chunks to event packets: cutting, numbering, counting."""
+"""Publishing a camera's chunks as numbered event packets."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from eschorty_ros.nodes.packets import Packetizer
 class PacketPublisher:
     """Publishes one camera's stream; used by one thread at a time.
 
-    A gap leaves one number out, a restart begins at 0 again: that is how readers learn of both.
-    What is not sent for want of a subscriber is a gap, too, once there has been one.
+    A gap skips one number, a restart resets it to 0, so that subscribers notice both. Bytes
+    without a subscriber count as a gap after the first packet.
 
     Parameters
     ----------
@@ -30,28 +30,28 @@ class PacketPublisher:
     ----------
     seq : int
         Number of the next packet.
-    packets, published_bytes, unheard_bytes : int
-        Packets and bytes sent, and bytes not sent because nobody listened.
+    packets, published_bytes, unsubscribed_bytes : int
+        Packets and bytes published, and bytes without a subscriber.
     words : WordCounter
-        What was in all of them.
+        Counts of the words in all of them.
     """
 
     def __init__(self, publisher: Any, width: int, height: int, frame_id: str) -> None:
         self.seq = 0
         self.packets = 0
         self.published_bytes = 0
-        self.unheard_bytes = 0
+        self.unsubscribed_bytes = 0
         self.words = WordCounter()
         self._publisher = publisher
         self._width = width
         self._height = height
         self._frame_id = frame_id
-        self._unheard = False
+        self._gap = False
         self._packetizer = Packetizer(0, 2)
 
     @property
     def losses(self) -> dict[str, int]:
-        """What the sensor says of events it dropped, by name."""
+        """Events that the sensor reports as dropped, by name."""
         words = self.words
         return {
             "sensor_drop_words": words.drop_words,
@@ -59,12 +59,12 @@ class PacketPublisher:
             "erc_events_dropped": max(words.erc_events_in - words.erc_events_out, 0),
         }
 
-    def cut_by(self, age_ns: int, size_bytes: int) -> None:
-        """Let packets leave at this age or size."""
+    def set_thresholds(self, age_ns: int, size_bytes: int) -> None:
+        """Publish packets at this age or size."""
         self._packetizer = Packetizer(age_ns, size_bytes)
 
-    def take(self, chunk: EventChunk | None, now_ns: int) -> None:
-        """Publish what is due; ``None`` lets time pass."""
+    def push(self, chunk: EventChunk | None, now_ns: int) -> None:
+        """Publish the packets that are due; ``None`` stands for a wait without data."""
         if chunk is None:
             self._publish(self._packetizer.push(b"", now_ns))
             return
@@ -75,18 +75,18 @@ class PacketPublisher:
         self._publish(self._packetizer.push(chunk.data, chunk.arrival_ns))
 
     def flush(self) -> None:
-        """Publish what is left."""
+        """Publish the last, incomplete packet."""
         self._publish(self._packetizer.flush())
 
     def _publish(self, payloads: Iterable[tuple[int, bytes]]) -> None:
         for stamp_ns, payload in payloads:
             if self._publisher.get_subscription_count() == 0:
-                self.unheard_bytes += len(payload)
-                self._unheard = True
+                self.unsubscribed_bytes += len(payload)
+                self._gap = True
                 continue
-            if self._unheard and self.seq:
+            if self._gap and self.seq:
                 self.seq += 1
-            self._unheard = False
+            self._gap = False
             message = EventPacket(
                 height=self._height,
                 width=self._width,

@@ -1,4 +1,4 @@
-"""Parameters of the cameras, under the names of ``metavision_driver`` where it has them."""
+"""Parameters of the camera node, with the names of ``metavision_driver`` where it has them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ EVK4_TABLE = (
     Param(
         "bias_range",
         "normal",
-        "ranges of the biases: wide ones may make the sensor noisy or deaf",
+        "ranges of the biases: wide ones may make the sensor noisy or insensitive",
         choices=("normal", "wide"),
     ),
     *_BIAS_TABLE,
@@ -56,12 +56,12 @@ EVK4_TABLE = (
     Param(
         "erc_mode",
         "na",
-        "event-rate control, off unless enabled: what it drops is told, and falsifies the centroid",
+        "event-rate control, off unless enabled: dropped events are counted and bias the centroid",
         choices=("na", "disabled", "enabled"),
     ),
     Param("erc_rate", 100_000_000, "rate beyond which it drops", "events/s", 5_000, RATE_MAX),
     Param("roi", _FULL_FRAME, "x, y, width, height per window; columns and rows multiply", "px"),
-    Param("hot_pixels", "", "pixels to silence, at most 64: 'x,y x,y'"),
+    Param("hot_pixels", "", "pixels to mask, at most 64: 'x,y x,y'"),
     Param("trail_filter", False, "filter of trailing events" + _IGNORED),
     Param("trail_filter_type", "trail", "kind of that filter", choices=TYPES),
     Param("trail_filter_threshold", 10_000, "its time, in steps of 1 ms", "us", *THRESHOLD_US),
@@ -79,14 +79,14 @@ EVK4_TABLE = (
 
 
 def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
-    """Make the settings of an EVK4 from the node's parameters.
+    """Return the settings of an EVK4 from the node's parameters.
 
     Raises
     ------
     ArgumentError
         For a value outside its range.
     FormatError
-        For a bias file that is none.
+        For a malformed bias file.
     """
     roi = tuple(parameters["roi"])
     enabled = parameters["erc_mode"] == "enabled"
@@ -95,7 +95,7 @@ def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
         wide_biases=parameters["bias_range"] == "wide",
         packet_period_us=parameters["mipi_frame_period"],
         erc_rate=parameters["erc_rate"] if enabled else None,
-        anti_flicker=anti_flicker(parameters),
+        anti_flicker=_anti_flicker(parameters),
         trail_filter=parameters["trail_filter_type"] if parameters["trail_filter"] else "",
         trail_threshold_us=parameters["trail_filter_threshold"],
         windows=() if roi == _FULL_FRAME else windows_of(roi),
@@ -104,14 +104,8 @@ def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
     )
 
 
-def anti_flicker(parameters: Mapping[str, Any]) -> AntiFlicker | None:
-    """Band of the anti-flicker filter, ``None`` when it is off.
-
-    Raises
-    ------
-    ArgumentError
-        For a band that is none.
-    """
+def _anti_flicker(parameters: Mapping[str, Any]) -> AntiFlicker | None:
+    """Return the band of the anti-flicker filter, ``None`` when it is off."""
     if not parameters["anti_flicker"]:
         return None
     return AntiFlicker(
@@ -122,7 +116,7 @@ def anti_flicker(parameters: Mapping[str, Any]) -> AntiFlicker | None:
 
 
 def missing_bias_file(parameters: Mapping[str, Any]) -> str:
-    """Tell in one line that the bias file is still to be made; empty when it is there."""
+    """Return one line when the bias file does not exist yet, else an empty string."""
     path = parameters["bias_file"]
     if not path or Path(path).exists():
         return ""

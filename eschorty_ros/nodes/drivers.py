@@ -1,6 +1,6 @@
-"""Driver names of the ``driver`` parameter and what makes each of them.
+"""The drivers that the ``driver`` parameter names, and their parameters.
 
-A driver is imported when it is asked for. ``fake`` is the real driver at an emulated bench.
+A driver is imported when it is chosen. ``fake`` is the real driver at an emulated bench.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LASER_TABLE = from_settings(AwgSettings)
 
 
 def _bench(parameters: Mapping[str, Any]) -> Path:
-    """Folder of the bench the node is to use."""
+    """Return the folder of the bench; raises ``DeviceGoneError`` when no bench runs there."""
     folder = bench_folder(parameters["bench"])
     if not (folder / READY_FILE).exists():
         raise DeviceGoneError(f"no emulated bench in {folder}; start eschorty-bench")
@@ -112,14 +112,14 @@ STAGES: Registry[LinearStage] = {"fake": _fake_stage, "apt": _apt}
 
 
 def make(registry: Registry[Device], parameters: Mapping[str, Any], clock_ns: ClockNs) -> Device:
-    """Make the device the ``driver`` parameter names.
+    """Return the device that the ``driver`` parameter names.
 
     Raises
     ------
     ArgumentError
-        For a name the registry does not hold.
+        For an unknown name.
     EschortyError
-        Whatever the driver refuses.
+        When the driver refuses its parameters.
     """
     name = parameters["driver"]
     if name not in registry:

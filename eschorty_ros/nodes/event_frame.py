@@ -1,4 +1,4 @@
-"""The recent events as a picture: an exponential time surface."""
+"""An image of the recent events: an exponential time surface."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from eschorty_ros.core.evt3 import Decoder
 
 
 class EventFrame:
-    """Brightness of a pixel = exp(-age of its newest event / ``tau_us``).
+    """Image whose brightness is exp(-age of the pixel's newest event / ``tau_us``).
 
     Parameters
     ----------
     columns, rows : int
     tau_us : float
-        Age at which a pixel has faded to 1/e.
+        Age at which the brightness is 1/e.
     """
 
     def __init__(self, columns: int, rows: int, tau_us: float = 30_000.0) -> None:
@@ -26,17 +26,17 @@ class EventFrame:
         self._tau_us = tau_us
 
     def push(self, data: Any) -> None:
-        """Take the next bytes of the EVT3 stream; it may begin anywhere."""
+        """Decode the next bytes of the EVT3 stream, which may start anywhere."""
         events = self._decoder.decode(data)
         self._newest_us[events.y, events.x] = events.t
 
     def render(self) -> NDArray[np.uint8]:
-        """Draw the picture now, (rows, columns) uint8."""
+        """Return the image at the newest sensor time, (rows, columns) uint8."""
         now_us = self._decoder.time_us
         if now_us is None:
             return np.zeros(self._newest_us.shape, dtype=np.uint8)
-        picture = np.zeros(self._newest_us.shape, dtype=np.uint8)
+        image = np.zeros(self._newest_us.shape, dtype=np.uint8)
         recent = now_us - self._newest_us < round(8 * self._tau_us)
         age_us = (now_us - self._newest_us[recent]).astype(np.float64)
-        picture[recent] = np.rint(255.0 * np.exp(-np.maximum(age_us, 0.0) / self._tau_us))
-        return picture
+        image[recent] = np.rint(255.0 * np.exp(-np.maximum(age_us, 0.0) / self._tau_us))
+        return image

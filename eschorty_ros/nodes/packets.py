@@ -10,14 +10,14 @@ SIZE_MAX_BYTES = 256_000
 
 
 class Packetizer:
-    """Collects bytes until they are old or many enough to send.
+    """Collects bytes until the packet reaches an age or a size.
 
     Parameters
     ----------
     time_threshold_ns : int
-        Age of its first byte at which a packet leaves.
+        Age of a packet's first byte at which it is complete.
     size_threshold : int
-        Bytes at which a packet leaves; no packet is larger. Whole 16-bit words.
+        Bytes of a complete packet, rounded down to 16-bit words.
 
     Raises
     ------
@@ -36,7 +36,7 @@ class Packetizer:
         self._first_ns = 0
 
     def push(self, data: bytes, arrival_ns: int) -> Iterator[tuple[int, bytes]]:
-        """Add ``data``, ``b""`` to let time pass; yields (arrival of the first byte, bytes)."""
+        """Add ``data``, or ``b""``; yields complete packets: (first arrival, bytes)."""
         if data and not self._pending:
             self._first_ns = arrival_ns
         self._pending += data
@@ -48,7 +48,7 @@ class Packetizer:
             yield from self.flush()
 
     def flush(self) -> Iterator[tuple[int, bytes]]:
-        """Yield what is left."""
+        """Yield the incomplete packet."""
         if self._pending:
             yield self._first_ns, bytes(self._pending)
             self._pending.clear()

@@ -1,4 +1,4 @@
-"""Numbers of the packets: what readers learn gaps and restarts from."""
+"""Numbers of the packets, from which subscribers notice gaps and restarts."""
 
 import pytest
 
@@ -9,43 +9,43 @@ from eschorty_ros.nodes.camera_packets import PacketPublisher
 
 
 class Publisher:
-    """Keeps the numbers it is given while ``listeners`` is not 0."""
+    """Records the numbers of the packets; ``subscribers`` is what ROS would count."""
 
     def __init__(self):
-        self.listeners = 1
+        self.subscribers = 1
         self.seqs = []
 
     def get_subscription_count(self):
-        return self.listeners
+        return self.subscribers
 
     def publish(self, message):
         self.seqs.append(message.seq)
 
 
-def taken(packets, count, **marks):
+def push(packets, count, **marks):
     for k in range(count):
-        packets.take(EventChunk(b"\0\0", k, **(marks if k == 0 else {})), k)
+        packets.push(EventChunk(b"\0\0", k, **(marks if k == 0 else {})), k)
 
 
 def test_gaps_and_restarts_show_in_the_numbers():
     publisher = Publisher()
     packets = PacketPublisher(publisher, 1280, 720, "f")
-    taken(packets, 3)
-    taken(packets, 2, gap=True)
-    taken(packets, 2, restarted=True)
+    push(packets, 3)
+    push(packets, 2, gap=True)
+    push(packets, 2, restarted=True)
     assert publisher.seqs == [0, 1, 2, 4, 5, 0, 1]
 
 
-def test_what_nobody_heard_is_a_gap_but_not_before_the_first_listener():
+def test_bytes_without_a_subscriber_are_a_gap_after_the_first_packet():
     publisher = Publisher()
     packets = PacketPublisher(publisher, 1280, 720, "f")
-    publisher.listeners = 0
-    taken(packets, 5)
-    publisher.listeners = 1
-    taken(packets, 2)
-    publisher.listeners = 0
-    taken(packets, 5)
-    publisher.listeners = 1
-    taken(packets, 2)
+    publisher.subscribers = 0
+    push(packets, 5)
+    publisher.subscribers = 1
+    push(packets, 2)
+    publisher.subscribers = 0
+    push(packets, 5)
+    publisher.subscribers = 1
+    push(packets, 2)
     assert publisher.seqs == [0, 1, 3, 4]
-    assert packets.unheard_bytes == 20
+    assert packets.unsubscribed_bytes == 20

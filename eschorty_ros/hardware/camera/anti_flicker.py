@@ -1,7 +1,7 @@
-"""Anti-flicker filter: removes (or keeps alone) what flickers at 50 to 520 Hz.
+"""Anti-flicker filter: removes light that flickers at 50 to 520 Hz, or keeps only that.
 
-Source: openeb 5.1.1 ``antiflicker_filter.cpp``. A laser modulated within the band is erased by
-the band-stop; at kHz it is out of reach. Unconfirmed on hardware.
+Source: openeb 5.1.1 ``antiflicker_filter.cpp``. The band-stop erases a laser modulated within the
+band; modulation at kHz passes. Unconfirmed on hardware.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class AntiFlicker:
     low_hz, high_hz : int
         Band edges, 50 to 520 Hz.
     band_pass : bool
-        Keep what flickers and drop the rest, instead of dropping it.
+        Keep only light that flickers in the band.
     duty_percent : float
         Duty cycle of the light, above 0 to 100 %; resolved to sixteenths.
 
@@ -58,7 +58,7 @@ class AntiFlicker:
             )
 
     def erases(self, frequency_hz: float) -> bool:
-        """Whether light modulated at ``frequency_hz`` does not get past."""
+        """Return whether the filter removes light modulated at ``frequency_hz``."""
         inside = self.low_hz <= frequency_hz <= self.high_hz
         return inside != self.band_pass
 
@@ -85,5 +85,5 @@ def set_anti_flicker(registers: Registers, band: AntiFlicker | None) -> None:
 
 
 def _period(frequency_hz: int) -> int:
-    """Period in the filter's unit of 128 us."""
+    """Return the period in units of 128 us."""
     return 1_000_000 // frequency_hz >> 7

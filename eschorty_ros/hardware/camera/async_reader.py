@@ -34,7 +34,7 @@ _CANCEL_TURN_S = 0.02
 def make_reader(
     backend: usb.backend.IBackend, device: usb.core.Device, endpoint: int, clock_ns: ClockNs
 ) -> BulkReader:
-    """Queued transfers on a real libusb with the package ``libusb1``, else synchronous reads."""
+    """Return an ``AsyncReader`` on libusb with the package ``libusb1``, else a ``SyncReader``."""
     synchronous = SyncReader(device, endpoint, clock_ns)
     library = _queueing_library(backend)
     if library is None:
@@ -50,7 +50,7 @@ def _queueing_library(backend: usb.backend.IBackend) -> Any | None:
         from usb1 import libusb1
     except ImportError:
         return None
-    # A library object of its own: declaring prototypes on pyusb's would break pyusb's calls.
+    # A separate library object: declaring prototypes on pyusb's would break pyusb's calls.
     if not libusb1.loadLibrary(_library(backend.lib._name)):
         return None
     return libusb1
@@ -67,7 +67,7 @@ class AsyncReader:
     """Keeps ``TRANSFERS`` bulk reads queued on one endpoint.
 
     A time-out with data counts as completed, one without is queued again. A stall or an error
-    ends the transfer; ``stop`` and ``start`` begin anew.
+    stops the queue until ``resume`` or ``start``.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class AsyncReader:
         self._queue_all()
 
     def resume(self) -> None:
-        """Cancel what is queued, clear the halt, queue anew; what has come can still be read."""
+        """Cancel what is queued, clear the halt, queue again; received data can still be read."""
         self.stop()
         self._synchronous.resume()
         self._queue_all()
@@ -124,7 +124,7 @@ class AsyncReader:
             self._queue_new()
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
-        """Take the oldest completed transfer, handling libusb's events until there is one."""
+        """Return the oldest completed transfer, handling libusb's events until there is one."""
         if not self._received and self._failure is None:
             self._handle_events(timeout_s)
         if self._received:
@@ -137,14 +137,14 @@ class AsyncReader:
         """Cancel what is queued and wait for it, at most 1 s."""
         self._stopping = True
         for transfer in self._transfers:
-            # Cancelling one that has completed is refused; that is all it does.
+            # libusb refuses to cancel a completed transfer, without further effect.
             self._library.libusb_cancel_transfer(transfer)
         for _ in range(_CANCEL_TURNS):
             if not self._pending:
                 break
             self._handle_events(_CANCEL_TURN_S)
         if self._pending:
-            # libusb still owns them: leaking 2.5 MB is better than freeing memory in use.
+            # libusb still owns them: 2.5 MB are leaked, because freeing them would crash.
             _LEAKED.append((self._transfers, self._buffers, self._on_completed))
         else:
             for transfer in self._transfers:
@@ -179,15 +179,15 @@ class AsyncReader:
             self._fail(DeviceGoneError if gone else DeviceError, f"not queued (libusb {code})")
 
     def _completed(self, transfer: Any) -> None:
-        """Take a finished transfer; runs in whichever thread handles libusb's events."""
+        """Collect a finished transfer; runs in the thread that handles libusb's events."""
         library, done = self._library, transfer.contents
         status = done.status
-        # What completes after a failed transfer lies behind a gap that is not marked yet.
+        # Data after a failed transfer lies behind a gap that is not marked yet.
         if done.actual_length and self._failure is None:
             data = ctypes.string_at(done.buffer, done.actual_length)
             self._received.append((data, self._clock_ns()))
-        resting = status in (library.LIBUSB_TRANSFER_COMPLETED, library.LIBUSB_TRANSFER_TIMED_OUT)
-        if resting and not self._stopping and self._failure is None:
+        finished = status in (library.LIBUSB_TRANSFER_COMPLETED, library.LIBUSB_TRANSFER_TIMED_OUT)
+        if finished and not self._stopping and self._failure is None:
             self._submit(transfer)
             return
         self._pending -= 1
@@ -195,7 +195,7 @@ class AsyncReader:
             self._fail(DeviceStallError, "the endpoint is halted")
         elif status == library.LIBUSB_TRANSFER_NO_DEVICE:
             self._fail(DeviceGoneError, "the camera is gone; check cable and power")
-        elif not resting and status != library.LIBUSB_TRANSFER_CANCELLED:
+        elif not finished and status != library.LIBUSB_TRANSFER_CANCELLED:
             self._fail(DeviceError, f"transfer status {status}; check cable and hub")
 
     def _fail(self, kind: type[DeviceError], text: str) -> None:

@@ -1,4 +1,4 @@
-"""Pixel biases as offsets from the factory trim, and the ``.bias`` files that keep them.
+"""Pixel biases as offsets from the factory trim, and ``.bias`` files.
 
 Source: openeb 5.1.1 ``imx636_ll_biases.cpp``, ``imx636_bias_settings*.h``. A bias register holds
 an 8-bit DAC value below its enable bits; the factory's trim is what it reads after the sensor's
@@ -21,7 +21,7 @@ _DAC = 0xFF
 
 @dataclass(frozen=True, slots=True)
 class BiasInfo:
-    """Where a bias lives and which offsets it takes (inclusive)."""
+    """Register address of a bias and its ranges of offsets (inclusive)."""
 
     address: int
     normal: tuple[int, int]
@@ -46,7 +46,7 @@ class BiasBank:
     ----------
     registers : Registers
     wide : bool
-        Allow the wide ranges, which may make the sensor noisy or deaf.
+        Allow the wide ranges, which may make the sensor noisy or insensitive.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class BiasBank:
         self.factory = {name: registers.read(info.address) & _DAC for name, info in BIASES.items()}
 
     def read(self) -> dict[str, int]:
-        """Offsets from the factory trim that the camera has now."""
+        """Return the offsets in the camera."""
         return {
             name: (self._registers.read(info.address) & _DAC) - self.factory[name]
             for name, info in BIASES.items()
@@ -74,7 +74,7 @@ class BiasBank:
     def write(self, name: str, offset: int) -> int:
         """Set one bias; returns the offset the camera reads back.
 
-        The DAC is clamped to 0..255, so the offset read back may be nearer to 0 than asked.
+        The DAC is clamped to 0..255, so the offset read back may be nearer to 0.
 
         Raises
         ------
@@ -96,13 +96,7 @@ class BiasBank:
 
 
 def check_offset(name: str, offset: int, wide: bool = False) -> BiasInfo:
-    """Check a bias by name and range.
-
-    Raises
-    ------
-    ArgumentError
-        Naming what is allowed.
-    """
+    """Return a bias's entry; raises ``ArgumentError`` for an unknown name or wrong offset."""
     if name not in BIASES:
         raise ArgumentError(f"bias {name!r} is unknown; choose one of {', '.join(BIASES)}")
     low, high = BIASES[name].wide if wide else BIASES[name].normal
@@ -112,14 +106,14 @@ def check_offset(name: str, offset: int, wide: bool = False) -> BiasInfo:
 
 
 def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:
-    """Read offsets from a ``.bias`` file: ``value % name`` per line, ``%`` begins a comment.
+    """Return the offsets in a ``.bias`` file: ``value % name`` per line, ``%`` begins a comment.
 
-    Names of biases that users do not set (``bias_diff``) are passed over.
+    Biases that users do not set (``bias_diff``) are skipped.
 
     Raises
     ------
     FormatError
-        Naming file and line.
+        For a file that cannot be read or a line that is no bias.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -145,13 +139,7 @@ def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:
 
 
 def save_bias_file(path: str | os.PathLike[str], offsets: Mapping[str, int]) -> None:
-    """Write offsets as a ``.bias`` file.
-
-    Raises
-    ------
-    ArgumentError
-        When it cannot be written.
-    """
+    """Write offsets as a ``.bias`` file; raises ``ArgumentError`` when it cannot be written."""
     text = "".join(f"{offset}  % {name}\n" for name, offset in offsets.items())
     try:
         Path(path).write_text(text, encoding="utf-8")

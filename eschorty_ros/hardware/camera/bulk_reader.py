@@ -1,4 +1,4 @@
-"""Receiving from the data endpoint: what a reader offers, and the one over synchronous pyusb."""
+"""Receiving from the data endpoint: the interface of a reader, and a synchronous one on pyusb."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ ClockNs = Callable[[], int]
 
 
 class BulkReader(Protocol):
-    """Reads one bulk endpoint; used by one thread."""
+    """Reads one bulk endpoint, in one thread."""
 
     def start(self) -> None:
-        """Throw away what waits in the device, then be ready to receive."""
+        """Discard what the device still holds, then be ready to receive."""
 
     def resume(self) -> None:
-        """Be ready again after a failed transfer, keeping what the device still has."""
+        """Be ready again after a failed transfer; keeps what the device still holds."""
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
-        """Bytes and their arrival time (ns); ``b""`` when none came.
+        """Return bytes and their arrival time (ns); ``b""`` when none came.
 
         Raises ``DeviceStallError``, ``DeviceGoneError`` or ``DeviceError``.
         """
 
     def stop(self) -> None:
-        """Receive no more; idempotent."""
+        """Stop receiving; idempotent."""
 
 
 class SyncReader:
-    """One transfer at a time over pyusb, into a buffer that is reused.
+    """Reads one transfer at a time over pyusb, into a buffer that is reused.
 
-    Between two reads only the camera's bridge holds data: enough for a line scene, unconfirmed
-    on hardware for more.
+    Between two reads only the camera's USB bridge buffers data: enough for a line scene,
+    unconfirmed on hardware for more.
     """
 
     def __init__(self, device: usb.core.Device, endpoint: int, clock_ns: ClockNs) -> None:
@@ -66,7 +66,7 @@ class SyncReader:
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """Read one transfer."""
         try:
-            # A reader wakes often enough for an end of the stream.
+            # libusb takes 0 ms as unlimited.
             count = self._device.read(self._endpoint, self._buffer, max(int(timeout_s * 1e3), 1))
         except usb.core.USBError as error:
             failure = translate(error, _NAME)
@@ -76,11 +76,11 @@ class SyncReader:
         return bytes(self._view[:count]), self._clock_ns()
 
     def stop(self) -> None:
-        """Nothing is under way between two reads."""
+        """Do nothing: no transfer is pending between two reads."""
 
 
 def drain(device: usb.core.Device, endpoint: int, buffer: array.array[int]) -> None:
-    """Read ``endpoint`` until it has nothing more, at most 64 transfers."""
+    """Read ``endpoint`` until it is empty, at most 64 transfers."""
     with suppress(usb.core.USBError):
         for _ in range(_DRAIN_MAX):
             device.read(endpoint, buffer, _DRAIN_MS)

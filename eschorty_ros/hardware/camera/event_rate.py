@@ -1,8 +1,7 @@
 """Event-rate control: the sensor drops events beyond a rate.
 
-Source: openeb 5.1.1 ``gen41_erc.cpp``. What it drops cannot be weighted back into a centroid:
-leave it off for accuracy. Whether its tables survive a reset is unconfirmed on hardware, so they
-are always written.
+Source: openeb 5.1.1 ``gen41_erc.cpp``. Dropped events bias a centroid: leave the control off for
+accuracy. Whether its tables survive a reset is unconfirmed on hardware, so they are always written.
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ INITIALISE = _BEFORE_TABLES + _TABLES + _AFTER_TABLES
 
 
 def initialise(registers: Registers) -> None:
-    """Write the tables and leave the control off; once after the sensor's initialisation."""
+    """Write the tables and switch the control off, after the sensor's initialisation."""
     run_sequence(registers, INITIALISE, lambda _s: None)
 
 
 def set_event_rate(registers: Registers, enabled: bool, rate: int) -> int:
-    """Switch the control and set its limit (events/s); returns the limit the camera holds.
+    """Switch the control and set its limit (events/s); returns the limit read back.
 
     Raises
     ------

@@ -48,7 +48,7 @@ TIMING = _timing()
 
 
 def set_event_trail(registers: Registers, kind: str, threshold_us: int) -> int:
-    """Switch a filter on; ``kind`` is one of :data:`TYPES`. Returns the threshold used (us).
+    """Switch a filter of :data:`TYPES` on; returns the threshold in force (us).
 
     Raises
     ------
@@ -84,5 +84,5 @@ def set_event_trail(registers: Registers, kind: str, threshold_us: int) -> int:
 
 
 def clear_event_trail(registers: Registers) -> None:
-    """Let everything past."""
+    """Switch the filters off."""
     registers.write(_PIPELINE, _BYPASS)

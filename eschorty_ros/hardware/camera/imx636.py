@@ -45,10 +45,10 @@ DESTROY = parse_sequence("""
 
 
 def is_imx636(registers: Registers) -> bool:
-    """Whether the sensor answers as an IMX636."""
+    """Return whether the sensor identifies itself as an IMX636."""
     return registers.read(CHIP_ID) == CHIP_ID_IMX636 and registers.read(CHIP_VARIANT) & 3 == 0
 
 
 def is_streaming(registers: Registers) -> bool:
-    """Whether the time base runs; it does not after a reset or a power cycle."""
+    """Return whether the time base runs; it stops at a reset or power cycle."""
     return bool(registers.read(TIME_BASE) & TIME_BASE_ENABLED)

@@ -35,7 +35,7 @@ _OFF = parse_sequence("C[7]=0 74[3]=0 4C[3]=0 5C[3]=0")
 
 
 def begin_monitors(registers: Registers, sleep: Sleep) -> None:
-    """Switch temperature ADC and light meter on; once after the sensor's initialisation."""
+    """Switch temperature ADC and light meter on, after the sensor's initialisation."""
     run_sequence(registers, _ADC_SETUP + _LIGHT_SETUP, sleep)
 
 
@@ -45,7 +45,7 @@ def end_monitors(registers: Registers, sleep: Sleep) -> None:
 
 
 def read_temperature_c(registers: Registers, sleep: Sleep) -> float:
-    """Temperature of the sensor (C).
+    """Return the temperature of the sensor (C).
 
     Raises
     ------
@@ -61,7 +61,7 @@ def read_temperature_c(registers: Registers, sleep: Sleep) -> float:
 def set_packet_period(registers: Registers, period_us: int) -> int:
     """Set the time after which a packet leaves the sensor; returns the one in force (us).
 
-    It is rounded down to 16 us. Too small a period corrupts data; 1008 us gives 1 ms of latency.
+    It is rounded down to a multiple of 16 us. Too short a period corrupts data.
 
     Raises
     ------

@@ -28,7 +28,7 @@ _VALID = 1 << 31
 
 
 def windows_of(flat: Sequence[int]) -> tuple[Window, ...]:
-    """Windows of a flat list x, y, width, height, x, ...
+    """Return the windows of a flat list x, y, width, height, x, ...
 
     Raises
     ------
@@ -48,12 +48,6 @@ def windows_of(flat: Sequence[int]) -> tuple[Window, ...]:
     return tuple(windows)
 
 
-def effective_pixels(windows: Sequence[Window]) -> int:
-    """Pixels that stay on: the product of the windows' columns and rows."""
-    columns, rows = _lines(windows)
-    return int(columns.sum()) * int(rows.sum())
-
-
 def set_windows(registers: Registers, windows: Sequence[Window]) -> None:
     """Keep the pixels whose column and row lie in a window; all of them without windows."""
     for first, wanted in zip((_COLUMNS, _ROWS), _lines(windows), strict=True):
@@ -65,7 +59,7 @@ def set_windows(registers: Registers, windows: Sequence[Window]) -> None:
 
 
 def set_hot_pixels(registers: Registers, pixels: Sequence[tuple[int, int]]) -> None:
-    """Silence up to 64 pixels given as (column, row).
+    """Mask up to 64 pixels given as (column, row).
 
     Raises
     ------
@@ -97,7 +91,7 @@ def _lines(windows: Sequence[Window]) -> tuple[NDArray[np.bool_], NDArray[np.boo
 
 
 def _mask_words(wanted: NDArray[np.bool_]) -> list[int]:
-    """Words of a mask in which 1 switches a line off; lines past the last are off."""
+    """Return the words of a mask in which 1 switches a line off; lines past the last are off."""
     padded = np.ones(-(-wanted.size // 32) * 32, dtype=bool)
     padded[: wanted.size] = ~wanted
     if wanted.all():

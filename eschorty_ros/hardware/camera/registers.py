@@ -1,4 +1,4 @@
-"""Access to the sensor's 32-bit registers, and sequences of accesses kept as data."""
+"""Access to the sensor's 32-bit registers, and sequences of accesses as data."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eschorty_ros.core.errors import DeviceError
 FULL = 0xFFFF_FFFF
 
 Sleep = Callable[[float], None]
-"""Waits that many seconds."""
+"""Waits some seconds."""
 
 _TOKEN = re.compile(
     r"/(?P<wait>[\d.]+)(?P<unit>s|ms|us)/"
@@ -25,7 +25,7 @@ class Registers(Protocol):
     """Registers of one sensor; both methods raise ``DeviceError`` when it does not answer."""
 
     def read(self, address: int) -> int:
-        """Value of the register at ``address``."""
+        """Return the register at ``address``."""
 
     def write(self, address: int, value: int) -> None:
         """Replace the register at ``address``."""
@@ -33,7 +33,7 @@ class Registers(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Write ``value`` where ``mask`` has ones; the other bits are read first and kept."""
+    """Writes ``value`` where ``mask`` has ones; the other bits are read first and kept."""
 
     address: int
     value: int
@@ -42,7 +42,7 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Wait for ``us`` microseconds."""
+    """Waits ``us`` microseconds."""
 
     us: float
 
@@ -51,12 +51,12 @@ Step = Write | Wait
 
 
 def parse_sequence(text: str) -> tuple[Step, ...]:
-    """Read a sequence: ``addr=value`` and ``addr[mask]=value`` in hex, ``/1ms/`` waits.
+    """Parse a sequence: ``addr=value`` and ``addr[mask]=value`` in hex, ``/1ms/`` waits.
 
     Raises
     ------
     ValueError
-        For a token that is none of these.
+        For any other token.
     """
     return tuple(_steps(text.split()))
 
@@ -74,13 +74,7 @@ def _steps(tokens: Iterable[str]) -> Iterator[Step]:
 
 
 def run_sequence(registers: Registers, steps: Iterable[Step], sleep: Sleep) -> None:
-    """Carry out ``steps`` in order.
-
-    Raises
-    ------
-    DeviceError
-        When the device does not answer.
-    """
+    """Execute ``steps`` in order; raises ``DeviceError`` when the device does not answer."""
     for step in steps:
         if isinstance(step, Wait):
             sleep(step.us * 1e-6)
@@ -102,7 +96,7 @@ def await_bits(registers: Registers, address: int, mask: int, tries: int, what: 
     Raises
     ------
     DeviceError
-        When they are not after ``tries`` reads; names ``what``.
+        When they are not set after ``tries`` reads; names ``what``.
     """
     value = 0
     for _ in range(tries):

@@ -1,4 +1,4 @@
-"""What a user sets on the camera, and how it is written to the sensor."""
+"""The camera's settings, and writing them to the sensor."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class CameraSettings:
     windows : tuple of (int, int, int, int)
         Regions of interest: first column, first row, width, height.
     hot_pixels : tuple of (int, int)
-        Columns and rows to silence, at most 64.
+        Columns and rows to mask, at most 64.
     trigger_input : bool
     """
 
@@ -61,14 +61,14 @@ class CameraSettings:
             check_offset(name, offset, self.wide_biases)
 
     def with_bias(self, name: str, offset: int) -> CameraSettings:
-        """Make the same settings but for one bias."""
+        """Return these settings with one bias changed."""
         return replace(self, biases={**self.biases, name: offset})
 
 
 def apply_settings(
     registers: Registers, biases: BiasBank, settings: CameraSettings
 ) -> dict[str, float]:
-    """Write every setting; returns what the camera has then, by name with unit.
+    """Write every setting; returns the values read back, by name with unit.
 
     Raises
     ------
