@@ -1,4 +1,4 @@
-"""Which targets follow one curve: least median of squares, then Cauchy weights, then a cut."""
+"""Which targets follow one curve: least median of squares, then Cauchy's loss, then a cut."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCALE_MAX = 10.0
 # 95 % efficiency on Gaussian errors.
 _CAUCHY = 2.385
 _ITERATIONS = 15
-_SETTLED = 1e-3
+_SCALE_CONVERGED = 1e-3
 _PAIRED_MAX = 40
 _MAD = 1.4826
 
@@ -47,16 +47,14 @@ def inliers(
         When no curve explains more than half of the targets.
     """
     values = _least_median(observed, design)
-    problem = Problem(observed, design, names, priors, values)
-    refuse_singular(problem, values)
-    weight = np.zeros(len(observed))
+    refuse_singular(Problem(observed, design, names, priors, values), values)
+    before = 0.0
     for _ in range(_ITERATIONS):
-        distance = problem.distance(values)
-        before, weight = weight, _cauchy(distance, _scale(distance, observed.known))
-        if np.abs(weight - before).max() < _SETTLED:
+        problem = Problem(observed, design, names, priors, values)
+        scale = _scale(problem.distance(values), observed.known)
+        if abs(scale - before) < _SCALE_CONVERGED * scale:
             break
-        problem = Problem(observed, design, names, priors, values, np.sqrt(weight))
-        values = search(problem, values)
+        values, before = search(problem, values, cauchy_scale=_CAUCHY * scale), scale
     return _cut(observed, design, names, priors, values)
 
 
@@ -128,11 +126,6 @@ def _least_median(observed: Observed, design: RangeModel) -> Values:
 def _scale(distance: Array, known: Mask) -> float:
     """How much larger the residuals of the better half are than stated; at least 1."""
     return max(1.0, _MAD * float(np.median(np.abs(distance[known]))))
-
-
-def _cauchy(distance: Array, scale: float) -> Array:
-    ratio = np.abs(distance).max(axis=1) / (_CAUCHY * scale)
-    return np.asarray(1.0 / (1.0 + ratio * ratio))
 
 
 def _refuse_chaos(kept: Mask, scale: float, observed: Observed) -> None:

@@ -18,7 +18,7 @@ from eschorty_ros.core._calibration_model import (
     Values,
     values_of,
 )
-from eschorty_ros.core._least_squares import condition_number, minimise
+from eschorty_ros.core._least_squares import condition_number
 from eschorty_ros.core.errors import ArgumentError, FitError
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 
@@ -27,6 +27,11 @@ Array = NDArray[np.float64]
 PAPER_FREE = ("k_prime_px", "b_prime_px")
 """What the paper fits: k and b stay at their design values."""
 _REWEIGHTINGS = 3
+_TOLERANCE = float(np.finfo(np.float64).eps)
+# A robust search only finds out which targets a least-squares fit uses.
+_START_TOLERANCE = 1e-9
+_EVALUATIONS_MAX = 500
+_IMPOSSIBLE = 1e50
 
 
 class Problem:
@@ -43,8 +48,6 @@ class Problem:
         Standard deviations.
     at : Values
         Where the targets' covariances are taken.
-    weight : ndarray, shape (n,), optional
-        Square root of each target's weight in a robust fit.
     """
 
     def __init__(
@@ -54,15 +57,11 @@ class Problem:
         names: tuple[str, ...],
         priors: Mapping[str, float],
         at: Values,
-        weight: Array | None = None,
     ) -> None:
         self.observed, self.design, self.names, self.priors = observed, design, names, dict(priors)
         root = observed.root_covariance(at)
         self.root = root
-        self.unit_whitener = np.linalg.inv(root)
-        self.whitener = (
-            self.unit_whitener if weight is None else weight[:, None, None] * self.unit_whitener
-        )
+        self.whitener = np.linalg.inv(root)
         self.sigma_px = np.linalg.norm(root, axis=2)
         self._fixed = values_of(design)
         self._centre = np.array([self._fixed[name] for name in self.priors])
@@ -95,24 +94,18 @@ class Problem:
         return np.concatenate([white.reshape(-1, len(self.names))[self._rows], held])
 
     def distance(self, values: Values) -> Array:
-        """Whitened residuals without robust weights, shape (n, 3); infinite for no build."""
+        """Whitened residuals, shape (n, 3); infinite for no build."""
         seen = self.observed.residual(values)
         if seen is None:
             return np.full(self.observed.seen.shape, np.inf)
-        return np.asarray(np.einsum("nij,nj->ni", self.unit_whitener, seen))
+        return np.asarray(np.einsum("nij,nj->ni", self.whitener, seen))
 
     def leverage(self, values: Values, covariance: Array) -> Array:
         """Covariance of the whitened expected channels, shape (n, 3, 3)."""
         direct = self.observed.derivative(values, self.names)
-        white = np.einsum("nij,njp->nip", self.unit_whitener, direct)
+        white = np.einsum("nij,njp->nip", self.whitener, direct)
         white = np.where(self.observed.known[:, :, None], white, 0.0)
         return np.asarray(np.einsum("nip,pq,njq->nij", white, covariance, white))
-
-    def size(self) -> float:
-        """Length of the vector of fitted values, against which steps count as small."""
-        seen = np.where(self.observed.known, self.observed.seen / self.sigma_px, 0.0)
-        held = np.linalg.norm(self._centre / self._spread)
-        return float(np.linalg.norm(seen) + held) + math.sqrt(len(self.observed))
 
 
 def solve(
@@ -159,79 +152,61 @@ def straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Value
     }
 
 
-def search(problem: Problem, start: Values) -> Values:
-    """Values of the smallest sum of squares, from ``start`` on.
+def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -> Values:
+    """Return the values of the smallest sum of squares, from ``start`` on.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : Values
+    cauchy_scale : float, optional
+        Residuals of targets count by Cauchy's loss beyond this many standard deviations; those of
+        priors stay squared.
 
     Raises
     ------
     FitError
-        When the search does not end.
+        When the search does not converge.
     """
-    straight = _Straightened(problem, float(np.mean(problem.observed.range_mm)))
+    # 0.3 s to import, which only a calibration has to spend.
+    from scipy.optimize import least_squares
 
-    def derivative(searched: Array) -> Array:
-        direct = problem.jacobian(straight.parameters(searched))
-        return np.asarray(direct @ straight.derivative(searched))
+    robust = cauchy_scale is not None
+    tolerance = _START_TOLERANCE if robust else _TOLERANCE
+    targets = problem.observed.known.sum()
 
-    begin = straight.searched(start)
-    found = minimise(
-        begin, lambda s: problem.residual(straight.parameters(s)), derivative, problem.size()
+    def residual(free: Array) -> Array:
+        found = problem.residual(free)
+        # The search shortens a step that leads to no possible build.
+        return np.full(targets + len(problem.priors), _IMPOSSIBLE) if found is None else found
+
+    def loss(square: Array) -> Array:
+        rho = np.stack([square, np.ones_like(square), np.zeros_like(square)])
+        softened = 1.0 + square[:targets]
+        rho[:, :targets] = np.log(softened), 1.0 / softened, -1.0 / softened**2
+        return rho
+
+    begin = problem.free(start)
+    found = least_squares(
+        residual,
+        begin,
+        problem.jacobian,
+        method="trf" if robust else "lm",
+        x_scale="jac",
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance,
+        loss=loss if robust else "linear",
+        f_scale=cauchy_scale or 1.0,
+        max_nfev=_EVALUATIONS_MAX,
     )
-    if found is None:
-        condition = condition_number(derivative(begin))
+    if not found.success:
+        condition = condition_number(problem.jacobian(begin))
         raise FitError(
             f"the search for {', '.join(problem.names)} does not end (condition number "
             f"{condition:.3g}); add targets at other ranges or a prior_sigma"
         )
-    return problem.values(straight.parameters(found))
-
-
-class _Straightened:
-    """Parameters in which the valley of the sum of squares is straight.
-
-    With b free, k' and b' are searched as slope and height of the curve in the middle of the
-    targets: then b is its curvature alone. Otherwise the parameters are searched as they are.
-    """
-
-    def __init__(self, problem: Problem, middle_mm: float) -> None:
-        self._names, self._problem, self._middle_mm = problem.names, problem, middle_mm
-        self._active = {"k_prime_px", "b_mm", "b_prime_px"} <= set(problem.names)
-
-    def searched(self, start: Values) -> Array:
-        values = dict(start)
-        if self._active:
-            depth = self._middle_mm + values["b_mm"]
-            product = values["k_mm"] * values["k_prime_px"]
-            values["b_prime_px"] = product / depth - values["b_prime_px"]
-            values["k_prime_px"] = -product / (depth * depth)
-        return self._problem.free(values)
-
-    def parameters(self, searched: Array) -> Array:
-        if not self._active:
-            return searched
-        p = self._problem.values(searched)
-        depth, slope = self._middle_mm + p["b_mm"], p["k_prime_px"]
-        p["k_prime_px"] = -slope * depth * depth / p["k_mm"]
-        p["b_prime_px"] = -slope * depth - p["b_prime_px"]
-        return self._problem.free(p)
-
-    def derivative(self, searched: Array) -> Array:
-        """Parameters (rows) by searched ones (columns)."""
-        matrix = np.eye(len(self._names))
-        if not self._active:
-            return matrix
-        p = self._problem.values(searched)
-        depth, slope, k_mm = self._middle_mm + p["b_mm"], p["k_prime_px"], p["k_mm"]
-        at = {name: index for index, name in enumerate(self._names)}
-        k_prime, b_prime, b = at["k_prime_px"], at["b_prime_px"], at["b_mm"]
-        matrix[k_prime, k_prime] = -depth * depth / k_mm
-        matrix[k_prime, b] = -2.0 * slope * depth / k_mm
-        if "k_mm" in at:
-            matrix[k_prime, at["k_mm"]] = slope * (depth / k_mm) ** 2
-        matrix[b_prime, k_prime] = -depth
-        matrix[b_prime, b] = -slope
-        matrix[b_prime, b_prime] = -1.0
-        return matrix
+    return problem.values(found.x)
 
 
 def build(design: RangeModel, values: Values) -> RangeModel:

@@ -34,7 +34,7 @@ _SHARE_BEYOND = 0.0027
 _PROFILE_POINTS = 41
 _PROFILE_SIGMA = 4.0
 _CHI_SQUARE_95 = 3.841
-_Z_999 = 3.09
+_RARE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,12 +125,6 @@ def prior_ratios(found: CalibrationFit) -> dict[str, float]:
     return {name: sigma[name] / spread for name, spread in found.prior_sigma.items()}
 
 
-def chi_square_limit(dof: int) -> float:
-    """Chi-square that one fit in a thousand exceeds, by Wilson and Hilferty."""
-    part = 2.0 / (9.0 * dof)
-    return dof * (1.0 - part + _Z_999 * math.sqrt(part)) ** 3
-
-
 def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tuple[str, ...]:
     """One line each: ``identifiable`` where it is, then every reservation with its remedy."""
     ratios = prior_ratios(found)
@@ -215,8 +209,10 @@ def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:
 
 
 def _residuals(targets: Targets, found: CalibrationFit) -> list[str]:
+    from scipy.special import chdtrc
+
     lines = []
-    if found.dof and found.chi_square > chi_square_limit(found.dof):
+    if found.dof and chdtrc(found.dof, found.chi_square) < _RARE:
         lines.append(
             f"residuals exceed the stated sigmas: reduced chi-square "
             f"{found.reduced_chi_square:.2f} with {found.dof} degrees of freedom; check the "
