@@ -86,7 +86,7 @@ def _awg(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LaserModulator:
 
 
 def _apt(parameters: Mapping[str, Any], clock_ns: ClockNs) -> LinearStage:
-    from eschorty_ros.hardware.stage.apt_open import open_stage
+    from eschorty_ros.hardware.stage.apt_stage import open_stage
 
     settings = AptSettings(
         controller=parameters["controller"],

@@ -10,16 +10,15 @@ import contextlib
 import threading
 from collections.abc import Callable
 
-from eschorty_ros.core.errors import DeviceError, DeviceTimeoutError
+from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
 from eschorty_ros.core.motion import plan_move
 from eschorty_ros.hardware.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
-from eschorty_ros.hardware.stage.apt_follow import Kind
-from eschorty_ros.hardware.stage.apt_judge import Status
 from eschorty_ros.hardware.stage.apt_link import AptLink
-from eschorty_ros.hardware.stage.apt_refusals import may_move, may_run_at, ready
+from eschorty_ros.hardware.stage.apt_port import find_port, open_port
 from eschorty_ros.hardware.stage.apt_setup import AptSettings, AptSetup
-from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, WARN_AGE_NS, Tracker
+from eschorty_ros.hardware.stage.apt_status import Status
+from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, WARN_AGE_NS, Kind, Tracker
 
 MOVE_NS = 12 * BYTE_NS
 KEEP_ALIVE_S = 0.5
@@ -31,6 +30,28 @@ _PROFILED, _IMMEDIATE = 2, 1
 _ON, _OFF = 1, 2
 
 MakeLink = Callable[[Callable[[apt.Frame, int], None], Callable[[DeviceError], None]], AptLink]
+
+
+def open_stage(
+    settings: AptSettings, clock_ns: Callable[[], int], port: str = "", serial: str = ""
+) -> AptStage:
+    """Open the stage on ``port``, or on the port whose USB serial number is ``serial``.
+
+    Raises
+    ------
+    DeviceError
+        With the remedy when there is no such port or no such stage behind it.
+    """
+    opened = open_port(port or find_port(settings.controller, serial))
+
+    def make_link(
+        on_frame: Callable[[apt.Frame, int], None], on_lost: Callable[[DeviceError], None]
+    ) -> AptLink:
+        link = AptLink(opened, on_frame, on_lost)
+        link.start()
+        return link
+
+    return AptStage(make_link, clock_ns, settings)
 
 
 class AptStage:
@@ -306,3 +327,44 @@ class AptStage:
                     apt.pack("set_enabled", address, channel=apt.CHANNEL, state=_OFF),
                 ),
             ]
+
+
+def ready(tracker: Tracker, closed: bool) -> Status:
+    """Newest status of a stage that takes orders; raises ``DeviceError`` when it takes none."""
+    if tracker.failure is not None:
+        raise tracker.failure
+    if closed:
+        raise DeviceGoneError("the stage is closed; open it again")
+    if tracker.motion is not None:
+        raise DeviceError("the stage is moving; stop it or wait before the next move")
+    assert tracker.status is not None
+    if not tracker.status.bits & apt.ENABLED:
+        raise DeviceError("the stage is not enabled; check the front panel, configure again")
+    return tracker.status
+
+
+def may_move(
+    status: Status, blocked_sense: int, position_mm: float, travel_mm: tuple[float, float]
+) -> None:
+    """Raise ``DeviceError`` when ``position_mm`` cannot be reached.
+
+    ``blocked_sense`` is the sign of the way that a limit has barred, 0 when none has.
+    """
+    if not status.bits & apt.HOMED:
+        raise DeviceError("the stage is not homed; home it before moving")
+    low, high = travel_mm
+    if not low <= position_mm <= high:
+        raise DeviceError(f"position_mm is {position_mm!r}; the travel is {low:g} to {high:g} mm")
+    if blocked_sense * (position_mm - status.position_mm) > 0.0:
+        raise DeviceError(
+            f"the stage met a limit at {status.position_mm:.3f} mm; move it back from there "
+            "first, and check the travel for obstacles"
+        )
+
+
+def may_run_at(speed_mm_s: float, speed_max_mm_s: float) -> None:
+    """Raise ``DeviceError`` when the stage has no such speed."""
+    if not 0.0 < speed_mm_s <= speed_max_mm_s:
+        raise DeviceError(
+            f"speed_mm_s is {speed_mm_s!r}; choose above 0 to {speed_max_mm_s:g} mm/s"
+        )

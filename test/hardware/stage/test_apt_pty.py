@@ -17,9 +17,8 @@ from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.apt_model import AptModel
 from eschorty_ros.emulation.pty_port import PtyPort
 from eschorty_ros.hardware.stage import apt_port
-from eschorty_ros.hardware.stage.apt_open import open_stage
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
-from eschorty_ros.hardware.stage.apt_stage import AptStage
+from eschorty_ros.hardware.stage.apt_stage import AptStage, open_stage
 
 # To the far end it takes longer than anything that is waited for here.
 SLOW_MM_S = 10.0
