@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from eschorty_ros.hardware.stage.apt_messages import HEADER_BYTES, Frame, frame_bytes, parse
 
-_PATIENCE_NS = 50_000_000
+_TIMEOUT_NS = 50_000_000
 
 
 class AptFramer:
     """Strict framer: known identifier, its exact length, for the host, from a known source.
 
-    What is no frame is skipped byte by byte until one begins again. A frame that is not whole
-    50 ms after its last byte has lost some: it is given up the same way.
+    What is no frame is skipped byte by byte up to the next one, and so is a frame that is
+    incomplete 50 ms after its last byte.
 
     Attributes
     ----------
     frames, skipped_bytes, broken_frames : int
-        Frames handed out, bytes that belonged to none, frames given up for missing bytes.
+        Frames returned, bytes that belonged to none, incomplete frames.
     """
 
     def __init__(self) -> None:
@@ -27,24 +27,19 @@ class AptFramer:
         self._last_ns = 0
 
     def feed(self, data: bytes, now_ns: int) -> list[Frame]:
-        """Frames that are whole with ``data``, which arrived at ``now_ns``; may be empty."""
+        """Return the frames that ``data``, received at ``now_ns`` and maybe empty, completes."""
         frames: list[Frame] = []
-        if self._buffer and now_ns - self._last_ns > _PATIENCE_NS:
+        if self._buffer and now_ns - self._last_ns > _TIMEOUT_NS:
             self.broken_frames += 1
             self._skip()
-            self._take(frames)
+            self._cut(frames)
         if data:
             self._last_ns = now_ns
             self._buffer += data
-            self._take(frames)
+            self._cut(frames)
         return frames
 
-    def reset(self) -> None:
-        """Forget what is not whole."""
-        self.skipped_bytes += len(self._buffer)
-        self._buffer.clear()
-
-    def _take(self, frames: list[Frame]) -> None:
+    def _cut(self, frames: list[Frame]) -> None:
         buffer = self._buffer
         while len(buffer) >= HEADER_BYTES:
             size = frame_bytes(bytes(buffer[:HEADER_BYTES]))

@@ -1,8 +1,7 @@
-"""Link to an APT controller: two threads, answers as futures, a stop that waits for nobody.
+"""Link to an APT controller: two threads, answers as futures, a stop that passes every queue.
 
-The reader hands every frame on as it comes; the writer sends what is queued and what is due
-periodically. Both are loops around :meth:`AptLink.receive` and :meth:`AptLink.service`, which work
-without threads, too, in whatever time ``now_ns`` tells.
+The reader thread loops around :meth:`AptLink.receive`, the writer thread around
+:meth:`AptLink.service`. Tests call both without threads, in the time of their own ``now_ns``.
 """
 
 from __future__ import annotations
@@ -21,9 +20,7 @@ from eschorty_ros.hardware.stage.apt_messages import Frame
 
 _READ_S = 0.05
 _STOP_LOCK_S = 0.01
-_GONE_EXCEPTIONS = (OSError, TypeError, ValueError)
-
-Wait = Callable[[threading.Condition, float], object]
+_PORT_ERRORS = (OSError, TypeError, ValueError)
 
 
 class SerialPort(Protocol):
@@ -36,7 +33,7 @@ class SerialPort(Protocol):
         """Bytes that can be read at once."""
 
     def read(self, size: int = 1) -> bytes:
-        """Up to ``size`` bytes within ``timeout``."""
+        """Return up to ``size`` bytes within ``timeout``."""
 
     def write(self, data: bytes, /) -> int | None:
         """Send."""
@@ -46,7 +43,7 @@ class SerialPort(Protocol):
 
 
 class _Timer:
-    """Something the writer does every so often."""
+    """A periodic action of the writer."""
 
     def __init__(self, period_ns: int, action: Callable[[], None], due_ns: int) -> None:
         self.period_ns, self.action, self.due_ns = period_ns, action, due_ns
@@ -78,8 +75,6 @@ class AptLink:
     Attributes
     ----------
     framer : AptFramer
-    stray_answers : int
-        Answers nobody waited for any more.
     """
 
     def __init__(
@@ -88,15 +83,14 @@ class AptLink:
         on_frame: Callable[[Frame, int], None],
         on_lost: Callable[[DeviceError], None],
         now_ns: Callable[[], int] = time.monotonic_ns,
-        wait: Wait = threading.Condition.wait,
+        wait: Callable[[threading.Condition, float], object] = threading.Condition.wait,
     ) -> None:
         self.framer = AptFramer()
-        self.stray_answers = 0
         self.now_ns = now_ns
         self._port = port
         self._on_frame, self._on_lost = on_frame, on_lost
-        self._wait_on = wait
-        self._news = threading.Condition(threading.RLock())
+        self._wait = wait
+        self._changed = threading.Condition(threading.RLock())
         self._port_lock = threading.Lock()
         self._queue: deque[bytes] = deque()
         self._timers: list[_Timer] = []
@@ -106,29 +100,29 @@ class AptLink:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Begin to read and write in threads."""
+        """Start the threads that read and write."""
         for name, loop in (("apt reader", self._read_loop), ("apt writer", self._write_loop)):
             thread = threading.Thread(target=self._run, args=(loop,), name=name, daemon=True)
             self._threads.append(thread)
             thread.start()
 
-    def every(self, period_s: float, action: Callable[[], None]) -> None:
-        """Have the writer call ``action`` every ``period_s``, for the first time now."""
-        with self._news:
+    def call_every(self, period_s: float, action: Callable[[], None]) -> None:
+        """Let the writer call ``action`` now and then every ``period_s``."""
+        with self._changed:
             self._timers.append(_Timer(round(period_s * 1e9), action, self.now_ns()))
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def send(self, frame: bytes) -> None:
         """Queue a frame."""
         self._check()
-        with self._news:
+        with self._changed:
             self._queue.append(frame)
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def send_now(self, *frames: bytes) -> None:
         """Write past every queue, in the caller's thread; on the wire when it returns.
 
-        Tried even on a link that has failed: the controller may still hear a stop.
+        Tried even on a link that has failed: the controller may still obey a stop.
 
         Raises
         ------
@@ -142,7 +136,7 @@ class AptLink:
         try:
             for frame in frames:
                 self._port.write(frame)
-        except _GONE_EXCEPTIONS as error:
+        except _PORT_ERRORS as error:
             failure = _port_failure(error)
         else:
             return
@@ -152,8 +146,17 @@ class AptLink:
         self._fail(failure)
         raise failure
 
+    def write(self, frame: bytes) -> None:
+        """Write a frame past the queue, from a timer's action or while a frame is handled."""
+        try:
+            with self._port_lock:
+                self._port.write(frame)
+        except _PORT_ERRORS as error:
+            # Without the lock: ``on_lost`` may wait for a thread that waits for it.
+            self._fail(_port_failure(error))
+
     def request(self, frame: bytes, answer: str, source: int, timeout_s: float) -> Frame:
-        """Send ``frame`` and wait for the message ``answer`` from ``source``.
+        """Send ``frame`` and return the message ``answer`` from ``source``.
 
         Raises
         ------
@@ -164,13 +167,13 @@ class AptLink:
         """
         key = (answer, source)
         future: Future[Frame] = Future()
-        with self._news:
+        with self._changed:
             self._answers[key] = future
         try:
             self.send(frame)
             self.wait_until(future.done, timeout_s)
         finally:
-            with self._news:
+            with self._changed:
                 if self._answers.get(key) is future:
                     del self._answers[key]
         if future.done():
@@ -182,58 +185,49 @@ class AptLink:
         )
 
     def wait_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait for something that a frame brings; whether it holds."""
+        """Wait for a condition that frames bring about; return whether it holds."""
         end_ns = self.now_ns() + round(timeout_s * 1e9)
-        with self._news:
+        with self._changed:
             while not condition() and self._lost is None:
                 left_ns = end_ns - self.now_ns()
                 if left_ns <= 0:
                     break
-                self._wait_on(self._news, left_ns * 1e-9)
+                self._wait(self._changed, left_ns * 1e-9)
         return condition()
 
     def receive(self, data: bytes) -> None:
-        """Take bytes that have just come; without any, give up what stays incomplete."""
+        """Handle bytes that have just come; without any, drop what stays incomplete."""
         now_ns = self.now_ns()
         for frame in self.framer.feed(data, now_ns):
             self._on_frame(frame, now_ns)
-            with self._news:
+            with self._changed:
                 future = self._answers.pop((frame.name, frame.source), None)
                 if future is not None:
                     future.set_result(frame)
-                self._news.notify_all()
+                self._changed.notify_all()
 
     def service(self) -> float:
-        """Do what is due and send what is queued; seconds until something is due again."""
+        """Do what is due, send what is queued; return the time to the next action (s)."""
         now_ns = self.now_ns()
         for timer in self._timers:
             if timer.due_ns <= now_ns:
-                # After a pause one call, not all that were missed.
+                # After a stall one call, not all that were missed.
                 timer.due_ns = max(timer.due_ns + timer.period_ns, now_ns + timer.period_ns // 2)
                 timer.action()
         while self._queue:
-            self.write_at_once(self._queue.popleft())
+            self.write(self._queue.popleft())
         due_ns = min((timer.due_ns for timer in self._timers), default=now_ns + 10**9)
         return max(due_ns - self.now_ns(), 0) * 1e-9
-
-    def write_at_once(self, frame: bytes) -> None:
-        """Write a frame past the queue, from a timer's action or a frame's."""
-        try:
-            with self._port_lock:
-                self._port.write(frame)
-        except _GONE_EXCEPTIONS as error:
-            # Without the lock: whoever is told may wait for one who waits for it.
-            self._fail(_port_failure(error))
 
     def close(self) -> None:
         """End the threads and release the port; idempotent."""
         self._closing.set()
-        with self._news:
-            self._news.notify_all()
+        with self._changed:
+            self._changed.notify_all()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout=1.0)
-        with contextlib.suppress(*_GONE_EXCEPTIONS):
+        with contextlib.suppress(*_PORT_ERRORS):
             self._port.close()
 
     def _check(self) -> None:
@@ -250,8 +244,8 @@ class AptLink:
             return
         self._lost = failure
         self._on_lost(failure)
-        with self._news:
-            self._news.notify_all()
+        with self._changed:
+            self._changed.notify_all()
 
     def _run(self, loop: Callable[[], None]) -> None:
         try:
@@ -269,7 +263,7 @@ class AptLink:
                 data = port.read(1)
                 if data:
                     data += port.read(port.in_waiting)
-            except _GONE_EXCEPTIONS as error:
+            except _PORT_ERRORS as error:
                 self._fail(_port_failure(error))
                 return
             self.receive(data)
@@ -277,6 +271,6 @@ class AptLink:
     def _write_loop(self) -> None:
         while not self._closing.is_set() and self._lost is None:
             idle_s = self.service()
-            with self._news:
+            with self._changed:
                 if not self._queue and not self._closing.is_set():
-                    self._news.wait(idle_s)
+                    self._changed.wait(idle_s)

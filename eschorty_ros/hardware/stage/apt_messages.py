@@ -23,7 +23,7 @@ CHANNEL: Final = 1
 
 
 def bay_address(bay: int) -> int:
-    """Address of bay ``bay`` of a rack, counted from 1."""
+    """Return the address of bay ``bay`` of a rack, counted from 1."""
     if not 1 <= bay <= 10:
         raise ArgumentError(f"bay is {bay}; choose 1 to 10")
     return 0x20 + bay
@@ -184,33 +184,33 @@ ENABLED: Final = 0x8000_0000
 
 
 def decode_bits(bits: int) -> tuple[str, ...]:
-    """Names of the status bits that are set."""
+    """Return the names of the status bits that are set."""
     return tuple(name for mask, name in STATUS_BITS.items() if bits & mask)
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One message that came from the controller."""
+    """One message from the controller."""
 
     name: str
     source: int
     values: Mapping[str, int | bytes]
 
-    def whole(self, field: str) -> int:
-        """Value of an integer field."""
+    def integer(self, field: str) -> int:
+        """Return the value of an integer field."""
         value = self.values[field]
         assert isinstance(value, int)
         return value
 
     def text(self, field: str) -> str:
-        """Value of a text field without its padding."""
+        """Return the value of a text field without its padding."""
         value = self.values[field]
         assert isinstance(value, bytes)
         return value.split(b"\0", 1)[0].decode("ascii", "replace").strip()
 
 
 def pack(name: str, destination: int, **values: int) -> bytes:
-    """Frame of the message ``name`` from the host; every field must be given."""
+    """Return the frame of the message ``name`` from the host; every field must be given."""
     layout = TO_CONTROLLER[name]
     fields = [values.pop(field) for field in layout.fields]
     if values:
@@ -223,7 +223,7 @@ def pack(name: str, destination: int, **values: int) -> bytes:
 
 
 def parse(frame: bytes) -> Frame:
-    """Fields of one whole frame from the controller.
+    """Return the fields of one complete frame from the controller.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def parse(frame: bytes) -> Frame:
     """
     layout = _layout(frame)
     if layout is None or len(frame) != HEADER_BYTES + layout.payload_bytes:
-        raise ArgumentError(f"frame is {frame.hex(' ')}; give one whole known message")
+        raise ArgumentError(f"frame is {frame.hex(' ')}; give one complete known message")
     if layout.payload:
         fields = struct.unpack_from("<" + layout.payload, frame, HEADER_BYTES)
     else:
@@ -241,7 +241,7 @@ def parse(frame: bytes) -> Frame:
 
 
 def frame_bytes(header: bytes) -> int:
-    """Length of the frame that begins with these six bytes, 0 when no frame does."""
+    """Return the length of the frame that begins with these six bytes, 0 when no frame does."""
     if header[4] & ~LONG not in (0, HOST) or header[5] not in SOURCES:
         return 0
     layout = _layout(header)
@@ -273,19 +273,19 @@ class Scale:
     cycle_s: float = 102.4e-6
 
     def position(self, mm: float) -> int:
-        """Convert to counts of a position."""
+        """Return the counts of a position."""
         return round(mm * self.counts_per_mm)
 
     def velocity(self, mm_s: float) -> int:
-        """Convert to counts of a velocity parameter."""
+        """Return the counts of a velocity parameter."""
         return round(mm_s * self.velocity_unit)
 
     def acceleration(self, mm_s2: float) -> int:
-        """Convert to counts of an acceleration parameter."""
+        """Return the counts of an acceleration parameter."""
         return round(mm_s2 * self.acceleration_unit)
 
     def mm(self, counts: int) -> float:
-        """Position of counts."""
+        """Return the position of counts."""
         return counts / self.counts_per_mm
 
     @property

@@ -1,4 +1,4 @@
-"""The controller's serial port: found by its USB serial number, opened for one program."""
+"""The controller's serial port: found by its USB serial number, opened exclusively."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ BAUD = 115_200
 # First digits of the USB serial numbers of the controllers that move a DDS220.
 PREFIXES = {"kbd101": ("28",), "bbd30x": ("103",)}
 _SETTLE_S = 0.05
-# Frames are a few bytes and never wait on a port that works; a machine that stalls is no dead port.
+# Long, as a stall of the host is no dead port; frames are a few bytes and never wait on a live one.
 _WRITE_S = 2.0
 
 
 class _Port(serial.Serial):
-    """A local port whose writing fails only while it takes no bytes.
+    """A local port whose ``write`` fails only while the port takes no bytes.
 
-    Pyserial's own fails also when all was written and the host then stood still for a while.
+    That of pyserial fails also when the host stalls after all was written.
     """
 
     def write(self, data: Any, /) -> int:
@@ -44,7 +44,7 @@ class _Port(serial.Serial):
 
 
 def find_port(controller: str, serial_number: str = "") -> str:
-    """Device name of the port with this USB serial number, or of the only fitting one.
+    """Return the device name of the port with this USB serial number, or of the only fitting one.
 
     Raises
     ------
@@ -75,14 +75,14 @@ def find_port(controller: str, serial_number: str = "") -> str:
 
 
 def open_port(name: str) -> SerialPort:
-    """Open ``name``, a device or a URL of pyserial, for this process alone.
+    """Return the port ``name``, a device or a URL of pyserial, opened for this process alone.
 
     Raises
     ------
     DeviceGoneError
         When there is no such port.
     DeviceError
-        When it may not be opened or another program holds it.
+        When access is denied or another program holds it.
     """
     try:
         make = serial.serial_for_url if "://" in name else _Port

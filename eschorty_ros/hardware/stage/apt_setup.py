@@ -1,7 +1,7 @@
-"""What a stage controller is asked and told when it is connected: all that later use relies on.
+"""What is read from a stage controller and written to it at each connection.
 
-Settings of these controllers are volatile and other programs rewrite them, so every one is written
-at every connection, and read back where the controller answers.
+Settings of these controllers are volatile and other programs rewrite them, so all are written at
+every connection, and read back where the controller answers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CONTROLLERS = ("kbd101", "bbd30x")
 _ANSWER_S = 0.3
 _ATTEMPTS = 3
 _PULSE_US = 500
-# As many passes as anybody will make in one session.
+# More passes than any session makes.
 _CYCLES = 1_000_000
 _STEPS_BOTH = 0x0F
 _OUTPUT = 1
@@ -83,7 +83,7 @@ class AptSettings:
 
 @dataclass(frozen=True, slots=True)
 class AxisData:
-    """What the controller says of itself and its stage, within the settings' caps."""
+    """What the controller reports of itself and its stage, within the settings' caps."""
 
     identity: DeviceIdentity
     scale: apt.Scale
@@ -93,7 +93,7 @@ class AxisData:
 
 
 class AptSetup:
-    """Questions and settings over a link.
+    """Requests and settings over a link.
 
     Parameters
     ----------
@@ -105,16 +105,26 @@ class AptSetup:
         self._link = link
         self._settings = settings
 
-    def ask(self, request: str, answer: str, **values: int) -> apt.Frame:
-        """Ask the axis, again when no answer comes; only for what may be asked twice."""
-        return self._ask(self._settings.address, request, answer, **values)
+    def request(
+        self, name: str, answer: str, address: int | None = None, **values: int
+    ) -> apt.Frame:
+        """Return an answer, by default the axis's; requested again when none comes."""
+        to = self._settings.address if address is None else address
+        frame = apt.pack(name, to, **values)
+        for attempt in range(_ATTEMPTS):
+            try:
+                return self._link.request(frame, answer, to, _ANSWER_S)
+            except DeviceTimeoutError:
+                if attempt == _ATTEMPTS - 1:
+                    raise
+        raise AssertionError
 
-    def tell(self, name: str, **values: int) -> None:
-        """Send the axis a setting."""
+    def send(self, name: str, **values: int) -> None:
+        """Send the axis a message."""
         self._link.send(apt.pack(name, self._settings.address, **values))
 
     def read_axis(self) -> AxisData:
-        """Identify controller and stage.
+        """Return what controller and stage are.
 
         Raises
         ------
@@ -124,43 +134,43 @@ class AptSetup:
         settings = self._settings
         rack = settings.controller == "bbd30x"
         if rack:
-            bay = self._ask(apt.RACK, "request_bay", "bay", bay=settings.bay - 1)
-            if bay.whole("state") != 1:
+            bay = self.request("request_bay", "bay", apt.RACK, bay=settings.bay - 1)
+            if bay.integer("state") != 1:
                 raise DeviceError(f"stage: bay {settings.bay} of the rack is empty; check bay")
-        info = self._ask(apt.RACK if rack else settings.address, "request_info", "info")
-        axis = self.ask("request_axis", "axis", channel=apt.CHANNEL)
-        counts = axis.whole("counts_per_unit")
+        info = self.request("request_info", "info", apt.RACK if rack else None)
+        axis = self.request("request_axis", "axis", channel=apt.CHANNEL)
+        counts = axis.integer("counts_per_unit")
         if not 100 <= counts <= 1_000_000:
             raise DeviceError(
                 f"stage: the controller reports {counts} counts per mm; check that a DDS stage is "
                 "connected and its memory readable"
             )
         scale = apt.Scale(float(counts))
-        low = max(settings.travel_mm[0], scale.mm(axis.whole("minimum")))
-        high = min(settings.travel_mm[1], scale.mm(axis.whole("maximum")))
+        low = max(settings.travel_mm[0], scale.mm(axis.integer("minimum")))
+        high = min(settings.travel_mm[1], scale.mm(axis.integer("maximum")))
         if not low < high:
             raise DeviceError(
                 f"stage: no travel is left between {low:g} and {high:g} mm; check travel"
             )
-        firmware = ".".join(str(info.whole(part)) for part in ("major", "interim", "minor"))
+        firmware = ".".join(str(info.integer(part)) for part in ("major", "interim", "minor"))
         name = f"{info.text('model')} with {axis.text('part') or 'unknown stage'}"
         return AxisData(
-            DeviceIdentity(name, str(info.whole("serial")), firmware),
+            DeviceIdentity(name, str(info.integer("serial")), firmware),
             scale,
             (low, high),
-            _least(settings.speed_max_mm_s, axis.whole("velocity"), scale.velocity_unit),
+            _least(settings.speed_max_mm_s, axis.integer("velocity"), scale.velocity_unit),
             _least(
-                settings.acceleration_mm_s2, axis.whole("acceleration"), scale.acceleration_unit
+                settings.acceleration_mm_s2, axis.integer("acceleration"), scale.acceleration_unit
             ),
         )
 
     def write(self, axis: AxisData) -> None:
         """Write all settings but the trigger."""
         scale = axis.scale
-        self.tell("set_profile_mode", channel=apt.CHANNEL, mode=0, jerk=0)
+        self.send("set_profile_mode", channel=apt.CHANNEL, mode=0, jerk=0)
         self.write_velocity(axis, axis.speed_max_mm_s)
         # Reverse, to the reverse limit switch, as the manufacturer's own software sets it.
-        self.tell(
+        self.send(
             "set_home",
             channel=apt.CHANNEL,
             direction=2,
@@ -168,27 +178,27 @@ class AptSetup:
             velocity=scale.velocity(min(self._settings.homing_mm_s, axis.speed_max_mm_s)),
             offset=0,
         )
-        self.tell("resume_end_of_move")
+        self.send("resume_end_of_move")
 
     def write_velocity(self, axis: AxisData, speed_mm_s: float) -> tuple[float, float]:
-        """Set speed and acceleration; both as the controller has them (mm/s, mm/s2).
+        """Set speed and acceleration; return them as the controller has them (mm/s, mm/s2).
 
         Raises
         ------
         DeviceError
-            When the controller does not take them.
+            When the controller keeps others.
         """
         wanted = {
             "acceleration": axis.scale.acceleration(axis.acceleration_mm_s2),
             "velocity": axis.scale.velocity(speed_mm_s),
         }
-        self.tell("set_velocity", channel=apt.CHANNEL, minimum=0, **wanted)
-        answer = self.ask("request_velocity", "velocity", channel=apt.CHANNEL)
+        self.send("set_velocity", channel=apt.CHANNEL, minimum=0, **wanted)
+        answer = self.request("request_velocity", "velocity", channel=apt.CHANNEL)
         for name, value in wanted.items():
-            if answer.whole(name) != value:
+            if answer.integer(name) != value:
                 raise DeviceError(
-                    f"stage: the controller keeps {name} {answer.whole(name)} instead of {value}; "
-                    "lower speed or acceleration, and close other programs that use it"
+                    f"stage: the controller keeps {name} {answer.integer(name)} instead of "
+                    f"{value}; lower speed or acceleration, and close other programs that use it"
                 )
         return (
             wanted["velocity"] / axis.scale.velocity_unit,
@@ -196,12 +206,12 @@ class AptSetup:
         )
 
     def write_trigger(self, axis: AxisData) -> PulseTrain | None:
-        """Program the pulses for the camera over the travel; ``None`` when there are none.
+        """Program the pulses for the camera over the travel; return them, ``None`` for none.
 
         Raises
         ------
         DeviceError
-            When the controller does not take the pattern.
+            When the interval does not fit or the controller keeps another pattern.
         """
         scale, (low, high) = axis.scale, axis.travel_mm
         interval = scale.position(self._settings.trigger_interval_mm)
@@ -227,11 +237,11 @@ class AptSetup:
         }
         self._write_pulses(pulses, _STEPS_BOTH)
         kind = "pulses" if self._settings.controller == "kbd101" else "rack_trigger"
-        answer = self.ask(f"request_{kind}", kind, channel=apt.CHANNEL)
+        answer = self.request(f"request_{kind}", kind, channel=apt.CHANNEL)
         for name, value in pulses.items():
-            if answer.whole(name) != value:
+            if answer.integer(name) != value:
                 raise DeviceError(
-                    f"stage: the controller keeps trigger {name} {answer.whole(name)} instead of "
+                    f"stage: the controller keeps trigger {name} {answer.integer(name)} instead of "
                     f"{value}; set trigger_interval to 0 to go without"
                 )
         return PulseTrain(scale.mm(first), scale.mm(interval), count)
@@ -240,9 +250,9 @@ class AptSetup:
         port = self._settings.trigger_port
         if self._settings.controller == "kbd101":
             if pulses:
-                self.tell("set_pulses", channel=apt.CHANNEL, **pulses)
+                self.send("set_pulses", channel=apt.CHANNEL, **pulses)
             modes = [mode if number == port else 0 for number in (1, 2)]
-            self.tell(
+            self.send(
                 "set_ports",
                 channel=apt.CHANNEL,
                 mode_1=modes[0],
@@ -252,7 +262,7 @@ class AptSetup:
                 reserved=0,
             )
             return
-        self.tell("set_rack_trigger_state", channel=apt.CHANNEL, state=_DISARM)
+        self.send("set_rack_trigger_state", channel=apt.CHANNEL, state=_DISARM)
         if not pulses:
             return
         self._link.send(
@@ -264,7 +274,7 @@ class AptSetup:
                 source=self._settings.bay,
             )
         )
-        self.tell(
+        self.send(
             "set_rack_trigger",
             channel=apt.CHANNEL,
             in_mode=0,
@@ -275,22 +285,12 @@ class AptSetup:
             reserved=0,
             **pulses,
         )
-        self.tell("set_rack_trigger_state", channel=apt.CHANNEL, state=_ARM)
-
-    def _ask(self, address: int, request: str, answer: str, **values: int) -> apt.Frame:
-        frame = apt.pack(request, address, **values)
-        for attempt in range(_ATTEMPTS):
-            try:
-                return self._link.request(frame, answer, address, _ANSWER_S)
-            except DeviceTimeoutError:
-                if attempt == _ATTEMPTS - 1:
-                    raise
-        raise AssertionError
+        self.send("set_rack_trigger_state", channel=apt.CHANNEL, state=_ARM)
 
 
 def _least(cap: float, counts: int, unit: float) -> float:
-    """Cap, or what is reported when that is less; 0 and below tell nothing.
+    """Return the cap, or the reported value if that is less; 0 and below report nothing.
 
-    What rounds to the reported counts is still within them.
+    A value that rounds to the reported counts is within them.
     """
     return min(cap, (counts + 0.49) / unit) if counts > 0 else cap

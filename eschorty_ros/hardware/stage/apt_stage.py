@@ -20,9 +20,9 @@ from eschorty_ros.hardware.stage.apt_setup import AptSettings, AptSetup
 from eschorty_ros.hardware.stage.apt_status import Status
 from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, WARN_AGE_NS, Kind, Tracker
 
-MOVE_NS = 12 * BYTE_NS
-KEEP_ALIVE_S = 0.5
-HEALTH_S = 0.05
+_MOVE_NS = 12 * BYTE_NS
+_KEEP_ALIVE_S = 0.5
+_HEALTH_S = 0.05
 _ENABLE_S = 10.0
 _FIRST_STATUS_S = 1.5
 _CLOSE_S = 1.2
@@ -35,12 +35,12 @@ MakeLink = Callable[[Callable[[apt.Frame, int], None], Callable[[DeviceError], N
 def open_stage(
     settings: AptSettings, clock_ns: Callable[[], int], port: str = "", serial: str = ""
 ) -> AptStage:
-    """Open the stage on ``port``, or on the port whose USB serial number is ``serial``.
+    """Return the stage on ``port``, or on the port whose USB serial number is ``serial``.
 
     Raises
     ------
     DeviceError
-        With the remedy when there is no such port or no such stage behind it.
+        When there is no such port or no such stage behind it.
     """
     opened = open_port(port or find_port(settings.controller, serial))
 
@@ -80,7 +80,7 @@ class AptStage:
         self._lock = threading.RLock()
         self._stopping: list[tuple[int, bytes]] = []
         self._closed = False
-        # Counted so that a stop and an order that cross are noticed, on both sides.
+        # Both counters show a stop and an order that cross, on either side.
         self._stops = self._orders = 0
         # Frames may come at once; they wait for the tracker.
         with self._lock:
@@ -94,9 +94,9 @@ class AptStage:
             raise
 
     def _connect(self) -> None:
-        self._setup.tell("stop_updates")
-        # Whoever used it before may have left it moving.
-        self._setup.tell("stop", channel=apt.CHANNEL, mode=_PROFILED)
+        self._setup.send("stop_updates")
+        # The program that used it before may have left it moving.
+        self._setup.send("stop", channel=apt.CHANNEL, mode=_PROFILED)
         axis = self._setup.read_axis()
         self._axis = axis
         self._tracker.scale = axis.scale
@@ -106,11 +106,11 @@ class AptStage:
         self.acceleration_mm_s2 = axis.acceleration_mm_s2
         self._setup.write(axis)
         self.trigger = self._setup.write_trigger(axis)
-        self._setup.tell("set_enabled", channel=apt.CHANNEL, state=_ON)
-        self._tracker.order(Kind.STOP, 0.0, 0.0, self.speed_max_mm_s, _ENABLE_S)
-        self._link.every(KEEP_ALIVE_S, self._keep_alive)
-        self._link.every(1.0 / self._settings.poll_hz, self.ask_status)
-        self._link.every(HEALTH_S, self._check_health)
+        self._setup.send("set_enabled", channel=apt.CHANNEL, state=_ON)
+        self._tracker.begin_motion(Kind.STOP, 0.0, 0.0, self.speed_max_mm_s, _ENABLE_S)
+        self._link.call_every(_KEEP_ALIVE_S, self._keep_alive)
+        self._link.call_every(1.0 / self._settings.poll_hz, self.request_status)
+        self._link.call_every(_HEALTH_S, self._check_health)
         if not self._link.wait_until(lambda: self._tracker.status is not None, _FIRST_STATUS_S):
             raise DeviceTimeoutError(
                 f"stage: {self.identity.model} sends no status; check that no other program uses it"
@@ -130,8 +130,6 @@ class AptStage:
                 "interlock and the motor cable"
             )
 
-    # LinearStage
-
     def home(self) -> None:
         """Start homing; raises ``DeviceError`` when moving, failed or closed."""
         with self._lock:
@@ -140,36 +138,32 @@ class AptStage:
             speed = min(self._settings.homing_mm_s, self.speed_max_mm_s)
             limit_s = (high - low) / speed + 10.0
             self._orders += 1
-            self._tracker.order(Kind.HOME, high, low, speed, limit_s)
+            self._tracker.begin_motion(Kind.HOME, high, low, speed, limit_s)
             self._tracker.fit.expect_unknown(self._clock_ns())
             self._tracker.blocked_sense = 0
             self._send_now("home", channel=apt.CHANNEL)
 
     def move_to(self, position_mm: float, speed_mm_s: float) -> None:
-        """Start a move; raises ``DeviceError`` when it cannot be carried out or is stopped."""
+        """Start a move; raises ``DeviceError`` when it is refused or stopped before it begins."""
         with self._lock:
             stops = self._stops
-            status = self._ready()
-            may_move(status, self._tracker.blocked_sense, position_mm, self.travel_mm)
-            may_run_at(speed_mm_s, self.speed_max_mm_s)
+            self._check_move(self._ready(), position_mm, speed_mm_s)
         speed, acceleration = self._setup.write_velocity(self._axis, speed_mm_s)
         with self._lock:
             if stops != self._stops:
                 raise DeviceError("stage refused: it was stopped before the move began")
-            status = self._ready()
+            start = self._ready().position_mm
             counts = self._tracker.scale.position(position_mm)
             target = self._tracker.scale.mm(counts)
-            start = status.position_mm
-            distance = abs(target - start)
             if counts == self._tracker.scale.position(start):
                 return
-            limit_s = distance / speed + 2.0 * speed / acceleration + 2.0
+            limit_s = abs(target - start) / speed + 2.0 * speed / acceleration + 2.0
             self._orders += 1
-            self._tracker.order(Kind.MOVE, start, target, speed, limit_s)
+            self._tracker.begin_motion(Kind.MOVE, start, target, speed, limit_s)
             order_ns = self._clock_ns()
             self._send_now("move_absolute", channel=apt.CHANNEL, position=counts)
             self._tracker.fit.expect_move(
-                plan_move(order_ns + MOVE_NS, start, target, speed, acceleration)
+                plan_move(order_ns + _MOVE_NS, start, target, speed, acceleration)
             )
 
     def stop(self) -> None:
@@ -181,14 +175,10 @@ class AptStage:
             if orders != self._orders:
                 # An order may have gone out after it.
                 self._send_stop()
-            self._tracker.order_stop(self.acceleration_mm_s2)
-
-    def _send_stop(self) -> None:
-        with contextlib.suppress(DeviceError):
-            self._send_now("stop", channel=apt.CHANNEL, mode=_PROFILED)
+            self._tracker.begin_stop(self.acceleration_mm_s2)
 
     def state(self, t_ns: int | None = None) -> StageState:
-        """Position, velocity and flags at ``t_ns``, by default the newest time that is known.
+        """Return position, velocity and flags at ``t_ns``, by default the newest time known.
 
         Raises
         ------
@@ -210,14 +200,14 @@ class AptStage:
         )
 
     def statistics(self) -> dict[str, float]:
-        """Counters for diagnostics."""
+        """Return counters for diagnostics."""
         framer, fit = self._link.framer, self._tracker.fit
         return {
             "fit_residual_um": fit.residual_mm * 1e3,
             "fit_sigma_um": fit.sigma_mm * 1e3,
             "fit_outliers": fit.outliers,
             "status_age_s": self._tracker.age_ns * 1e-9,
-            "statuses_rejected": self._tracker.judge.rejected,
+            "statuses_rejected": self._tracker.checks.rejected,
             "late_statuses": fit.late_readings,
             "clock_sets": self._tracker.clock_sets,
             "frames": framer.frames,
@@ -246,36 +236,69 @@ class AptStage:
     # Orders
 
     def _ready(self) -> Status:
-        return ready(self._tracker, self._closed)
+        """Return the newest status; raise ``DeviceError`` when no order can be carried out."""
+        tracker = self._tracker
+        if tracker.failure is not None:
+            raise tracker.failure
+        if self._closed:
+            raise DeviceGoneError("the stage is closed; open it again")
+        if tracker.motion is not None:
+            raise DeviceError("the stage is moving; stop it or wait before the next move")
+        assert tracker.status is not None
+        if not tracker.status.bits & apt.ENABLED:
+            raise DeviceError("the stage is not enabled; check the front panel, configure again")
+        return tracker.status
+
+    def _check_move(self, status: Status, position_mm: float, speed_mm_s: float) -> None:
+        if not status.bits & apt.HOMED:
+            raise DeviceError("the stage is not homed; home it before moving")
+        low, high = self.travel_mm
+        if not low <= position_mm <= high:
+            raise DeviceError(
+                f"position_mm is {position_mm!r}; the travel is {low:g} to {high:g} mm"
+            )
+        if self._tracker.blocked_sense * (position_mm - status.position_mm) > 0.0:
+            raise DeviceError(
+                f"the stage met a limit at {status.position_mm:.3f} mm; move it back from there "
+                "first, and check the travel for obstacles"
+            )
+        if not 0.0 < speed_mm_s <= self.speed_max_mm_s:
+            raise DeviceError(
+                f"speed_mm_s is {speed_mm_s!r}; choose above 0 to {self.speed_max_mm_s:g} mm/s"
+            )
 
     def _send_now(self, name: str, **values: int) -> None:
         self._link.send_now(apt.pack(name, self._settings.address, **values))
 
+    def _send_stop(self) -> None:
+        with contextlib.suppress(DeviceError):
+            self._send_now("stop", channel=apt.CHANNEL, mode=_PROFILED)
+
     # Timers, in the writer's thread
 
     def _keep_alive(self) -> None:
-        self._link.write_at_once(apt.pack("keep_alive", self._settings.address))
+        self._link.write(apt.pack("keep_alive", self._settings.address))
 
-    def ask_status(self) -> None:
-        """See ``Actions``."""
-        if self._tracker.ask():
-            self._link.write_at_once(
+    def request_status(self) -> None:
+        """Request a status unless one is on its way; see ``Actions``."""
+        if self._tracker.begin_poll():
+            self._link.write(
                 apt.pack("request_status", self._settings.address, channel=apt.CHANNEL)
             )
 
     def _check_health(self) -> None:
-        # The writer waits for nobody: it also keeps the controller's watchdog quiet.
-        if not self._lock.acquire(timeout=HEALTH_S):
+        # The writer must not block: it also keeps the controller's watchdog alive.
+        if not self._lock.acquire(timeout=_HEALTH_S):
             return
         try:
             now_ns = self._link.now_ns()
             due = [frame for at_ns, frame in self._stopping if at_ns <= now_ns]
             self._stopping = [entry for entry in self._stopping if entry[0] > now_ns]
-            self._tracker.look()
+            self._tracker.check_age()
         finally:
             self._lock.release()
         for frame in due:
-            self._link.write_at_once(frame)
+            self._link.write(frame)
 
     # Frames, in the reader's thread
 
@@ -286,7 +309,7 @@ class AptStage:
         with self._lock:
             match frame.name:
                 case "status":
-                    self._tracker.hear(frame, received_ns, clock_ns)
+                    self._tracker.add_status(frame, received_ns, clock_ns)
                 case "moved" | "stopped" | "homed":
                     if self._tracker.motion is not None:
                         self._tracker.motion.ended_by_message = True
@@ -295,7 +318,7 @@ class AptStage:
                         DeviceError("the stage controller reports an error; look at its display")
                     )
                 case "error_text":
-                    code, text = frame.whole("code"), frame.text("text")
+                    code, text = frame.integer("code"), frame.text("text")
                     self.fail(
                         DeviceError(
                             f"the stage controller reports error {code}: {text or 'no text'}; "
@@ -310,61 +333,13 @@ class AptStage:
             self.fail(error)
 
     def fail(self, error: DeviceError, escalate: bool = False) -> None:
-        """Stop at once; a stuck carriage also loses its current."""
+        """Stop for good; with ``escalate`` stop at once and switch the current off soon after."""
         if self._tracker.failure is not None:
             return
         self._tracker.failure = error
         self._send_stop()
         if escalate:
             address, now_ns = self._settings.address, self._link.now_ns()
-            self._stopping = [
-                (
-                    now_ns + 200_000_000,
-                    apt.pack("stop", address, channel=apt.CHANNEL, mode=_IMMEDIATE),
-                ),
-                (
-                    now_ns + 300_000_000,
-                    apt.pack("set_enabled", address, channel=apt.CHANNEL, state=_OFF),
-                ),
-            ]
-
-
-def ready(tracker: Tracker, closed: bool) -> Status:
-    """Newest status of a stage that takes orders; raises ``DeviceError`` when it takes none."""
-    if tracker.failure is not None:
-        raise tracker.failure
-    if closed:
-        raise DeviceGoneError("the stage is closed; open it again")
-    if tracker.motion is not None:
-        raise DeviceError("the stage is moving; stop it or wait before the next move")
-    assert tracker.status is not None
-    if not tracker.status.bits & apt.ENABLED:
-        raise DeviceError("the stage is not enabled; check the front panel, configure again")
-    return tracker.status
-
-
-def may_move(
-    status: Status, blocked_sense: int, position_mm: float, travel_mm: tuple[float, float]
-) -> None:
-    """Raise ``DeviceError`` when ``position_mm`` cannot be reached.
-
-    ``blocked_sense`` is the sign of the way that a limit has barred, 0 when none has.
-    """
-    if not status.bits & apt.HOMED:
-        raise DeviceError("the stage is not homed; home it before moving")
-    low, high = travel_mm
-    if not low <= position_mm <= high:
-        raise DeviceError(f"position_mm is {position_mm!r}; the travel is {low:g} to {high:g} mm")
-    if blocked_sense * (position_mm - status.position_mm) > 0.0:
-        raise DeviceError(
-            f"the stage met a limit at {status.position_mm:.3f} mm; move it back from there "
-            "first, and check the travel for obstacles"
-        )
-
-
-def may_run_at(speed_mm_s: float, speed_max_mm_s: float) -> None:
-    """Raise ``DeviceError`` when the stage has no such speed."""
-    if not 0.0 < speed_mm_s <= speed_max_mm_s:
-        raise DeviceError(
-            f"speed_mm_s is {speed_mm_s!r}; choose above 0 to {speed_max_mm_s:g} mm/s"
-        )
+            stop = apt.pack("stop", address, channel=apt.CHANNEL, mode=_IMMEDIATE)
+            disable = apt.pack("set_enabled", address, channel=apt.CHANNEL, state=_OFF)
+            self._stopping = [(now_ns + 200_000_000, stop), (now_ns + 300_000_000, disable)]

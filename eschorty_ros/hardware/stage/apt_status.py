@@ -1,7 +1,7 @@
-"""Which status messages to believe, and what they say about the axis.
+"""Plausibility checks of status messages.
 
-A frame has no checksum: one flipped bit is a wrong position. One odd message is therefore asked
-for again, and only what two say is so.
+A frame has no checksum: one flipped bit is a wrong position. An implausible message is therefore
+requested again, and only what two messages agree on counts.
 """
 
 from __future__ import annotations
@@ -12,26 +12,30 @@ from enum import Enum, auto
 
 from eschorty_ros.hardware.stage import apt_messages as apt
 
-# An answer that belongs to no known request may be so late.
+# The longest delay of an answer whose request is unknown.
 LATE_NS = 500_000_000
-REST_MARGIN_MM = 0.02
-MOVE_MARGIN_MM = 1.0
+_REST_MARGIN_MM = 0.02
+_MOVE_MARGIN_MM = 1.0
 _CRITICAL = apt.HOMED | apt.ENABLED | apt.FAULTS | apt.LIMITS
 
 
-class Verdict(Enum):
-    """What to do with a status message."""
+class Plausibility(Enum):
+    """What a status message shows; all but ``REPEAT`` and ``CONTRADICTORY`` are used."""
 
-    BELIEVE = auto()
-    ASK_AGAIN = auto()
-    BEHIND = auto()
+    NORMAL = auto()
+    REPEAT = auto()
+    """Implausible: request another one."""
+    OFF_PATH = auto()
+    """Two messages agree that the carriage is not where its motion should be."""
     JUMPED = auto()
+    """Two messages agree on a position that the carriage cannot have reached."""
     CONTRADICTORY = auto()
+    """Two implausible messages disagree."""
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """One status message: where, its bits, and when it can have been taken (ns)."""
+    """One status message: position, bits, and when it can have been taken (ns)."""
 
     position_mm: float
     bits: int
@@ -40,7 +44,7 @@ class Status:
 
     @property
     def not_before_ns(self) -> int:
-        """Time before which it was not taken, whether its request is known or not."""
+        """Time before which it was not taken, also where its request is unknown."""
         return self.latest_ns - LATE_NS if self.earliest_ns is None else self.earliest_ns
 
     @property
@@ -49,69 +53,69 @@ class Status:
         return self.bits & _CRITICAL
 
 
-class Judge:
-    """Plausibility of status messages.
+class StatusChecks:
+    """Compares each status message with the one before and with the expected motion.
 
     Attributes
     ----------
     rejected : int
-        Messages that were not believed.
+        Messages that were not used.
     """
 
     def __init__(self) -> None:
         self.rejected = 0
         self._last: Status | None = None
-        self._odd: Status | None = None
+        self._implausible: Status | None = None
 
-    def forget(self) -> None:
-        """Take the next message as it comes."""
-        self._last = self._odd = None
+    def reset(self) -> None:
+        """Use the next message whatever it holds."""
+        self._last = self._implausible = None
 
-    def judge(
+    def check(
         self, status: Status, expected_mm: tuple[float, float] | None, speed_mm_s: float
-    ) -> Verdict:
-        """Judge one message.
+    ) -> Plausibility:
+        """Return what one message shows.
 
         Parameters
         ----------
         status : Status
         expected_mm : tuple of float or None
-            Where the ordered motion can be; ``None`` when nobody knows.
+            Where the ordered motion can be; ``None`` when unknown.
         speed_mm_s : float
             Fastest the carriage may move now; 0 at rest.
         """
-        last, odd = self._last, self._odd
+        last, implausible = self._last, self._implausible
         if last is None:
-            return self._believe(status)
-        margin_mm = MOVE_MARGIN_MM if speed_mm_s else REST_MARGIN_MM
-        reach_mm = margin_mm + _reach_mm(last, status, speed_mm_s)
-        continuous = abs(status.position_mm - last.position_mm) <= reach_mm
+            return self._use(status)
+        margin_mm = _MOVE_MARGIN_MM if speed_mm_s else _REST_MARGIN_MM
+        continuous = _reachable(last, status, speed_mm_s, margin_mm)
         low, high = expected_mm or (-math.inf, math.inf)
         slack_mm = margin_mm + 6e-3 * speed_mm_s
-        on_its_way = low - slack_mm <= status.position_mm <= high + slack_mm
-        if continuous and on_its_way and status.critical == last.critical:
-            return self._believe(status)
-        if odd is None:
-            self._odd = status
+        on_path = low - slack_mm <= status.position_mm <= high + slack_mm
+        if continuous and on_path and status.critical == last.critical:
+            return self._use(status)
+        if implausible is None:
+            self._implausible = status
             self.rejected += 1
-            return Verdict.ASK_AGAIN
-        near = abs(status.position_mm - odd.position_mm) <= (
-            margin_mm + _reach_mm(odd, status, speed_mm_s)
-        )
-        if not near or status.critical != odd.critical:
+            return Plausibility.REPEAT
+        if (
+            not _reachable(implausible, status, speed_mm_s, margin_mm)
+            or status.critical != implausible.critical
+        ):
             self.rejected += 1
-            return Verdict.CONTRADICTORY
-        self._believe(status)
+            return Plausibility.CONTRADICTORY
+        self._use(status)
         if not continuous:
-            return Verdict.JUMPED
-        return Verdict.BELIEVE if on_its_way else Verdict.BEHIND
+            return Plausibility.JUMPED
+        return Plausibility.NORMAL if on_path else Plausibility.OFF_PATH
 
-    def _believe(self, status: Status) -> Verdict:
-        self._last, self._odd = status, None
-        return Verdict.BELIEVE
+    def _use(self, status: Status) -> Plausibility:
+        self._last, self._implausible = status, None
+        return Plausibility.NORMAL
 
 
-def _reach_mm(first: Status, second: Status, speed_mm_s: float) -> float:
-    """How far the carriage gets between two messages."""
-    begin_ns = first.not_before_ns
-    return 1.2 * speed_mm_s * max(second.latest_ns - begin_ns, 0) * 1e-9
+def _reachable(first: Status, second: Status, speed_mm_s: float, margin_mm: float) -> bool:
+    """Return whether the carriage can get from one message's position to the other's."""
+    between_s = max(second.latest_ns - first.not_before_ns, 0) * 1e-9
+    distance_mm = abs(second.position_mm - first.position_mm)
+    return distance_mm <= margin_mm + 1.2 * speed_mm_s * between_s

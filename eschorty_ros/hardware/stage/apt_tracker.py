@@ -1,4 +1,4 @@
-"""What status messages say: where the stage is, what has become of its motion, what is wrong."""
+"""State of the axis from its status messages: position, the motion under way, failures."""
 
 from __future__ import annotations
 
@@ -11,31 +11,50 @@ from eschorty_ros.core.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.motion_fit import MotionFit
 from eschorty_ros.hardware.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
-from eschorty_ros.hardware.stage.apt_status import LATE_NS, Judge, Status, Verdict
+from eschorty_ros.hardware.stage.apt_status import LATE_NS, Plausibility, Status, StatusChecks
 
 BYTE_NS = 86_806
 REQUEST_NS = 6 * BYTE_NS
 ANSWER_NS = 20 * BYTE_NS
 WARN_AGE_NS = 500_000_000
 FAULT_AGE_NS = 1_500_000_000
-_POLL_LOST_NS = 250_000_000
-# No drift between two messages and no simulated clock's step is so large.
-_CLOCK_SET_NS = 500_000_000
-# A host that stood still itself has not looked often enough to call the controller silent.
-_LOOKS_LEAST = 20
-TOLERANCE_MM = 1e-3
-STALL_NS = 200_000_000
-BEGIN_NS = 300_000_000
+_TOLERANCE_MM = 1e-3
+_STALL_NS = 200_000_000
+_BEGIN_NS = 300_000_000
 # A limit this near to where a move began is the one it leaves.
 _LIMIT_LEFT_MM = 1.0
 _READINGS_AT_REST = 2
+_POLL_LOST_NS = 250_000_000
+# Larger than any drift between two messages and any step of a simulated clock.
+_CLOCK_SET_NS = 500_000_000
+# After a stall of the host, statuses may still wait to be read: so many checks come first.
+_AGE_CHECKS_MIN = 20
+
+
+class Kind(Enum):
+    """What was ordered."""
+
+    HOME = "homing"
+    MOVE = "move"
+    STOP = "stop"
+
+
+class Outcome(Enum):
+    """What has become of a motion."""
+
+    GOING = auto()
+    ENDED = auto()
+    MET_LIMIT = auto()
+    NOT_BEGUN = auto()
+    LATE = auto()
+    STUCK = auto()
 
 
 class Actions(Protocol):
-    """What follows from what the status messages say."""
+    """What the tracker has done about what the status messages show."""
 
-    def ask_status(self) -> None:
-        """Ask for another status message."""
+    def request_status(self) -> None:
+        """Request another status message."""
 
     def stop(self) -> None:
         """Profiled stop."""
@@ -45,7 +64,7 @@ class Actions(Protocol):
 
 
 class Tracker:
-    """State of the axis as its status messages tell it; not thread-safe.
+    """State of the axis; not thread-safe.
 
     Parameters
     ----------
@@ -59,24 +78,24 @@ class Tracker:
     ----------
     scale : Scale
     fit : MotionFit
-    judge : Judge
+    checks : StatusChecks
     motion : Motion or None
         The motion under way.
     status : Status or None
-        The newest message that was believed.
+        The newest message that was used.
     failure : DeviceError or None
     blocked_sense : int
-        Sign of the way that a limit has barred.
+        Sign of the direction that a limit has barred.
     clock_sets : int
-        Times the clock was set. Readings alone tell the rest of a motion under way then.
+        Times the clock was set. The rest of a motion under way then follows readings alone.
     """
 
     def __init__(
         self, actions: Actions, now_ns: Callable[[], int], clock_ns: Callable[[], int]
     ) -> None:
         self.scale = apt.Scale()
-        self.fit = MotionFit(TOLERANCE_MM)
-        self.judge = Judge()
+        self.fit = MotionFit(_TOLERANCE_MM)
+        self.checks = StatusChecks()
         self.motion: Motion | None = None
         self.status: Status | None = None
         self.failure: DeviceError | None = None
@@ -90,7 +109,7 @@ class Tracker:
         self._unmatched_until_ns = 0
         self._rest_ns = 0
         self._known_from_ns = 0
-        self._looks = 0
+        self._age_checks = 0
 
     @property
     def age_ns(self) -> int:
@@ -103,10 +122,10 @@ class Tracker:
         return self.motion is not None and self.motion.kind is Kind.HOME
 
     def has(self, bits: int) -> bool:
-        """Whether one of the status bits is set."""
+        """Return whether one of the status bits is set."""
         return self.status is not None and bool(self.status.bits & bits)
 
-    def order(
+    def begin_motion(
         self, kind: Kind, start_mm: float, target_mm: float, speed: float, limit_s: float
     ) -> None:
         """Expect a motion that ends within ``limit_s``."""
@@ -114,7 +133,7 @@ class Tracker:
         deadline_ns = now_ns + round(limit_s * 1e9)
         self.motion = Motion(kind, start_mm, target_mm, speed, now_ns, deadline_ns)
 
-    def order_stop(self, deceleration_mm_s2: float) -> None:
+    def begin_stop(self, deceleration_mm_s2: float) -> None:
         """Expect the motion under way to end in a ramp."""
         motion = self.motion
         if motion is None:
@@ -123,20 +142,20 @@ class Tracker:
             self.fit.expect_stop(self._clock_ns() + REQUEST_NS, deceleration_mm_s2)
         motion.stop()
 
-    def ask(self) -> bool:
-        """Whether to ask for a status now; if so, the request goes out at once."""
+    def begin_poll(self) -> bool:
+        """Return whether to request a status; if so, the request must be sent at once."""
         now_ns, poll = self._now_ns(), self._poll
-        # One at a time: so an answer belongs to its request.
+        # One at a time, so that an answer belongs to its request.
         if poll is not None:
             if now_ns - poll[1] < _POLL_LOST_NS:
                 return False
-            # Its answer may still come, and must not be taken for the next one's.
+            # Its answer may still come, and must not count as the next one's.
             self._unmatched_until_ns = now_ns + LATE_NS
         self._poll = self._clock_ns(), now_ns
         return True
 
     def state(self, t_ns: int | None, lag_ns: int) -> StageState:
-        """Position, velocity and flags at ``t_ns``, by default as new as they can be known."""
+        """Return the state at ``t_ns``, by default the newest that is known, ``lag_ns`` ago."""
         until_ns, status = self.fit.until_ns, self.status
         assert until_ns is not None
         assert status is not None
@@ -150,28 +169,28 @@ class Tracker:
         homed = bool(status.bits & apt.HOMED) and not self.homing
         return StageState(position, velocity, t_ns, homed, moving, flags)
 
-    def look(self) -> None:
-        """Notice that no status messages come."""
-        self._looks += 1
-        if self.age_ns > FAULT_AGE_NS and self._looks >= _LOOKS_LEAST:
+    def check_age(self) -> None:
+        """Fail when status messages do not come any more."""
+        self._age_checks += 1
+        if self.age_ns > FAULT_AGE_NS and self._age_checks >= _AGE_CHECKS_MIN:
             self._actions.fail(
                 DeviceGoneError(
-                    f"the stage controller is silent for {FAULT_AGE_NS * 1e-9:g} s; check its "
-                    "power and cable"
+                    f"the stage controller sent no status for {FAULT_AGE_NS * 1e-9:g} s; check "
+                    "its power and cable"
                 )
             )
 
-    def hear(self, frame: apt.Frame, received_ns: int, clock_ns: int) -> None:
-        """Take one status message, received at this time of both clocks."""
+    def add_status(self, frame: apt.Frame, received_ns: int, clock_ns: int) -> None:
+        """Use one status message, received at this time of both clocks."""
         latest_ns = clock_ns - ANSWER_NS
-        position_mm = self.scale.mm(frame.whole("position"))
-        self._notice_set_clock(position_mm, latest_ns, clock_ns - received_ns)
+        position_mm = self.scale.mm(frame.integer("position"))
+        self._follow_clock(position_mm, latest_ns, clock_ns - received_ns)
         earliest_ns = None
         if self._poll is not None and received_ns >= self._unmatched_until_ns:
             earliest_ns = min(self._poll[0] + REQUEST_NS, latest_ns)
         self._poll = None
-        status = Status(position_mm, frame.whole("bits"), earliest_ns, latest_ns)
-        self._status_ns, self._looks = received_ns, 0
+        status = Status(position_mm, frame.integer("bits"), earliest_ns, latest_ns)
+        self._status_ns, self._age_checks = received_ns, 0
         motion = self.motion
         expected = None
         if motion is None and self.status is not None:
@@ -180,76 +199,79 @@ class Tracker:
             expected = self.fit.expected_mm(status.not_before_ns, latest_ns)
         speed = 0.0 if motion is None else motion.speed_mm_s
         if self.status is None or self.failure is not None:
-            self.judge.forget()
-        match self.judge.judge(status, expected, speed):
-            case Verdict.ASK_AGAIN:
-                self._actions.ask_status()
-            case Verdict.CONTRADICTORY:
+            self.checks.reset()
+        match self.checks.check(status, expected, speed):
+            case Plausibility.REPEAT:
+                self._actions.request_status()
+            case Plausibility.CONTRADICTORY:
                 self._actions.fail(
                     DeviceError(
-                        "two status messages of the stage running make no sense; check the cable "
-                        "for interference"
+                        "two status messages of the stage in a row are implausible; check the "
+                        "cable for interference"
                     )
                 )
-            case verdict:
-                self._believe(status, verdict)
+            case plausibility:
+                self._use(status, plausibility)
 
-    def _notice_set_clock(self, position_mm: float, latest_ns: int, offset_ns: int) -> None:
-        """Begin anew with the positions when the clock has been set since the last message."""
+    def _follow_clock(self, position_mm: float, latest_ns: int, offset_ns: int) -> None:
+        """Drop the positions so far when the clock was set since the last message."""
         before_ns, self._offset_ns = self._offset_ns, offset_ns
         if before_ns is None or abs(offset_ns - before_ns) < _CLOCK_SET_NS:
             return
         self.clock_sets += 1
         self._poll = None
         self._rest_ns += offset_ns - before_ns
-        self.fit = MotionFit(TOLERANCE_MM)
-        self.fit.add_reading(position_mm, latest_ns)
-        self._known_from_ns = self.fit.until_ns or 0
-        self.judge.forget()
+        self._restart_fit(position_mm, latest_ns, None)
+        self.checks.reset()
 
-    def _believe(self, status: Status, verdict: Verdict) -> None:
+    def _restart_fit(self, position_mm: float, latest_ns: int, earliest_ns: int | None) -> None:
+        self.fit = MotionFit(_TOLERANCE_MM)
+        self.fit.add_reading(position_mm, latest_ns, earliest_ns)
+        self._known_from_ns = self.fit.until_ns or 0
+
+    def _use(self, status: Status, plausibility: Plausibility) -> None:
         before, self.status = self.status, status
         if self.failure is not None:
             if before is not None and before.position_mm == status.position_mm:
                 self.motion = None
             return
-        if before is not None and not self.homing:
-            lost = before.bits & ~status.bits
-            if lost & (apt.HOMED | apt.ENABLED):
-                what = "its reference" if lost & apt.HOMED else "the axis enabled"
-                self._actions.fail(
-                    DeviceError(
-                        f"the stage controller does not have {what} any more, as after a restart; "
-                        "configure and home again"
-                    )
-                )
-                return
-            if verdict is Verdict.JUMPED:
-                jump_mm = status.position_mm - before.position_mm
-                self._actions.fail(
-                    DeviceError(
-                        f"the stage's encoder jumped by {jump_mm:.3f} mm; home again and check the "
-                        "encoder's cable"
-                    )
-                )
-                return
-        if status.bits & apt.FAULTS:
-            names = ", ".join(apt.decode_bits(status.bits & apt.FAULTS))
-            self._actions.fail(
-                DeviceError(f"the stage controller reports {names}; clear its cause")
-            )
+        error = self._error_of(before, status, plausibility)
+        if error is not None:
+            self._actions.fail(error)
             return
         if not (self.homing and status.bits & apt.HOMED):
             self.fit.add_reading(status.position_mm, status.latest_ns, status.earliest_ns)
         if self.motion is not None:
-            self._follow(self.motion, before, status, verdict)
+            self._follow_motion(self.motion, before, status, plausibility)
 
-    def _follow(
-        self, motion: Motion, before: Status | None, status: Status, verdict: Verdict
+    def _error_of(
+        self, before: Status | None, status: Status, plausibility: Plausibility
+    ) -> DeviceError | None:
+        if before is not None and not self.homing:
+            lost = before.bits & ~status.bits
+            if lost & (apt.HOMED | apt.ENABLED):
+                what = "its reference" if lost & apt.HOMED else "the axis enabled"
+                return DeviceError(
+                    f"the stage controller does not have {what} any more, as after a restart; "
+                    "configure and home again"
+                )
+            if plausibility is Plausibility.JUMPED:
+                jump_mm = status.position_mm - before.position_mm
+                return DeviceError(
+                    f"the stage's encoder jumped by {jump_mm:.3f} mm; home again and check the "
+                    "encoder's cable"
+                )
+        if status.bits & apt.FAULTS:
+            names = ", ".join(apt.decode_bits(status.bits & apt.FAULTS))
+            return DeviceError(f"the stage controller reports {names}; clear its cause")
+        return None
+
+    def _follow_motion(
+        self, motion: Motion, before: Status | None, status: Status, plausibility: Plausibility
     ) -> None:
         what, at_mm = motion.kind.value, status.position_mm
         assert self._offset_ns is not None
-        match motion.follow(before, status, verdict, self._offset_ns):
+        match motion.update(before, status, plausibility, self._offset_ns):
             case Outcome.MET_LIMIT:
                 self.blocked_sense = motion.sense
                 self._actions.stop()
@@ -258,7 +280,7 @@ class Tracker:
             case Outcome.NOT_BEGUN:
                 self._actions.fail(
                     DeviceError(
-                        f"the stage does not begin its {what} within {BEGIN_NS * 1e-9:g} s; check "
+                        f"the stage does not begin its {what} within {_BEGIN_NS * 1e-9:g} s; check "
                         "its front panel, the interlock and the motor cable"
                     )
                 )
@@ -283,35 +305,14 @@ class Tracker:
         self.motion = None
         self._rest_ns = status.latest_ns
         if status.bits & apt.HOMED and motion.kind is Kind.HOME:
-            # Before, the encoder counted from somewhere else.
-            self.fit = MotionFit(TOLERANCE_MM)
-            self.fit.add_reading(status.position_mm, status.latest_ns, status.earliest_ns)
-            self._known_from_ns = self.fit.until_ns or 0
+            # Before, the encoder counted from another zero.
+            self._restart_fit(status.position_mm, status.latest_ns, status.earliest_ns)
             return
         planned_mm = float(self.fit.state(status.latest_ns)[0])
-        if abs(planned_mm - status.position_mm) > TOLERANCE_MM:
+        if abs(planned_mm - status.position_mm) > _TOLERANCE_MM:
             self.fit.discard_motion()
         if self.blocked_sense and motion.sense == -self.blocked_sense:
             self.blocked_sense = 0
-
-
-class Kind(Enum):
-    """What was ordered."""
-
-    HOME = "homing"
-    MOVE = "move"
-    STOP = "stop"
-
-
-class Outcome(Enum):
-    """What has become of it."""
-
-    GOING = auto()
-    ENDED = auto()
-    MET_LIMIT = auto()
-    NOT_BEGUN = auto()
-    LATE = auto()
-    STUCK = auto()
 
 
 @dataclass(slots=True)
@@ -339,25 +340,27 @@ class Motion:
 
     @property
     def sense(self) -> int:
-        """Sign of the way to go."""
+        """Sign of its direction."""
         return (self.target_mm > self.start_mm) - (self.target_mm < self.start_mm)
 
     def stop(self) -> None:
         """Expect it to end anywhere."""
         self.kind, self._resting = Kind.STOP, 0
 
-    def follow(
-        self, before: Status | None, status: Status, verdict: Verdict, offset_ns: int
+    def update(
+        self, before: Status | None, status: Status, plausibility: Plausibility, offset_ns: int
     ) -> Outcome:
-        """Learn from a status message that is believed, and the one before it.
+        """Return the outcome as of a status message and the one before it.
 
-        ``offset_ns`` is what the statuses' clock is ahead of the steady one. A status that is heard
-        late, since the host stood still, tells nothing of the time since it was taken.
+        ``offset_ns`` is what the statuses' clock is ahead of the steady one. A status that is
+        received late, after a stall of the host, shows nothing of the time since it was taken.
         """
         not_before_ns = status.not_before_ns - offset_ns
-        frozen = before is not None and abs(status.position_mm - before.position_mm) <= TOLERANCE_MM
+        frozen = (
+            before is not None and abs(status.position_mm - before.position_mm) <= _TOLERANCE_MM
+        )
         rests = frozen and not status.bits & apt.MOVING
-        arrived = abs(status.position_mm - self.target_mm) <= TOLERANCE_MM
+        arrived = abs(status.position_mm - self.target_mm) <= _TOLERANCE_MM
         homing = self.kind is Kind.HOME
         self._seen_moving |= not rests and before is not None
         if homing:
@@ -366,27 +369,28 @@ class Motion:
         self._resting = self._resting + 1 if rests and settled else 0
         if self._meets_limit(status, arrived):
             return Outcome.MET_LIMIT
-        if self._resting >= _READINGS_AT_REST and self._complete(status, arrived):
+        if self._resting >= _READINGS_AT_REST and self._is_complete(status, arrived):
             return Outcome.ENDED
         if not_before_ns > self.deadline_ns:
             return Outcome.LATE
         if self.kind is Kind.STOP:
             return Outcome.GOING
-        if not self._seen_moving and not_before_ns - self.begun_ns > BEGIN_NS:
+        if not self._seen_moving and not_before_ns - self.begun_ns > _BEGIN_NS:
             return Outcome.NOT_BEGUN
         wrong = bool(status.bits & apt.POSITION_ERROR)
         if not homing:
-            wrong |= verdict is Verdict.BEHIND or (frozen and self._seen_moving and not arrived)
+            wrong |= plausibility is Plausibility.OFF_PATH
+            wrong |= frozen and self._seen_moving and not arrived
         if not wrong:
             self._wrong_since_ns = None
             return Outcome.GOING
         if self._wrong_since_ns is None:
             self._wrong_since_ns = status.latest_ns - offset_ns
         stuck_ns = not_before_ns - self._wrong_since_ns
-        return Outcome.STUCK if stuck_ns >= STALL_NS else Outcome.GOING
+        return Outcome.STUCK if stuck_ns >= _STALL_NS else Outcome.GOING
 
-    def _complete(self, status: Status, arrived: bool) -> bool:
-        """Whether rest is the end: told so, or where it was to be."""
+    def _is_complete(self, status: Status, arrived: bool) -> bool:
+        """Return whether rest is the end: by a message, or at the target."""
         if self.kind is Kind.HOME:
             begun = self._seen_moving or self.ended_by_message
             return begun and bool(status.bits & apt.HOMED)

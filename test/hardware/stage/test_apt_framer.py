@@ -17,7 +17,7 @@ def status(position: int) -> bytes:
 
 
 def positions(frames: list) -> list[int]:
-    return [frame.whole("position") for frame in frames if frame.name == "status"]
+    return [frame.integer("position") for frame in frames if frame.name == "status"]
 
 
 def test_frames_in_any_pieces() -> None:

@@ -31,14 +31,14 @@ def test_whoever_hears_of_a_failure_may_use_the_link() -> None:
     heard: list[DeviceError] = []
 
     def on_lost(error: DeviceError) -> None:
-        reader = threading.Thread(target=link.write_at_once, args=(b"again",), daemon=True)
+        reader = threading.Thread(target=link.write, args=(b"again",), daemon=True)
         reader.start()
         reader.join(DEADLINE_S)
         assert not reader.is_alive()
         heard.append(error)
 
     link = AptLink(DeadPort(), lambda frame, at_ns: None, on_lost)
-    link.write_at_once(b"frame")
+    link.write(b"frame")
     assert [str(error) for error in heard] == [
         "the stage's port failed: [Errno 5] Input/output error; check the cable, then configure "
         "again"

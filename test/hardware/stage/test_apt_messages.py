@@ -132,7 +132,7 @@ def test_fields_are_those_of_the_oracle(id: int, payload: bytes) -> None:
             "moving_forward": theirs.moving_forward,
             "position_error": theirs.motion_error,
         }
-        decoded = apt.decode_bits(ours.whole("bits"))
+        decoded = apt.decode_bits(ours.integer("bits"))
         assert {name for name, holds in names.items() if holds} == set(decoded) & set(names)
 
 
@@ -141,9 +141,9 @@ def test_axis_data_of_the_manual() -> None:
     data = frame(0x04F2, struct.pack("<3H16s2I5i24x", *values))
     ours = apt.parse(data)
     (theirs,) = oracle.Unpacker(__import__("io").BytesIO(data))
-    assert ours.whole("counts_per_unit") == theirs.counts_per_unit == 20_000
-    assert ours.whole("maximum") == theirs.max_pos == 1_500_000
-    assert ours.whole("velocity") == theirs.max_vel
+    assert ours.integer("counts_per_unit") == theirs.counts_per_unit == 20_000
+    assert ours.integer("maximum") == theirs.max_pos == 1_500_000
+    assert ours.integer("velocity") == theirs.max_vel
     assert ours.text("part") == "MLS203"
 
 
@@ -158,5 +158,5 @@ def test_wrong_use_is_refused() -> None:
         apt.bay_address(11)
     with pytest.raises(ArgumentError, match="no field speed"):
         apt.pack("home", BAY, channel=1, speed=3)
-    with pytest.raises(ArgumentError, match="whole known message"):
+    with pytest.raises(ArgumentError, match="complete known message"):
         apt.parse(b"\x91\x04\x00\x00\x01\x21")

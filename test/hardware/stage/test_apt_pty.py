@@ -113,9 +113,9 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
         stage.move_to(200.0, SLOW_MM_S)
         wait_until(lambda: model.axis.moving(time.monotonic_ns()), "motion")
         if thread == "apt reader":
-            stage._tracker.hear = mistake  # type: ignore[method-assign]
+            stage._tracker.add_status = mistake  # type: ignore[method-assign]
         else:
-            stage._link.every(1.0, mistake)
+            stage._link.call_every(1.0, mistake)
         wait_until(lambda: failed(stage), "the failure")
         assert not stage.healthy
         for call in (stage.state, stage.home, lambda: stage.move_to(10.0, 10.0)):
