@@ -25,7 +25,8 @@ _BIAS_TABLE = tuple(
         name,
         0,
         f"offset from the factory trim, acts on the {info.acts_on}; "
-        f"normal range {info.normal[0]} to {info.normal[1]}",
+        f"normal range {info.normal[0]} to {info.normal[1]}"
+        + (_IGNORED if name == "bias_hpf" else ""),
         "",
         *info.wide,
         dynamic=True,

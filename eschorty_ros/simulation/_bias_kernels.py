@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numba import njit
 
-from eschorty_ros.simulation._highpass_kernels import _forgotten, _nearest_levels
 from eschorty_ros.simulation._passage_kernels import GAP_MAX
 from eschorty_ros.simulation._pixel_kernels import HELD, WAITS
 from eschorty_ros.simulation._response_kernels import _advanced, _earliest_us
@@ -18,10 +17,9 @@ def _rebias(pixels, spans, due, t_us, before, after):
     """Anchor every pixel anew at ``t_us``, up to which ``_run_columns`` has been.
 
     ``before`` and ``after`` are the ``model`` of ``_live``; the pixels' thresholds are the new
-    ones already. Signals and references are those that the old biases left; an event that would
+    ones already. Signals are those that the old biases left; an event that would
     have come later is looked for anew, and a dead time that has begun ends when it was to end.
     """
-    forgot, forgets = before[7] < np.inf, after[7] < np.inf
     reach = math.exp(GAP_MAX * after[2])
     rows = pixels.shape[1]
     for column in range(pixels.shape[0]):
@@ -35,16 +33,12 @@ def _rebias(pixels, spans, due, t_us, before, after):
             held = pixel.state == HELD
             elapsed_us = t_us - pixel.t
             tau_us = settled / before[0]
-            if forgot and not held:
-                y_ref = _forgotten(u, y, y_ref, settled, tau_us, before[1], before[7], elapsed_us)
             u, y = _advanced(u, y, settled, tau_us, before[1], elapsed_us)
-            pixel.u, pixel.y, pixel.y_ref, pixel.t = u, y, y_ref, t_us
+            pixel.u, pixel.y, pixel.t = u, y, t_us
             if not held:
                 pixel.state = WAITS
                 on_level = y_ref * np.float64(pixel.on_factor)
                 off_level = y_ref * np.float64(pixel.off_factor)
-                if forgets:
-                    on_level, off_level = _nearest_levels(pixel, u, y, y_ref)
                 pixel.t_next = _earliest_us(
                     u, y, settled, t_us, settled / after[0], after[1], on_level, off_level, reach
                 )

@@ -13,8 +13,6 @@ import numpy as np
 from numba import njit
 
 from eschorty_ros.simulation._draw_kernels import _bits, _gaussian, _mix, _uniform
-from eschorty_ros.simulation._highpass_kernels import _forgotten, _nearest_levels
-from eschorty_ros.simulation._highpass_passage_kernels import _passage_highpass
 from eschorty_ros.simulation._light_kernels import _add_patch, _window
 from eschorty_ros.simulation._passage_kernels import GAP_MAX, _noisy
 from eschorty_ros.simulation._prompt_kernels import _prompt
@@ -60,13 +58,11 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
     """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
     An empty ``light`` leaves theirs as it is. ``model`` = omega0 (per us), follower (us), noise,
-    refractory time (us) and its relative spread, latency and its spread (us), time constant of
-    the high-pass (us; ``inf`` for none). Returns the number of events in ``out`` and the earliest
-    time something is due in these rows, ``_FULL`` when the output did not suffice: call again
-    with more room.
+    refractory time (us) and its relative spread, latency and its spread (us). Returns the number
+    of events in ``out`` and the earliest time something is due in these rows, ``_FULL`` when the
+    output did not suffice: call again with more room.
     """
-    omega, follower_us, noise, highpass_us = model[0], model[1], model[2], model[7]
-    forgets = highpass_us < np.inf
+    omega, follower_us, noise = model[0], model[1], model[2]
     table = tables[0]
     reach = math.exp(GAP_MAX * noise)
     earliest = np.inf
@@ -86,13 +82,7 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
         full = False
         while t_next <= until_us:
             if state == WAITS:
-                if forgets:
-                    after_us, what = _passage_highpass(
-                        u, y, y_ref, settled, tau_us, follower_us, highpass_us,
-                        np.float64(pixel.on_factor), np.float64(pixel.off_factor), noise, table,
-                        t_next - t, until_us - t, _uniform(_bits(t, column, row, seed, 1)),
-                    )  # fmt: skip
-                elif noise > 0.0:
+                if noise > 0.0:
                     budget = -math.log(_uniform(_bits(t, column, row, seed, 1)))
                     after_us, what = _noisy(
                         u, y, settled, tau_us, follower_us, on_level, off_level, y_ref, noise,
@@ -115,8 +105,6 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
                     y_ref *= _fade(noise * _gaussian(_bits(t, column, row, seed, 2)))
                 on_level = y_ref * np.float64(pixel.on_factor)
                 off_level = y_ref * np.float64(pixel.off_factor)
-                if forgets:
-                    on_level, off_level = _nearest_levels(pixel, u, y, y_ref)
                 state = WAITS
                 t_next = _earliest_us(
                     u, y, settled, t, tau_us, follower_us, on_level, off_level, reach
@@ -135,10 +123,6 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
                     held_us *= max(0.0, 1.0 + model[4] * _gaussian(_mix(bits)))
                 t_next += max(1.0, held_us)
         if relit and not full:
-            if forgets and state != HELD:
-                y_ref = _forgotten(
-                    u, y, y_ref, settled, tau_us, follower_us, highpass_us, until_us - t
-                )  # fmt: skip
             u, y = _advanced(u, y, settled, tau_us, follower_us, until_us - t)
             t = until_us
             settled = 1.0 / light[np.uintp(row)]
@@ -146,8 +130,6 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
             if state != HELD:
                 state = WAITS
                 tau_us = settled / omega
-                if forgets:
-                    on_level, off_level = _nearest_levels(pixel, u, y, y_ref)
                 t_next = _earliest_us(
                     u, y, settled, t, tau_us, follower_us, on_level, off_level, reach
                 )
@@ -168,7 +150,7 @@ def _foresee(pixels, column, lo, hi, model, tables, seed):
     """Look up the next event of the rows [lo, hi) just lit that set out from rest.
 
     A pass of its own, since without branches on what a pixel does the processor works at
-    several pixels at once; not for references that forget. Other rows are left to :func:`_live`.
+    several pixels at once. Other rows are left to :func:`_live`.
     """
     omega, follower_us, noise = model[0], model[1], model[2]
     ways, gaps = tables[1], tables[2]
@@ -231,7 +213,7 @@ def _relight(
             earliest = min(earliest, other)
         if earliest == _FULL:
             return k, n
-        if model[2] > 0.0 and model[7] == np.inf:
+        if model[2] > 0.0:
             _foresee(pixels, column, lo, hi, model, tables, seed)
             if apart or old_lo < lo or old_hi > hi:
                 _foresee(pixels, column, old_lo, old_hi, model, tables, seed)

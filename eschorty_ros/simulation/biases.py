@@ -1,9 +1,8 @@
 """The camera's bias settings as parameters of the pixel model.
 
 A model, not a measurement: the sensor's maker says which way each bias works and gives its range,
-not what it does in numbers. Each acts by a factor ``exp(bias / scale)``, the high-pass by adding
-``HIGHPASS_HZ (exp(bias / scale) - 1)``, so that 0 leaves the base as it is and the effect is
-monotone.
+not what it does in numbers. Each acts by a factor ``exp(bias / scale)``, so that 0 leaves the base
+as it is and the effect is monotone. The high-pass (``bias_hpf``) is not modelled.
 """
 
 from __future__ import annotations
@@ -18,16 +17,12 @@ LIMITS = {
     "diff_on": (-85, 140),
     "diff_off": (-35, 190),
     "fo": (-35, 55),
-    "hpf": (0, 120),
     "refr": (-20, 235),
 }
 """Offsets the IMX636 takes."""
 
 THRESHOLD_SCALE = 120.0
 FOLLOWER_SCALE = 20.0
-HIGHPASS_SCALE = 26.0
-HIGHPASS_HZ = 10.0
-"""With the scale, 1 kHz at the largest offset: the photoreceptor's own pole in the dark."""
 REFRACTORY_SCALE = -80.0
 
 
@@ -41,9 +36,6 @@ class Biases:
         More raises the ON or OFF threshold: fewer events, a narrower line.
     fo : int
         More widens the source follower: events come sooner, and more of them above some kHz.
-    hpf : int
-        More raises the pole of the high-pass: slow changes make no events, so the line has no
-        late ones and narrows; little changes above some kHz.
     refr : int
         More shortens the refractory time: more events above 500 Hz.
 
@@ -56,7 +48,6 @@ class Biases:
     diff_on: int = 0
     diff_off: int = 0
     fo: int = 0
-    hpf: int = 0
     refr: int = 0
 
     def __post_init__(self) -> None:
@@ -74,6 +65,5 @@ def parameters_from_biases(base: PixelParameters, biases: Biases) -> PixelParame
         threshold_on=base.threshold_on * math.exp(biases.diff_on / THRESHOLD_SCALE),
         threshold_off=base.threshold_off * math.exp(biases.diff_off / THRESHOLD_SCALE),
         follower_hz=base.follower_hz * math.exp(biases.fo / FOLLOWER_SCALE),
-        highpass_hz=base.highpass_hz + HIGHPASS_HZ * math.expm1(biases.hpf / HIGHPASS_SCALE),
         refractory_us=max(1.0, base.refractory_us * math.exp(biases.refr / REFRACTORY_SCALE)),
     )

@@ -2,9 +2,9 @@
 
 Per pixel: relative photocurrent ``I = I_bg + A rho g(y) w(t)`` with a Gaussian ``g`` over the
 rows, a photoreceptor whose bandwidth grows with ``I``, a source follower, comparator noise, an
-ON/OFF comparator with fixed mismatch whose reference may forget slow changes, a refractory time
-during which the reference follows the signal, leak and background activity, a latency with
-jitter. Times of threshold crossings are solved, never stepped through.
+ON/OFF comparator with fixed mismatch, a refractory time during which its reference follows the
+signal, leak and background activity, a latency with jitter. Times of threshold crossings are
+solved in closed form.
 """
 
 from __future__ import annotations
@@ -114,12 +114,11 @@ class PixelArray:
             [
                 p.omega_per_us,
                 p.follower_us,
-                p.comparator_noise,
+                p.noise,
                 p.refractory_us,
                 p.refractory_jitter,
                 p.latency_us,
                 p.latency_jitter_us,
-                p.highpass_us,
             ]
         )
         correlation_us = max(p.follower_us, DECISION_US)
@@ -128,7 +127,7 @@ class PixelArray:
         self._draw_thresholds()
         # Leaks of dark pixels come at random times too: each has its own phase and rate.
         both_hz = self._background_hz * self.columns * self.rows + p.hot_hz * self._hot.size
-        total_hz = both_hz + p.leak_events_hz * self.columns * self.rows
+        total_hz = both_hz + p.leak_hz * self.columns * self.rows
         self._background_per_us = total_hz * 1e-6
         self._shares = np.zeros(2)
         if total_hz:

@@ -10,7 +10,6 @@ from eschorty_ros.core.errors import ArgumentError
 _MAY_VANISH = frozenset(
     (
         "threshold_mismatch",
-        "highpass_hz",
         "noise",
         "refractory_jitter",
         "leak_hz",
@@ -44,18 +43,14 @@ class PixelParameters:
         Photoreceptor bandwidth at ``I = 1``; proportional to ``I``.
     follower_hz : float
         Pole of the source follower; ``inf`` for none.
-    highpass_hz : float
-        Pole of the high-pass: changes slower than this are forgotten, as the comparator's
-        reference follows the signal while it waits; 0 for none.
     noise : float
         Standard deviation of the signal behind the follower, in log intensity.
     refractory_us : float
     refractory_jitter : float
         Relative standard deviation of the refractory time, drawn per event.
     leak_hz : float
-        ON events per second of any pixel, lit or not, from its reference leaking away; fewer
-        behind a high-pass. The 0.1 Hz of P* are left to the background activity, of which they
-        are a part.
+        ON events per second of any pixel, lit or not, from its reference leaking away. The 0.1 Hz
+        of P* are left to the background activity, of which they are a part.
     hot_fraction : float
         Share of pixels that fire all by themselves, ON and OFF alike, ...
     hot_hz : float
@@ -78,7 +73,6 @@ class PixelParameters:
     threshold_min: float = 0.03
     bandwidth_hz: float = 1000.0
     follower_hz: float = 20_000.0
-    highpass_hz: float = 0.0
     noise: float = 0.04
     refractory_us: float = 700.0
     refractory_jitter: float = 0.0
@@ -109,24 +103,6 @@ class PixelParameters:
     def follower_us(self) -> float:
         """Time constant of the source follower, us."""
         return max(1e6 / (2.0 * math.pi * self.follower_hz), 1e-6)
-
-    @property
-    def highpass_us(self) -> float:
-        """Time constant of the high-pass, us; ``inf`` for none."""
-        return 1e6 / (2.0 * math.pi * self.highpass_hz) if self.highpass_hz > 0.0 else math.inf
-
-    @property
-    def comparator_noise(self) -> float:
-        """Standard deviation of what the high-pass leaves of the noise."""
-        return self.noise * math.sqrt(1.0 / (1.0 + self.highpass_hz / self.follower_hz))
-
-    @property
-    def leak_events_hz(self) -> float:
-        """Leak events per second; none where the reference is drawn back faster than it leaks."""
-        lost = 2.0 * math.pi * self.highpass_hz
-        if lost == 0.0:
-            return self.leak_hz
-        return -lost / math.log1p(-lost / self.leak_hz) if self.leak_hz > lost else 0.0
 
     @property
     def least_contrast(self) -> float:

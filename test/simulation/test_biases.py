@@ -55,24 +55,7 @@ def test_a_shorter_refractory_time_gives_more_events_at_2_khz() -> None:
     assert counts[-1] > 1.5 * counts[0]
 
 
-def test_a_higher_high_pass_narrows_a_slow_line_and_ends_it_sooner() -> None:
-    low, high = LIMITS["hpf"]
-    runs = [bench(Biases(hpf=int(b)), 70.0, 0.1) for b in np.linspace(low, high, 5)]
-    counts = [len(e) for e in runs]
-    widths = [float(np.std(e.y)) for e in runs]
-    late = [int(np.sum(e.t % round(5e5 / 70.0) > 600)) for e in runs]
-    print(counts, widths, late)
-    for falling in (counts, widths, late):
-        assert falling == sorted(falling, reverse=True)
-    assert counts[-1] < 0.85 * counts[0]
-    assert late[-1] < 0.1 * late[0]
-    fast = [len(bench(Biases(hpf=hpf), 5000.0, 0.03)) for hpf in (low, high)]
-    assert 0.9 * fast[0] < fast[1] < fast[0]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("diff_on", -86), ("fo", 56), ("hpf", -1), ("hpf", 121)]
-)
+@pytest.mark.parametrize(("name", "value"), [("diff_on", -86), ("fo", 56), ("refr", -21)])
 def test_offsets_outside_the_range_are_refused(name: str, value: int) -> None:
     with pytest.raises(ArgumentError, match=f"{name} is {value}"):
         Biases(**{name: value})

@@ -7,6 +7,7 @@ import math
 import mpmath
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.simulation._response_kernels import OFF, ON, _advanced, _noiseless
@@ -205,6 +206,74 @@ def test_row_position_is_found_between_rows() -> None:
     # Whole rows fire or not: a quarter row at worst for one position, nothing on average.
     assert np.max(np.abs(error)) < 0.3
     assert abs(np.mean(error)) < 0.03
+
+
+def quiet_events(
+    p: PixelParameters, offset: float, edges_us: list[int], end_us: int
+) -> list[tuple[float, int]]:
+    """Time and polarity of the events of a pixel without noise whose light changes at the edges."""
+    bright = p.background_intensity + p.amplitude * math.exp(-0.5 * (offset / p.sigma_rows) ** 2)
+    state, reference, held_us, events = [1.0, 1.0], 1.0, 0.0, []
+    for k, begin_us in enumerate(edges_us):
+        intensity = p.background_intensity if k % 2 else bright
+        rate = p.omega_per_us * intensity
+
+        def slopes(_, s, rate=rate, intensity=intensity):
+            return [(1.0 / intensity - s[0]) * rate, (s[0] - s[1]) / p.follower_us]
+
+        now_us, stop_us = float(begin_us), edges_us[k + 1] if k + 1 < len(edges_us) else end_us
+        while now_us < stop_us:
+            waits = now_us >= held_us
+            on, off = reference * math.exp(-p.threshold_on), reference * math.exp(p.threshold_off)
+            levels = [lambda _, s, on=on: s[1] - on, lambda _, s, off=off: s[1] - off]
+            for level in levels:
+                level.terminal = True
+            until_us = stop_us if waits else min(held_us, stop_us)
+            path = solve_ivp(
+                slopes, (now_us, until_us), state, "DOP853", rtol=1e-11, atol=1e-13,
+                events=levels if waits else None,
+            )  # fmt: skip
+            state, now_us = path.y[:, -1], path.t[-1]
+            if now_us == held_us:
+                reference = state[1]
+            if path.status == 1:
+                events.append((now_us, ON if path.t_events[0].size else OFF))
+                held_us = now_us + p.refractory_us
+    return events
+
+
+@pytest.mark.parametrize("follower_hz", [1000.0, 20_000.0])
+def test_events_of_a_flashing_line_come_when_an_integrator_says(follower_hz: float) -> None:
+    quiet = PixelParameters(**(CLEAN | {"follower_hz": follower_hz}))
+    edges_us, end_us = [0, 1300, 4100, 5000, 7700, 8000, 8300], 20_000
+    pixels = PixelArray(1, ROWS, quiet, SEED)
+    for k, t_us in enumerate(edges_us):
+        pixels.relight(t_us, np.array([0]), np.array([CENTRE]), np.array([1.0 - k % 2]))
+    pixels.run_until(end_us)
+    t, _, y, p = unpack(pixels.take(end_us))
+    for row in (40, 44, 47, 48):
+        wanted = quiet_events(quiet, row - CENTRE, edges_us, end_us)
+        mine = sorted(zip(t[y == row].tolist(), p[y == row].tolist(), strict=True))
+        assert [what for _, what in mine] == [what for _, what in wanted]
+        # A request takes 1 us and is read out at the next whole microsecond.
+        late_us = np.array([t for t, _ in mine]) - np.array([t for t, _ in wanted])
+        assert np.all((late_us >= 1.0 - 1e-6) & (late_us <= 2.0 + 1e-6)), row
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.04])
+def test_looking_in_between_changes_nothing(noise: float) -> None:
+    looked_at, left_alone = (PixelArray(8, ROWS, PixelParameters(noise=noise), SEED) for _ in "ab")
+    column, line = np.arange(8), np.full(8, CENTRE)
+    for k in range(14):
+        for array in (looked_at, left_alone):
+            array.relight(k * 7143, column, line, np.full(8, 1.0 - k % 2))
+        for t_us in range(k * 7143, (k + 1) * 7143, 97):
+            looked_at.run_until(t_us)
+    for array in (looked_at, left_alone):
+        array.run_until(200_000)
+    keys = looked_at.take(200_000)
+    assert keys.size > 1000
+    assert np.array_equal(keys, left_alone.take(200_000))
 
 
 def test_dark_columns_stay_silent_and_untouched() -> None:

@@ -6,7 +6,6 @@ import mpmath
 import numpy as np
 import pytest
 
-from eschorty_ros.simulation._highpass_kernels import _forgotten, _noiseless_highpass
 from eschorty_ros.simulation._response_kernels import NOTHING, OFF, ON, _advanced, _noiseless
 
 SEED = 25
@@ -100,56 +99,3 @@ def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, measured):
 def test_case_25_level_out_of_reach_is_no_event():
     assert _noiseless(1.0, 1.0, 0.5, TAU_US, 8.0, 0.4, 2.0) == (np.inf, NOTHING)
     assert _noiseless(1.0, 1.0, 1.0, TAU_US, 8.0, 0.4, 2.0) == (np.inf, NOTHING)
-
-
-def exact_chain(u, y, reference, settled, follower_us, highpass_us, t_us):
-    """Follower and reference after ``t_us``; equal rates are taken 1e-40 apart, of 150 digits."""
-    u, y, reference, settled, t_us = (mpmath.mpf(v) for v in (u, y, reference, settled, t_us))
-    rates = [1 / mpmath.mpf(tau_us) for tau_us in (TAU_US, follower_us, highpass_us)]
-    x, z, k = (rate * (1 + n * mpmath.mpf(10) ** -40) for n, rate in enumerate(rates))
-    at_x, at_z, at_k = (mpmath.exp(-rate * t_us) for rate in (x, z, k))
-    w, e, g = u - settled, y - settled, reference - settled
-    w_to_e, e_to_g = z * (at_x - at_z) / (z - x), k * (at_z - at_k) / (k - z)
-    w_to_g = (k * w_to_e - z * e_to_g) / (k - x)
-    return settled + e * at_z + w * w_to_e, settled + g * at_k + e * e_to_g + w * w_to_g
-
-
-FORGETS = [1e-3, 8.0, 8.0 * (1.0 + 1e-12), 100.0, TAU_US, TAU_US * (1.0 - 1e-7), 1600.0, 1e6, 1e12]
-
-
-@pytest.mark.parametrize("follower_us", [1e-6, 8.0, TAU_US, TAU_US * (1.0 + 1e-9), 600.0])
-def test_case_25_reference_that_forgets(follower_us, measured):
-    """A third exponential: all rates far apart, nearly equal and equal."""
-    worst = 0.0
-    with mpmath.workdps(150):
-        for highpass_us in FORGETS:
-            for x in np.geomspace(1e-18, 1e5, 70):
-                state = 1.0, 0.9, 0.8, 0.2
-                t_us = float(x) * TAU_US
-                _, exact = exact_chain(*state, follower_us, highpass_us, t_us)
-                ours = _forgotten(*state, TAU_US, follower_us, highpass_us, t_us)
-                worst = max(worst, relative(ours, exact))
-    measured("reference behind the high-pass after a step, relative", worst, 1e-13)
-
-
-@pytest.mark.parametrize("follower_us", [1e-6, 8.0, TAU_US, 600.0])
-def test_case_25_crossing_behind_the_high_pass(follower_us, measured):
-    """There the signal is at its level of a reference that moves too."""
-    rng = np.random.default_rng(SEED)
-    worst, found = 0.0, 0
-    with mpmath.workdps(150):
-        for highpass_us in FORGETS:
-            for theta in np.geomspace(1e-9, 0.4, 6):
-                u, settled, y = 1.0, rng.uniform(0.1, 0.9), rng.uniform(1.0 - 0.5 * theta, 1.0)
-                factors = float(np.exp(-theta)), float(np.exp(theta))
-                ours_us, what = _noiseless_highpass(
-                    u, y, 1.0, settled, TAU_US, follower_us, highpass_us, *factors
-                )
-                if what == NOTHING:
-                    continue
-                found += 1
-                there, level = exact_chain(u, y, 1.0, settled, follower_us, highpass_us, ours_us)
-                level *= factors[0] if what == ON else factors[1]
-                worst = max(worst, relative(there, level))
-    assert found > 25
-    measured("level at the crossing behind the high-pass, relative", worst, 1e-13)
