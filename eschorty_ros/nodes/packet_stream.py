@@ -25,20 +25,20 @@ _GAP_NS = WRAP_US * NS_PER_US // 2
 
 
 class PacketStream:
-    """Drives a ``Reconstructor`` over packets whose clock and modulation arrive separately.
+    """Runs a ``Reconstructor`` over packets whose clock and modulation arrive separately.
 
     Packets are held, in order and bounded, until the modulation and the clock are known. The
-    clock is exact when the camera's zero is announced, as a replay does; when nobody does so
-    within ``clock_timeout_s`` it follows the packets' stamps and, where the stage is wired to the
-    trigger input, its edges. The modulation's phase is then taken from the events (or from the
-    laser's edges), since such a clock is not good to a microsecond.
+    clock is exact when the camera's zero is announced, as a replay does. Without an announcement
+    within ``clock_timeout_s`` the clock is fitted to the packets' stamps and, where the stage is
+    wired to the trigger input, to its edges. Such a clock is not good to a microsecond, so the
+    modulation's phase then comes from the events (or from the laser's edges).
 
-    A packet's stamp is when its first bytes arrived. The camera had collected them for up to
-    ``packet_period_s`` then, so this is taken off.
+    A packet's stamp is the time at which its first bytes arrived. The camera had collected them
+    for up to ``packet_period_s`` then, which is subtracted.
 
-    The decoder counts time from the last wrap of the stream's 24-bit time before it started. A
-    stream joined later than its first packet, or after more than half a wrap without packets, is
-    brought to the clock by the packets' stamps.
+    The decoder counts time from the last wrap of the stream's 24-bit time before it started. The
+    packets' stamps give the number of wraps of a stream that is joined later than its first
+    packet, or goes on after more than half a wrap without packets.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ class PacketStream:
     packets, packets_lost, restarts : int
         Packets reconstructed, missing by their ``seq``, and new starts of the stream.
     packets_late : int
-        Packets that came twice or after later ones, and were not used; the latter are among
-        ``packets_lost``.
+        Packets left out because they came twice or after later ones; ``packets_lost`` includes
+        the latter.
     clock_restarts : int
-        Times the clock began anew because stamps or sensor times went back.
+        Restarts of the clock because stamps or sensor times went back.
     announcement_expected : bool
-        Whether somebody may announce the camera's zero; without, nobody waits for it.
+        Whether packets wait for an announcement of the camera's zero.
     """
 
     def __init__(
@@ -103,19 +103,19 @@ class PacketStream:
 
     @property
     def waits_for(self) -> str:
-        """What the held packets wait for, empty when nothing."""
+        """What the held packets wait for, ``""`` when for nothing."""
         if self._laser is None:
             return "modulation"
         return "camera clock" if self._epoch is None else ""
 
     @property
     def epoch(self) -> SensorEpoch | None:
-        """Time of the stream, ``None`` while it is unknown."""
+        """The stream's epoch, ``None`` while its clock is unknown."""
         return self._epoch
 
     @property
     def clock_announced(self) -> bool:
-        """Whether times come from an announcement (exact)."""
+        """Whether the clock is exact because it was announced."""
         return self._epoch is not None and self._epoch.clock.exact
 
     @property
@@ -131,14 +131,14 @@ class PacketStream:
 
     @property
     def counters(self) -> Counter[str]:
-        """Counters of all reconstructors so far, summed by name."""
+        """Counters of all reconstructors of the stream, summed by name."""
         total, reconstructor = Counter(self._retired), self._reconstructor
         if reconstructor is not None:
             total.update(reconstructor.counters)
         return total
 
     def announce_zero(self, zero_ns: int) -> None:
-        """Take somebody's word that sensor time 0 was ROS time ``zero_ns``."""
+        """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
         epoch = self._epoch
         if epoch is not None and epoch.clock.exact and epoch.clock.zero_ns == zero_ns:
             self._epoch_used = False
@@ -151,8 +151,8 @@ class PacketStream:
     ) -> None:
         """Use this modulation and ROS time of one rising edge for packets processed later.
 
-        ``on_since_ns`` tells when the laser was switched on, ``None`` when it is off: its phase
-        begins anew then, unless ``epoch_ns`` says it.
+        ``on_since_ns`` is when the laser was switched on, ``None`` while it is off. Its phase
+        restarts then, unless ``epoch_ns`` gives it.
         """
         switched_on = on_since_ns is not None and on_since_ns != self._on_since_ns
         self._on_since_ns = on_since_ns
@@ -164,15 +164,15 @@ class PacketStream:
             self._reconstructor.restart_phase()
 
     def set_pulses(self, pulses: PulseTrain | None) -> None:
-        """Expect pulses there, or none, where the trigger input is wired to the stage."""
+        """Expect these pulses, or none, if the trigger input is wired to the stage."""
         self._pulses = pulses
         if self._epoch is not None:
             self._epoch.set_pulses(self._expected_pulses())
 
-    def follow_edges(self, track: StageTrack, *, now: bool = False) -> None:
-        """Let the clock follow the stage's edges; with ``now`` up to the very newest."""
+    def fit_edges(self, track: StageTrack, *, now: bool = False) -> None:
+        """Fit the clock to the stage's edges that are due, with ``now`` to all of them."""
         if self._epoch is not None:
-            self._epoch.follow(track, now=now)
+            self._epoch.fit_edges(track, now=now)
 
     def set_settings(self, settings: Settings) -> None:
         """Use ``settings`` for packets processed later; the open period is closed first."""
@@ -188,14 +188,14 @@ class PacketStream:
         self._renew()
 
     def add(self, packet: Packet, now_s: float) -> None:
-        """Queue one packet that arrived at steady time ``now_s``."""
+        """Queue one packet that arrived at ``now_s`` of the steady clock."""
         if self._held_since_s is None:
             self._held_since_s = now_s
         if len(self._held) < self._held_max:
             self._held.append(packet)
 
     def process(self, now_s: float) -> list[TimedProfiles]:
-        """Reconstruct what can be; returns the profiles completed since the last call."""
+        """Reconstruct the packets that need not wait; return the profiles completed since."""
         while self._held:
             if overtaken(self._held[0], self._next_seq, self._last_stamp_ns):
                 self._held.popleft()
@@ -209,13 +209,13 @@ class PacketStream:
             self._held_since_s = now_s
         if not self._held:
             self._held_since_s = None
-        return self._take()
+        return self._completed()
 
     def flush(self) -> list[TimedProfiles]:
-        """Close the open period."""
+        """Close the open period; return the profiles completed since the last call."""
         if self._reconstructor is not None:
             self._collect(self._reconstructor.flush())
-        return self._take()
+        return self._completed()
 
     def _forget_stream(self) -> None:
         self._retire()
@@ -245,7 +245,7 @@ class PacketStream:
         missing = 0 if self._next_seq is None else packet.seq - self._next_seq
         self.packets_lost += missing
         time_us = self._reconstructor.time_us if self._reconstructor is not None else None
-        # Without a number left out it may be the host that stood still.
+        # Without a number left out, the host may have stalled.
         if packet.stamp_ns - self._last_stamp_ns > _GAP_NS and (
             missing or skips_time(packet.data, time_us)
         ):
@@ -268,7 +268,7 @@ class PacketStream:
         self.packets += 1
 
     def _observe(self, packet: Packet, before_us: int | None, after: Reconstructor) -> None:
-        """Pair the packet's stamp with the sensor time of its first bytes; take its edges."""
+        """Add the packet's stamp and edges to the clock."""
         assert self._epoch is not None
         shift_us = self._wraps * WRAP_US
         t_us = first_time_us(packet.data, before_us, after.time_us)
@@ -283,12 +283,12 @@ class PacketStream:
         self._epoch.edges.add(edges_us + shift_us, kinds)
 
     def _missed_wraps(self, packet: Packet, high_us: int | None) -> int:
-        """Count the wraps before this packet that a fresh decoder does not know of."""
+        """Count the wraps before this packet that a new decoder has not seen."""
         assert self._epoch is not None
         clock = self._epoch.clock
         if packet.seq == 0 or clock.line is None or high_us is None:
             return 0
-        # Where it goes on, the stream's own time says better than a stamp where it belongs.
+        # In a stream that goes on, the newest time is closer to this packet than a stamp.
         known_ns = self._last_stamp_ns if self._next_seq == packet.seq else packet.stamp_ns
         return max(round((clock.to_us(known_ns) - high_us) / WRAP_US), 0)
 
@@ -301,13 +301,13 @@ class PacketStream:
         return replace(modulation, on_edge_us=edge_us)
 
     def _renew(self) -> None:
-        """End the reconstructor; the next one goes on where it stopped."""
+        """End the reconstructor; the next packet starts one at the same time."""
         if self._reconstructor is not None:
             self._last_stamp_ns = self.processed_until_ns or self._last_stamp_ns
             self._retire()
 
     def _retire(self) -> None:
-        """Close the open period and keep the counters of the reconstructor that ends here."""
+        """End the reconstructor: close its period, keep its counters."""
         if self._reconstructor is None:
             return
         self._collect(self._reconstructor.flush())
@@ -319,7 +319,7 @@ class PacketStream:
             assert self._epoch is not None
             self._out.append(TimedProfiles.within(self._epoch, profiles, self._wraps * WRAP_US))
 
-    def _take(self) -> list[TimedProfiles]:
+    def _completed(self) -> list[TimedProfiles]:
         out, self._out = self._out, []
         return out
 

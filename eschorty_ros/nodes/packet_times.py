@@ -12,9 +12,9 @@ from eschorty_ros.core import _evt3_words as w3
 WRAP_US = 1 << 24
 # A stream repeats its time far more often than this.
 _WORDS_SEARCHED = 8192
-# A stream that goes on skips no more of its own time than this from one packet to the next.
+# A stream without losses skips less of its own time than this between two packets.
 _STEP_US = 100_000
-# A packet at most so many numbers back that is stamped no later was overtaken on its way.
+# A packet at most so many numbers back that is stamped no later was overtaken in transit.
 _OVERTAKEN = 16
 
 
@@ -28,20 +28,21 @@ class Packet:
 
 
 def first_time_high_us(data: Any) -> int | None:
-    """Sensor time (us, modulo 2^24) of the first TIME_HIGH word, ``None`` when there is none."""
+    """Return the time (us, modulo 2^24) of the first TIME_HIGH word, ``None`` without one."""
     words = _words(data)
     found = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
     return int(words[found[0]] & 0xFFF) << 12 if found.size else None
 
 
 def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int | None:
-    """Sensor time at which a packet's first bytes were sent, not later than that.
+    """Return the latest known sensor time at or before a packet's first bytes.
 
     Parameters
     ----------
     data : buffer of EVT3 words
     before_us, after_us : int, optional
-        Times the decoder had reached before and after it; what lies outside is a broken word.
+        Times the decoder had reached before and after the packet; a time outside comes from a
+        broken word.
 
     Returns
     -------
@@ -55,17 +56,17 @@ def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int
 
 
 def overtaken(packet: Packet, next_seq: int | None, last_stamp_ns: int) -> bool:
-    """Whether it is no restart of the stream but a packet that came twice or too late."""
+    """Return whether a packet came twice or too late, as opposed to a restart of the stream."""
     if next_seq is None or packet.stamp_ns > last_stamp_ns:
         return False
     return 0 < packet.seq < next_seq <= packet.seq + _OVERTAKEN
 
 
 def skips_time(data: Any, before_us: int | None) -> bool:
-    """Whether sensor time does not go on at ``before_us``: something was left out in between.
+    """Return whether part of the stream is missing between ``before_us`` and this packet.
 
-    Packets that a host at a standstill has only stamped late go on in the stream's own time. A
-    driver numbers only what it sends, and sends nothing while it sees no subscriber.
+    Packets that a stalled host stamped late are continuous in sensor time. A missing part need
+    not show in ``seq``: a driver numbers what it sends, and sends nothing without a subscriber.
     """
     high_us = first_time_high_us(data)
     if high_us is None or before_us is None:

@@ -1,4 +1,4 @@
-"""The reconstruction node's work without ROS: packets and stage samples to scans."""
+"""Packets and stage samples in, live profiles, points and scans out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from eschorty_ros.nodes.stage_placer import StagePlacer
 
 @dataclass(frozen=True, slots=True)
 class ScanReport:
-    """An assembled scan and what was lost while it was collected."""
+    """An assembled scan, and the losses while it was collected."""
 
     scan: AssembledScan
     events: int
@@ -32,7 +32,7 @@ class ScanReport:
 
     @property
     def message(self) -> str:
-        """What was lost, and why a scan without points is empty; ``""`` when all is well."""
+        """The losses, or why a scan without points is empty; ``""`` when nothing was lost."""
         notes = []
         if self.points_without_stage:
             notes.append(f"{self.points_without_stage} points had no stage position")
@@ -57,9 +57,7 @@ class ScanReport:
 
 
 class Pipeline:
-    """Packets, laser settings and stage samples in; live profiles, points and scans out.
-
-    Owned by one thread.
+    """Runs packet stream, stage placement and scan buffer; used by one thread.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ class Pipeline:
     Attributes
     ----------
     capture : Capture or None
-        Gets a calibration's events and placed profiles while it is set.
+        Receives a calibration's events and placed profiles while it is set.
     """
 
     def __init__(
@@ -96,25 +94,20 @@ class Pipeline:
 
     @property
     def scan_id(self) -> str:
-        """Of the scan being collected, empty when none."""
+        """Identifier of the scan being collected, ``""`` without one."""
         return self._buffer.scan_id if self._buffer is not None else ""
 
-    @property
-    def scan_points(self) -> int:
-        """Points collected for the scan so far."""
-        return len(self._buffer) if self._buffer is not None else 0
-
     def add_packet(self, packet: Packet, now_s: float) -> None:
-        """Queue a packet and reconstruct what is possible."""
+        """Queue a packet and reconstruct the packets that need not wait."""
         self.stream.add(packet, now_s)
         self._receive(self.stream.process(now_s), now_s)
         if self.capture is not None:
             self.capture.packet(packet)
 
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
-        """Advance whatever waited: profiles completed and points placed since the last call."""
+        """Return the profiles completed and the points placed since the last call."""
         self._receive(self.stream.process(now_s), now_s)
-        self.stream.follow_edges(self.placer.track)
+        self.stream.fit_edges(self.placer.track)
         ready = self.placer.ready(now_s)
         if self.capture is not None:
             for timed, stage_mm in ready:
@@ -145,7 +138,7 @@ class Pipeline:
         self.model = calibration.model()
 
     def begin_scan(self, scan_id: str, start_mm: float, stop_mm: float) -> None:
-        """Start collecting; a request repeated because its answer got lost changes nothing.
+        """Start collecting; a repeated request, as after a lost answer, changes nothing.
 
         Raises
         ------
@@ -165,7 +158,7 @@ class Pipeline:
         self._at_begin = self._losses()
 
     def set_capture(self, capture: Capture | None) -> None:
-        """Begin or, with ``None``, end feeding a calibration's capture.
+        """Start to feed a calibration's capture, or stop with ``None``.
 
         Raises
         ------
@@ -179,7 +172,7 @@ class Pipeline:
         self.capture = capture
 
     def close_period(self, scan_id: str, now_s: float) -> None:
-        """First half of ending a scan: complete the open period, as the light is off by now.
+        """Begin the end of a scan: complete the open period, since the laser is off.
 
         Raises
         ------
@@ -195,13 +188,13 @@ class Pipeline:
         self._receive(self.stream.flush(), now_s)
 
     def end_scan(self) -> ScanReport:
-        """Second half: what was collected, in order.
+        """Return the scan that was collected.
 
-        Points are placed again, by the clock as the whole sweep shows it.
+        Points are placed again, by the clock as fitted to the entire sweep.
         """
         assert self._buffer is not None
         buffer, self._buffer = self._buffer, None
-        self.stream.follow_edges(self.placer.track, now=True)
+        self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
         events, lost, dropped, without = np.subtract(self._losses(), self._at_begin).tolist()
         return ScanReport(
@@ -223,7 +216,7 @@ class Pipeline:
             return part
         t_ns, edge_ns = part.sensor.to_ns()
         stage_mm = self.placer.track.position_mm(t_ns // NS_PER_US)
-        # The odometry is not kept for ever: what it has forgotten stays where it was.
+        # The odometry is bounded: points from before its begin stay in their place.
         known = np.isfinite(stage_mm)
         stage_mm = np.where(known, stage_mm, part.stage_mm)
         points = part.points.copy()

@@ -1,4 +1,4 @@
-"""A recording's byte stream cut into packets as a camera node sends them."""
+"""A recording's byte stream cut into packets like those of a camera node."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TimedPacket:
 
 
 def timed_packets(reader: RawReader) -> Iterator[TimedPacket]:
-    """Cut the stream into packets of at most 256 kB and about 10 ms; joined they are the file."""
+    """Yield the stream in packets of at most 256 kB and about 10 ms; joined they are the file."""
     decoder = Decoder(reader.header.width, reader.header.height)
     pending: list[bytes] = []
     size = 0

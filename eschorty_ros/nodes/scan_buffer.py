@@ -1,4 +1,4 @@
-"""Collects the points of one scan and puts them in order."""
+"""The points of one scan, collected and put in order."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _HALF_NM = 0.5e-6
 
 @dataclass(frozen=True, slots=True)
 class PlacedPoints:
-    """Points in the static frame with what a scan needs to sort them; one entry per point.
+    """Points in the static frame with the times and positions that sort them; one entry each.
 
-    ``points`` is as ``place`` gives it (its ``t`` is not used), ``t_ns`` and ``edge_ns`` are int64
-    ROS nanoseconds of the point and of the rising edge of its period, ``stage_mm`` is float64.
-    ``sensor`` holds the sensor times where the clock may still get better.
+    ``points`` is as ``place`` returns it, its ``t`` unused. ``t_ns`` and ``edge_ns`` are int64 ROS
+    nanoseconds of the point and of the rising edge of its period, ``stage_mm`` is float64.
+    ``sensor`` holds the sensor times while the clock may still improve.
     """
 
     points: NDArray[Any]
@@ -35,7 +35,7 @@ class PlacedPoints:
         return len(self.points)
 
     def select(self, mask: NDArray[Any]) -> PlacedPoints:
-        """Points where ``mask`` (boolean, indices or slice-like index array) says."""
+        """Return the points at ``mask``: booleans or indices."""
         return PlacedPoints(
             self.points[mask],
             self.t_ns[mask],
@@ -58,7 +58,7 @@ class AssembledScan:
 class ScanBuffer:
     """Points whose stage position lies between two limits.
 
-    Points whose place is not final are kept wherever they are until the end.
+    Points whose place is not final are all kept until the end.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class ScanBuffer:
     Attributes
     ----------
     points_outside, points_over_limit : int
-        Points left out since they are not between the limits, or were too many.
+        Points left out because they are not between the limits, or were too many.
 
     Raises
     ------
@@ -118,9 +118,9 @@ class ScanBuffer:
     def assemble(
         self, placed_again: Callable[[PlacedPoints], PlacedPoints] | None = None
     ) -> AssembledScan:
-        """Everything kept so far as one cloud; an empty one when nothing was kept.
+        """Return all kept points as one cloud, which may be empty.
 
-        ``placed_again`` gives points their final place.
+        ``placed_again`` returns points in their final place.
         """
         if placed_again is not None:
             self._parts = [self._inside(placed_again(part)) for part in self._parts]

@@ -1,4 +1,4 @@
-"""The sensor's time from one start of the camera to the next, and what carries it."""
+"""The clock of the sensor between two starts of the camera, and profiles timed by it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PULSES_MISSING = 30
 
 
 class SensorEpoch:
-    """Clock of one stretch of sensor time that never goes back.
+    """The clock of an interval in which sensor time never goes back.
 
     Parameters
     ----------
@@ -42,17 +42,17 @@ class SensorEpoch:
 
     @property
     def expects_edges(self) -> bool:
-        """Whether edges of the stage are to tell the time."""
+        """Whether the clock is fitted to edges of the stage."""
         return self.edges.pulses is not None and not self.clock.exact
 
     def set_pulses(self, pulses: PulseTrain | None) -> None:
-        """Take pulses at other places from now on, or none."""
+        """Expect other pulses from now on, or none."""
         if pulses != self.edges.pulses:
             self.edges = EdgeClock(pulses)
             self.clock.adopt(None)
 
-    def follow(self, track: StageTrack, *, now: bool = False) -> None:
-        """Let the clock follow edges that have come in, and with ``now`` the very newest, too."""
+    def fit_edges(self, track: StageTrack, *, now: bool = False) -> None:
+        """Fit the clock to the edges that are due, with ``now`` to all of them."""
         arrivals = self.clock.arrival_line
         if arrivals is None or not self.expects_edges:
             return
@@ -72,8 +72,8 @@ class SensorEpoch:
         self._position_mm = position_mm
         self.edges_missing = self._passed_mm > _PULSES_MISSING * self.edges.pulses.interval_mm
 
-    def settled(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Tell which sensor times edges cover, if edges are expected."""
+    def covered(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which sensor times lie before the last fitted edge; all without edges."""
         if not self.expects_edges:
             return np.ones(t_us.shape, dtype=bool)
         until_us = self.edges.until_us
@@ -89,11 +89,11 @@ class SensorTimes:
     edge_us: NDArray[np.int64]
 
     def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> SensorTimes:
-        """Points where ``mask`` says."""
+        """Return the points where ``mask`` is set."""
         return SensorTimes(self.epoch, self.t_us[mask], self.edge_us[mask])
 
     def to_ns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """ROS times as the clock has them now."""
+        """Return the ROS times by the clock as it is now."""
         return self.epoch.clock.to_ns(self.t_us), self.epoch.clock.to_ns(self.edge_us)
 
 
@@ -101,7 +101,7 @@ class SensorTimes:
 class TimedProfiles:
     """Profiles with int64 ROS nanoseconds of each point and of its period's rising edge.
 
-    ``sensor`` holds the sensor times where the clock may still get better.
+    ``sensor`` holds the sensor times while the clock may still improve.
     """
 
     profiles: Profiles
@@ -111,32 +111,32 @@ class TimedProfiles:
 
     @classmethod
     def within(cls, epoch: SensorEpoch, profiles: Profiles, shift_us: int) -> TimedProfiles:
-        """Profiles whose times are ``shift_us`` less than the epoch's."""
+        """Make profiles from some whose times are ``shift_us`` less than the epoch's."""
         sensor = SensorTimes(epoch, profiles.t_us + shift_us, profiles.edge_us + shift_us)
         return cls(profiles, *sensor.to_ns(), None if epoch.clock.exact else sensor)
 
     def select(self, mask: NDArray[np.bool_]) -> TimedProfiles:
-        """Points where ``mask`` is set."""
+        """Return the points where ``mask`` is set."""
         sensor = None if self.sensor is None else self.sensor.select(mask)
         return TimedProfiles(
             self.profiles.select(mask), self.t_ns[mask], self.edge_ns[mask], sensor
         )
 
     def retimed(self) -> TimedProfiles:
-        """Give the same points the ROS times that the clock has for them now."""
+        """Return the same points with ROS times by the clock as it is now."""
         if self.sensor is None:
             return self
         t_ns, edge_ns = self.sensor.to_ns()
         return replace(self, t_ns=t_ns, edge_ns=edge_ns)
 
     def earliest_ns(self) -> int:
-        """ROS time of the first point as the clock has it now."""
+        """Return the ROS time of the first point by the clock as it is now."""
         if self.sensor is None:
             return int(self.t_ns.min())
         return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.min()))
 
-    def settled(self) -> NDArray[np.bool_]:
-        """Tell which points' times are as good as they will be while the stage moves."""
+    def covered(self) -> NDArray[np.bool_]:
+        """Return which points' times are as good as they will be while the stage moves."""
         if self.sensor is None:
             return np.ones(len(self.t_ns), dtype=bool)
-        return self.sensor.epoch.settled(self.sensor.t_us)
+        return self.sensor.epoch.covered(self.sensor.t_us)

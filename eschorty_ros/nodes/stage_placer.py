@@ -1,4 +1,4 @@
-"""Holds measured profiles until the stage's position at their time is known."""
+"""Profiles wait here until the stage's position at their time is known."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ from numpy.typing import NDArray
 from eschorty_ros.core.clock import NS_PER_US, StageTrack
 from eschorty_ros.nodes.sensor_epoch import TimedProfiles
 
-__all__ = ["StagePlacer", "TimedProfiles"]
-
 _HISTORY_US = 600_000_000
-# Odometry comes in order: what lies further back than this was stamped by a clock set anew.
+# Odometry comes in order: a stamp further back than this comes from a clock that was set.
 _CLOCK_BACK_US = 100_000
-# A stage that rests gives no pulses, and a wire may be off: nobody waits longer for an edge.
+# A stage at rest gives no pulses, and a wire may be off: longest wait for an edge.
 _EDGE_WAIT_S = 0.3
 
 
 class StagePlacer:
     """Joins profiles and stage positions by time; interpolates, never extrapolates.
 
-    Profiles have sensor times until then: they are placed by the clock as it is known when their
-    position is, and where edges of the stage are expected, when edges cover their time.
+    A profile's ROS times are computed when its position is known, by the clock as it is then.
+    Where edges of the stage are expected, a profile waits until edges cover its time.
 
     Parameters
     ----------
     gap_s : float
-        Longest distance of two stage samples that is bridged; 0 bridges any.
+        Longest time between two stage samples that is bridged; 0 bridges any.
     timeout_s : float
         Longest time (steady clock) a profile waits for a stage position.
 
@@ -39,8 +37,8 @@ class StagePlacer:
     waiting : int
         Points that wait for a stage position.
     track_restarts : int
-        Times the odometry began anew because its stamps went back: the clock was set, or a
-        recording is played again.
+        Restarts of the odometry because its stamps went back: the clock was set, or a recording
+        is played again.
     track : StageTrack
         The odometry over ROS time, us, since the last restart.
     """
@@ -56,11 +54,11 @@ class StagePlacer:
 
     @property
     def late_samples(self) -> int:
-        """Stage samples that were not later than the one before, and so were not used."""
+        """Stage samples left out because they were not later than the one before."""
         return self._late_before + self.track.dropped
 
     def set_gap(self, gap_s: float) -> None:
-        """Change the longest bridged distance of two samples."""
+        """Change the longest time between two samples that is bridged."""
         self.track.max_gap_us = round(gap_s * 1e6) or None
 
     def add_stage(self, t_ns: int, position_mm: float) -> None:
@@ -75,17 +73,17 @@ class StagePlacer:
         self.track.forget_before(self.track.last_us - _HISTORY_US)
 
     def add_profiles(self, timed: TimedProfiles, now_s: float) -> None:
-        """Queue profiles that arrived at steady time ``now_s``."""
+        """Queue profiles that arrived at ``now_s`` of the steady clock."""
         if len(timed.profiles):
             self._waiting.append((now_s, timed))
             self.waiting += len(timed.profiles)
 
     def holds(self, until_s: float) -> bool:
-        """Whether a profile that arrived by steady time ``until_s`` still waits."""
+        """Return whether a profile that arrived by ``until_s`` of the steady clock waits."""
         return bool(self._waiting) and self._waiting[0][0] <= until_s
 
     def ready(self, now_s: float) -> list[tuple[TimedProfiles, NDArray[np.float64]]]:
-        """Profiles whose position is known, each with its positions (mm, float64), oldest first."""
+        """Return the profiles whose positions (mm, float64) are known, oldest first."""
         placed = []
         still: deque[tuple[float, TimedProfiles]] = deque()
         last_us = self.track.last_us
@@ -98,7 +96,7 @@ class StagePlacer:
             t_us = timed.t_ns // NS_PER_US
             early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
             if now_s - arrived_s <= min(_EDGE_WAIT_S, self.timeout_s):
-                early |= ~timed.settled()
+                early |= ~timed.covered()
             if expired:
                 self.points_without_stage += int(np.count_nonzero(early))
             elif early.any():

@@ -10,7 +10,8 @@ from eschorty_ros.core.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.core.errors import ArgumentError
 from eschorty_ros.nodes.pipeline import ScanReport
 from eschorty_ros.nodes.scan_buffer import PlacedPoints, ScanBuffer
-from eschorty_ros.nodes.stage_placer import StagePlacer, TimedProfiles
+from eschorty_ros.nodes.sensor_epoch import TimedProfiles
+from eschorty_ros.nodes.stage_placer import StagePlacer
 
 T0_NS = 1_700_000_000_000_000_123
 
