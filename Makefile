@@ -59,13 +59,13 @@ report: $(SETUP) $(BUILD)/kernels.stamp
 
 tradeoff: $(SETUP) $(BUILD)/kernels.stamp
 	@$(ENTER) eschorty report --out report --only tradeoff
-	@$(ENTER) python -m eschorty_ros.report.readme_table report/tradeoff-changes.csv README.md
+	@$(ENTER) python -m eschorty_experiments.readme_table report/tradeoff-changes.csv README.md
 
 faults: $(SETUP)
-	@$(ENTER) python test/fault_table.py
+	@$(ENTER) python test/support/fault_table.py
 
 reference: $(SETUP) $(BUILD)/kernels.stamp
-	@$(ENTER) python test/interface_tables.py
+	@$(ENTER) python test/support/interface_tables.py
 
 test: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)

@@ -41,7 +41,7 @@ setup(
     entry_points={
         "console_scripts": [
             "eschorty = eschorty_ros.cli:main",
-            "eschorty-bench = eschorty_ros.emulation.bench:main",
+            "eschorty-bench = eschorty_ros.emulation.bench.server:main",
         ]
     },
 )

@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "test")]
+sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "test" / "support")]
 
-from streams import line_row_events, sparse_events  # noqa: E402
+from support.streams import line_row_events, sparse_events  # noqa: E402
 
-from eschorty_ros.core import evt3  # noqa: E402
-from eschorty_ros.core.noise import ActivityFilter  # noqa: E402
-from eschorty_ros.core.raw_file import RawReader, RawWriter  # noqa: E402
+from eschorty_ros.core.evt3 import decoder as evt3  # noqa: E402
+from eschorty_ros.core.evt3.activity_filter import ActivityFilter  # noqa: E402
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter  # noqa: E402
 
 PIECE_BYTES = 128 * 1024
 SEED = 20_240_601

@@ -17,11 +17,11 @@ import numpy as np
 import usb.core
 import usb.util
 
-from eschorty_ros.emulation.evk4_model import DATA_IN, Evk4Model
-from eschorty_ros.emulation.evk4_sequences import SEQUENCES
-from eschorty_ros.emulation.usb_backend import EmulatedBackend
-from eschorty_ros.emulation.usb_remote import backend
-from eschorty_ros.emulation.usb_server import UsbServer
+from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.bus.usb_remote import backend
+from eschorty_ros.emulation.bus.usb_server import UsbServer
+from eschorty_ros.emulation.evk4.model import DATA_IN, Evk4Model
+from eschorty_ros.emulation.evk4.sequences import SEQUENCES
 
 PERIODS_US = (1008, 4000)
 EVENTS_PER_US = 20

@@ -4,7 +4,7 @@ ros2 launch eschorty_ros calibrate.launch.py method:=paper capture_time:=2
 ros2 launch eschorty_ros calibrate.launch.py --show-args
 """
 
-from eschorty_ros.nodes.launching import (
+from eschorty_ros.nodes.ros.launching import (
     FAKE,
     PARAMETERS,
     PIXELS,

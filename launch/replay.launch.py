@@ -6,7 +6,7 @@ ros2 launch eschorty_ros replay.launch.py recording:=/path/to/rec rviz:=true
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.parameter_descriptions import ParameterValue
 
-from eschorty_ros.nodes.launching import EVENTS, PARAMETERS, declare, node, number, rviz, text
+from eschorty_ros.nodes.ros.launching import EVENTS, PARAMETERS, declare, node, number, rviz, text
 from launch import LaunchDescription
 
 ARGUMENTS = (

@@ -8,7 +8,7 @@ from launch.actions import EmitEvent, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 
-from eschorty_ros.nodes.launching import (
+from eschorty_ros.nodes.ros.launching import (
     FAKE,
     PARAMETERS,
     PIXELS,

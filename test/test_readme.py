@@ -14,9 +14,9 @@ def test_the_python_examples_run(tmp_path):
     code = "".join(re.findall(r"```python\n(.*?)```", README, re.DOTALL))
     environment_code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from eschorty_ros.core.calibration import load_calibration\n"
-        "from eschorty_ros.simulation.recorder import simulate_recording\n"
-        "from eschorty_ros.simulation.scene import named\n"
+        "from eschorty_ros.core.optics.calibration_file import load_calibration\n"
+        "from eschorty_ros.simulation.world.recorder import simulate_recording\n"
+        "from eschorty_ros.simulation.scenes.names import named\n"
         "simulate_recording('rec', named('steps'), load_calibration('config_3'), stop_mm=14.0)\n"
         "import pathlib, shutil; pathlib.Path('mine').mkdir()\n"
         "shutil.copy('rec/events.raw', 'mine')\n"

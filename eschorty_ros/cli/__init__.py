@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from eschorty_ros.core.errors import EschortyError
+from eschorty_ros.core.base.errors import EschortyError
 
 COMMANDS = {
     "scan": "Scan a simulated scene through the ROS 2 nodes; cloud, picture and error.",

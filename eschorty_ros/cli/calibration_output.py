@@ -9,9 +9,9 @@ from pathlib import Path
 import click
 
 from eschorty_ros.cli.console import show, table
-from eschorty_ros.core.calibrate import CalibrationReport
-from eschorty_ros.core.calibration import save_calibration
-from eschorty_ros.core.files import atomic_write
+from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.calibration.calibrate import CalibrationReport
+from eschorty_ros.core.optics.calibration_file import save_calibration
 from eschorty_ros.report.calibration_page import calibration_html, parameters
 from eschorty_ros.report.page import number
 

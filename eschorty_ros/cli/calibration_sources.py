@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import progress_bar
-from eschorty_ros.core.errors import FitError
+from eschorty_ros.core.base.errors import FitError
 
 if TYPE_CHECKING:
-    from eschorty_ros.core.calibration import Calibration
-    from eschorty_ros.core.posts import KnownTarget
-    from eschorty_ros.core.targets import Targets
+    from eschorty_ros.core.calibration.posts import KnownTarget
+    from eschorty_ros.core.calibration.targets import Targets
+    from eschorty_ros.core.optics.calibration_file import Calibration
 
 
 def recorded(
@@ -34,8 +34,11 @@ def recorded(
     EschortyError
         When the recording or the distances are at fault, or no post lies where they say.
     """
-    from eschorty_ros.core.recorded_targets import recorded_moving_target, recorded_posts
-    from eschorty_ros.core.recording import load_recording
+    from eschorty_ros.core.calibration.recorded_targets import (
+        recorded_moving_target,
+        recorded_posts,
+    )
+    from eschorty_ros.core.storage.recording import load_recording
 
     recording = load_recording(source)
     with progress_bar("reading") as report:
@@ -67,9 +70,9 @@ def known(distances: str | None, range_sigma: float) -> list[KnownTarget]:
     EschortyError
         When the file cannot be read.
     """
-    from eschorty_ros.core.calibration import config_file
-    from eschorty_ros.core.posts import KnownTarget
-    from eschorty_ros.core.targets_file import read_distances
+    from eschorty_ros.core.calibration.posts import KnownTarget
+    from eschorty_ros.core.calibration.targets_file import read_distances
+    from eschorty_ros.core.optics.calibration_file import config_file
 
     if distances is None:
         return read_distances(config_file("posts.csv"))

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import NoReturn
 
-from eschorty_ros.core.errors import EschortyError
+from eschorty_ros.core.base.errors import EschortyError
 
 
 def nodes_module(name: str, make: str) -> ModuleType:

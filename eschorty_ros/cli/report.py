@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from eschorty_experiments import NAMES
 
 from eschorty_ros.cli.console import progress_bar, show, table
-from eschorty_ros.core.errors import ArgumentError, EschortyError
-from eschorty_ros.report.experiments import NAMES
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 
 if TYPE_CHECKING:
     from eschorty_ros.report.sections import Section
@@ -55,8 +55,9 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
       1  an experiment failed, or the folder cannot be written
       2  wrong usage, such as an unknown NAME
     """  # noqa: D301
+    from eschorty_experiments import load
+
     from eschorty_ros.report.experiment import Effort
-    from eschorty_ros.report.experiments import load
     from eschorty_ros.report.page import write_page
     from eschorty_ros.report.provenance import provenance
     from eschorty_ros.report.sections import run_sections

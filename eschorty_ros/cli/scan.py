@@ -10,10 +10,10 @@ import click
 from eschorty_ros.cli.console import pairs, progress_bar
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, sweep_options
-from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.core.base.errors import DeviceError
 
 if TYPE_CHECKING:
-    from eschorty_ros.nodes.one_scan import OneScan, Outcome
+    from eschorty_ros.nodes.one_process.scan import OneScan, Outcome
     from eschorty_ros.report.accuracy import Accuracy
 
 
@@ -60,7 +60,7 @@ def command(
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
       eschorty scan --hardware lab.yaml --calibration my.yaml
     """  # noqa: D301
-    from eschorty_ros.core.files import check_writable
+    from eschorty_ros.core.base.files import check_writable
 
     check_sweep(start, stop)
     one_scan = nodes_module("one_scan", make="scan")
@@ -84,8 +84,8 @@ def command(
 
 def _check(scene: str, calibration: str) -> None:
     """Refuse what is no scene or calibration before any node starts."""
-    from eschorty_ros.core.calibration import load_calibration
-    from eschorty_ros.simulation.scene import named
+    from eschorty_ros.core.optics.calibration_file import load_calibration
+    from eschorty_ros.simulation.scenes.names import named
 
     named(scene)
     load_calibration(calibration)
@@ -93,10 +93,10 @@ def _check(scene: str, calibration: str) -> None:
 
 def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
     """Write cloud and picture, print the table; a scan that failed or is empty raises."""
-    from eschorty_ros.core.calibration import load_calibration
-    from eschorty_ros.core.cloud import write_cloud
+    from eschorty_ros.core.optics.calibration_file import load_calibration
+    from eschorty_ros.core.storage.cloud import write_cloud
     from eschorty_ros.report import accuracy, figures
-    from eschorty_ros.simulation import scene as scenes
+    from eschorty_ros.simulation.scenes import names as scenes
 
     if outcome.success or len(outcome.points):
         write_cloud(out / "scan.pcd", outcome.points)

@@ -8,7 +8,7 @@ import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
 from eschorty_ros.cli.options import check_sweep, sweep_options
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 
 
 @click.command("simulate")
@@ -51,11 +51,11 @@ def command(
     check_sweep(start, stop)
     if out.is_dir() and any(out.iterdir()):
         raise ArgumentError(f"{out} is not empty; choose a new folder")
-    from eschorty_ros.core.calibration import load_calibration
-    from eschorty_ros.core.modulation import Modulation
-    from eschorty_ros.simulation.presets import preset
-    from eschorty_ros.simulation.recorder import simulate_recording
-    from eschorty_ros.simulation.scene import named
+    from eschorty_ros.core.modulation.modulation import Modulation
+    from eschorty_ros.core.optics.calibration_file import load_calibration
+    from eschorty_ros.simulation.pixels.presets import preset
+    from eschorty_ros.simulation.scenes.names import named
+    from eschorty_ros.simulation.world.recorder import simulate_recording
 
     with progress_bar("simulating") as report:
         recording = simulate_recording(

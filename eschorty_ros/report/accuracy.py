@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics.range_model import RangeModel
 from eschorty_ros.report.profiles import profile_index
 
 

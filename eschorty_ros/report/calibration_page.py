@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eschorty_ros.core.calibrate import CalibrationReport
-from eschorty_ros.core.calibration_fit import COLUMN_TERMS, PARAMETERS, WIDTH_BIAS
+from eschorty_ros.core.calibration.calibrate import CalibrationReport
+from eschorty_ros.core.calibration.fit import COLUMN_TERMS, PARAMETERS, WIDTH_BIAS
 from eschorty_ros.report import calibration_figures as drawn
 from eschorty_ros.report.figures import DPI
 from eschorty_ros.report.page import number, render

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.report.cloud_image import Grid, grid_of, image_of, line_edges
 

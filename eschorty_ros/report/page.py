@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from eschorty_ros.core.files import atomic_write
+from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.report.experiment import Finding
 from eschorty_ros.report.sections import Section
 

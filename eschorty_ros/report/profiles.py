@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 
 # Returns of one period, in their mean times; a part of the period.
 RETURNS_APART = 0.2

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eschorty_ros.core.files import atomic_write
+from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.report import figures
 from eschorty_ros.report.experiment import (
     DataTable,

@@ -9,12 +9,12 @@ import tempfile
 import unittest
 from pathlib import Path
 
-import calibration_scenarios as scenarios
 import launch_testing.actions
-from launch_processes import TestShutdown, bench_action, node_process
+from support import calibration_scenarios as scenarios
+from support.launch_processes import TestShutdown, bench_action, node_process
 
 import launch
-from eschorty_ros.nodes.domain import free_domain
+from eschorty_ros.nodes.ros.domain import free_domain
 
 __all__ = ["TestShutdown"]
 

@@ -10,11 +10,11 @@ import unittest
 from pathlib import Path
 
 import launch_testing.actions
-import scan_scenarios as scenarios
-from launch_processes import TestShutdown, bench_action, node_process
+from support import scan_scenarios as scenarios
+from support.launch_processes import TestShutdown, bench_action, node_process
 
 import launch
-from eschorty_ros.nodes.domain import free_domain
+from eschorty_ros.nodes.ros.domain import free_domain
 
 __all__ = ["TestShutdown"]
 

@@ -22,7 +22,7 @@ TESTS = Path(__file__).resolve().parents[1]
 
 @pytest.mark.parametrize("name", ["scan", "calibration"])
 def test_scenarios_under_launch(name, tmp_path):
-    search = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
+    search = [str(TESTS / "support"), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
     said = tmp_path / "said.log"
     with (
         said.open("w") as log,

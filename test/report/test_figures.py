@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from eschorty_ros.core.cloud import POINT_DTYPE
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.storage.cloud import POINT_DTYPE
 from eschorty_ros.report import cloud_image, figures
 
 

@@ -4,13 +4,13 @@ import csv
 import re
 from pathlib import Path
 
-import html_check
+import eschorty_experiments as experiments
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from support import html_check
 
 from eschorty_ros.cli import main
-from eschorty_ros.report import experiments
 from eschorty_ros.report.experiment import DataTable, Experiment, Finding, Outcome
 from eschorty_ros.report.figures import new_figure
 from eschorty_ros.report.page import band, number

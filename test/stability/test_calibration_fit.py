@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.calibration import BUILDS, load_calibration
-from eschorty_ros.core.calibration_fit import PARAMETERS, CalibrationFit, fit_targets
-from eschorty_ros.core.errors import CalibrationError, FitError
-from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.base.errors import CalibrationError, FitError
+from eschorty_ros.core.calibration.fit import PARAMETERS, CalibrationFit, fit_targets
+from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
+from eschorty_ros.core.optics.range_model import RangeModel
 
 SEED = 13
 NOMINAL = load_calibration("nominal").model()

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from line_events import encoded
+from support.line_events import encoded
 
-from eschorty_ros.core._row_kernels import _uncut
-from eschorty_ros.core.calibration import load_calibration
-from eschorty_ros.core.centroid import METHODS, estimate
-from eschorty_ros.core.evt3 import sort_readout
-from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.evt3.decoder import sort_readout
+from eschorty_ros.core.line._row import _uncut
+from eschorty_ros.core.line.centroid import METHODS, estimate
+from eschorty_ros.core.line.row_sigma import METHOD_NOISE, SIGMA_FLOOR_PX
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import load_calibration
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
-from eschorty_ros.core.row_sigma import METHOD_NOISE, SIGMA_FLOOR_PX
 
 SEED = 20
 

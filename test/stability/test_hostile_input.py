@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile import calibrating, columns, posts, ranging, stored, streams, timing
 from hostile.kinds import Call
 from hostile.surface import parameters, public_callables
+from support.hostile import calibrating, columns, posts, ranging, stored, streams, timing
 
-from eschorty_ros.core.errors import EschortyError
+from eschorty_ros.core.base.errors import EschortyError
 
 HANDED_OUT = {
     "calibrate.CalibrationReport", "calibrate.Rejected", "calibration_diagnostics.KProfile",
@@ -38,7 +38,7 @@ TESTED_ELSEWHERE = {
     "calibration_identity.refuse_other_instrument",
     # Their arguments go to moving_target and match_posts.
     "recorded_targets.recorded_moving_target", "recorded_targets.recorded_posts",
-    # Every key of the file has its own test in test/core/test_calibration_file.py.
+    # Every key of the file has its own test in test/core/optics/test_calibration_file.py.
     "calibration.Calibration",
 }  # fmt: skip
 PACKAGE_OBJECTS = {

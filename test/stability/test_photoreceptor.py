@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from eschorty_ros.simulation._response_kernels import NOTHING, OFF, ON, _advanced, _noiseless
+from eschorty_ros.simulation.pixels._response import NOTHING, OFF, ON, _advanced, _noiseless
 
 SEED = 25
 TAU_US = 159.0

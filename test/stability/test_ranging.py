@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from line_events import blank_profiles
+from support.line_events import blank_profiles
 
-from eschorty_ros.core.calibration import BUILDS, load_calibration
-from eschorty_ros.core.cloud import POINT_DTYPE
-from eschorty_ros.core.optics import RangeModel, depth_of_field_mm
-from eschorty_ros.core.profiles import place
+from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
+from eschorty_ros.core.optics.range_model import RangeModel, depth_of_field_mm
+from eschorty_ros.core.reconstruction.profiles import place
+from eschorty_ros.core.storage.cloud import POINT_DTYPE
 
 ROWS = np.arange(720)
 POLE_DISTANCES_PX = np.array([1e-12, 1e-9, 1e-6, 1e-3, 0.5, 0.999999])

@@ -13,7 +13,7 @@ from typing import Any
 import usb.backend
 import usb.core
 
-from eschorty_ros.core.errors import (
+from eschorty_ros.core.base.errors import (
     DeviceError,
     DeviceGoneError,
     DeviceStallError,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from eschorty_ros.core.errors import ArgumentError, DeviceError, FormatError
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError, FormatError
 from eschorty_ros.hardware.camera.registers import Registers
 
 ENABLED = 0x11A1_0000

@@ -9,8 +9,8 @@ from typing import Protocol
 
 import usb.core
 
-from eschorty_ros.core.errors import DeviceTimeoutError
-from eschorty_ros.hardware.usb import translate
+from eschorty_ros.core.base.errors import DeviceTimeoutError
+from eschorty_ros.hardware.base.usb import translate
 
 TRANSFER_BYTES = 128 << 10
 _NAME = "camera: reading events"

@@ -16,8 +16,8 @@ import usb.backend
 import usb.core
 import usb.util
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, EschortyError
-from eschorty_ros.hardware import usb as bus
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, EschortyError
+from eschorty_ros.hardware.base import usb as bus
 from eschorty_ros.hardware.camera import treuzell
 from eschorty_ros.hardware.camera.bulk_reader import drain
 

@@ -6,8 +6,8 @@ import threading
 import time
 from collections import deque
 
-from eschorty_ros.core.errors import DeviceError
-from eschorty_ros.hardware.protocols import EventChunk
+from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.hardware.base.protocols import EventChunk
 
 BYTES_MAX = 64 << 20
 

@@ -6,7 +6,7 @@ accuracy. Whether its tables survive a reset is unconfirmed on hardware, so they
 
 from __future__ import annotations
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.camera.registers import Registers, Write, run_sequence, update
 
 PERIOD_US = 200

@@ -6,7 +6,7 @@ for a laser modulated at kHz. Unconfirmed on hardware.
 
 from __future__ import annotations
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.camera.registers import Registers, await_bits, update
 
 TYPES = ("trail", "stc_cut_trail", "stc_keep_trail")

@@ -12,17 +12,17 @@ from collections.abc import Callable
 
 import usb.backend
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, EschortyError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, EschortyError
+from eschorty_ros.hardware.base.protocols import DeviceIdentity, EventChunk
 from eschorty_ros.hardware.camera.bulk_reader import ClockNs
 from eschorty_ros.hardware.camera.camera_usb import NAME
 from eschorty_ros.hardware.camera.chunk_queue import BYTES_MAX, ChunkQueue
 from eschorty_ros.hardware.camera.health import HealthMonitor
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
-from eschorty_ros.hardware.camera.keeper import Connection, EndedError, Reconnection
+from eschorty_ros.hardware.camera.reconnection import Connection, EndedError, Reconnection
 from eschorty_ros.hardware.camera.registers import Sleep
 from eschorty_ros.hardware.camera.session import Session
 from eschorty_ros.hardware.camera.settings import CameraSettings
-from eschorty_ros.hardware.protocols import DeviceIdentity, EventChunk
 
 _READ_S = 0.05
 _STUCK_S = 1.0

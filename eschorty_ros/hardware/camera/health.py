@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.hardware.camera.session import Session
 
 _QUIET_S = 0.1

@@ -5,7 +5,7 @@ Source: openeb 5.1.1 ``imx636_tz_device.cpp``. Unconfirmed on hardware.
 
 from __future__ import annotations
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.camera.registers import (
     Registers,
     Sleep,

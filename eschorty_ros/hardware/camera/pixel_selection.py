@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
 from eschorty_ros.hardware.camera.registers import Registers, update
 

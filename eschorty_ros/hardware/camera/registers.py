@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.core.base.errors import DeviceError
 
 FULL = 0xFFFF_FFFF
 

@@ -11,7 +11,8 @@ from contextlib import suppress
 
 import usb.backend
 
-from eschorty_ros.core.errors import DeviceError, EschortyError
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.hardware.base.protocols import DeviceIdentity
 from eschorty_ros.hardware.camera import event_rate, imx636, monitors, treuzell
 from eschorty_ros.hardware.camera.async_reader import make_reader
 from eschorty_ros.hardware.camera.biases import BiasBank
@@ -24,7 +25,6 @@ from eschorty_ros.hardware.camera.camera_usb import (
 )
 from eschorty_ros.hardware.camera.registers import Sleep, run_sequence
 from eschorty_ros.hardware.camera.settings import CameraSettings, apply_settings
-from eschorty_ros.hardware.protocols import DeviceIdentity
 
 FIRMWARE_OLDEST = 0x030800
 

@@ -10,7 +10,7 @@ import struct
 import threading
 from typing import Protocol
 
-from eschorty_ros.core.errors import DeviceError, DeviceStallError, DeviceTimeoutError
+from eschorty_ros.core.base.errors import DeviceError, DeviceStallError, DeviceTimeoutError
 
 SERIAL = 0x72
 FIRMWARE = 0x79

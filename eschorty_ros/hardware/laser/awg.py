@@ -10,20 +10,20 @@ from typing import Any
 
 import usb.core
 
-from eschorty_ros.core.errors import ArgumentError, DeviceError
-from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_settings
-from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
-from eschorty_ros.hardware.laser.awg_settings import AwgSettings
-from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
-from eschorty_ros.hardware.laser.usbtmc import UsbTmc, is_usbtmc
-from eschorty_ros.hardware.protocols import (
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.hardware.base.protocols import (
     DeviceIdentity,
     LaserModulator,
     LaserOutput,
     LaserReadback,
 )
-from eschorty_ros.hardware.usb import find_device, open_backend
+from eschorty_ros.hardware.base.usb import find_device, open_backend
+from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_settings
+from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
+from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
+from eschorty_ros.hardware.laser.usbtmc import UsbTmc, is_usbtmc
 
 FREQUENCY_DEFAULT_HZ = 70.0
 """Reported before the first ``configure``."""

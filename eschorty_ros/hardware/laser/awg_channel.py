@@ -6,14 +6,14 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceGoneError
-from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceGoneError
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.hardware.base.protocols import DeviceIdentity
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser.scpi import Scpi
 from eschorty_ros.hardware.laser.usbtmc import UsbTmc
-from eschorty_ros.hardware.protocols import DeviceIdentity
 
 NAME = "laser generator"
 Result = TypeVar("Result")

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from eschorty_ros.core._values import file_path
-from eschorty_ros.core.errors import ArgumentError
-from eschorty_ros.core.files import config_folders
-from eschorty_ros.core.yaml_file import Schema, read_yaml, validate
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.files import config_folders
+from eschorty_ros.core.base.numbers import file_path
+from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
 
 SETTINGS = (
     "output",

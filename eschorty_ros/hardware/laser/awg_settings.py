@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from eschorty_ros.core._values import number, whole
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import number, whole
 
 READBACK_POLICIES = ("required", "best_effort", "off")
 HIGH_LIMIT_V = 10.0

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.core.base.errors import DeviceError
 
 
 class VoidedError(DeviceError):

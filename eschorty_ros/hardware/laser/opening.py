@@ -6,8 +6,8 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from eschorty_ros.core.errors import DeviceError
-from eschorty_ros.hardware.protocols import LaserModulator
+from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.hardware.base.protocols import LaserModulator
 
 
 def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
 from eschorty_ros.hardware.laser.in_flight import VoidedError
 from eschorty_ros.hardware.laser.usbtmc import UsbTmc

@@ -14,8 +14,8 @@ from typing import Any
 import usb.core
 import usb.util
 
-from eschorty_ros.core.errors import DeviceError, DeviceStallError
-from eschorty_ros.hardware.usb import claim, release, translate
+from eschorty_ros.core.base.errors import DeviceError, DeviceStallError
+from eschorty_ros.hardware.base.usb import claim, release, translate
 
 INTERFACE_CLASS, INTERFACE_SUBCLASS = 0xFE, 0x03
 REPLY_LIMIT = 65_536

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
 from eschorty_ros.hardware.stage.apt_framer import AptFramer
 from eschorty_ros.hardware.stage.apt_messages import Frame
 

@@ -12,7 +12,7 @@ from typing import Any
 import serial
 from serial.tools import list_ports
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage.apt_link import SerialPort
 
 BAUD = 115_200

@@ -10,9 +10,9 @@ import contextlib
 import threading
 from collections.abc import Callable
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
-from eschorty_ros.core.motion import plan_move
-from eschorty_ros.hardware.protocols import StageState
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
+from eschorty_ros.core.clocks.motion import plan_move
+from eschorty_ros.hardware.base.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_link import AptLink
 from eschorty_ros.hardware.stage.apt_port import find_port, open_port

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError, DeviceStallError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, DeviceStallError
 from eschorty_ros.hardware.camera import async_reader
 from eschorty_ros.hardware.camera.async_reader import TRANSFERS, AsyncReader, make_reader
 from eschorty_ros.hardware.camera.bulk_reader import TRANSFER_BYTES, SyncReader

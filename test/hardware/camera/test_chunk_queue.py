@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from eschorty_ros.core.errors import DeviceGoneError
+from eschorty_ros.core.base.errors import DeviceGoneError
 from eschorty_ros.hardware.camera.chunk_queue import ChunkQueue
 
 

@@ -6,13 +6,13 @@ import threading
 import time
 
 import pytest
-from evk4_bench import PATIENCE_S, SERIAL, OnDemand, Rig, until
+from support.evk4_bench import PATIENCE_S, SERIAL, OnDemand, Rig, until
 
-from eschorty_ros.core.errors import ArgumentError, DeviceError, DeviceGoneError
-from eschorty_ros.emulation.evk4_model import Evk4Model
-from eschorty_ros.emulation.evk4_sequences import Phase
-from eschorty_ros.emulation.evk4_treuzell import BoardIdentity
-from eschorty_ros.emulation.usb_backend import EmulatedBackend
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceGoneError
+from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.evk4.model import Evk4Model
+from eschorty_ros.emulation.evk4.sequences import Phase
+from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker
 from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.settings import CameraSettings

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from camera_register_file import RegisterFile
+from support.camera_register_file import RegisterFile
 
-from eschorty_ros.core.errors import ArgumentError, DeviceError, FormatError
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError, FormatError
 from eschorty_ros.hardware.camera import event_rate, event_trail, monitors
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
 from eschorty_ros.hardware.camera.biases import (

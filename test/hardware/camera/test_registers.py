@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from camera_register_file import RegisterFile
+from support.camera_register_file import RegisterFile
 
-from eschorty_ros.core.errors import DeviceError
+from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.hardware.camera import imx636
 from eschorty_ros.hardware.camera.registers import (
     Wait,

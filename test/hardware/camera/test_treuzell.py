@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.errors import DeviceError, DeviceStallError, DeviceTimeoutError
+from eschorty_ros.core.base.errors import DeviceError, DeviceStallError, DeviceTimeoutError
 from eschorty_ros.hardware.camera import treuzell
 from eschorty_ros.hardware.camera.treuzell import FrameError, Treuzell
 

@@ -6,9 +6,9 @@ import itertools
 import random
 
 import pytest
-from apt_bench import AptBench
+from support.apt_bench import AptBench
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage import apt_messages
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 

@@ -6,9 +6,9 @@ import errno
 import threading
 
 import pytest
-from waiting import DEADLINE_S
+from support.waiting import DEADLINE_S
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage.apt_link import AptLink
 
 

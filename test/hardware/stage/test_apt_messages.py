@@ -7,7 +7,7 @@ import struct
 import pytest
 import thorlabs_apt_protocol as oracle
 
-from eschorty_ros.core.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.stage import apt_messages as apt
 
 BAY = 0x21

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 import serial
-from waiting import DEADLINE_S, wait_until
+from support.waiting import DEADLINE_S, wait_until
 
-from eschorty_ros.core.errors import DeviceError, DeviceGoneError
-from eschorty_ros.emulation.apt_model import AptModel
-from eschorty_ros.emulation.pty_port import PtyPort
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
+from eschorty_ros.emulation.apt.model import AptModel
+from eschorty_ros.emulation.bus.pty_port import PtyPort
 from eschorty_ros.hardware.stage import apt_port
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 from eschorty_ros.hardware.stage.apt_stage import AptStage, open_stage

@@ -6,9 +6,9 @@ import random
 
 import numpy as np
 import pytest
-from apt_bench import EPOCH_NS, AptBench
+from support.apt_bench import EPOCH_NS, AptBench
 
-from eschorty_ros.core.errors import ArgumentError, DeviceError
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 
 BAY_2 = AptSettings(controller="bbd30x", bay=2, trigger_port=3)

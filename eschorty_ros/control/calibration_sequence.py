@@ -1,0 +1,130 @@
+"""The order of a capture for a calibration, without ROS: whatever happens, laser off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from eschorty_ros.control.scan_sequence import End, Instrument, ScanCanceled, check_laser
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.calibration.calibrate import METHODS
+from eschorty_ros.live.calibration_capture import CaptureRequest
+
+CAPTURE_MAX_S = 120.0
+_DRAIN_S = 10.0
+_SETTLE_MM_S = 100.0
+
+
+@dataclass(slots=True)
+class CaptureOutcome:
+    """How a capture ended."""
+
+    end: End = End.ABORTED
+    message: str = ""
+
+
+class CaptureInstrument(Instrument, Protocol):
+    """What a capture needs beyond a scan's hands."""
+
+    def hold(self, duration_s: float) -> None:
+        """Wait until so much sensor time has passed."""
+
+
+def check_request(request: CaptureRequest) -> None:
+    """Raise ``ArgumentError`` with name, value and remedy when a capture cannot be done."""
+    if request.method not in METHODS:
+        raise ArgumentError(f"method is {request.method!r}; choose one of {', '.join(METHODS)}")
+    check_laser(request.frequency_hz, request.duty)
+    sweep = request.sweep
+    if sweep is None:
+        if len(request.targets) < 2:
+            raise ArgumentError(
+                f"targets holds {len(request.targets)}; give two or more, or sweep_speed for one "
+                "that the stage moves"
+            )
+        if not 0.0 < request.capture_s <= CAPTURE_MAX_S:
+            raise ArgumentError(
+                f"capture_time is {request.capture_s:g} s; choose more than 0 and at most "
+                f"{CAPTURE_MAX_S:g} s"
+            )
+        return
+    if len(request.targets) != 1:
+        raise ArgumentError(
+            f"targets holds {len(request.targets)}; with sweep_speed give the one that moves"
+        )
+    if not (sweep.speed_mm_s > 0.0 and math.isfinite(sweep.speed_mm_s)):
+        raise ArgumentError(f"sweep_speed is {sweep.speed_mm_s * 1e-3:g} m/s; choose more than 0")
+    if not abs(sweep.stop_mm - sweep.start_mm) > 0.0:
+        raise ArgumentError(
+            f"sweep_start and sweep_stop are both {sweep.start_mm * 1e-3:g} m; choose different "
+            "ones"
+        )
+    if not 0.0 < abs(sweep.range_per_stage) <= 1.0:
+        raise ArgumentError(
+            f"range_per_stage is {sweep.range_per_stage:g}; choose -1 to 1 and not 0"
+        )
+
+
+def run_capture(
+    instrument: CaptureInstrument,
+    request: CaptureRequest,
+    begin: Callable[[], None],
+    finish: Callable[[], None],
+) -> CaptureOutcome:
+    """Do one capture; never raises an ``EschortyError``, and leaves laser off and stage at rest.
+
+    ``begin`` and ``finish`` have the reconstruction collect events and cease to; ``finish`` is
+    called whenever ``begin`` was.
+    """
+    outcome = CaptureOutcome()
+    collecting = False
+    sweep = request.sweep
+    try:
+        instrument.report("preparing")
+        # Before anything is waited for or touched: it is refused while a scan is under way.
+        begin()
+        collecting = True
+        instrument.check_nodes()
+        instrument.configure_laser(request.frequency_hz, request.duty)
+        if sweep is not None:
+            instrument.move(sweep.start_mm, _SETTLE_MM_S)
+        instrument.laser_on()
+        instrument.watch(True)
+        instrument.report("capturing")
+        if sweep is None:
+            instrument.hold(request.capture_s)
+        else:
+            instrument.move(sweep.stop_mm, sweep.speed_mm_s)
+            instrument.move(sweep.start_mm, sweep.speed_mm_s)
+        outcome.end = End.SUCCEEDED
+    except ScanCanceled:
+        outcome.end, outcome.message = End.CANCELED, "canceled"
+    except EschortyError as error:
+        outcome.message = str(error)
+    finally:
+        _finish(instrument, outcome, finish if collecting else None)
+    return outcome
+
+
+def _finish(
+    instrument: CaptureInstrument, outcome: CaptureOutcome, finish: Callable[[], None] | None
+) -> None:
+    """Leave every capture the same way: light off first."""
+    instrument.shield()
+    instrument.watch(False)
+    steps: list[Callable[[], None]] = [instrument.laser_off]
+    if outcome.end is not End.SUCCEEDED:
+        steps.append(instrument.stop_stage)
+    elif finish is not None:
+        instrument.report("finishing")
+        steps.append(lambda: instrument.drain(_DRAIN_S))
+    if finish is not None:
+        steps.append(finish)
+    for step in steps:
+        try:
+            step()
+        except EschortyError as error:
+            if outcome.end is not End.ABORTED:
+                outcome.end, outcome.message = End.ABORTED, str(error)

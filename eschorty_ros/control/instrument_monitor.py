@@ -1,0 +1,123 @@
+"""The newest state of laser, stage and reconstruction, and which of them has stopped reporting."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from eschorty_ros.control.scan_sequence import ScanFailure
+from eschorty_ros.hardware.base.protocols import LaserOutput
+
+# With Fast DDS's defaults a lost message is repeated after 3 s.
+_STALE_S = 4.0
+_REST_MM_S = 0.1
+_SAMPLES_MAX = 500_000
+
+
+@dataclass(frozen=True, slots=True)
+class LaserStatus:
+    """The output (a value of ``LaserOutput``) and modulation read back, and the output's reason."""
+
+    output: int
+    frequency_hz: float
+    duty: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReconstructionStatus:
+    """How far the reconstruction has come, ROS time in ns, and its totals since its start."""
+
+    processed_until_ns: int
+    events_per_second: float
+    profiles: int
+    points: int
+    scan_id: str
+
+
+class InstrumentMonitor:
+    """Newest status of the other components, aged on the steady clock.
+
+    Parameters
+    ----------
+    camera_present : callable
+        Whether anything publishes events.
+
+    Attributes
+    ----------
+    samples : deque of (int, float)
+        ROS time (ns) and stage position (mm) since the last ``samples.clear()``.
+    """
+
+    def __init__(self, camera_present: Callable[[], bool]) -> None:
+        self._camera_present = camera_present
+        self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
+        self.laser: LaserStatus | None = None
+        self.reconstruction: ReconstructionStatus | None = None
+        self.position_mm = float("nan")
+        self.at_rest = False
+        self.until_ns = 0
+        self._laser_s = self._reconstruction_s = self._stage_s = self._advanced_s = 0.0
+
+    def update_laser(self, status: LaserStatus) -> None:
+        """Store the laser's newest status."""
+        self.laser, self._laser_s = status, time.monotonic()
+
+    def update_reconstruction(self, status: ReconstructionStatus) -> None:
+        """Store the reconstruction's newest status."""
+        now_s = time.monotonic()
+        if status.processed_until_ns != self.until_ns:
+            self.until_ns, self._advanced_s = status.processed_until_ns, now_s
+        self.reconstruction, self._reconstruction_s = status, now_s
+
+    def update_stage(self, t_ns: int, position_mm: float, velocity_mm_s: float) -> None:
+        """Store a sample of the stage's position."""
+        self.position_mm = position_mm
+        self._stage_s = time.monotonic()
+        self.at_rest = abs(velocity_mm_s) < _REST_MM_S
+        self.samples.append((t_ns, position_mm))
+
+    @property
+    def output(self) -> int | None:
+        """Output the laser reads back, ``None`` before its first status."""
+        return self.laser.output if self.laser is not None else None
+
+    @property
+    def stage_reports(self) -> bool:
+        """Whether odometry is fresh."""
+        return _age_s(self._stage_s) < _STALE_S
+
+    def restart_progress(self) -> None:
+        """Count the time without progress of the reconstruction from now."""
+        self._advanced_s = time.monotonic()
+
+    def check_stage(self) -> None:
+        """Raise ``ScanFailure`` when odometry stopped."""
+        if not self.stage_reports:
+            raise ScanFailure(f"stage: no odometry for {_STALE_S:g} s")
+
+    def check_progress(self, timeout_s: float) -> None:
+        """Raise ``ScanFailure`` when the reconstruction made no progress for ``timeout_s``."""
+        if _age_s(self._advanced_s) > timeout_s:
+            raise ScanFailure(f"{self.why_no_progress()} for {timeout_s:g} s")
+
+    def check_laser(self) -> None:
+        """Raise ``ScanFailure`` when the laser does not report or is not on."""
+        if self.laser is None or _age_s(self._laser_s) > _STALE_S:
+            raise ScanFailure(f"laser: no state for {_STALE_S:g} s")
+        if self.laser.output != LaserOutput.ON:
+            raise ScanFailure(f"laser: went off: {self.laser.reason}")
+
+    def why_no_progress(self) -> str:
+        """Name the component that keeps the reconstruction from advancing."""
+        if _age_s(self._reconstruction_s) > _STALE_S:
+            return "reconstruction: it does not report"
+        if not self._camera_present():
+            return "camera: its node is gone; no events"
+        return "camera: no events reach the reconstruction"
+
+
+def _age_s(at_s: float) -> float:
+    return time.monotonic() - at_s

@@ -1,0 +1,132 @@
+"""Waiting in ticks; every tick gives feedback and checks each reason to end."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from eschorty_ros.control.instrument_monitor import InstrumentMonitor
+from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure
+
+_TICK_S = 0.02
+
+
+class PacedWaiting:
+    """The waits of one sequence, which can be watched, canceled and ended.
+
+    Its methods block, so they run in a thread of their own.
+
+    Parameters
+    ----------
+    name : str
+        Of the program that waits, for messages.
+    monitor : InstrumentMonitor
+    now_ns : callable
+        The clock that stamps the events.
+    running : callable
+        Whether the program goes on.
+    events_timeout_s : float
+        Longest time without progress of the reconstruction while watching.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        monitor: InstrumentMonitor,
+        now_ns: Callable[[], int],
+        running: Callable[[], bool],
+        events_timeout_s: float,
+    ) -> None:
+        self.monitor = monitor
+        self._name = name
+        self._now_ns = now_ns
+        self._running = running
+        self._events_timeout_s = events_timeout_s
+        self._tick_s = 0.0
+        self._ended = threading.Event()
+        self._watching = False
+        self._shielded = False
+        self._canceled: Callable[[], bool] = lambda: False
+        self._feedback: Callable[[str], None] = lambda phase: None
+        self._phase = ""
+
+    def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
+        """Reset for a new sequence; both callables are used at every tick."""
+        self._canceled, self._feedback = canceled, feedback
+        self._watching = self._shielded = False
+        self._phase = "preparing"
+        self.monitor.samples.clear()
+
+    def end(self) -> None:
+        """Make every wait fail from now on."""
+        self._ended.set()
+
+    def ticked_within(self, limit_s: float) -> bool:
+        """Return whether the last tick is at most ``limit_s`` old."""
+        return time.monotonic() - self._tick_s < limit_s
+
+    def watch(self, enabled: bool) -> None:
+        """See ``Instrument``."""
+        self.monitor.restart_progress()
+        self._watching = enabled
+
+    def shield(self) -> None:
+        """See ``Instrument``."""
+        self._shielded = True
+
+    @contextlib.contextmanager
+    def shielded(self) -> Iterator[None]:
+        """Defer a cancel until the block has ended."""
+        before, self._shielded = self._shielded, True
+        try:
+            yield
+        finally:
+            self._shielded = before
+
+    def drain(self, no_progress_s: float) -> None:
+        """See ``Instrument``."""
+        target_ns = self._now_ns()
+        self.monitor.restart_progress()
+        while self.monitor.until_ns < target_ns:
+            self.tick()
+            self.monitor.check_progress(no_progress_s)
+
+    def hold(self, duration_s: float) -> None:
+        """Wait until the reconstruction has passed so much sensor time from now on."""
+        target_ns = self._now_ns() + round(duration_s * 1e9)
+        self.monitor.restart_progress()
+        while self.monitor.until_ns < target_ns:
+            self.tick()
+
+    def report(self, phase: str) -> None:
+        """See ``Instrument``."""
+        self._phase = phase
+        # After a signal feedback can no longer be sent.
+        with contextlib.suppress(ScanFailure):
+            self._feedback(phase)
+
+    def tick(self) -> None:
+        """Give feedback, check the reasons to end, sleep for one tick."""
+        if self._ended.is_set() or not self._running():
+            raise ScanFailure(f"{self._name}: the node was shut down")
+        self._tick_s = time.monotonic()
+        self._feedback(self._phase)
+        if self._watching:
+            self.monitor.check_laser()
+            self.monitor.check_progress(self._events_timeout_s)
+        if not self._shielded and self._canceled():
+            raise ScanCanceled
+        time.sleep(_TICK_S)
+
+    def wait(
+        self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
+    ) -> None:
+        """Wait for ``condition``; raises ``ScanFailure`` with ``failure`` after ``timeout_s``."""
+        end_s = time.monotonic() + timeout_s
+        while not condition():
+            self.tick()
+            if time.monotonic() > end_s:
+                text = failure if isinstance(failure, str) else failure()
+                raise ScanFailure(f"{text} within {timeout_s:g} s; check that the node runs")

@@ -1,0 +1,247 @@
+"""The order of a scan, without ROS: whatever happens, laser off, stage at rest, points kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from itertools import pairwise
+from typing import Protocol
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
+
+
+class ScanFailure(EschortyError):  # noqa: N818 - named as the other failures are told
+    """A scan that cannot go on; the message begins with the culprit."""
+
+
+class ScanCanceled(Exception):  # noqa: N818 - a request, not an error
+    """The client asked the scan to end."""
+
+
+class End(Enum):
+    """How a scan ended."""
+
+    SUCCEEDED = "succeeded"
+    CANCELED = "canceled"
+    ABORTED = "aborted"
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRequest:
+    """What is asked for; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+
+    scan_id: str
+    start_mm: float
+    stop_mm: float
+    speed_mm_s: float
+    frequency_hz: float = 0.0
+    duty: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScanLimits:
+    """What the stage can do, how it goes to the start, and how long the pipeline may stall."""
+
+    travel_mm: tuple[float, float]
+    speed_max_mm_s: float
+    acceleration_mm_s2: float
+    approach_mm_s: float
+    drain_timeout_s: float
+
+
+@dataclass(slots=True)
+class ScanSummary:
+    """What an assembled scan holds."""
+
+    profiles: int = 0
+    points: int = 0
+    events: int = 0
+    packets_lost: int = 0
+    events_dropped: int = 0
+    sigma_median_m: float = math.nan
+    message: str = ""
+
+
+@dataclass(slots=True)
+class ScanOutcome:
+    """How a scan ended and what it gave."""
+
+    end: End = End.ABORTED
+    message: str = ""
+    summary: ScanSummary = field(default_factory=ScanSummary)
+
+
+class Instrument(Protocol):
+    """What a sequence asks of laser, stage and reconstruction. Waiting calls ``pause``."""
+
+    def check_nodes(self) -> None:
+        """Raise ``ScanFailure`` naming the node that does not answer."""
+
+    def configure_laser(self, frequency_hz: float, duty: float) -> None:
+        """Set what is not 0; raises ``ScanFailure`` with the laser's reason."""
+
+    def move(self, position_mm: float, speed_mm_s: float) -> None:
+        """Move and wait until the stage is there."""
+
+    def stop_stage(self) -> None:
+        """End a move under way and wait for the stage to rest."""
+
+    def laser_on(self) -> None:
+        """Heartbeat, arm, enable; returns when the output reads back on."""
+
+    def laser_off(self) -> None:
+        """Disable; returns when the output reads back off. The heartbeat ends in any case."""
+
+    def watch(self, enabled: bool) -> None:
+        """Whether ``pause`` raises ``ScanFailure`` when light, events or odometry stop."""
+
+    def shield(self) -> None:
+        """From here on ``pause`` no longer raises ``ScanCanceled``."""
+
+    def drain(self, no_progress_s: float) -> None:
+        """Wait until the reconstruction has passed the present time."""
+
+    def report(self, phase: str) -> None:
+        """Name the phase in the feedback."""
+
+
+class ScanInstrument(Instrument, Protocol):
+    """What a scan needs beyond that."""
+
+    def begin_scan(self, request: ScanRequest) -> None:
+        """Have the reconstruction collect points."""
+
+    def end_scan(self, scan_id: str) -> ScanSummary:
+        """Have it publish what it collected."""
+
+
+def check_request(request: ScanRequest, limits: ScanLimits) -> None:
+    """Raise ``ArgumentError`` with name, value and remedy when a scan cannot be done."""
+    low, high = limits.travel_mm
+    for name in ("start_mm", "stop_mm"):
+        value = getattr(request, name)
+        if not low <= value <= high:
+            raise ArgumentError(
+                f"{name[:-3]} is {value * 1e-3:g} m; choose {low * 1e-3:g} to {high * 1e-3:g} m, "
+                "the stage's travel"
+            )
+    if request.start_mm == request.stop_mm:
+        raise ArgumentError(
+            f"start and stop are both {request.start_mm * 1e-3:g} m; choose different ones"
+        )
+    if not 0.0 < request.speed_mm_s <= limits.speed_max_mm_s:
+        raise ArgumentError(
+            f"speed is {request.speed_mm_s * 1e-3:g} m/s; choose more than 0 and at most "
+            f"{limits.speed_max_mm_s * 1e-3:g} m/s"
+        )
+    check_laser(request.frequency_hz, request.duty)
+
+
+def check_laser(frequency_hz: float, duty: float) -> None:
+    """Raise ``ArgumentError`` when the laser cannot be set so; 0 keeps its setting."""
+    if frequency_hz != 0.0 and not FREQUENCY_MIN_HZ <= frequency_hz <= FREQUENCY_MAX_HZ:
+        raise ArgumentError(
+            f"frequency is {frequency_hz:g} Hz; choose {FREQUENCY_MIN_HZ:g} to "
+            f"{FREQUENCY_MAX_HZ:g} Hz, or 0 to keep the laser's"
+        )
+    if not 0.0 <= duty < 1.0:
+        raise ArgumentError(
+            f"duty is {duty:g}; choose a value between 0 and 1, or 0 to keep the laser's"
+        )
+
+
+def sweep_ends_mm(request: ScanRequest, limits: ScanLimits) -> tuple[float, float]:
+    """Where the sweep begins and ends so that speed is constant in between, within the travel."""
+    run_up = 1.1 * request.speed_mm_s**2 / (2.0 * limits.acceleration_mm_s2) + 0.2
+    run_up = math.copysign(run_up, request.stop_mm - request.start_mm)
+    low, high = limits.travel_mm
+    return (
+        min(max(request.start_mm - run_up, low), high),
+        min(max(request.stop_mm + run_up, low), high),
+    )
+
+
+def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | None:
+    """Time of the first crossing of ``level_mm``, linear between samples (ns, mm).
+
+    ``None`` when the samples do not cross it.
+    """
+    for (t0_ns, p0_mm), (t1_ns, p1_mm) in pairwise(samples):
+        if p0_mm != p1_mm and min(p0_mm, p1_mm) <= level_mm <= max(p0_mm, p1_mm):
+            return t0_ns + round((t1_ns - t0_ns) * (level_mm - p0_mm) / (p1_mm - p0_mm))
+    return None
+
+
+def sweep_progress(phase: str, position_mm: float, request: ScanRequest) -> float:
+    """Return the share of the sweep that is done in ``phase``, 0 to 1."""
+    if phase == "finishing":
+        return 1.0
+    if phase != "sweeping" or math.isnan(position_mm):
+        return 0.0
+    share = (position_mm - request.start_mm) / (request.stop_mm - request.start_mm)
+    return min(max(share, 0.0), 1.0)
+
+
+def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
+    """Do one scan; never raises an ``EschortyError``, and leaves laser off and stage at rest."""
+    outcome = ScanOutcome()
+    collecting = False
+    begin_mm, end_mm = sweep_ends_mm(request, limits)
+    try:
+        instrument.report("preparing")
+        instrument.check_nodes()
+        instrument.configure_laser(request.frequency_hz, request.duty)
+        instrument.report("to_start")
+        instrument.move(begin_mm, limits.approach_mm_s)
+        instrument.begin_scan(request)
+        collecting = True
+        instrument.laser_on()
+        instrument.watch(True)
+        instrument.report("sweeping")
+        instrument.move(end_mm, request.speed_mm_s)
+        outcome.end = End.SUCCEEDED
+    except ScanCanceled:
+        outcome.end, outcome.message = End.CANCELED, "canceled"
+    except EschortyError as error:
+        outcome.message = str(error)
+    finally:
+        _finish(instrument, request, limits, outcome, collecting)
+    return outcome
+
+
+def _finish(
+    instrument: ScanInstrument,
+    request: ScanRequest,
+    limits: ScanLimits,
+    outcome: ScanOutcome,
+    collecting: bool,
+) -> None:
+    """Leave every scan the same way: light off first."""
+    instrument.shield()
+    instrument.watch(False)
+    _attempt(outcome, instrument.laser_off)
+    if outcome.end is not End.SUCCEEDED:
+        _attempt(outcome, instrument.stop_stage)
+    if not collecting:
+        return
+    instrument.report("finishing")
+    # After a failure whatever is still on the way is kept, but a dead camera is not waited for.
+    patience_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
+    _attempt(outcome, lambda: instrument.drain(patience_s))
+
+    def end_scan() -> None:
+        outcome.summary = instrument.end_scan(request.scan_id)
+
+    _attempt(outcome, end_scan)
+
+
+def _attempt(outcome: ScanOutcome, step: Callable[[], None]) -> None:
+    """Run a step of the way out; its failure turns success into failure, the first reason stays."""
+    try:
+        step()
+    except EschortyError as error:
+        if outcome.end is not End.ABORTED:
+            outcome.end, outcome.message = End.ABORTED, str(error)

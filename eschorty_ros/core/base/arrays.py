@@ -1,0 +1,145 @@
+"""Checks at the boundary: what compiled code would wrap around, numpy would cast silently."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import (
+    SMALLEST,
+    TIME_LIMIT,
+    file_path,
+    number,
+    number_or_nan,
+    positive,
+    short,
+    whole,
+)
+
+__all__ = [
+    "SMALLEST",
+    "TIME_LIMIT",
+    "as_array",
+    "broadcast",
+    "exact",
+    "file_path",
+    "number",
+    "number_or_nan",
+    "octets",
+    "positive",
+    "reals",
+    "selection",
+    "short",
+    "times",
+    "vector",
+    "whole",
+    "whole_vector",
+]
+
+
+def reals(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """``values`` of any shape as float64; NaN and infinity pass, texts and objects do not."""
+    array = as_array(name, values)
+    if array.dtype.kind not in "iuf":
+        raise ArgumentError(f"{name} has dtype {array.dtype}; give real numbers")
+    return array.astype(np.float64, copy=False)
+
+
+def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """``values`` as one axis of finite float64."""
+    array = reals(name, values)
+    if array.ndim != 1:
+        raise ArgumentError(f"{name} has shape {array.shape}; give one axis")
+    wrong = ~np.isfinite(array)
+    if wrong.any():
+        raise ArgumentError(f"{name} is {array[wrong][0]}; give finite numbers")
+    return array
+
+
+def whole_vector(
+    name: str, values: ArrayLike, dtype: DTypeLike, low: int, high: int
+) -> NDArray[Any]:
+    """``values`` as a contiguous vector of ``dtype``, each from ``low`` to ``high``."""
+    array = as_array(name, values)
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise ArgumentError(
+            f"{name} is {array.dtype} of shape {array.shape}; give one axis of integers"
+        )
+    if array.size:
+        lowest, highest = int(array.min()), int(array.max())
+        if lowest < low or highest > high:
+            wrong = lowest if lowest < low else highest
+            raise ArgumentError(f"{name} holds {wrong}; choose {low} to {high}")
+    return np.ascontiguousarray(array, dtype=dtype)
+
+
+def exact(name: str, values: Any, dtype: DTypeLike, size: int | None = None) -> NDArray[Any]:
+    """``values`` as compiled code takes them: one contiguous axis of just this dtype."""
+    if not isinstance(values, np.ndarray) or values.dtype != dtype or values.ndim != 1:
+        raise ArgumentError(f"{name} is {_form(values)}; give one axis of {np.dtype(dtype)}")
+    if size is not None and values.size != size:
+        raise ArgumentError(f"{name} has {values.size} entries; give {size}")
+    return np.ascontiguousarray(values)
+
+
+def times(name: str, values: ArrayLike) -> NDArray[np.int64]:
+    """Integer times of any shape as int64; floats are refused, since they lose microseconds."""
+    array = as_array(name, values)
+    if array.size and array.dtype.kind not in "iu":
+        raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
+    if array.dtype == np.uint64 and array.size and int(array.max()) > TIME_LIMIT:
+        raise ArgumentError(f"{name} holds {array.max()}; choose {TIME_LIMIT} at most")
+    return array.astype(np.int64, copy=False)
+
+
+def selection(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
+    """``which`` as a mask of ``size`` entries or as indices below it."""
+    array = as_array(name, which)
+    if array.size == 0:
+        return np.empty(0, dtype=np.intp)
+    if array.dtype == np.bool_ and array.shape == (size,):
+        return array
+    if array.ndim > 1 or array.dtype.kind not in "iu":
+        raise ArgumentError(f"{name} is {_form(array)}; give {size} truth values or indices")
+    lowest, highest = int(array.min()), int(array.max())
+    if lowest < -size or highest >= size:
+        wrong = highest if highest >= size else lowest
+        raise ArgumentError(f"{name} holds {wrong}; choose indices below {size}")
+    return array
+
+
+def octets(name: str, data: Any) -> memoryview:
+    """``data`` as bytes; arrays of anything wider are refused, not reinterpreted."""
+    try:
+        view = memoryview(data)
+    except TypeError:
+        raise ArgumentError(f"{name} is {short(data)}; give bytes") from None
+    if view.format not in ("B", "b", "c") or not view.c_contiguous:
+        raise ArgumentError(f"{name} is {_form(data)}; give contiguous bytes")
+    return view.cast("B")
+
+
+def broadcast(names: str, *arrays: NDArray[Any]) -> tuple[int, ...]:
+    """Common shape of ``arrays``."""
+    try:
+        return np.broadcast_shapes(*(array.shape for array in arrays))
+    except ValueError:
+        shapes = " and ".join(str(array.shape) for array in arrays)
+        raise ArgumentError(f"{names} have shapes {shapes}; give shapes that fit") from None
+
+
+def _form(values: Any) -> str:
+    if isinstance(values, np.ndarray):
+        return f"{values.dtype} of shape {values.shape}"
+    return short(values)
+
+
+def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """``values`` as an array of whatever they are; ragged nests are refused."""
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ArgumentError(f"{name} is {short(values)}; give numbers") from error

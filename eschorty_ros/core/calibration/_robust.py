@@ -1,0 +1,142 @@
+"""Which targets follow one curve: least median of squares, then Cauchy's loss, then a cut."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.errors import FitError
+from eschorty_ros.core.calibration._least_squares import condition_number, covariance
+from eschorty_ros.core.calibration._model import Observed, Values, values_of
+from eschorty_ros.core.calibration._solvers import Problem, refuse_singular, search
+from eschorty_ros.core.optics.range_model import RangeModel
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TARGETS_MIN = 5
+"""With fewer targets nobody can tell which one is wrong."""
+CUT_SIGMA = 4.0
+SCALE_MAX = 10.0
+"""Beyond this many times the stated sigmas the targets contradict each other."""
+# 95 % efficiency on Gaussian errors.
+_CAUCHY = 2.385
+_ITERATIONS = 15
+_SCALE_CONVERGED = 1e-3
+_PAIRED_MAX = 40
+_MAD = 1.4826
+
+
+def inliers(
+    observed: Observed, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
+) -> tuple[Mask, Array]:
+    """Tell the targets that one curve explains.
+
+    Returns
+    -------
+    kept : ndarray of bool, shape (n,)
+    distance : ndarray of float64, shape (n, 3)
+        Residuals against the curve of the kept targets in standard deviations; those of the
+        others include the uncertainty of that curve.
+
+    Raises
+    ------
+    FitError
+        When no curve explains more than half of the targets.
+    """
+    values = _least_median(observed, design)
+    refuse_singular(Problem(observed, design, names, priors, values), values)
+    before = 0.0
+    for _ in range(_ITERATIONS):
+        problem = Problem(observed, design, names, priors, values)
+        scale = _scale(problem.distance(values), observed.known)
+        if abs(scale - before) < _SCALE_CONVERGED * scale:
+            break
+        values, before = search(problem, values, cauchy_scale=_CAUCHY * scale), scale
+    return _cut(observed, design, names, priors, values)
+
+
+def _cut(
+    observed: Observed,
+    design: RangeModel,
+    names: tuple[str, ...],
+    priors: Mapping[str, float],
+    values: Values,
+) -> tuple[Mask, Array]:
+    """Refit what lies within the cut until that no longer changes."""
+    every = Problem(observed, design, names, priors, values)
+    distance = every.distance(values)
+    kept = np.zeros(len(observed), dtype=bool)
+    for _ in range(_ITERATIONS):
+        # Once the wrong ones are out they no longer widen the cut.
+        better = observed.known & kept[:, None] if kept.any() else observed.known
+        scale = _scale(distance, better)
+        before, kept = kept, np.abs(distance).max(axis=1) <= CUT_SIGMA * scale
+        _refuse_chaos(kept, scale, observed)
+        if np.array_equal(kept, before):
+            break
+        part = Problem(observed.select(kept), design, names, priors, values)
+        values = search(part, values)
+        every = Problem(observed, design, names, priors, values)
+        spread = _spread(part, values)
+        distance = every.distance(values)
+        if spread is not None:
+            own = np.einsum("nii->ni", every.leverage(values, spread))
+            distance = np.where(kept[:, None], distance, distance / np.sqrt(1.0 + own))
+    return kept, distance
+
+
+def _spread(problem: Problem, values: Values) -> Array | None:
+    jacobian = problem.jacobian(problem.free(values))
+    return covariance(jacobian) if np.isfinite(condition_number(jacobian)) else None
+
+
+def _least_median(observed: Observed, design: RangeModel) -> Values:
+    """Line through two targets with the smallest median residual; k and b of the design."""
+    x = 1.0 / (observed.range_mm + design.b_mm)
+    rows, sigma = observed.seen[:, 0], observed.sigma[:, 0]
+    sigma = np.hypot(sigma, design.product_mm_px * x * x * observed.sigma_range_mm)
+    chosen = np.argsort(x, kind="stable")
+    if chosen.size > _PAIRED_MAX:
+        chosen = chosen[np.linspace(0, chosen.size - 1, _PAIRED_MAX).astype(np.intp)]
+    one, other = (chosen[side] for side in np.triu_indices(chosen.size, 1))
+    apart = x[one] != x[other]
+    one, other = one[apart], other[apart]
+    product = (rows[one] - rows[other]) / (x[one] - x[other])
+    offset = product * x[one] - rows[one]
+    possible = (product < 0.0) & (offset <= -1.0)
+    if not possible.any():
+        raise FitError(
+            "no two targets show rows that grow with range (condition number inf); check row and "
+            "range_mm"
+        )
+    product, offset = product[possible], offset[possible]
+    residual = np.abs(product[:, None] * x - offset[:, None] - rows) / sigma
+    middle = (rows.size + 3) // 2
+    median = np.partition(residual, middle - 1, axis=1)[:, middle - 1]
+    best = int(np.argmin(median))
+    return values_of(design) | {
+        "k_prime_px": float(product[best] / design.k_mm),
+        "b_prime_px": float(offset[best]),
+    }
+
+
+def _scale(distance: Array, known: Mask) -> float:
+    """How much larger the residuals of the better half are than stated; at least 1."""
+    return max(1.0, _MAD * float(np.median(np.abs(distance[known]))))
+
+
+def _refuse_chaos(kept: Mask, scale: float, observed: Observed) -> None:
+    if scale > SCALE_MAX:
+        raise FitError(
+            f"the targets contradict each other: even the better half lies {scale:.0f} times "
+            "farther from any curve than their sigmas allow; check ranges, which target is which "
+            "and sigma_row_px"
+        )
+    if 2 * int(kept.sum()) <= len(observed) or np.ptp(observed.range_mm[kept]) == 0.0:
+        raise FitError(
+            f"only {int(kept.sum())} of {len(observed)} targets follow one curve; check their "
+            "ranges and which target is which"
+        )

@@ -1,0 +1,240 @@
+"""How far a calibration can be trusted: leave-one-out, profile of k, share of the priors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.errors import FitError
+from eschorty_ros.core.calibration._model import COLUMN_TERMS, WIDTH_BIAS, Observed
+from eschorty_ros.core.calibration._solvers import Problem, solve
+from eschorty_ros.core.calibration.fit import (
+    CONDITION_WARNING,
+    PRIOR_SIGMA,
+    CalibrationFit,
+    fit,
+)
+from eschorty_ros.core.calibration.targets import Targets
+from eschorty_ros.core.optics.range_model import RangeModel
+
+Array = NDArray[np.float64]
+
+PRIOR_SHARE = math.sqrt(0.5)
+"""Above this ratio of standard deviations a prior tells more than the targets."""
+RESIDUAL_SIGMA = 3.0
+LISTED = 4
+"""Targets that a verdict names."""
+_MARGIN = 0.05
+_FAR_SHARE = 0.25
+# Of Gaussian errors.
+_SHARE_BEYOND = 0.0027
+_PROFILE_POINTS = 41
+_PROFILE_SIGMA = 4.0
+_CHI_SQUARE_95 = 3.841
+_RARE = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KProfile:
+    """Profile likelihood of k: every other parameter at its best for each k.
+
+    Attributes
+    ----------
+    k_mm : ndarray of float64, shape (n,)
+    delta_chi_square : ndarray of float64, shape (n,)
+        Above the smallest; the prior on k is left out, the others count.
+    interval_mm : tuple of float
+        95 % interval; infinite on a side where it lies beyond the profile.
+    """
+
+    k_mm: Array
+    delta_chi_square: Array
+    interval_mm: tuple[float, float]
+
+
+def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KProfile | None:
+    """Profile likelihood of k within four standard deviations.
+
+    ``None`` where k was fixed, or no k lets the other parameters be found.
+    """
+    if "k_mm" not in found.free:
+        return None
+    at = found.free.index("k_mm")
+    half = _PROFILE_SIGMA * math.sqrt(found.covariance[at, at])
+    # At a k of 0 or less there is no build.
+    low = max(found.model.k_mm - half, 0.1 * found.model.k_mm)
+    k_mm = np.linspace(low, found.model.k_mm + half, _PROFILE_POINTS)
+    free = tuple(name for name in found.free if name != "k_mm")
+    priors = {name: value for name, value in found.prior_sigma.items() if name != "k_mm"}
+    chi_square = np.full(k_mm.size, np.nan)
+    observed = Observed.of(targets, design)
+    for index, value in enumerate(k_mm.tolist()):
+        try:
+            problem, values = solve(observed, replace(design, k_mm=value), free, priors)
+        except FitError:
+            continue
+        white = problem.residual(problem.free(values))
+        chi_square[index] = np.nan if white is None else white @ white
+    if np.isnan(chi_square).all():
+        return None
+    delta = chi_square - np.nanmin(chi_square)
+    return KProfile(k_mm, delta, _interval(k_mm, delta))
+
+
+def _interval(k_mm: Array, delta: Array) -> tuple[float, float]:
+    best = int(np.nanargmin(delta))
+    low, high = -math.inf, math.inf
+    for index in range(best, 0, -1):
+        if delta[index - 1] > _CHI_SQUARE_95:
+            low = float(np.interp(_CHI_SQUARE_95, delta[[index, index - 1]],
+                                  k_mm[[index, index - 1]]))  # fmt: skip
+            break
+    for index in range(best, k_mm.size - 1):
+        if delta[index + 1] > _CHI_SQUARE_95:
+            high = float(np.interp(_CHI_SQUARE_95, delta[[index, index + 1]],
+                                   k_mm[[index, index + 1]]))  # fmt: skip
+            break
+    return low, high
+
+
+def leave_one_out_px(targets: Targets, design: RangeModel, found: CalibrationFit) -> Array:
+    """Row of each target minus the row that the others predict, shape (n,).
+
+    By the leverage of each target, which is exact where the model is linear. NaN where the others
+    do not determine the parameters.
+    """
+    observed = Observed.of(targets, design)
+    if not np.isfinite(found.lateral_residual_px).any():
+        observed = observed.rows_only()
+    problem = Problem(observed, design, found.free, found.prior_sigma, found.values)
+    white = problem.distance(found.values)
+    left = np.eye(white.shape[1]) - problem.leverage(found.values, found.covariance)
+    alone = np.linalg.eigvalsh(left)[:, 0] < 1e-9
+    left[alone] = np.eye(white.shape[1])
+    without = np.linalg.solve(left, white[:, :, None])
+    rows = np.einsum("nij,njk->nik", problem.root, without)[:, 0, 0]
+    return np.where(alone, np.nan, rows)
+
+
+def prior_ratios(found: CalibrationFit) -> dict[str, float]:
+    """Posterior over prior standard deviation of each parameter that has a prior."""
+    sigma = dict(zip(found.free, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+    return {name: sigma[name] / spread for name, spread in found.prior_sigma.items()}
+
+
+def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tuple[str, ...]:
+    """One line each: ``identifiable`` where it is, then every reservation with its remedy."""
+    ratios = prior_ratios(found)
+    held = {name: ratio for name, ratio in ratios.items() if ratio > PRIOR_SHARE}
+    lines = []
+    if found.condition_number <= CONDITION_WARNING and found.dof > 0 and not held:
+        lines.append("identifiable")
+    lines += found.verdicts
+    for name, ratio in held.items():
+        lines.append(
+            f"prior dominates {name}: the targets narrow it only to {ratio:.2f} of its prior "
+            f"sigma of {found.prior_sigma[name]:g}{_remedy(name)}"
+        )
+    for name, spread in found.prior_sigma.items():
+        pull = (found.values[name] - _centre(design, name)) / spread
+        if abs(pull) > RESIDUAL_SIGMA:
+            lines.append(
+                f"{name} lies {abs(pull):.1f} prior sigmas from the design; check the nominal "
+                "build or widen its prior"
+            )
+    lines += _sizes(targets, design, found)
+    return (*lines, *_coverage(targets, found), *_residuals(targets, found))
+
+
+def _remedy(name: str) -> str:
+    if name in ("k_mm", WIDTH_BIAS):
+        return "; add targets of another size, or spacings"
+    if name in COLUMN_TERMS:
+        return "; spread the targets over the columns"
+    return "; spread the targets over the range"
+
+
+def _centre(design: RangeModel, name: str) -> float:
+    return 0.0 if name == WIDTH_BIAS else float(getattr(design, name))
+
+
+def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[str]:
+    """Say when known sizes contradict a k that stayed as designed."""
+    if "k_mm" in found.free or not targets.lateral:
+        return []
+    names, priors = ["k_mm", *found.free], dict(found.prior_sigma)
+    if targets.has_width.any() and WIDTH_BIAS not in names:
+        names.append(WIDTH_BIAS)
+        priors[WIDTH_BIAS] = PRIOR_SIGMA[WIDTH_BIAS]
+    try:
+        freed = fit(targets, design, names, prior_sigma=priors)
+    except FitError:
+        return []
+    k_mm, sigma = freed.model.k_mm, math.sqrt(freed.covariance[0, 0])
+    away = abs(k_mm - design.k_mm) / sigma
+    if away <= RESIDUAL_SIGMA:
+        return []
+    return [
+        f"sizes contradict k_mm: they say {k_mm:.3f} with a sigma of {sigma:.3f}, {away:.1f} sigma "
+        f"from the {design.k_mm:.3f} it was held at; method joint fits it"
+    ]
+
+
+def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:
+    """Say where the sensor sees farther or nearer than the targets, and how they are laid out."""
+    model, lines = found.model, []
+    first, last = float(targets.row.min()), float(targets.row.max())
+    margin = _MARGIN * model.rows
+    if first > margin or last < model.rows - 1 - margin:
+        ends = np.array([0.0, model.rows - 1.0])
+        near, far = model.range_mm(ends)
+        worst = np.nanmax(found.range_sigma_mm([near, far]))
+        lines.append(
+            f"extrapolates outside {targets.range_mm.min():.0f} to {targets.range_mm.max():.0f} mm "
+            f"(rows {first:.0f} to {last:.0f}): the sensor sees {near:.0f} to {far:.0f} mm, where "
+            f"sigma grows to {worst:.2g} mm"
+        )
+    near, far = model.range_limits_mm
+    third = near + (far - near) * 2.0 / 3.0
+    beyond = int((targets.range_mm >= third).sum())
+    if math.isfinite(third) and beyond < _FAR_SHARE * len(targets):
+        lines.append(
+            f"{beyond} of {len(targets)} targets lie in the far third, beyond {third:.0f} mm; put "
+            "at least a third of them there"
+        )
+    return lines
+
+
+def _residuals(targets: Targets, found: CalibrationFit) -> list[str]:
+    from scipy.special import chdtrc
+
+    lines = []
+    if found.dof and chdtrc(found.dof, found.chi_square) < _RARE:
+        lines.append(
+            f"residuals exceed the stated sigmas: reduced chi-square "
+            f"{found.reduced_chi_square:.2f} with {found.dof} degrees of freedom; check the "
+            "targets or state larger sigmas"
+        )
+    ratio = np.abs(found.residual_px) / found.sigma_px
+    beyond = np.flatnonzero(ratio > RESIDUAL_SIGMA)
+    by_chance = _SHARE_BEYOND * len(targets)
+    if beyond.size > by_chance + RESIDUAL_SIGMA * math.sqrt(by_chance):
+        worst = beyond[np.argsort(-ratio[beyond], kind="stable")][:LISTED].tolist()
+        each = [
+            f"{targets.labels[i]} {found.residual_px[i]:+.2f} px = {ratio[i]:.1f} sigma"
+            for i in worst
+        ]
+        lines.append(
+            f"{beyond.size} of {len(targets)} targets have residuals beyond {RESIDUAL_SIGMA:g} "
+            f"sigma: {listed(each, beyond.size)}; measure them again"
+        )
+    return lines
+
+
+def listed(first: list[str], count: int) -> str:
+    """``first`` in one line, and how many more there are."""
+    rest = count - len(first)
+    return ", ".join(first) + (f" and {rest} more" if rest else "")

@@ -1,0 +1,115 @@
+"""Targets of a calibration straight from a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from eschorty_ros.core.base.errors import CalibrationError, FitError
+from eschorty_ros.core.calibration.posts import (
+    AggregateFrame,
+    KnownTarget,
+    PostMatch,
+    find_posts,
+    match_posts,
+    moving_target,
+)
+from eschorty_ros.core.calibration.targets import Targets
+from eschorty_ros.core.evt3.decoder import Decoder
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.reconstruction.offline import reconstruct_recording
+from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.core.storage.recording import Recording
+
+_CHUNK_BYTES = 1 << 20
+
+
+def recorded_posts(
+    recording: Recording,
+    known: Sequence[KnownTarget],
+    nominal: Calibration,
+    progress: Callable[[int, int], Any] | None = None,
+) -> PostMatch:
+    """Find the posts in all events of a recording and tell which is which.
+
+    Parameters
+    ----------
+    recording : Recording
+        Of posts that keep their range: the stage still, or moving along them.
+    known : sequence of KnownTarget
+    nominal : Calibration
+        The design of the build that made the recording.
+    progress : callable, optional
+        Called with bytes read so far and bytes in all.
+
+    Returns
+    -------
+    PostMatch
+
+    Raises
+    ------
+    CalibrationError
+        When the design has another sensor.
+    FitError
+        When no post is found, or the posts agree with the ranges in more than one way.
+    FormatError
+        When the event file is not EVT3.
+    """
+    _check_sensor(recording, nominal)
+    frame = AggregateFrame(nominal.columns, nominal.rows)
+    decoder = Decoder(nominal.columns, nominal.rows)
+    total, done = recording.events_path.stat().st_size, 0
+    for chunk in RawReader(recording.events_path).chunks(_CHUNK_BYTES):
+        frame.add(decoder.decode(chunk))
+        done += len(chunk)
+        if progress is not None:
+            progress(done, total)
+    posts = find_posts(frame)
+    if not posts:
+        raise FitError(
+            f"{recording.path}: no post is seen in {frame.events} events; check laser, focus and "
+            "that the posts cross the sheet"
+        )
+    return match_posts(posts, known, nominal.model())
+
+
+def recorded_moving_target(
+    recording: Recording,
+    nominal: Calibration,
+    range_at_zero_mm: float,
+    *,
+    range_per_stage: float = 1.0,
+    blocks: int = 1,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Targets:
+    """Take every profile of a flat target that the stage moves along the range as a target.
+
+    Parameters
+    ----------
+    recording, nominal, progress
+        As in `recorded_posts`.
+    range_at_zero_mm, range_per_stage, blocks
+        As in `moving_target`, which also says what is raised.
+
+    Returns
+    -------
+    Targets
+    """
+    _check_sensor(recording, nominal)
+    profiles = reconstruct_recording(recording, progress=progress).profiles
+    return moving_target(
+        profiles,
+        recording.stage.position_mm(profiles.t_us),
+        range_at_zero_mm,
+        range_per_stage=range_per_stage,
+        blocks=blocks,
+    )
+
+
+def _check_sensor(recording: Recording, nominal: Calibration) -> None:
+    made = recording.calibration
+    if (made.columns, made.rows) != (nominal.columns, nominal.rows):
+        raise CalibrationError(
+            f"{recording.path} has a sensor of {made.columns} x {made.rows} and the nominal build "
+            f"{nominal.name} one of {nominal.columns} x {nominal.rows}; choose the build's own"
+        )

@@ -1,0 +1,182 @@
+"""Targets at known ranges: what a calibration is fitted to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.base.arrays import reals, selection, short
+from eschorty_ros.core.base.errors import ArgumentError
+
+Array = NDArray[np.float64]
+
+SIGMA_ROW_PX = 0.3
+"""Standard deviation of a centroid when nothing better is known."""
+SIGMA_WIDTH_PX = 0.4
+"""The same of a width or a spacing: the difference of two edges or centres."""
+
+_ALWAYS = ("row", "range_mm", "sigma_row_px", "sigma_range_mm")
+_SIZES = (
+    ("width_px", "sigma_width_px", "size_mm"),
+    ("spacing_px", "sigma_spacing_px", "spacing_mm"),
+)
+_POSITIVE_OR_UNKNOWN = tuple(name for names in _SIZES for name in names)
+
+
+@dataclass(frozen=True, slots=True, eq=False, init=False)
+class Targets:
+    """Rows at which targets of known range appear, with what else is known of them.
+
+    Every argument is a scalar for all targets or one entry for each. Attributes are float64 of
+    shape (n,) and read-only.
+
+    Parameters
+    ----------
+    row : array_like
+        Where the targets appear, px, on the sensor.
+    range_mm : array_like
+        Their ranges along the sheet from the mechanical datum, mm, positive.
+    sigma_row_px, sigma_range_mm : array_like
+        Standard deviations; of a range 0 or more.
+    column : array_like, optional
+        Column of the target's centre, px; NaN where unknown.
+    width_px, sigma_width_px, size_mm : array_like, optional
+        Columns that the lit target covers, its standard deviation, and the true size along the
+        laser line; NaN where unknown. Blooming widens the image of a lit target.
+    spacing_px, sigma_spacing_px, spacing_mm : array_like, optional
+        Columns between the centres of two marks at this range, its standard deviation, and the
+        true distance; NaN where unknown. Blooming does not move centres.
+    labels : sequence of str, optional
+        What messages and reports call the targets; ``1``, ``2``, ... by default.
+
+    Raises
+    ------
+    ArgumentError
+        When an entry is not finite, of the wrong sign or missing; names the target.
+    """
+
+    row: Array
+    range_mm: Array
+    sigma_row_px: Array
+    sigma_range_mm: Array
+    column: Array
+    width_px: Array
+    sigma_width_px: Array
+    size_mm: Array
+    spacing_px: Array
+    sigma_spacing_px: Array
+    spacing_mm: Array
+    labels: tuple[str, ...]
+
+    def __init__(
+        self,
+        row: ArrayLike,
+        range_mm: ArrayLike,
+        sigma_row_px: ArrayLike = SIGMA_ROW_PX,
+        sigma_range_mm: ArrayLike = 0.0,
+        column: ArrayLike = math.nan,
+        width_px: ArrayLike = math.nan,
+        sigma_width_px: ArrayLike = SIGMA_WIDTH_PX,
+        size_mm: ArrayLike = math.nan,
+        spacing_px: ArrayLike = math.nan,
+        sigma_spacing_px: ArrayLike = SIGMA_WIDTH_PX,
+        spacing_mm: ArrayLike = math.nan,
+        labels: Sequence[str] = (),
+    ) -> None:
+        given = {
+            "row": row,
+            "range_mm": range_mm,
+            "sigma_row_px": sigma_row_px,
+            "sigma_range_mm": sigma_range_mm,
+            "column": column,
+            "width_px": width_px,
+            "sigma_width_px": sigma_width_px,
+            "size_mm": size_mm,
+            "spacing_px": spacing_px,
+            "sigma_spacing_px": sigma_spacing_px,
+            "spacing_mm": spacing_mm,
+        }
+        size = np.atleast_1d(reals("row", row)).size
+        for name, value in given.items():
+            array = np.array(np.broadcast_to(_entries(name, value, size), size))
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if not isinstance(labels, list | tuple):
+            raise ArgumentError(f"labels is {short(labels)}; give {size} texts")
+        named = tuple(labels) or tuple(str(index + 1) for index in range(size))
+        if len(named) != size or not all(isinstance(label, str) for label in named):
+            raise ArgumentError(f"labels holds {len(named)} entries; give {size} texts")
+        object.__setattr__(self, "labels", named)
+        self._check()
+
+    def _check(self) -> None:
+        for name in _ALWAYS:
+            self._refuse(name, ~np.isfinite(getattr(self, name)), "give a finite number")
+        self._refuse("range_mm", self.range_mm <= 0.0, "choose a positive range")
+        self._refuse("sigma_row_px", self.sigma_row_px <= 0.0, "choose a positive number")
+        self._refuse("sigma_range_mm", self.sigma_range_mm < 0.0, "choose 0 or more")
+        self._refuse("column", np.isinf(self.column), "give a finite number")
+        for name in _POSITIVE_OR_UNKNOWN:
+            value = getattr(self, name)
+            self._refuse(name, np.isinf(value) | (value <= 0.0), "choose a positive number or NaN")
+        for seen, sigma, _ in _SIZES:
+            unknown = np.isfinite(getattr(self, seen)) & np.isnan(getattr(self, sigma))
+            self._refuse(sigma, unknown, "choose a positive number")
+
+    def __len__(self) -> int:
+        return self.row.size
+
+    @property
+    def has_width(self) -> NDArray[np.bool_]:
+        """Targets whose width and size are both known, shape (n,)."""
+        return np.isfinite(self.width_px) & np.isfinite(self.size_mm)
+
+    @property
+    def has_spacing(self) -> NDArray[np.bool_]:
+        """Targets whose spacing is known in columns and in mm, shape (n,)."""
+        return np.isfinite(self.spacing_px) & np.isfinite(self.spacing_mm)
+
+    @property
+    def lateral(self) -> int:
+        """Number of known sizes and spacings: what tells k from k'."""
+        return int(self.has_width.sum() + self.has_spacing.sum())
+
+    def select(self, which: ArrayLike) -> Targets:
+        """Targets at these indices, or where this mask is true."""
+        index = np.arange(len(self))[selection("which", which, len(self))]
+        numbers = {name: getattr(self, name)[index] for name in _NUMBERS}
+        return Targets(**numbers, labels=tuple(self.labels[i] for i in index))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Targets]) -> Targets:
+        """All targets of ``parts`` in their order, with their labels.
+
+        Raises
+        ------
+        ArgumentError
+            When there is nothing to join.
+        """
+        if not parts:
+            raise ArgumentError("parts is empty; give at least one Targets")
+        numbers = {n: np.concatenate([getattr(part, n) for part in parts]) for n in _NUMBERS}
+        return Targets(**numbers, labels=tuple(label for part in parts for label in part.labels))
+
+    def _refuse(self, name: str, wrong: NDArray[np.bool_], remedy: str) -> None:
+        if wrong.any():
+            index = int(np.flatnonzero(wrong)[0])
+            value = getattr(self, name)[index]
+            raise ArgumentError(f"{name} of target {self.labels[index]} is {value:g}; {remedy}")
+
+
+_NUMBERS = tuple(item.name for item in fields(Targets) if item.name != "labels")
+
+
+def _entries(name: str, value: ArrayLike, size: int) -> Array:
+    array = reals(name, value)
+    if array.ndim > 1 or array.size not in (1, size):
+        raise ArgumentError(f"{name} has shape {array.shape}; give one number or {size}")
+    return array

@@ -1,0 +1,216 @@
+"""Targets and distances as CSV files that a person writes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from eschorty_ros.core.base.arrays import file_path
+from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.calibration.posts import KnownTarget
+from eschorty_ros.core.calibration.targets import SIGMA_ROW_PX, SIGMA_WIDTH_PX, Targets
+
+SIGMA_RANGE_MM = 1.0
+"""Standard deviation of a range that was measured by hand."""
+
+_COLUMNS = {
+    "row": "row",
+    "range_mm": "range_mm",
+    "row_sigma": "sigma_row_px",
+    "range_sigma_mm": "sigma_range_mm",
+    "column": "column",
+    "width_px": "width_px",
+    "width_sigma_px": "sigma_width_px",
+    "size_mm": "size_mm",
+    "spacing_px": "spacing_px",
+    "spacing_sigma_px": "sigma_spacing_px",
+    "spacing_mm": "spacing_mm",
+}
+TARGET_COLUMNS = (*_COLUMNS, "label")
+DISTANCE_COLUMNS = ("range_mm", "range_sigma_mm", "size_mm", "column", "row", "label")
+
+
+def read_targets(
+    path: str | os.PathLike[str],
+    *,
+    sigma_row_px: float = SIGMA_ROW_PX,
+    sigma_range_mm: float = SIGMA_RANGE_MM,
+) -> Targets:
+    """Read targets, one a line.
+
+    Parameters
+    ----------
+    path : path
+        CSV with a header line: ``row`` and ``range_mm``, and any of ``row_sigma``,
+        ``range_sigma_mm``, ``column``, ``width_px``, ``width_sigma_px``, ``size_mm``,
+        ``spacing_px``, ``spacing_sigma_px``, ``spacing_mm``, ``label``, in any order. An empty
+        cell means unknown; lines that begin with ``#`` are remarks.
+    sigma_row_px, sigma_range_mm : float
+        Standard deviations where the file gives none.
+
+    Returns
+    -------
+    Targets
+        Labelled ``line N`` where the file has no label.
+
+    Raises
+    ------
+    FormatError
+        Names file, line, column and value.
+    """
+    table = _read(file_path("path", path), TARGET_COLUMNS, ("row", "range_mm"))
+    default = {
+        "row_sigma": sigma_row_px,
+        "range_sigma_mm": sigma_range_mm,
+        "width_sigma_px": SIGMA_WIDTH_PX,
+        "spacing_sigma_px": SIGMA_WIDTH_PX,
+    }
+    numbers = {
+        _COLUMNS[name]: [line.number(name, default.get(name, math.nan)) for line in table]
+        for name in _COLUMNS
+    }
+    return Targets(**numbers, labels=[line.text("label") or f"line {line.at}" for line in table])
+
+
+def write_targets(path: str | os.PathLike[str], targets: Targets) -> None:
+    """Write targets so that :func:`read_targets` gives the same ones, to the last bit.
+
+    Parameters
+    ----------
+    path : path
+        Appears whole or not at all.
+    targets : Targets
+
+    Raises
+    ------
+    ArgumentError
+        When the file cannot be written.
+    """
+    columns = [getattr(targets, attribute).tolist() for attribute in _COLUMNS.values()]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(TARGET_COLUMNS)
+    for *values, label in zip(*columns, targets.labels, strict=True):
+        writer.writerow([*("" if math.isnan(value) else repr(value) for value in values), label])
+    with atomic_write(path) as stream:
+        stream.write(text.getvalue().encode())
+
+
+def read_distances(
+    path: str | os.PathLike[str], *, sigma_range_mm: float = SIGMA_RANGE_MM
+) -> list[KnownTarget]:
+    """Read what is known of the posts of a recording, one a line.
+
+    Parameters
+    ----------
+    path : path
+        CSV with a header line: ``range_mm``, and any of ``range_sigma_mm``, ``size_mm``,
+        ``column`` and ``row`` (where the post should be seen), ``label``.
+    sigma_range_mm : float
+        Standard deviation where the file gives none.
+
+    Returns
+    -------
+    list of KnownTarget
+
+    Raises
+    ------
+    FormatError
+        Names file, line, column and value.
+    """
+    return [
+        KnownTarget(
+            line.number("range_mm"),
+            line.number("range_sigma_mm", sigma_range_mm),
+            line.number("size_mm"),
+            line.number("column"),
+            line.number("row"),
+            line.text("label"),
+        )
+        for line in _read(file_path("path", path), DISTANCE_COLUMNS, ("range_mm",))
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Cells of one line by column name; ``at`` is its number in the file."""
+
+    path: Path
+    at: int
+    cells: dict[str, str]
+
+    def text(self, name: str) -> str:
+        return self.cells.get(name, "")
+
+    def number(self, name: str, default: float = math.nan) -> float:
+        text = self.text(name)
+        if not text:
+            return default
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise FormatError(f"{self.path} line {self.at}: {name} is {text!r}; write a number")
+        return value
+
+
+def _read(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[_Line]:
+    try:
+        lines = [
+            (at, [cell.strip() for cell in cells])
+            for at, cells in enumerate(csv.reader(io.StringIO(_text(path))), 1)
+            if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#")
+        ]
+    except csv.Error as cause:
+        raise FormatError(f"{path}: {cause}; give a CSV file") from cause
+    if not lines:
+        raise FormatError(f"{path}: it holds no line; begin with the header {','.join(needed)}")
+    header = lines[0][1]
+    _check_header(path, header, known, needed)
+    made = []
+    for at, cells in lines[1:]:
+        if len(cells) != len(header):
+            raise FormatError(
+                f"{path} line {at}: it has {len(cells)} cells and the header {len(header)}; "
+                "write one for each column, empty where unknown"
+            )
+        line = _Line(path, at, dict(zip(header, cells, strict=True)))
+        for name in needed:
+            if not line.text(name):
+                raise FormatError(f"{path} line {at}: {name} is empty; write a number")
+        made.append(line)
+    if not made:
+        raise FormatError(f"{path}: it holds a header and no targets; add one line for each")
+    return made
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as cause:
+        raise FormatError(f"cannot read {path}: {cause.strerror}; check the path") from cause
+    except UnicodeDecodeError as cause:
+        raise FormatError(f"{path}: it is not text; give a CSV file") from cause
+
+
+def _check_header(
+    path: Path, header: Sequence[str], known: Sequence[str], needed: Sequence[str]
+) -> None:
+    for name in header:
+        if name not in known:
+            near = get_close_matches(name, known, n=1)
+            remedy = f"did you mean {near[0]}?" if near else f"choose of {', '.join(known)}"
+            raise FormatError(f"{path}: column {name!r} is not known; {remedy}")
+        if header.count(name) > 1:
+            raise FormatError(f"{path}: column {name!r} appears twice; remove one")
+    missing = [name for name in needed if name not in header]
+    if missing:
+        raise FormatError(f"{path}: column {missing[0]!r} is missing; add it to the header")

@@ -1,0 +1,290 @@
+"""Where the stage was at a sensor time, and what ROS time that was."""
+
+from __future__ import annotations
+
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.base.arrays import TIME_LIMIT, reals, times, whole
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.clocks.clock_line import NS_PER_US, T_US_LIMIT, ClockLine
+from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
+
+__all__ = [
+    "NM_PER_MM",
+    "NS_PER_US",
+    "POSITION_LIMIT_MM",
+    "SensorClock",
+    "StageTrack",
+    "quantise_nm",
+]
+
+NM_PER_MM = 1_000_000
+POSITION_LIMIT_MM = 1e9
+
+
+def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np.int64]:
+    """Positions rounded to the nanometre, int64.
+
+    Positions that went through text with six decimals and through ROS metres give the same
+    integers, so a recording and the live nodes place points identically. ``name`` is what an
+    error calls them.
+
+    Raises
+    ------
+    ArgumentError
+        When a position is not finite or farther than 1e9 mm.
+    """
+    position = reals(name, position_mm)
+    wrong = ~(np.abs(position) <= POSITION_LIMIT_MM)
+    if wrong.any():
+        raise ArgumentError(
+            f"{name} is {float(position[wrong][0])!r}; give finite positions within "
+            f"{POSITION_LIMIT_MM:g} mm"
+        )
+    return np.rint(position * NM_PER_MM).astype(np.int64)
+
+
+class StageTrack:
+    """Stage positions over sensor time, linear between samples, never extrapolated.
+
+    Parameters
+    ----------
+    max_gap_us : int, optional
+        Longest distance of two samples that is still bridged, us; ``None`` bridges any.
+
+    Attributes
+    ----------
+    dropped : int
+        Samples refused because they were not later than the one before.
+    """
+
+    def __init__(self, max_gap_us: int | None = None) -> None:
+        if max_gap_us is not None:
+            whole("max_gap_us", max_gap_us, 1, TIME_LIMIT)
+        self.max_gap_us = max_gap_us
+        self.dropped = 0
+        self._t_us = np.empty(256, np.int64)
+        self._nm = np.empty(256, np.int64)
+        self._begin = 0
+        self._end = 0
+
+    def __len__(self) -> int:
+        """Count the samples held."""
+        return self._end - self._begin
+
+    @property
+    def first_us(self) -> int | None:
+        """Time of the oldest sample held, ``None`` when there is none."""
+        return int(self._t_us[self._begin]) if len(self) else None
+
+    @property
+    def last_us(self) -> int | None:
+        """Time of the newest sample, ``None`` when there is none."""
+        return int(self._t_us[self._end - 1]) if len(self) else None
+
+    def append(self, t_us: ArrayLike, position_mm: ArrayLike) -> None:
+        """Add samples; those not later than all before them are dropped and counted.
+
+        Parameters
+        ----------
+        t_us : int or array_like of int, shape (n,)
+            Sensor time, us.
+        position_mm : float or array_like, shape (n,)
+            Position, quantised to 1 nm.
+
+        Raises
+        ------
+        ArgumentError
+            For fractional times, unequal lengths or positions that are not finite.
+        """
+        at_us = np.atleast_1d(times("t_us", t_us))
+        positions = np.atleast_1d(quantise_nm(position_mm))
+        if at_us.ndim != 1 or at_us.shape != positions.shape:
+            raise ArgumentError(
+                f"t_us has shape {at_us.shape} and position_mm {positions.shape}; "
+                "give one position for each time"
+            )
+        floor = np.iinfo(np.int64).min if self.last_us is None else self.last_us
+        newest_before = np.maximum.accumulate(np.concatenate(([floor], at_us)))[:-1]
+        later = at_us > newest_before
+        self.dropped += int(later.size - np.count_nonzero(later))
+        self._extend(at_us[later], positions[later])
+
+    def position_mm(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Stage position at sensor times.
+
+        Parameters
+        ----------
+        t_us : array_like of int, any shape
+            Sensor time, us.
+
+        Returns
+        -------
+        ndarray of float64, shape of ``t_us``
+            mm; NaN outside the samples and inside a gap longer than ``max_gap_us``.
+        """
+        query = times("t_us", t_us)
+        held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
+        if held.size == 0:
+            return np.full(query.shape, np.nan)
+        left = np.clip(np.searchsorted(held, query, side="right") - 1, 0, held.size - 1)
+        right = np.minimum(left + 1, held.size - 1)
+        since = query - held[left]
+        gap = held[right] - held[left]
+        step_nm = (nm[right] - nm[left]).astype(np.float64)
+        position = (nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM
+        unknown = (query < held[left]) | (query > held[right])
+        if self.max_gap_us is not None:
+            unknown |= (gap > self.max_gap_us) & (since > 0)
+        return np.where(unknown, np.nan, position)
+
+    def forget_before(self, t_us: int) -> None:
+        """Release samples that no query at ``t_us`` or later needs."""
+        whole("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
+        held = self._t_us[self._begin : self._end]
+        self._begin += max(int(np.searchsorted(held, t_us, side="right")) - 1, 0)
+
+    def _extend(self, times: NDArray[np.int64], nm: NDArray[np.int64]) -> None:
+        if self._end + times.size > self._t_us.size:
+            self._make_room(times.size)
+        stop = self._end + times.size
+        self._t_us[self._end : stop] = times
+        self._nm[self._end : stop] = nm
+        self._end = stop
+
+    def _make_room(self, count: int) -> None:
+        size = max(2 * (len(self) + count), 256)
+        for name in ("_t_us", "_nm"):
+            grown = np.empty(size, np.int64)
+            grown[: len(self)] = getattr(self, name)[self._begin : self._end]
+            setattr(self, name, grown)
+        self._begin, self._end = 0, len(self)
+
+
+class SensorClock:
+    """Conversion between sensor microseconds and ROS nanoseconds.
+
+    With ``zero_ns`` given (announced by the camera) the relation is fixed and exact. Without it
+    offset and drift are the lower envelope of the packets' arrivals over a sliding window, see
+    :class:`~eschorty_ros.core.clocks.lower_envelope.LowerEnvelope`, until a better relation is known from
+    trigger edges (:meth:`adopt`).
+
+    The estimate may step at an observation, never between two of them: times converted between
+    two observations are strictly monotone. When arrival or sensor time goes back (clock set,
+    camera restarted) everything starts anew and ``restarts`` counts it.
+
+    Parameters
+    ----------
+    zero_ns : int, optional
+        ROS time (ns) at which the sensor's clock read zero.
+    window_ns : int
+        Length of the sliding window, ns of arrival time.
+
+    Attributes
+    ----------
+    restarts : int
+        Times the window was thrown away.
+    residual_ns : int or None
+        How much later than the clock says the last observed packet arrived.
+    """
+
+    def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
+        self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
+        self._fixed = None if zero_ns is None else ClockLine(0, _zero(zero_ns))
+        self._adopted: ClockLine | None = None
+        self._envelope = LowerEnvelope(window_ns)
+        self._last: tuple[int, int] | None = None
+        self.restarts = 0
+        self.residual_ns: int | None = None
+
+    @property
+    def exact(self) -> bool:
+        """Whether the zero was announced."""
+        return self._fixed is not None
+
+    @property
+    def from_edges(self) -> bool:
+        """Whether the relation comes from trigger edges."""
+        return self._adopted is not None
+
+    @property
+    def line(self) -> ClockLine | None:
+        """The relation as known now, ``None`` while nothing is known."""
+        return self._fixed or self._adopted or self._envelope.line
+
+    @property
+    def arrival_line(self) -> ClockLine | None:
+        """The relation as the packets' arrivals alone show it."""
+        return self._fixed or self._envelope.line
+
+    @property
+    def zero_ns(self) -> int | None:
+        """ROS time of sensor time 0, ns; ``None`` while nothing is known."""
+        return None if self.line is None else self.line.to_ns(0)
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster ROS time passes than sensor time; 0 while nothing is known."""
+        return 0.0 if self.line is None else self.line.drift_ppb * 1e-3
+
+    @property
+    def offset_age_us(self) -> int:
+        """Sensor time since the newest packet that arrived without delay."""
+        return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
+
+    def goes_on(self, t_us: int, arrival_ns: int) -> bool:
+        """Whether neither time lies before the last observed."""
+        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])
+
+    def observe(self, t_us: int, arrival_ns: int) -> None:
+        """Take note that the event of sensor time ``t_us`` arrived at ROS time ``arrival_ns``."""
+        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        if self._fixed is None:
+            if not self.goes_on(t_us, arrival_ns):
+                self._envelope = LowerEnvelope(self._window_ns)
+                self._adopted = None
+                self.restarts += 1
+            self._envelope.observe(t_us, arrival_ns)
+        self._last = (t_us, arrival_ns)
+        self.residual_ns = arrival_ns - self.to_ns(t_us)
+
+    def adopt(self, line: ClockLine | None) -> None:
+        """Use ``line``, known from edges, until another comes; ``None`` goes back to arrivals.
+
+        An announced zero stays.
+        """
+        self._adopted = line
+
+    @overload
+    def to_ns(self, t_us: int) -> int: ...
+    @overload
+    def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
+    def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+        """ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
+        return self._known().to_ns(t_us)
+
+    @overload
+    def to_us(self, t_ns: int) -> int: ...
+    @overload
+    def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
+    def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+        """Sensor time (us, nearest, halves up) of ROS time ``t_ns``; undoes :meth:`to_ns`."""
+        return self._known().to_us(t_ns)
+
+    def _known(self) -> ClockLine:
+        line = self.line
+        if line is None:
+            raise ArgumentError(
+                "the ROS time of sensor time 0 is unknown; announce it or observe a packet first"
+            )
+        return line
+
+
+def _zero(zero_ns: int) -> int:
+    return whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT)

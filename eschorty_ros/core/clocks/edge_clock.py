@@ -1,0 +1,96 @@
+"""The sensor's clock from a stage's trigger edges, while they come in."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import TIME_LIMIT, whole_vector
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.clocks.clock import StageTrack
+from eschorty_ros.core.clocks.clock_line import NS_PER_US, ClockLine
+from eschorty_ros.core.clocks.position_edges import EdgeFit, fit_edges
+from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
+
+_WINDOW_US = 60_000_000
+_EDGES_MAX = 8192
+_REFIT_US = 50_000
+
+
+class EdgeClock:
+    """Collects the edges of the last minute and fits them whenever new ones have a position.
+
+    Attributes
+    ----------
+    fit : EdgeFit or None
+        The last fit that held.
+    pulses : PulseTrain or None
+        Where the stage gives its pulses; without it no edge means anything.
+    edges_dropped : int
+        Edges beyond what is kept: the input sees something faster than a stage.
+    """
+
+    def __init__(self, pulses: PulseTrain | None = None) -> None:
+        self.fit: EdgeFit | None = None
+        self.pulses = pulses
+        self.edges_dropped = 0
+        self._t_us = np.empty(0, np.int64)
+        self._polarity = np.empty(0, np.uint8)
+        self._fitted_us: int | None = None
+
+    def __len__(self) -> int:
+        """Count the edges kept, both kinds."""
+        return self._t_us.size
+
+    @property
+    def until_us(self) -> int | None:
+        """Sensor time of the last edge used, ``None`` without a fit."""
+        return self.fit.last_us if self.fit is not None else None
+
+    def add(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
+        """Append edges of the trigger input, in time order; 1 for rising ones."""
+        t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+        polarity = whole_vector("polarity", polarity, np.uint8, 0, 1)
+        if t_us.shape != polarity.shape:
+            raise ArgumentError(
+                f"t_us has {t_us.size} edges and polarity {polarity.size}; give one for each"
+            )
+        if t_us.size == 0:
+            return
+        t_us = np.concatenate([self._t_us, t_us])
+        begin = int(np.searchsorted(t_us, t_us[-1] - _WINDOW_US))
+        excess = t_us.size - begin - _EDGES_MAX
+        if excess > 0:
+            self.edges_dropped += excess
+            begin += excess
+        self._t_us = t_us[begin:]
+        self._polarity = np.concatenate([self._polarity, polarity])[begin:]
+
+    def update(self, track: StageTrack, arrivals: ClockLine, *, now: bool = False) -> bool:
+        """Fit again when there is something new; whether ``fit`` has changed.
+
+        Parameters
+        ----------
+        track : StageTrack
+            Odometry over ROS time, us.
+        arrivals : ClockLine
+            The clock as the packets' arrivals show it.
+        now : bool
+            Fit every new edge, not only after 50 ms of them.
+        """
+        last_us = track.last_us
+        if self.pulses is None or last_us is None or self._t_us.size == 0:
+            return False
+        newest = int(np.searchsorted(self._t_us, arrivals.to_us(last_us * NS_PER_US), side="right"))
+        if newest == 0:
+            return False
+        newest_us = int(self._t_us[newest - 1])
+        since_us = newest_us - self._fitted_us if self._fitted_us is not None else TIME_LIMIT
+        if since_us < (1 if now else _REFIT_US):
+            return False
+        self._fitted_us = newest_us
+        leading_us = leading_edges(self._t_us[:newest], self._polarity[:newest])
+        fit = fit_edges(leading_us, track, self.pulses, arrivals)
+        if fit is not None:
+            self.fit = fit
+        return fit is not None

@@ -1,0 +1,77 @@
+"""Pulses of a stage at equal distances, and the edges they make at a trigger input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import TIME_LIMIT, number, positive, reals, whole, whole_vector
+from eschorty_ros.core.base.errors import ArgumentError
+
+
+@dataclass(frozen=True, slots=True)
+class PulseTrain:
+    """Pulses of a stage: number n, below ``count``, begins at ``first_mm + n interval_mm``.
+
+    Raises
+    ------
+    ArgumentError
+        When a number is not finite, the interval not positive or the count negative.
+    """
+
+    first_mm: float
+    interval_mm: float
+    count: int
+
+    def __post_init__(self) -> None:
+        number("first_mm", self.first_mm, -1e6, 1e6)
+        positive("interval_mm", self.interval_mm)
+        whole("count", self.count, 0, 1 << 31)
+
+    def nearest(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the number of the pulse nearest to each position; NaN stays."""
+        n = np.rint((reals("position_mm", position_mm) - self.first_mm) / self.interval_mm)
+        return np.clip(n, 0, max(self.count - 1, 0))
+
+    def offset_mm(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the signed distance of each position from its nearest pulse; NaN stays."""
+        pulse_mm = self.first_mm + self.nearest(position_mm) * self.interval_mm
+        return reals("position_mm", position_mm) - pulse_mm
+
+
+def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Edges with which the pulses begin, out of rising and falling ones.
+
+    A pulse has one width and the pauses vary with the speed: where the time from rising to falling
+    edges is the steadier one, or the shorter one if both are as steady, pulses begin rising. With
+    edges of one kind only, they are taken.
+
+    Parameters
+    ----------
+    t_us : ndarray of int64, shape (n,)
+        In time order.
+    polarity : ndarray of uint8, shape (n,)
+        1 for rising.
+    """
+    t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    polarity = whole_vector("polarity", polarity, np.uint8, 0, 1)
+    if t_us.shape != polarity.shape:
+        raise ArgumentError(
+            f"t_us has {t_us.size} edges and polarity {polarity.size}; give one for each"
+        )
+    rising = polarity == 1
+    if rising.all() or not rising.any():
+        return t_us
+    gap = np.diff(t_us)
+    high, low = gap[rising[:-1] & ~rising[1:]], gap[~rising[:-1] & rising[1:]]
+    if min(high.size, low.size) < 3:
+        short = np.median(high) <= np.median(low) if high.size and low.size else True
+        return t_us[rising] if short else t_us[~rising]
+    spread = [float(np.subtract(*np.quantile(gaps, (0.8, 0.2)))) + 1.0 for gaps in (high, low)]
+    if max(spread) < 1.5 * min(spread):
+        begins_rising = np.median(high) <= np.median(low)
+    else:
+        begins_rising = spread[0] < spread[1]
+    return t_us[rising] if begins_rising else t_us[~rising]

@@ -1,0 +1,73 @@
+"""The laser's modulation as the reconstruction and the laser driver both see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import TIME_LIMIT, number, whole
+
+WAVEFORMS = ("square", "sine", "pulse")
+FREQUENCY_MIN_HZ = 16.0
+FREQUENCY_MAX_HZ = 20_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Modulation:
+    """A periodic laser gate.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Modulation frequency, 16 Hz to 20 kHz.
+    duty : float
+        Share of the period with the laser on, strictly between 0 and 1.
+    waveform : {"square", "sine", "pulse"}
+        ``square`` and ``pulse`` are both full light for ``duty`` of the period; generators name
+        them apart. ``sine`` rises as half a cosine wave for ``duty`` of the period and falls as
+        another for the rest; its rising edge is where the light is least.
+    on_edge_us : int, optional
+        Sensor time of one rising edge, int64 microseconds; ``None`` when unknown.
+
+    Raises
+    ------
+    ArgumentError
+        When a value lies outside its range.
+    """
+
+    frequency_hz: float
+    duty: float = 0.5
+    waveform: str = "square"
+    on_edge_us: int | None = None
+
+    def __post_init__(self) -> None:
+        number("duty", self.duty)
+        if not FREQUENCY_MIN_HZ <= number("frequency_hz", self.frequency_hz) <= FREQUENCY_MAX_HZ:
+            raise ArgumentError(
+                f"frequency_hz is {self.frequency_hz!r}; "
+                f"choose {FREQUENCY_MIN_HZ:g} to {FREQUENCY_MAX_HZ:g} Hz"
+            )
+        if not 0.0 < self.duty < 1.0:
+            raise ArgumentError(f"duty is {self.duty!r}; choose a value between 0 and 1")
+        if self.on_edge_us is not None:
+            whole("on_edge_us", self.on_edge_us, -TIME_LIMIT, TIME_LIMIT)
+        if self.waveform not in WAVEFORMS:
+            raise ArgumentError(
+                f"waveform is {self.waveform!r}; choose one of {', '.join(WAVEFORMS)}"
+            )
+
+    @property
+    def period_us(self) -> float:
+        """Length of one period in microseconds."""
+        return 1e6 / self.frequency_hz
+
+    def edge_us(self, index: int) -> int:
+        """Sensor time of rising edge ``index``, rounded to the microsecond.
+
+        Exact for any index: the period is a ratio of integers, never an accumulated float.
+        """
+        if self.on_edge_us is None:
+            raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")
+        whole("index", index, -TIME_LIMIT, TIME_LIMIT)
+        return self.on_edge_us + round(index * 1_000_000 / Fraction(self.frequency_hz))

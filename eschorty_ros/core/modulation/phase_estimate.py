@@ -1,0 +1,126 @@
+"""The modulation's phase, from the events it makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, whole, whole_vector
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.modulation.modulation import Modulation
+
+WINDOW_PERIODS = 4
+WINDOW_EVENTS = 2048
+_HISTOGRAM_BINS = 200
+_RAYLEIGH_MIN = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseEstimate:
+    """Rising edge seen in a window of events.
+
+    Attributes
+    ----------
+    edge_us : int
+        Sensor time of a rising edge within the window's first period, as the earliest events
+        after it show it: late by the pixels' shortest latency.
+    strength : float
+        Vector strength of all events, 0 to 1 (ON events against the rising edge, OFF events
+        against the falling one).
+    rayleigh : float
+        Strength squared times the number of events; exponential with mean 1 for unmodulated
+        events.
+    found : bool
+        Whether the Rayleigh test calls the window modulated.
+    """
+
+    edge_us: int
+    strength: float
+    rayleigh: float
+    found: bool
+
+
+def estimate_phase(
+    t_us: NDArray[np.int64], polarity: NDArray[np.uint8], modulation: Modulation
+) -> PhaseEstimate:
+    """Rising edge from a window of events, by circular statistics at the known frequency.
+
+    ON events follow the rising edge and OFF events the falling one, so OFF events are turned back
+    by the duty cycle and both vote for one direction. The burst's beginning, where the counts
+    rise above the background, is taken as the edge.
+
+    Parameters
+    ----------
+    t_us : ndarray of int64, shape (n,)
+        In time order.
+    polarity : ndarray of uint8, shape (n,)
+        1 for ON.
+    modulation : Modulation
+        ``on_edge_us`` is not used.
+
+    Returns
+    -------
+    PhaseEstimate
+
+    Raises ``ArgumentError`` when there are no events, or they are not in time order.
+    """
+    t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    fall = np.flatnonzero(np.diff(t_us) < 0)
+    if fall.size:
+        before, after = t_us[fall[0]], t_us[fall[0] + 1]
+        raise ArgumentError(f"t_us goes from {before} to {after}; sort the events by time")
+    polarity = whole_vector("polarity", polarity, np.uint8, 0, 1)
+    if t_us.size == 0 or t_us.shape != polarity.shape:
+        raise ArgumentError(
+            f"t_us has {t_us.size} events and polarity {polarity.size}; give one polarity per event"
+        )
+    period_us = modulation.period_us
+    origin = int(t_us[0])
+    phase = (t_us - origin) / period_us
+    phase -= np.where(polarity == 1, 0.0, modulation.duty)
+    phase -= np.floor(phase)
+    strength = float(abs(np.exp(2j * np.pi * phase).mean()))
+    rayleigh = strength * strength * t_us.size
+    begin = _burst_begin(phase)
+    return PhaseEstimate(
+        origin + round(begin * period_us), strength, rayleigh, rayleigh > _RAYLEIGH_MIN
+    )
+
+
+def _burst_begin(phase: NDArray[np.float64]) -> float:
+    """Phase (0 to 1) at which the largest burst rises above the background."""
+    bins = np.minimum((phase * _HISTOGRAM_BINS).astype(np.int64), _HISTOGRAM_BINS - 1)
+    counts = np.bincount(bins, minlength=_HISTOGRAM_BINS).astype(np.float64)
+    smooth = counts + np.roll(counts, 1) + np.roll(counts, -1)
+    peak = int(np.argmax(smooth))
+    background = float(np.quantile(counts, 0.2))
+    level = background + 0.05 * (float(counts[peak]) - background)
+    begin = peak
+    for back in range(1, _HISTOGRAM_BINS // 2):
+        if counts[(peak - back) % _HISTOGRAM_BINS] <= level:
+            break
+        begin = peak - back
+    return (begin % _HISTOGRAM_BINS) / _HISTOGRAM_BINS
+
+
+def decide_window(
+    t_us: NDArray[np.int64], watermark_us: int, modulation: Modulation
+) -> tuple[int, int] | None:
+    """Leading events of one estimation window and its end (us), ``None`` while it is still open.
+
+    A window is the fewest times ``WINDOW_PERIODS`` periods from the first event on that hold
+    ``WINDOW_EVENTS`` events; only events decide it, not when they arrived.
+    """
+    t_us = exact("t_us", t_us, np.int64)
+    whole("watermark_us", watermark_us, -TIME_LIMIT, TIME_LIMIT)
+    if t_us.size < WINDOW_EVENTS:
+        return None
+    span_us = WINDOW_PERIODS * modulation.period_us
+    first = int(t_us[0])
+    pieces = int((int(t_us[WINDOW_EVENTS - 1]) - first) / span_us) + 1
+    end_us = first + round(pieces * span_us)
+    if watermark_us <= end_us:
+        return None
+    return int(np.searchsorted(t_us, end_us)), end_us

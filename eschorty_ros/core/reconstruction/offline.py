@@ -1,0 +1,136 @@
+"""A whole recording at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.reconstruction.profiles import Profiles, place
+from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
+from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.core.storage.recording import Recording
+
+_SPEED_SAMPLES = 256
+_MOVING_SHARE = 0.8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """What a recording gave.
+
+    Attributes
+    ----------
+    points : ndarray of POINT_DTYPE
+        In ``eschorty_base``; ``t`` in seconds since the first event.
+    profiles : Profiles
+        The same points before placing, with their rows and times.
+    counters : dict
+        Those of the reconstructor, and ``points_without_stage``.
+    profile_count, events : int
+    seconds : float
+        Wall time of reconstruction and placing, reading of the file included.
+    warnings : tuple of str
+        One line each.
+    """
+
+    points: NDArray[np.void]
+    profiles: Profiles
+    counters: dict[str, int]
+    profile_count: int
+    events: int
+    seconds: float
+    warnings: tuple[str, ...]
+
+    @property
+    def events_per_second(self) -> float:
+        """Events over wall time."""
+        return self.events / self.seconds if self.seconds > 0.0 else 0.0
+
+
+def reconstruct_recording(
+    recording: Recording,
+    settings: Settings | None = None,
+    progress: Callable[[int, int], Any] | None = None,
+) -> Result:
+    """Reconstruct a whole recording.
+
+    Parameters
+    ----------
+    recording : Recording
+    settings : Settings, optional
+        ``stage_speed_mm_s`` is taken from the recording instead.
+    progress : callable, optional
+        Called with bytes read so far and bytes in all.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    FormatError
+        When the event file is not EVT3.
+    """
+    began = time.perf_counter()
+    settings = replace(settings or Settings(), stage_speed_mm_s=stage_speed_mm_s(recording))
+    reconstructor = Reconstructor(recording.calibration, recording.modulation, settings)
+    total = recording.events_path.stat().st_size
+    reader = RawReader(recording.events_path)
+    parts: list[Profiles] = []
+    done = 0
+    for chunk in reader.chunks(1 << 20):
+        parts.append(reconstructor.push(chunk))
+        done += len(chunk)
+        if progress is not None:
+            progress(done, total)
+    parts.append(reconstructor.flush())
+    profiles = Profiles.concatenate(parts)
+    position = recording.stage.position_mm(profiles.t_us)
+    known = np.isfinite(position)
+    if not known.all():
+        profiles = profiles.select(known)
+    origin_us = reconstructor.first_t_us or 0
+    points = place(
+        profiles,
+        reconstructor.model,
+        position[known],
+        recording.calibration.stage_direction,
+        origin_us,
+    )
+    counters = reconstructor.counters
+    counters["points_without_stage"] = int(known.size - known.sum())
+    warnings = [str(line) for line in reader.warnings]
+    if reconstructor.phase_missing:
+        warnings.append(
+            "no modulation phase found in the events; periods are cut from the first event on"
+        )
+    return Result(
+        points,
+        profiles,
+        counters,
+        profiles.profile_count,
+        counters["events"],
+        time.perf_counter() - began,
+        tuple(warnings),
+    )
+
+
+def stage_speed_mm_s(recording: Recording) -> float:
+    """Median speed of the recording's stage towards +y while it cruises; 0 when it rests."""
+    first_us, last_us = recording.stage.first_us, recording.stage.last_us
+    if first_us is None or last_us is None or last_us == first_us:
+        return 0.0
+    t_us = np.linspace(first_us, last_us, _SPEED_SAMPLES).astype(np.int64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        speed = np.diff(recording.stage.position_mm(t_us)) / np.diff(t_us) * 1e6
+    speed = speed[np.isfinite(speed)]
+    moving = np.abs(speed) > _MOVING_SHARE * np.abs(speed).max(initial=0.0)
+    if not moving.any():
+        return 0.0
+    return float(np.median(speed[moving])) * recording.calibration.stage_direction[1]

@@ -1,0 +1,243 @@
+"""Rows of the line, the points they become, and the points' place in space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.base.arrays import TIME_LIMIT, reals, selection, vector, whole
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.storage.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
+
+_DTYPES = {
+    "period": np.int64,
+    "edge_us": np.int64,
+    "t_us": np.int64,
+    "column": np.uint16,
+    "row": np.float64,
+    "sigma_row": np.float64,
+    "events": np.uint32,
+    "width_px": np.float64,
+    "return_index": np.uint8,
+    "range_mm": np.float64,
+    "sigma_mm": np.float64,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LineRows:
+    """Rows of the line as arrays of equal length, by period, column, return index.
+
+    Attributes
+    ----------
+    period : int64
+        Index of the modulation period the profile begins with.
+    edge_us : int64
+        Rising edge that begins it, sensor time.
+    t_us : int64
+        Mean time of the events used, sensor time.
+    column : uint16
+    row, sigma_row : float64
+        Row of the line and its standard deviation, px.
+    events : uint32
+        Events used.
+    width_px : float64
+        Sample standard deviation of the rows used; 0 for a single event.
+    return_index : uint8
+        Place among the rows of the same profile and column, nearest range first.
+    reflectance, reflectance_sigma : float64, optional
+        Relative reflectance and its standard deviation; ``None`` where it is not estimated.
+    """
+
+    period: NDArray[np.int64]
+    edge_us: NDArray[np.int64]
+    t_us: NDArray[np.int64]
+    column: NDArray[np.uint16]
+    row: NDArray[np.float64]
+    sigma_row: NDArray[np.float64]
+    events: NDArray[np.uint32]
+    width_px: NDArray[np.float64]
+    return_index: NDArray[np.uint8]
+    reflectance: NDArray[np.float64] | None = None
+    reflectance_sigma: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.column)
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return no rows."""
+        names = [item.name for item in fields(cls) if item.name in _DTYPES]
+        return cls(**{name: np.empty(0, _DTYPES[name]) for name in names})
+
+    @classmethod
+    def concatenate(cls, parts: Iterable[Self]) -> Self:
+        """Return all rows of ``parts`` in their order.
+
+        A reflectance that only some parts have is NaN in the others.
+        """
+        kept = [part for part in parts if len(part)]
+        if not kept:
+            return cls.empty()
+        if any(part.reflectance is not None for part in kept):
+            kept = [part if part.reflectance is not None else part._unknown() for part in kept]
+        joined: dict[str, Any] = {}
+        for item in fields(cls):
+            values = [getattr(part, item.name) for part in kept]
+            joined[item.name] = None if values[0] is None else np.concatenate(values)
+        return cls(**joined)
+
+    def select(self, mask: ArrayLike | slice) -> Self:
+        """Return the rows of a boolean mask, a slice or an index array."""
+        picked = mask if isinstance(mask, slice) else selection("mask", mask, len(self))
+        chosen = self._values()
+        for name, values in chosen.items():
+            chosen[name] = None if values is None else values[picked]
+        return type(self)(**chosen)
+
+    def _values(self) -> dict[str, Any]:
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def _unknown(self) -> Self:
+        """Return the rows with a reflectance of NaN."""
+        nothing = np.full(len(self), np.nan)
+        return replace(self, reflectance=nothing, reflectance_sigma=nothing)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Profiles(LineRows):
+    """Points of complete profiles: the line's rows and their ranges.
+
+    Attributes
+    ----------
+    range_mm, sigma_mm : float64
+        Range along the sheet (Eq. 2) and its standard deviation.
+    """
+
+    range_mm: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+
+    @classmethod
+    def from_rows(cls, rows: LineRows, model: RangeModel) -> Profiles:
+        """Return ``rows`` with their ranges; those at the pole and behind it are left out."""
+        range_mm = model.range_mm(rows.row, rows.column)
+        seen = np.isfinite(range_mm)
+        if not seen.all():
+            rows, range_mm = rows.select(seen), range_mm[seen]
+        sigma_mm = model.range_sigma_mm(rows.row, rows.sigma_row, rows.column)
+        return cls(**rows._values(), range_mm=range_mm, sigma_mm=sigma_mm)
+
+    @property
+    def profile_count(self) -> int:
+        """Number of different profiles."""
+        return int(np.count_nonzero(np.diff(self.edge_us))) + 1 if len(self) else 0
+
+
+def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDArray[np.void]:
+    """Points in the moving frame ``eschorty_link``: x = range, z along the line, y = 0.
+
+    Parameters
+    ----------
+    profiles : Profiles
+    model : RangeModel
+    origin_us : int
+        Sensor time that counts as ``t = 0``, subtracted before the conversion to float.
+
+    Returns
+    -------
+    ndarray of POINT_DTYPE, shape (len(profiles),)
+        Metres and seconds; ``sigma`` is the range's standard deviation. Of REFLECTANCE_DTYPE where
+        the profiles know their reflectance.
+    """
+    known = profiles.reflectance is not None
+    whole("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
+    points = np.zeros(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
+    points["x"] = profiles.range_mm * 1e-3
+    points["z"] = model.lateral_mm(profiles.column, profiles.range_mm) * 1e-3
+    points["intensity"] = profiles.events
+    points["sigma"] = profiles.sigma_mm * 1e-3
+    points["t"] = (profiles.t_us - np.int64(origin_us)) * 1e-6
+    points["column"] = profiles.column
+    if known:
+        points["reflectance"] = profiles.reflectance
+        points["reflectance_sigma"] = profiles.reflectance_sigma
+    return points
+
+
+def place(
+    profiles: Profiles,
+    model: RangeModel,
+    stage_position_mm: ArrayLike,
+    stage_direction: ArrayLike,
+    origin_us: int = 0,
+) -> NDArray[np.void]:
+    """Points in ``eschorty_base``: ``P = P_link + s t_hat``, s at the mean time of the events used.
+
+    Parameters
+    ----------
+    profiles : Profiles
+    model : RangeModel
+    stage_position_mm : array_like of float64, shape (len(profiles),) or scalar
+        Stage position at ``profiles.t_us``. Points whose position is NaN are left out; the
+        difference in length is theirs to count by the caller.
+    stage_direction : array_like of float64, shape (3,)
+        Unit vector of the stage's motion.
+    origin_us : int
+        Sensor time that counts as ``t = 0``.
+
+    Returns
+    -------
+    ndarray of POINT_DTYPE
+        Or of REFLECTANCE_DTYPE, as :func:`place_link` gives them.
+
+    Raises
+    ------
+    ArgumentError
+        When the positions do not match the points or the direction is not a unit vector.
+    """
+    position = reals("stage_position_mm", stage_position_mm)
+    if position.ndim and position.shape != (len(profiles),):
+        raise ArgumentError(
+            f"stage_position_mm has shape {position.shape}; give one position for each of the "
+            f"{len(profiles)} points"
+        )
+    position = np.broadcast_to(position, (len(profiles),))
+    known = np.isfinite(position)
+    if not known.all():
+        profiles = profiles.select(known)
+        position = position[known]
+    points = place_link(profiles, model, origin_us)
+    add_stage(points, position, stage_direction)
+    return points
+
+
+def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction: ArrayLike) -> None:
+    """Move ``points`` in place by ``s t_hat``: ``P = P_link + s t_hat``.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
+    position_mm : array_like of float64, shape (n,) or scalar
+    stage_direction : array_like of float64, shape (3,)
+    """
+    for axis, offset_m in zip("xyz", stage_offset_m(position_mm, stage_direction), strict=True):
+        points[axis] += offset_m
+
+
+def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArray[np.float64]:
+    """Return ``s t_hat`` in metres, x, y and z along the first axis.
+
+    Raises
+    ------
+    ArgumentError
+        When the direction is not a unit vector.
+    """
+    direction = vector("stage_direction", stage_direction)
+    if direction.shape != (3,) or not abs(float(direction @ direction) - 1.0) < 1e-6:
+        raise ArgumentError(f"stage_direction is {stage_direction!r}; give a unit vector x, y, z")
+    return np.multiply.outer(direction, reals("position_mm", position_mm)) * 1e-3

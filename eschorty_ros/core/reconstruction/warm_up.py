@@ -1,0 +1,43 @@
+"""Compiling the kernels before data arrive."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eschorty_ros.core.evt3.decoder import Encoder
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
+from eschorty_ros.core.reconstruction.settings import Settings
+
+FREQUENCY_HZ = 1000.0
+
+
+def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
+    """Run a few events through a reconstruction of its own.
+
+    The first run on a machine compiles for some seconds; later runs load what that left in
+    numba's cache. A node does this before it takes data, which would pile up meanwhile; a command
+    before it takes the time.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    settings : Settings, optional
+        What is to be compiled: filter and estimator.
+    """
+    periods, columns, events = 4, 8, 6
+    modulation = Modulation(FREQUENCY_HZ, on_edge_us=0)
+    t, column, event = np.meshgrid(
+        np.arange(periods) * 1000 + 100, np.arange(columns), np.arange(events), indexing="ij"
+    )
+    row = calibration.rows // 2 + event
+    data = Encoder(calibration.columns, calibration.rows).encode(
+        t.ravel().astype(np.int64),
+        column.ravel().astype(np.uint16),
+        row.ravel().astype(np.uint16),
+        np.ones(t.size, np.uint8),
+    )
+    reconstructor = Reconstructor(calibration, modulation, settings)
+    reconstructor.push(data)
+    reconstructor.flush()

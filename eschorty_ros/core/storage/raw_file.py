@@ -1,0 +1,269 @@
+"""Prophesee RAW files: ASCII header of ``% key value`` lines, then EVT3 words.
+
+Source: Prophesee's public RAW format description. Old files lack the closing ``% end``; their
+header stops at the first two bytes that are not ``% ``.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from eschorty_ros.core.base.arrays import file_path, octets, whole
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.evt3 import words as w3
+
+CHUNK_BYTES = 128 * 1024
+_HEADER_MAX_BYTES = 64 * 1024
+_SIZE_MAX = 2048
+_VERSIONS = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
+_REMEDY = "convert it to EVT3 or record again with format EVT3"
+
+
+class Header(Mapping[str, str]):
+    """The header's keys and values as written, plus what they mean.
+
+    ``width``, ``height`` : sensor size in pixels (1280 x 720 when the file does not say).
+    ``format`` : always ``"EVT3"``. ``size_bytes`` : offset of the first word.
+    """
+
+    def __init__(self, values: dict[str, str], width: int, height: int, size_bytes: int) -> None:
+        self._values = values
+        self.width = width
+        self.height = height
+        self.format = "EVT3"
+        self.size_bytes = size_bytes
+
+    def __getitem__(self, key: str) -> str:
+        return self._values[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+class RawReader:
+    """Streaming reader of one EVT3 RAW file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; its header is read at once, its words by ``chunks``.
+
+    Attributes
+    ----------
+    header : Header
+    warnings : list of str
+        One line per oddity that was read over: no ``% end``, no geometry, no events, an odd last
+        byte. The last is known when ``chunks`` has reached the end.
+
+    Raises
+    ------
+    FormatError
+        When the file is missing, unreadable, empty, not EVT3, or its header contradicts itself.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = file_path("path", path)
+        self.warnings: list[str] = []
+        try:
+            with self.path.open("rb") as file:
+                head = file.read(_HEADER_MAX_BYTES)
+            self.size_bytes = self.path.stat().st_size
+        except OSError as error:
+            raise FormatError(
+                f"{self.path}: {error.strerror or error}; name a readable RAW file"
+            ) from error
+        if not head:
+            raise FormatError(f"{self.path} is empty; record it again")
+        self.header = self._parse(head)
+        if self.size_bytes <= self.header.size_bytes:
+            self._warn("holds a header and no events")
+
+    def chunks(self, size: int = CHUNK_BYTES) -> Iterator[bytes]:
+        """Iterate over the words' bytes in pieces of ``size`` bytes, the last one shorter.
+
+        Raises
+        ------
+        ArgumentError
+            When ``size`` is not positive.
+        """
+        whole("size", size, 1, 1 << 40)
+        return self._chunks(size)
+
+    def __iter__(self) -> Iterator[bytes]:
+        return self.chunks()
+
+    def _chunks(self, size: int) -> Iterator[bytes]:
+        total = 0
+        with self.path.open("rb") as file:
+            file.seek(self.header.size_bytes)
+            while piece := file.read(size):
+                total += len(piece)
+                yield piece
+        if total % 2:
+            self._warn("ends in the middle of a word; its last byte is not decoded")
+
+    def _warn(self, what: str) -> None:
+        line = f"{self.path} {what}"
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+    def _parse(self, head: bytes) -> Header:
+        values: dict[str, str] = {}
+        at = 0
+        ended = False
+        while head.startswith(b"% ", at) and not ended:
+            stop = head.find(b"\n", at)
+            if stop < 0:
+                raise FormatError(
+                    f"{self.path} has a header line without end within {len(head)} bytes; "
+                    "the file is cut or no RAW file: record it again"
+                )
+            key, _, value = head[at + 2 : stop].decode("latin-1").strip().partition(" ")
+            at = stop + 1
+            ended = key == "end"
+            if not ended:
+                values[key] = " ".join(value.split())
+        if not values and not ended and not head.startswith(b"% "):
+            if not self._looks_like_evt3(head):
+                raise FormatError(
+                    f"{self.path} has no RAW header (first bytes {head[:8].hex(' ')}); "
+                    "name a Prophesee RAW file"
+                )
+            self._warn("has no header; taken as EVT3, 1280x720")
+        elif not ended:
+            self._warn("has no '% end'; its header is taken to stop where the '% ' lines do")
+        width, height = self._meaning(values)
+        return Header(values, width, height, at)
+
+    @staticmethod
+    def _looks_like_evt3(head: bytes) -> bool:
+        """Whether a file without header begins with a stream: types known, TIME_HIGH among them."""
+        kinds = [octet >> 4 for octet in head[1:4096:2]]
+        return w3.TIME_HIGH in kinds and not any(kind in w3.UNUSED for kind in kinds)
+
+    def _meaning(self, values: dict[str, str]) -> tuple[int, int]:
+        name, *options = values.get("format", "").split(";")
+        version = values.get("evt", "")
+        declared = name or _VERSIONS.get(version, f"evt {version}" if version else "EVT3")
+        if declared.upper() != "EVT3":
+            raise FormatError(f"{self.path} is {declared}, not EVT3; {_REMEDY}")
+        if name and version and version != "3.0":
+            raise FormatError(
+                f"{self.path} says format {name} and evt {version}; correct one of the two"
+            )
+        sizes = []
+        option = dict(part.split("=", 1) for part in options if "=" in part)
+        if "width" in option or "height" in option:
+            sizes.append(self._size(f"{option.get('width')}x{option.get('height')}", "format"))
+        if "geometry" in values:
+            sizes.append(self._size(values["geometry"], "geometry"))
+        if not sizes:
+            if values:
+                self._warn("names no geometry; taken as 1280x720")
+            return 1280, 720
+        if len(set(sizes)) > 1:
+            (width, height), (other_width, other_height) = sizes
+            raise FormatError(
+                f"{self.path} says {width}x{height} in format and {other_width}x{other_height} in "
+                "geometry; correct one of the two"
+            )
+        return sizes[0]
+
+    def _size(self, text: str, key: str) -> tuple[int, int]:
+        match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+        width, height = (int(group) for group in match.groups()) if match else (0, 0)
+        if not (1 <= width <= _SIZE_MAX and 1 <= height <= _SIZE_MAX):
+            raise FormatError(
+                f"{self.path} has {key} {text!r}; a sensor size such as 1280x720 belongs there"
+            )
+        return width, height
+
+
+class RawWriter:
+    """Writes an EVT3 RAW file with the header keys that older and newer readers ask for.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to write; replaced when it exists.
+    serial : str
+        Serial number, 8 hexadecimal digits.
+    width, height : int
+        Sensor size in pixels.
+    sensor_name : str
+    date : datetime, optional
+        Time of the recording; now (UTC) when left out.
+
+    Raises
+    ------
+    ArgumentError
+        When a value cannot stand in a header.
+    FormatError
+        When the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        serial: str = "00000000",
+        width: int = 1280,
+        height: int = 720,
+        sensor_name: str = "IMX636",
+        date: datetime.datetime | None = None,
+    ) -> None:
+        if not (isinstance(serial, str) and re.fullmatch(r"[0-9a-fA-F]{8}", serial)):
+            raise ArgumentError(f"serial is {serial!r}; give 8 hexadecimal digits")
+        if not (isinstance(sensor_name, str) and re.fullmatch(r"[!-~]+", sensor_name)):
+            raise ArgumentError(f"sensor_name is {sensor_name!r}; give one ASCII word")
+        for name, size in (("width", width), ("height", height)):
+            whole(name, size, 1, _SIZE_MAX)
+        self.path = file_path("path", path)
+        self.bytes_written = 0
+        moment = date or datetime.datetime.now(datetime.UTC)
+        header = {
+            "camera_integrator_name": "Prophesee",
+            "date": moment.strftime("%Y-%m-%d %H:%M:%S"),
+            "evt": "3.0",
+            "format": f"EVT3;height={height};width={width}",
+            "generation": "4.2",
+            "geometry": f"{width}x{height}",
+            "integrator_name": "Prophesee",
+            "plugin_integrator_name": "Prophesee",
+            "plugin_name": "hal_plugin_prophesee",
+            "sensor_generation": "4.2",
+            "sensor_name": sensor_name,
+            "serial_number": serial.lower(),
+            "system_ID": "49",
+        }
+        lines = "".join(f"% {key} {value}\n" for key, value in header.items()) + "% end\n"
+        try:
+            self._file: BinaryIO = self.path.open("wb")
+            self._file.write(lines.encode("ascii"))
+        except OSError as error:
+            raise FormatError(f"{self.path}: {error.strerror or error}; choose another") from error
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Append bytes of the stream; raises ``FormatError`` when the disk refuses."""
+        view = octets("data", data)
+        try:
+            self._file.write(view)
+        except OSError as error:
+            raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
+        self.bytes_written += len(view)
+
+    def close(self) -> None:
+        """Finish the file; idempotent."""
+        self._file.close()
+
+    def __enter__(self) -> RawWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

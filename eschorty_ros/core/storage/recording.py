@@ -1,0 +1,296 @@
+"""A recording: a folder with the camera's bytes and what is needed to turn them into points.
+
+``events.raw``, ``stage.csv``, ``laser.yaml``, ``calibration.yaml`` and, when simulated,
+``truth.csv``.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from eschorty_ros.core.base.arrays import as_array, file_path
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
+from eschorty_ros.core.clocks.clock import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import Calibration, load_calibration
+
+EVENTS_FILE = "events.raw"
+STAGE_FILE = "stage.csv"
+LASER_FILE = "laser.yaml"
+CALIBRATION_FILE = "calibration.yaml"
+TRUTH_FILE = "truth.csv"
+
+STAGE_DTYPE = np.dtype([("t_us", "<i8"), ("position_mm", "<f8")])
+TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")])
+"""One row per modulation period and lit column: the time is the middle of the lit phase."""
+
+_LINES_AT_ONCE = 65_536
+
+
+class _LaserFile(Schema):
+    frequency_hz: float
+    duty: float
+    waveform: str
+    on_edge_us: Annotated[int, Field(ge=-(2**63), lt=2**63)] | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a recording folder holds.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    events_path : Path
+        The camera's bytes, Prophesee RAW.
+    stage : StageTrack
+        Stage position over sensor time; bridges any gap.
+    stage_samples : ndarray of STAGE_DTYPE, shape (n,)
+        The samples behind ``stage``, positions on whole nanometres.
+    modulation : Modulation
+    calibration : Calibration
+    """
+
+    path: Path
+    events_path: Path
+    stage: StageTrack
+    stage_samples: NDArray[np.void]
+    modulation: Modulation
+    calibration: Calibration
+
+    @cached_property
+    def truth(self) -> NDArray[np.void] | None:
+        """True ranges, TRUTH_DTYPE, read on first use; ``None`` when there are none.
+
+        Raises
+        ------
+        FormatError
+            When ``truth.csv`` is malformed.
+        """
+        file = self.path / TRUTH_FILE
+        return _read_csv(file, TRUTH_DTYPE) if file.exists() else None
+
+
+def load_recording(path: str | os.PathLike[str]) -> Recording:
+    """Read a recording folder; the events themselves stay on disk.
+
+    Raises
+    ------
+    FormatError, CalibrationError
+        One line naming the file, the fault and the remedy.
+    """
+    folder = file_path("path", path)
+    if not folder.is_dir():
+        raise FormatError(f"{folder} is not a folder; give a recording folder")
+    for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE):
+        if not (folder / name).is_file():
+            raise FormatError(f"{folder / name} is missing; add it to the recording")
+    samples = _read_stage(folder / STAGE_FILE)
+    track = StageTrack()
+    track.append(samples["t_us"], samples["position_mm"])
+    return Recording(
+        path=folder,
+        events_path=folder / EVENTS_FILE,
+        stage=track,
+        stage_samples=samples,
+        modulation=read_laser_yaml(folder / LASER_FILE),
+        calibration=load_calibration(folder / CALIBRATION_FILE),
+    )
+
+
+def read_laser_yaml(path: str | os.PathLike[str]) -> Modulation:
+    """Read ``laser.yaml``.
+
+    Raises
+    ------
+    FormatError
+        One line naming the file, the key, the value and the remedy.
+    """
+    laser = validate(_LaserFile, read_yaml(path, FormatError), path, FormatError)
+    try:
+        return Modulation(**laser.model_dump())
+    except ArgumentError as error:
+        raise FormatError(f"{path}: {error}") from error
+
+
+def write_laser_yaml(path: str | os.PathLike[str], modulation: Modulation) -> None:
+    """Write ``laser.yaml`` at ``path``; an unknown ``on_edge_us`` is left out."""
+    data: dict[str, Any] = {
+        "frequency_hz": float(modulation.frequency_hz),
+        "duty": float(modulation.duty),
+        "waveform": modulation.waveform,
+    }
+    if modulation.on_edge_us is not None:
+        data["on_edge_us"] = int(modulation.on_edge_us)
+    with atomic_write(path) as stream:
+        stream.write(yaml.safe_dump(data, sort_keys=False).encode())
+
+
+def write_stage_csv(path: str | os.PathLike[str], t_us: ArrayLike, position_mm: ArrayLike) -> None:
+    """Write ``stage.csv`` at ``path``, positions to the nanometre.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    t_us : array_like of int, shape (n,)
+        Unwrapped sensor time, strictly increasing.
+    position_mm : array_like, shape (n,)
+
+    Raises
+    ------
+    ArgumentError
+        When the times do not increase, a position is not finite or the path cannot be written.
+    """
+    samples = _columns(STAGE_DTYPE, t_us=t_us, position_mm=position_mm)
+    back = np.flatnonzero(np.diff(samples["t_us"]) <= 0)
+    if back.size:
+        raise ArgumentError(
+            f"t_us goes from {samples['t_us'][back[0]]} to {samples['t_us'][back[0] + 1]}; "
+            "give samples in time order"
+        )
+    _write_csv(path, samples)
+
+
+def write_truth_csv(
+    path: str | os.PathLike[str], t_us: ArrayLike, column: ArrayLike, range_mm: ArrayLike
+) -> None:
+    """Write ``truth.csv`` at ``path``: arrays of shape (n,), ranges to the nanometre.
+
+    Raises
+    ------
+    ArgumentError
+        When a range is not finite or the path cannot be written.
+    """
+    _write_csv(path, _columns(TRUTH_DTYPE, t_us=t_us, column=column, range_mm=range_mm))
+
+
+def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
+    arrays = {name: as_array(name, value) for name, value in values.items()}
+    shapes = {array.shape for array in arrays.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        raise ArgumentError(
+            f"{', '.join(f'{n} has shape {a.shape}' for n, a in arrays.items())}; "
+            "give one-dimensional arrays of one length"
+        )
+    table = np.empty(next(iter(shapes)), dtype)
+    for name, array in arrays.items():
+        if dtype[name].kind == "f":
+            table[name] = quantise_nm(array, name) / NM_PER_MM
+        else:
+            table[name] = _whole(array, name, np.iinfo(dtype[name]))
+    return table
+
+
+def _whole(array: NDArray[Any], name: str, limits: np.iinfo[Any]) -> NDArray[Any]:
+    if array.size and array.dtype.kind not in "iu":
+        raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
+    wrong = (array < limits.min) | (array > limits.max)
+    if wrong.any():
+        raise ArgumentError(f"{name} is {array[wrong][0]}; choose {limits.min} to {limits.max}")
+    return array
+
+
+def _write_csv(path: str | os.PathLike[str], table: NDArray[np.void]) -> None:
+    names = table.dtype.names or ()
+    pattern = ",".join("%.6f" if table.dtype[name].kind == "f" else "%d" for name in names) + "\n"
+    with atomic_write(path) as stream:
+        stream.write((",".join(names) + "\n").encode())
+        for start in range(0, len(table), _LINES_AT_ONCE):
+            rows = table[start : start + _LINES_AT_ONCE].tolist()
+            stream.write("".join([pattern % row for row in rows]).encode())
+
+
+def _read_stage(path: Path) -> NDArray[np.void]:
+    samples = _read_csv(path, STAGE_DTYPE)
+    if len(samples) == 0:
+        raise FormatError(f"{path}: it has no samples; record at least one stage position")
+    times = samples["t_us"]
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if back.size:
+        raise FormatError(
+            f"{path} line {_line_number(path, back[0] + 1)}: t_us goes from {times[back[0]]} to "
+            f"{times[back[0] + 1]}; write each time once and in order"
+        )
+    samples["position_mm"] = quantise_nm(samples["position_mm"]) / NM_PER_MM
+    return samples
+
+
+def _read_csv(path: Path, dtype: np.dtype[Any]) -> NDArray[np.void]:
+    names = dtype.names or ()
+    try:
+        with path.open(encoding="utf-8-sig", newline=None) as stream:
+            header = stream.readline().strip()
+            if header.replace(" ", "") != ",".join(names):
+                raise FormatError(
+                    f"{path} line 1: it reads {header[:60]!r}; write {','.join(names)}"
+                )
+            table = _parse_table(stream, dtype)
+    except OSError as error:
+        raise FormatError(f"cannot read {path}: {error.strerror or error}; check it") from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: it is not text; write {','.join(names)} lines") from error
+    except ValueError:
+        raise FormatError(_first_fault(path, dtype)) from None
+    for name in names:
+        if dtype[name].kind == "f":
+            _check_lengths(path, name, table[name])
+    return table
+
+
+def _check_lengths(path: Path, name: str, values: NDArray[np.float64]) -> None:
+    wrong = np.flatnonzero(~(np.abs(values) <= POSITION_LIMIT_MM))
+    if wrong.size:
+        raise FormatError(
+            f"{path} line {_line_number(path, wrong[0])}: {name} is {values[wrong[0]]:g}; "
+            f"write a length within {POSITION_LIMIT_MM:g} mm"
+        )
+
+
+def _parse_table(stream: Any, dtype: np.dtype[Any]) -> NDArray[np.void]:
+    with warnings.catch_warnings():
+        # An empty table is for the caller to judge.
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data", UserWarning)
+        return np.atleast_1d(np.loadtxt(stream, dtype, delimiter=",", comments=None))
+
+
+def _line_number(path: Path, index: int) -> int:
+    """Line of table row ``index``, blank lines counted as an editor does."""
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    filled = [number for number, line in enumerate(lines, 1) if line.strip()]
+    return filled[index + 1]
+
+
+def _first_fault(path: Path, dtype: np.dtype[Any]) -> str:
+    """Say which line is the first that does not fit."""
+    names = dtype.names or ()
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
+        cells = line.split(",")
+        if number == 1 or not line.strip():
+            continue
+        if len(cells) != len(names):
+            return (
+                f"{path} line {number}: it has {len(cells)} cells; "
+                f"write {len(names)}: {','.join(names)}"
+            )
+        for name, cell in zip(names, cells, strict=True):
+            integer = dtype[name].kind in "iu"
+            try:
+                np.asarray(int(cell) if integer else float(cell), dtype[name])
+            except (ValueError, OverflowError):
+                kind = "a whole number in range" if integer else "a number"
+                return f"{path} line {number}: {name} is {cell.strip()!r}; write {kind}"
+    return f"{path}: it is no table of {','.join(names)}; write it again"

@@ -1,0 +1,276 @@
+"""A UTG900E-like waveform generator on an emulated USB bus, with the ways it fails.
+
+Quirks of the family kept: replies without a newline; a request for a reply where none is due is
+never answered; any command locks the front panel until ``:SYSTem:LOCK OFF``; a value out of range
+is ignored without a word; no error queue unless given one. Unconfirmed on hardware: everything
+after ``*RST`` and power-up, and that a load is told as scaled volts.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
+from eschorty_ros.emulation.awg.commands import ChannelState, find_command
+from eschorty_ros.emulation.awg.faults import AwgFaults
+from eschorty_ros.emulation.bus.usb_device import (
+    SPEED_FULL,
+    EmulatedUsbDevice,
+    EndpointIdentity,
+    UsbIdentity,
+)
+from eschorty_ros.emulation.bus.usb_pipe import Wait
+
+VENDOR_ID, PRODUCT_ID = 0x6656, 0x0834
+ENDPOINT_OUT, ENDPOINT_IN = 0x01, 0x81
+PACKET = 64
+CHANNELS = 2
+THRESHOLD_V = 2.0
+"""A TTL laser input takes this for on."""
+
+_REMEMBERED = 4096
+_HEADER = struct.Struct("<BBBBIB3x")
+_WAVEFORMS = {"SQUARE": "square", "PULSE": "pulse", "SINE": "sine"}
+_CLASS_INTERFACE_IN = 0xA1
+_CHANNEL = re.compile(r":?CHAN(?:nel)?([12]?):(.+)", re.I)
+_LOCK = re.compile(r":?SYST(?:em)?:LOCK", re.I)
+_ERROR = re.compile(r":?SYST(?:em)?:ERR(?:or)?", re.I)
+
+OnChange = Callable[[int, bool, Modulation], None]
+
+
+class AwgModel(EmulatedUsbDevice):
+    """The generator; channel 1 gates the laser.
+
+    Parameters
+    ----------
+    clock_ns : callable
+        Time of the world, ns: that of ``on_change``.
+    log_path : path, optional
+        Gets ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and whenever output 1 is switched,
+        on disk before the command is answered: the instrument's own witness.
+    serial : str
+    wait : callable
+        How a read waits, see ``EmulatedUsbDevice``.
+
+    Attributes
+    ----------
+    channels : list of ChannelState
+    locked : bool
+        Whether the front panel is locked.
+    faults : AwgFaults
+    errors : deque of str or None
+        The error queue; ``None`` as the family has none.
+    commands : deque of str
+        The last 4096 commands received, in order.
+    on_change : callable or None
+        ``on_change(since_ns, lit, modulation)`` whenever light or its modulation change; a rising
+        edge lies at ``since_ns``.
+    """
+
+    def __init__(
+        self,
+        clock_ns: Callable[[], int],
+        log_path: str | Path | None = None,
+        *,
+        serial: str = "AWG1234567890",
+        wait: Wait = threading.Condition.wait,
+    ) -> None:
+        identity = UsbIdentity(
+            vendor_id=VENDOR_ID,
+            product_id=PRODUCT_ID,
+            interface_class=0xFE,
+            interface_subclass=0x03,
+            interface_protocol=0x01,
+            endpoints=(
+                EndpointIdentity(ENDPOINT_OUT, PACKET),
+                EndpointIdentity(ENDPOINT_IN, PACKET),
+            ),
+            serial=serial,
+            manufacturer="UNI-T",
+            product="UTG962E",
+            speed=SPEED_FULL,
+        )
+        super().__init__(identity, wait=wait)
+        self._clock_ns = clock_ns
+        self._log_path = None if log_path is None else Path(log_path)
+        self.faults = AwgFaults()
+        self.errors: deque[str] | None = None
+        self.commands: deque[str] = deque(maxlen=_REMEMBERED)
+        self.on_change: OnChange | None = None
+        self._logged: bool | None = None
+        self._told: tuple[bool, Modulation] | None = None
+        self._message = b""
+        self._replies: deque[bytes] = deque()
+        self._reset_settings()
+
+    @property
+    def output(self) -> bool:
+        """Whether output 1 is switched on."""
+        return self.channels[0].output
+
+    @property
+    def lit(self) -> bool:
+        """Whether output 1 reaches what the laser takes for on."""
+        state = self.channels[0]
+        return state.output and max(state.high_v, state.low_v) >= THRESHOLD_V
+
+    def power_up(self) -> None:
+        """Start afresh: outputs off, settings of the maker, panel free."""
+        super().power_up()
+        self._reset_settings()
+
+    def reboot(self) -> None:
+        """Restart without leaving the bus, as after a brown-out."""
+        with self.mutex:
+            self.power_up()
+
+    def touch(self, path: str, text: str, channel: int = 1) -> bool:
+        """Set something at the front panel; False when it is locked."""
+        with self.mutex:
+            command = find_command(path)
+            if self.locked or command is None:
+                return False
+            command.put(self.channels[channel - 1], text)
+            self._changed()
+            return True
+
+    def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
+        """Take a message, or a request for a reply."""
+        kind, tag, inverse, _, size, attributes = _HEADER.unpack_from(data)
+        if tag == 0 or inverse != tag ^ 0xFF:
+            self.stalled.add(endpoint)
+        elif kind == 1:
+            self._message += data[_HEADER.size : _HEADER.size + size]
+            if attributes & 1:
+                message, self._message = self._message, b""
+                self._execute(message.decode("ascii", "replace"))
+        elif kind == 2:
+            self._answer(tag, size)
+        return len(data)
+
+    def control(
+        self,
+        request_type: int,
+        request: int,
+        value: int,
+        index: int,
+        data: bytes | int,
+        timeout_ms: int,
+    ) -> bytes | int:
+        """INITIATE_CLEAR and CHECK_CLEAR; the rest as any device."""
+        if request_type == _CLASS_INTERFACE_IN and request == 5 and not self.faults.no_clear:
+            self._message = b""
+            self._replies.clear()
+            self._pipes[ENDPOINT_IN].clear()
+            return b"\x01"
+        if request_type == _CLASS_INTERFACE_IN and request == 6:
+            return b"\x02\x00" if self.faults.take("pending_clears") else b"\x01\x00"
+        return super().control(request_type, request, value, index, data, timeout_ms)
+
+    def reset(self) -> None:
+        """Bus reset: what is under way is forgotten, the settings stay."""
+        super().reset()
+        self._message = b""
+        self._replies.clear()
+
+    def _reset_settings(self) -> None:
+        self.channels = [ChannelState() for _ in range(CHANNELS)]
+        self.locked = False
+        self._message = b""
+        self._replies.clear()
+        self._changed()
+
+    def _execute(self, message: str) -> None:
+        self.locked = True
+        for text in filter(None, (part.strip() for part in re.split(r"[;\n]", message))):
+            self.commands.append(text)
+            path, _, parameter = text.partition(" ")
+            if path.endswith("?"):
+                reply = self._queried(path[:-1])
+                if reply is not None:
+                    self._replies.append(reply.encode("ascii") + b"\n" * self.faults.newline)
+            else:
+                self._set(path, parameter.strip())
+
+    def _queried(self, path: str) -> str | None:
+        if path.upper() == "*IDN":
+            return f"UNI-T,UTG962E,{self.identity.serial},V1.08"
+        if _LOCK.fullmatch(path):
+            return "ON" if self.locked else "OFF"
+        if _ERROR.fullmatch(path):
+            if self.errors is None:
+                return None
+            return self.errors.popleft() if self.errors else '0,"No error"'
+        found = _CHANNEL.fullmatch(path)
+        command = find_command(found[2]) if found else None
+        return command.show(self._channel(found)) if found and command else None
+
+    def _set(self, path: str, parameter: str) -> None:
+        if path.upper() == "*RST":
+            self._reset_settings()
+            self.locked = True
+        elif _LOCK.fullmatch(path):
+            self.locked = parameter.upper() in ("ON", "1")
+        found = _CHANNEL.fullmatch(path)
+        command = find_command(found[2]) if found else None
+        if found and command and command.path not in self.faults.ignored:
+            command.put(self._channel(found), self.faults.changed.get(command.path, parameter))
+            self._changed()
+
+    def _channel(self, found: re.Match[str]) -> ChannelState:
+        return self.channels[int(found[1] or 1) - 1]
+
+    def _answer(self, tag: int, wanted: int) -> None:
+        """Send what is due in one reply transfer; nothing due, nothing sent."""
+        faults = self.faults
+        if not self._replies or faults.take("late_replies"):
+            return
+        if faults.take("lost_replies"):
+            self._replies.popleft()
+            return
+        reply = self._replies.popleft()
+        most = min(wanted, faults.transfer_bytes or wanted)
+        part, rest = reply[:most], reply[most:]
+        if rest:
+            self._replies.appendleft(rest)
+        if faults.take("wrong_tags"):
+            tag = tag % 255 + 1
+        kind = 3 if faults.take("wrong_kinds") else 2
+        size = len(part) + (100 if faults.take("oversized") else 0)
+        data = _HEADER.pack(kind, tag, tag ^ 0xFF, 0, size, 0 if rest else 1) + part
+        if faults.take("empty_packets"):
+            self.reply(ENDPOINT_IN, b"")
+        self.reply(ENDPOINT_IN, data[:7] if faults.take("short_headers") else data)
+
+    def _changed(self) -> None:
+        """Log the switch of output 1, tell the world the light."""
+        if self.output is not self._logged:
+            self._logged = self.output
+            if self._log_path is not None:
+                with self._log_path.open("a", encoding="ascii") as log:
+                    log.write(f"{time.monotonic_ns()} {'ON' if self.output else 'OFF'}\n")
+        told = (self.lit, self.modulation())
+        if self.on_change is not None and told != self._told:
+            self.on_change(self._clock_ns(), *told)
+        self._told = told
+
+    def modulation(self) -> Modulation:
+        """Gate that channel 1 makes; waveforms and frequencies no laser is gated with: nearest."""
+        state = self.channels[0]
+        frequency_hz = min(max(state.frequency_hz, FREQUENCY_MIN_HZ), FREQUENCY_MAX_HZ)
+        waveform = _WAVEFORMS.get(state.wave, "square")
+        duty = 0.5 if waveform == "sine" else state.duty_percent / 100.0
+        return Modulation(frequency_hz, 1.0 - duty if state.inversion else duty, waveform)
+
+
+def truth(log_path: str | Path) -> list[tuple[int, str]]:
+    """Read a log: monotonic ns and ON or OFF, in order."""
+    lines = Path(log_path).read_text(encoding="ascii").splitlines()
+    return [(int(t_ns), state) for t_ns, state in (line.split() for line in lines)]

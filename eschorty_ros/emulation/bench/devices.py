@@ -1,0 +1,102 @@
+"""A whole bench in one process: camera, generator and stage models around one simulated world."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.emulation.apt.model import AptModel
+from eschorty_ros.emulation.awg.model import AwgModel
+from eschorty_ros.emulation.bench.imperfections import Imperfections
+from eschorty_ros.emulation.bench.physics import Physics
+from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice
+from eschorty_ros.emulation.evk4.control import sensor_control
+from eschorty_ros.emulation.evk4.model import Evk4Model
+from eschorty_ros.simulation.pixels.presets import preset
+from eschorty_ros.simulation.scenes.names import named
+from eschorty_ros.simulation.world.warm_up import warm_up
+from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSettings:
+    """What stands on the bench and how it is wired.
+
+    Attributes
+    ----------
+    scene : str
+        A scene's name or a mesh file.
+    calibration : str
+        The optical build as it really is, a name or a file.
+    pixels : str
+        Preset of the event pixels.
+    seed : int
+    background_hz : float
+        Background events of one pixel.
+    trigger : {"none", "laser", "stage"}
+        What is wired to the camera's trigger input.
+    flaws : Imperfections
+    laser_log : str
+        File that gets one line per change of the generator's output; empty for none.
+    """
+
+    scene: str = "steps"
+    calibration: str = "config_3"
+    pixels: str = "paper"
+    seed: int = 1
+    background_hz: float = BACKGROUND_HZ
+    trigger: str = "stage"
+    flaws: Imperfections = field(default_factory=Imperfections)
+    laser_log: str = ""
+
+
+class Bench:
+    """Models of camera, generator and stage that act on each other as the real ones do.
+
+    Parameters
+    ----------
+    settings : BenchSettings
+    clock_ns : callable
+        The bench's clock.
+
+    Raises
+    ------
+    EschortyError
+        For a scene or calibration that cannot be used.
+    """
+
+    def __init__(
+        self, settings: BenchSettings, clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._scene = named(settings.scene)
+        calibration = load_calibration(settings.calibration)
+        pixels = preset(settings.pixels)
+        warm_up(calibration)
+
+        def world() -> World:
+            return World(self._scene, calibration, pixels, settings.seed, settings.background_hz)
+
+        self.physics = Physics(
+            world,
+            clock_ns,
+            settings.flaws,
+            settings.trigger,
+            lambda from_ns, until_ns: self.stage.trigger_pulses(from_ns, until_ns),
+        )
+        self.stage = AptModel(clock_ns, on_plan=self.physics.set_stage)
+        self.laser = AwgModel(clock_ns, log_path=settings.laser_log or None)
+        self.laser.on_change = self.physics.set_laser
+        # A command and the world's present exclude each other.
+        self.laser.mutex = self.physics.lock
+        self.camera = Evk4Model(self.physics)
+        self.camera.configure = lambda settings: self.physics.set_sensor(sensor_control(settings))
+
+    def look_at(self, scene: str) -> None:
+        """Put another scene in front of the camera, for the next start of its stream."""
+        self._scene = named(scene)
+
+    def usb_devices(self) -> list[EmulatedUsbDevice]:
+        """Give what is on the USB bus."""
+        return [self.camera, self.laser]

@@ -1,0 +1,277 @@
+"""What the emulated devices do to each other: laser and stage light the scene, the sensor sees it.
+
+Laser and stage act in bench time, int64 nanoseconds of the bench's clock. The sensor has a clock of
+its own, which starts at 0 with every start of the stream and may run fast or slow. The world is
+simulated on demand, never beyond the bench's present: when the machine is slow, bytes come late,
+and never other ones.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.clocks.motion import MotionPlan
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.emulation.bench.imperfections import Imperfections
+from eschorty_ros.simulation.world.sensor_control import SensorControl
+from eschorty_ros.simulation.world.world import World
+
+TRIGGERS = ("none", "laser", "stage")
+
+Pulses = Callable[[int, int], list[tuple[int, bool]]]
+"""Edges of the stage's trigger output from one bench time (ns) to before another: time, rising."""
+
+PACKET_US = 1_008
+"""The sensor hands out what it has once in so much of its time."""
+
+_PACKETS_AT_ONCE = 4
+_PACKET_S = PACKET_US * 1e-6
+_PULSE_MAX_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Light:
+    since_ns: int
+    on: bool
+    modulation: Modulation | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Control:
+    since_ns: int
+    control: SensorControl
+
+
+class Physics:
+    """Scene, laser and stage as the sensor sees them; the source of the camera's bytes.
+
+    Whoever lets a device act holds ``lock`` from reading the bench's clock until the change is
+    told, and calls :meth:`collect_pulses` before: then every change is known before the world
+    gets there. ``read``, ``start`` and ``stop`` belong to the camera.
+
+    Parameters
+    ----------
+    make_world : callable
+        Makes the world anew for each start of the stream.
+    clock_ns : callable
+        The bench's clock.
+    imperfections : Imperfections
+    trigger : {"none", "laser", "stage"}
+        What is wired to the camera's trigger input.
+    pulses : Pulses, optional
+        The stage's trigger output.
+
+    Attributes
+    ----------
+    lock : threading.RLock
+    late_changes : int
+        Changes told too late to be seen when they happened.
+    edges, edges_missed : int
+        Trigger edges on the wire, and those of them that the camera does not see.
+
+    Raises
+    ------
+    ArgumentError
+        For an unknown ``trigger``.
+    """
+
+    def __init__(
+        self,
+        make_world: Callable[[], World],
+        clock_ns: Callable[[], int],
+        imperfections: Imperfections | None = None,
+        trigger: str = "none",
+        pulses: Pulses | None = None,
+    ) -> None:
+        if trigger not in TRIGGERS:
+            raise ArgumentError(f"trigger is {trigger!r}; choose one of {', '.join(TRIGGERS)}")
+        self.lock = threading.RLock()
+        self.clock_ns = clock_ns
+        self.late_changes = 0
+        self.edges = 0
+        self.edges_missed = 0
+        self._make_world = make_world
+        self._flaws = imperfections or Imperfections()
+        self._trigger = trigger
+        self._pulses = pulses
+        self._edge_chance = random.Random(self._flaws.seed)
+        self._usb_chance = random.Random(self._flaws.seed + 1)
+        self._simulating = threading.Lock()
+        self._world: World | None = None
+        self._zero_ns = 0
+        self._light = _Light(clock_ns(), False, None)
+        self._plan = MotionPlan(clock_ns(), 0.0)
+        self._control = _Control(clock_ns(), SensorControl())
+        self._news: deque[_Light | MotionPlan | _Control] = deque()
+        self._stage_edges: deque[tuple[int, bool]] = deque()
+        self._collected_ns = 0
+        self._on_the_way: deque[tuple[int, bytes]] = deque()
+        self._rest = b""
+        self._running = threading.Event()
+
+    def set_laser(self, since_ns: int, on: bool, modulation: Modulation | None) -> None:
+        """Learn that the output is so from ``since_ns`` on; a rising edge lies there."""
+        with self.lock:
+            self._light = _Light(since_ns, on, modulation)
+            self._news.append(self._light)
+
+    def set_stage(self, plan: MotionPlan) -> None:
+        """Learn that the carriage follows ``plan`` from its start on."""
+        with self.lock:
+            self._plan = plan
+            self._news.append(plan)
+
+    def set_sensor(self, control: SensorControl) -> None:
+        """Learn that the sensor is set so from now on."""
+        with self.lock:
+            self._control = _Control(self.clock_ns(), control)
+            self._news.append(self._control)
+
+    def collect_pulses(self) -> None:
+        """Take the stage's trigger edges up to now; a later command changes only later ones."""
+        if self._trigger != "stage" or self._pulses is None:
+            return
+        with self.lock:
+            now_ns = self.clock_ns()
+            if now_ns <= self._collected_ns:
+                return
+            # Asked for a thousand times a second: a carriage at rest gives no pulses.
+            if self._collected_ns <= self._plan.end_ns + _PULSE_MAX_NS:
+                self._stage_edges.extend(self._pulses(self._collected_ns, now_ns))
+            self._collected_ns = now_ns
+
+    def start(self) -> None:
+        """Begin streaming; the sensor's clock reads 0 now."""
+        # Before the lock: laser and stage go on acting while the world is made.
+        world = self._make_world()
+        with self._simulating, self.lock:
+            self.collect_pulses()
+            self._stage_edges.clear()
+            self._news.clear()
+            self._zero_ns = self._collected_ns = self.clock_ns()
+            self._world = world
+            if self._trigger == "laser":
+                world.trigger_input = lambda a, b: self._seen(world.laser_edges(a, b))
+            elif self._trigger == "stage":
+                world.trigger_input = self._stage_trigger
+            self._apply_light(world, self._light)
+            self._apply_plan(world, self._plan)
+            world.set_sensor(0, self._control.control)
+            self._on_the_way.clear()
+            self._rest = b""
+            self._running.set()
+
+    def stop(self) -> None:
+        """End streaming; a waiting ``read`` returns; idempotent."""
+        self._running.clear()
+
+    def read(self, max_bytes: int, timeout_s: float) -> bytes:
+        """Return what the sensor has sent by now, ``b""`` when nothing comes in ``timeout_s``."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            with self._simulating:
+                if self._running.is_set():
+                    while self._simulate() and not self._on_the_way:
+                        pass
+                    self._deliver()
+                data, self._rest = self._rest[:max_bytes], self._rest[max_bytes:]
+            left_s = deadline_s - time.monotonic()
+            if data or left_s <= 0.0 or not self._running.is_set():
+                return data
+            time.sleep(min(_PACKET_S, left_s))
+
+    def statistics(self) -> dict[str, float]:
+        """Count events, those the rate control dropped, lag, late changes and trigger edges."""
+        world = self._world
+        behind_ns = 0
+        if world is not None and self._running.is_set():
+            behind_ns = self.clock_ns() - self._zero_ns - self._bench_ns(world.now_us)
+        return {
+            "events": float(world.events if world is not None else 0),
+            "rate_dropped": float(world.rate_dropped if world is not None else 0),
+            "behind_s": behind_ns * 1e-9,
+            "late_changes": float(self.late_changes),
+            "trigger_edges": float(self.edges),
+            "trigger_edges_missed": float(self.edges_missed),
+        }
+
+    def _simulate(self) -> bool:
+        """Advance the world by one piece towards the present; whether there was one."""
+        world = self._world
+        assert world is not None
+        with self.lock:
+            self.collect_pulses()
+            horizon_ns = self.clock_ns()
+            news = list(self._news)
+            self._news.clear()
+        for change in news:
+            if isinstance(change, _Light):
+                self._apply_light(world, change)
+            elif isinstance(change, _Control):
+                world.set_sensor(self._from_us(world, change.since_ns), change.control)
+            else:
+                self._apply_plan(world, change)
+        packets = (self._sensor_us(horizon_ns) - world.now_us) // PACKET_US
+        if packets < 1:
+            return False
+        data = world.advance(world.now_us + min(packets, _PACKETS_AT_ONCE) * PACKET_US)
+        if data:
+            late_ns = round(self._usb_chance.uniform(0.0, self._flaws.usb_jitter_ms) * 1e6)
+            self._on_the_way.append((horizon_ns + late_ns, data))
+        return True
+
+    def _deliver(self) -> None:
+        """Hand over what has arrived, in the order it was sent."""
+        while self._on_the_way and self._on_the_way[0][0] <= self.clock_ns():
+            self._rest += self._on_the_way.popleft()[1]
+
+    def _apply_light(self, world: World, light: _Light) -> None:
+        since_us = self._from_us(world, light.since_ns)
+        if not light.on or light.modulation is None:
+            world.set_laser(since_us, False)
+            return
+        wave = replace(light.modulation, on_edge_us=self._sensor_us(light.since_ns))
+        rate = self._flaws.sensor_rate / self._flaws.generator_rate
+        world.set_laser(since_us, True, wave, rate)
+
+    def _apply_plan(self, world: World, plan: MotionPlan) -> None:
+        since_us = self._from_us(world, plan.start_ns)
+        world.set_stage(plan, self._zero_ns, since_us, self._flaws.sensor_rate)
+
+    def _stage_trigger(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
+        edges = []
+        while self._stage_edges and self._sensor_us(self._stage_edges[0][0]) < end_us:
+            t_ns, rising = self._stage_edges.popleft()
+            edges.append((max(self._sensor_us(t_ns), begin_us), rising))
+        return self._seen(edges)
+
+    def _seen(self, edges: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
+        """Leave out the edges that the camera misses."""
+        seen = [edge for edge in edges if self._chance_of_edge() >= self._flaws.missing_edges]
+        self.edges += len(edges)
+        self.edges_missed += len(edges) - len(seen)
+        return seen
+
+    def _chance_of_edge(self) -> float:
+        return self._edge_chance.random() if self._flaws.missing_edges else 1.0
+
+    def _from_us(self, world: World, t_ns: int) -> int:
+        """Sensor time of ``t_ns``, not before what is simulated; counts what came too late."""
+        t_us = self._sensor_us(t_ns)
+        if t_us < world.now_us and world.now_us > 0:
+            self.late_changes += 1
+        return max(t_us, world.now_us)
+
+    def _sensor_us(self, t_ns: int) -> int:
+        rate = self._flaws.sensor_rate
+        return (t_ns - self._zero_ns) * rate.numerator // (rate.denominator * 1000)
+
+    def _bench_ns(self, t_us: int) -> int:
+        rate = self._flaws.sensor_rate
+        return t_us * 1000 * rate.denominator // rate.numerator

@@ -1,0 +1,77 @@
+"""Starting a bench as a process of its own, and ending it."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.emulation.bench.folder import READY_FILE
+
+START_S = 300.0
+"""A machine's first start compiles for some 20 s, a slow one's for minutes."""
+
+_END_S = 20.0
+_POLL_S = 0.02
+
+
+def bench_command(folder: Path, options: Mapping[str, object]) -> list[str]:
+    """Command line of a bench; ``options`` are those of ``eschorty-bench``, without dashes."""
+    command = [sys.executable, "-m", "eschorty_ros.emulation.bench.server", str(folder)]
+    for name, value in options.items():
+        command += [f"--{name}", str(value)]
+    return command
+
+
+@contextlib.contextmanager
+def bench_process(folder: Path, options: Mapping[str, object]) -> Iterator[subprocess.Popen[str]]:
+    """Run a bench in ``folder`` while inside; it is ready on entry.
+
+    Raises
+    ------
+    DeviceError
+        When the bench does not get ready; the message is its own.
+    """
+    # In a session of its own: Ctrl-C is for the nodes, which must reach their devices to the end.
+    process = subprocess.Popen(
+        bench_command(folder, options),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        _wait_until_ready(process, folder)
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.communicate(timeout=_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+
+def _ready(process: subprocess.Popen[str], folder: Path) -> bool:
+    """Whether this bench, and no other one in the folder, is ready."""
+    try:
+        return (folder / READY_FILE).read_text().strip() == str(process.pid)
+    except OSError:
+        return False
+
+
+def _wait_until_ready(process: subprocess.Popen[str], folder: Path) -> None:
+    end_s = time.monotonic() + START_S
+    while not _ready(process, folder):
+        if process.poll() is not None:
+            said = process.communicate()[1].strip().splitlines()
+            reason = said[-1] if said else f"exit code {process.returncode}"
+            raise DeviceError(f"the bench ended: {reason.removeprefix('eschorty-bench: ')}")
+        if time.monotonic() > end_s:
+            raise DeviceError(f"the bench is not ready after {START_S:.0f} s; see {folder}")
+        time.sleep(_POLL_S)

@@ -1,0 +1,183 @@
+"""The bench as a process of its own: the other ends of the USB and serial cables."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.emulation.bench.cables import serving
+from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
+from eschorty_ros.emulation.bench.folder import default_folder, stage_port, usb_spec
+from eschorty_ros.emulation.bench.imperfections import Imperfections
+from eschorty_ros.emulation.bench.physics import TRIGGERS
+from eschorty_ros.simulation.pixels.presets import PRESETS
+from eschorty_ros.simulation.world.world import BACKGROUND_HZ
+
+_LOCK_FILE = "lock"
+_POLL_S = 0.1
+_LINGER_S = 3.0
+
+
+class _Ending:
+    """What a signal asks for: out at once while setting up, an orderly end later."""
+
+    def __init__(self) -> None:
+        # Now: by the time the bench is made its parent may be gone.
+        self._parent = os.getppid()
+        # No event: a signal handler that sets one while it is waited for may wait for ever.
+        self._asked = False
+        self._serving = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._ask)
+
+    def wait(self) -> None:
+        """Wait for a signal or for the end of the process that started this one."""
+        self._serving = True
+        while not self._asked and os.getppid() == self._parent:
+            time.sleep(_POLL_S)
+
+    def _ask(self, *_: object) -> None:
+        self._asked = True
+        if not self._serving:
+            sys.exit(0)
+
+
+def serve(folder: Path, settings: BenchSettings) -> None:
+    """Make the bench and serve it in ``folder`` until a signal or the end of the parent process.
+
+    Raises
+    ------
+    EschortyError
+        When the folder cannot be used, another bench uses it, or the settings are refused.
+    """
+    ending = _Ending()
+    with _folder_of_its_own(folder):
+        bench = Bench(settings)
+        with serving(bench, folder) as usb:
+            _announce(folder, settings)
+            ending.wait()
+            # Ctrl-C reaches the nodes, too: on their way out they need their devices.
+            end_s = time.monotonic() + _LINGER_S
+            while usb.clients and time.monotonic() < end_s:
+                time.sleep(_POLL_S)
+
+
+def _announce(folder: Path, settings: BenchSettings) -> None:
+    print(
+        f"bench: {settings.scene}, {settings.calibration}; trigger {settings.trigger}; "
+        f"USB {usb_spec(folder)}, stage {stage_port(folder)}",
+        flush=True,
+    )
+
+
+@contextlib.contextmanager
+def _folder_of_its_own(folder: Path) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        lock = (folder / _LOCK_FILE).open("w")
+    except OSError as error:
+        raise DeviceError(
+            f"bench folder {folder}: {error.strerror or error}; choose another"
+        ) from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise DeviceError(
+                f"bench folder {folder}: another bench uses it; end it or choose another folder"
+            ) from error
+        yield
+
+
+@click.command(
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.argument("folder", required=False, type=click.Path(file_okay=False, path_type=Path))
+@click.option("--scene", default="steps", show_default=True,
+              help="What the camera sees: a scene's name or a mesh file.")  # fmt: skip
+@click.option("--calibration", default="config_3", show_default=True,
+              help="The optical build as it really is: a name in config/ or a file.")  # fmt: skip
+@click.option("--pixels", type=click.Choice(tuple(PRESETS)), default="paper", show_default=True,
+              help="Preset of the event pixels.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
+              help="Of pixels, noise and whatever else is drawn.")  # fmt: skip
+@click.option("--background", type=click.FloatRange(0.0, 100.0), default=BACKGROUND_HZ,
+              show_default=True, help="Background events of one pixel, Hz.")  # fmt: skip
+@click.option("--trigger", type=click.Choice(TRIGGERS), default="stage", show_default=True,
+              help="What is wired to the camera's trigger input.")  # fmt: skip
+@click.option("--missing-edges", type=click.FloatRange(0.0, 1.0), default=0.0, show_default=True,
+              help="Share of the trigger edges that the camera does not see.")  # fmt: skip
+@click.option("--sensor-ppm", type=float, default=0.0, show_default=True,
+              help="How much too fast the camera's clock runs.")  # fmt: skip
+@click.option("--generator-ppm", type=float, default=0.0, show_default=True,
+              help="How much too fast the generator's clock runs.")  # fmt: skip
+@click.option("--usb-jitter", type=click.FloatRange(0.0, 1000.0), default=0.0, show_default=True,
+              help="The camera's bytes come late by up to so many ms.")  # fmt: skip
+@click.option("--laser-log", type=click.Path(dir_okay=False, path_type=Path),
+              help="File that gets a line '<ns> ON|OFF' at every change of the laser output, "
+              "CLOCK_MONOTONIC.")  # fmt: skip
+def command(
+    folder: Path | None,
+    scene: str,
+    calibration: str,
+    pixels: str,
+    seed: int,
+    background: float,
+    trigger: str,
+    missing_edges: float,
+    sensor_ppm: float,
+    generator_ppm: float,
+    usb_jitter: float,
+    laser_log: Path | None,
+) -> None:
+    """Emulate camera, generator and stage at the far ends of their cables.
+
+    FOLDER gets a Unix socket for the USB bus (usb.sock), a serial port of the stage (stage) and,
+    once everything is there, the file ready. Without FOLDER it is the folder in which nodes with
+    driver "fake" look: one for each user and ROS_DOMAIN_ID.
+
+    The drivers that talk to it are those of the real devices. It ends with Ctrl-C, SIGTERM, or
+    when the process that started it ends; clients still there get 3 s to leave.
+
+    \b
+    Examples:
+      eschorty-bench                              # then: ros2 run eschorty_ros camera, ...
+      eschorty-bench --scene sphere --trigger laser
+      eschorty-bench /tmp/bench --sensor-ppm 50 --usb-jitter 3 --missing-edges 0.001
+    """  # noqa: D301
+    serve(
+        folder or default_folder(),
+        BenchSettings(
+            scene,
+            calibration,
+            pixels,
+            seed,
+            background,
+            trigger,
+            Imperfections(sensor_ppm, generator_ppm, usb_jitter, missing_edges, seed),
+            str(laser_log or ""),
+        ),
+    )
+
+
+def main() -> int:
+    """Entry point; a stated failure is one line and exit code 1."""
+    try:
+        command(prog_name="eschorty-bench", standalone_mode=True)
+    except EschortyError as error:
+        print(f"eschorty-bench: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

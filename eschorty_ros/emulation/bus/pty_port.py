@@ -1,0 +1,135 @@
+"""A serial device model behind a pseudo-terminal: a port that pyserial opens by its path."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pty
+import select
+import termios
+import threading
+import tty
+from pathlib import Path
+from typing import Protocol
+
+from eschorty_ros.core.base.errors import DeviceError
+
+_TICK_S = 0.002
+_READ_BYTES = 4096
+
+
+class SerialModel(Protocol):
+    """A device at the end of a serial line, in time of its own clock."""
+
+    gone: bool
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes of the host."""
+
+    def step(self) -> bytes:
+        """Carry on until now; the bytes the host gets."""
+
+
+class PtyPort:
+    """Serves a model on a pseudo-terminal whose changing name hides behind a fixed link.
+
+    While the model is ``gone`` there is no port and an open one hangs up, as when a USB adapter is
+    unplugged.
+
+    Parameters
+    ----------
+    model : SerialModel
+    link : path
+        Where the port is to be found; one left behind is replaced.
+    lock : threading.RLock, optional
+        Held while the model acts.
+
+    Raises
+    ------
+    DeviceError
+        The link cannot be made.
+    """
+
+    def __init__(
+        self,
+        model: SerialModel,
+        link: str | os.PathLike[str],
+        lock: contextlib.AbstractContextManager[bool] | None = None,
+    ) -> None:
+        self._model = model
+        self._link = Path(link)
+        self._lock = lock or threading.RLock()
+        self._ending = threading.Event()
+        self._ends = self._plug_in()
+        self._thread = threading.Thread(target=self._serve, name="pty port", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> PtyPort:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take the port away; idempotent."""
+        self._ending.set()
+        self._thread.join()
+
+    def _plug_in(self) -> tuple[int, int]:
+        host, device = pty.openpty()
+        # Else the line discipline eats carriage returns and 0x11, which is an APT address.
+        tty.setraw(device, termios.TCSANOW)
+        os.set_blocking(host, False)
+        try:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(os.ttyname(device))
+        except OSError as error:
+            os.close(host)
+            os.close(device)
+            raise DeviceError(
+                f"serial port {self._link}: {error.strerror or error}; choose another folder"
+            ) from error
+        return host, device
+
+    def _unplug(self) -> None:
+        ends, self._ends = self._ends, (-1, -1)
+        if ends[0] < 0:
+            return
+        self._link.unlink(missing_ok=True)
+        for end in ends:
+            os.close(end)
+
+    def _serve(self) -> None:
+        try:
+            while not self._ending.is_set():
+                if self._model.gone:
+                    self._unplug()
+                    self._ending.wait(_TICK_S)
+                    # Its time goes on: this may be the moment in which it is plugged in again.
+                    with self._lock:
+                        self._model.step()
+                    continue
+                if self._ends[0] < 0:
+                    self._ends = self._plug_in()
+                self._exchange(self._ends[0])
+        finally:
+            self._unplug()
+
+    def _exchange(self, host: int) -> None:
+        """Wait for bytes for a tick; the device end is held open, so that there is no hang-up."""
+        data = b""
+        if select.select([host], [], [], _TICK_S)[0]:
+            data = os.read(host, _READ_BYTES)
+        with self._lock:
+            if data:
+                self._model.feed(data)
+            out = self._model.step()
+        while out:
+            try:
+                out = out[os.write(host, out) :]
+            except OSError as error:
+                if error.errno != errno.EAGAIN:
+                    raise
+                # Nobody reads: a serial line without flow control loses what does not fit.
+                return

@@ -1,0 +1,224 @@
+"""A Prophesee EVK4 on the emulated bus: control protocol, registers, data endpoint.
+
+It streams only after the documented sequences were written in order, and keeps what a camera
+would not forgive in ``watch.violations``. How a camera reacts to a wrong order, whether a packet
+of whole USB packets ends with an empty one, and what its bridge buffers after a stop are
+*unconfirmed on hardware*; the model takes the harder case each time.
+"""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+
+from eschorty_ros.emulation.bus.usb_device import (
+    SPEED_SUPER,
+    EmulatedUsbDevice,
+    EndpointIdentity,
+    UsbIdentity,
+)
+from eschorty_ros.emulation.bus.usb_pipe import UsbFault, Wait
+from eschorty_ros.emulation.evk4.pixels import PixelMask
+from eschorty_ros.emulation.evk4.registers import SENSOR_RESET, Registers
+from eschorty_ros.emulation.evk4.sequences import Phase, SequenceWatch
+from eschorty_ros.emulation.evk4.settings import SETTING_ADDRESSES, SensorSettings, read_settings
+from eschorty_ros.emulation.evk4.stream import (
+    Packetiser,
+    SensorSource,
+    dropped,
+    without_triggers,
+)
+from eschorty_ros.emulation.evk4.treuzell import BoardIdentity, TreuzellBoard
+
+CONTROL_OUT, CONTROL_IN, DATA_IN = 0x02, 0x82, 0x81
+PACKET_BYTES = 1024
+_PULL_BYTES = 1 << 20
+
+
+class Evk4Model(EmulatedUsbDevice):
+    """EVK4 with an IMX636.
+
+    Parameters
+    ----------
+    source : SensorSource
+        Gives the pixels' words while the sensor streams; read only when the host reads.
+    board : BoardIdentity
+    factory_dacs : mapping, optional
+        The unit's bias trim by name.
+    clock_ns : callable, optional
+        With a clock the waits of the register sequences are judged.
+    wait : callable
+        As for ``EmulatedUsbDevice``.
+
+    Attributes
+    ----------
+    registers : Registers
+    watch : SequenceWatch
+        Phase and violations.
+    writes : deque of (address, value)
+        The latest register writes.
+    board : TreuzellBoard
+        Answers requests.
+    buffer_bytes : int or None
+        Space of the device's own buffer. None: nothing is lost however late the host reads.
+        Otherwise what came about since the last read and does not fit is dropped with the
+        sensor's mark.
+    configure : callable or None
+        Called with ``SensorSettings`` when registers that change what the pixels give were written.
+    """
+
+    def __init__(
+        self,
+        source: SensorSource,
+        *,
+        board: BoardIdentity | None = None,
+        factory_dacs: Mapping[str, int] | None = None,
+        clock_ns: Callable[[], int] | None = None,
+        wait: Wait = threading.Condition.wait,
+    ):
+        board = board or BoardIdentity()
+        super().__init__(
+            UsbIdentity(
+                0x04B4,
+                0x00F5,
+                interface_class=0xFF,
+                interface_subclass=0x19,
+                interface_protocol=0,
+                endpoints=tuple(
+                    EndpointIdentity(address, PACKET_BYTES)
+                    for address in (CONTROL_IN, CONTROL_OUT, DATA_IN)
+                ),
+                serial=f"{board.serial:08x}",
+                manufacturer="Prophesee",
+                product="EVK4",
+                bcd_device=0x0309,
+                speed=SPEED_SUPER,
+            ),
+            wait=wait,
+        )
+        self.registers = Registers(factory_dacs)
+        self.watch = SequenceWatch(clock_ns)
+        self.writes: deque[tuple[int, int]] = deque(maxlen=4096)
+        self.buffer_bytes: int | None = None
+        self.configure: Callable[[SensorSettings], None] | None = None
+        self._source = source
+        self.board = TreuzellBoard(board, self)
+        self._packets = Packetiser()
+        self._mask = PixelMask((), (), ())
+        # Between the reader's thread and the one that starts and stops.
+        self._stream_lock = threading.Lock()
+        self._run = 0
+        self._settings = read_settings(self.registers)
+
+    @property
+    def settings(self) -> SensorSettings:
+        """What the registers ask of the sensor now."""
+        return self._settings
+
+    def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
+        """Take a control request and queue its answer."""
+        if endpoint != CONTROL_OUT:
+            raise UsbFault(errno.EPIPE)
+        self.reply(CONTROL_IN, self.board.answer(data))
+        return len(data)
+
+    def bulk_in(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
+        """Give an answer or the next packet of events."""
+        if endpoint == DATA_IN and self.watch.phase is Phase.STREAMING:
+            self._pull(timeout_ms / 1e3)
+        return super().bulk_in(endpoint, size, timeout_ms)
+
+    def read(self, address: int) -> int:
+        """Read a register, as the control protocol does."""
+        return self.registers.read(address)
+
+    def write(self, address: int, value: int) -> None:
+        """Write a register, as the control protocol does."""
+        before = self.registers[address]
+        self.registers.write(address, value)
+        self.writes.append((address, value))
+        was = self.watch.phase
+        if address == SENSOR_RESET and before and not value:
+            self.watch.sensor_reset()
+        self.watch.wrote(address, before, value)
+        if was is not self.watch.phase:
+            self._change(was)
+        if address in SETTING_ADDRESSES:
+            self._configure()
+
+    def stale(self, data: bytes) -> None:
+        """Put bytes into the data endpoint that no start asked for."""
+        self._send(data)
+
+    def power_up(self) -> None:
+        """Come back with every register at its reset value."""
+        super().power_up()
+        was = self.watch.phase
+        self.watch.reset()
+        self._change(was)
+        self.registers.reset()
+        self._configure()
+
+    def _change(self, was: Phase) -> None:
+        if was is Phase.STREAMING:
+            with self._stream_lock:
+                self._run += 1
+                self._send(self._packets.flush())
+            self._source.stop()
+        elif self.watch.phase is Phase.STREAMING:
+            with self._stream_lock:
+                self._packets = Packetiser()
+            self._source.start()
+
+    def _configure(self) -> None:
+        settings = read_settings(self.registers)
+        if settings != self._settings:
+            self._settings = settings
+            self._mask = PixelMask(settings.columns_off, settings.rows_off, settings.pixels_off)
+            if self.configure:
+                self.configure(settings)
+
+    def _pull(self, timeout_s: float) -> None:
+        """Move words from the source to the endpoint until a packet is there or time is up."""
+        run, until_s = self._run, time.monotonic() + timeout_s
+        if self.buffer_bytes is not None:
+            self._overflow(run)
+        while not self.pending(DATA_IN):
+            data = self._source.read(_PULL_BYTES, max(0.0, until_s - time.monotonic()))
+            if not self._take(data, run):
+                return
+
+    def _overflow(self, run: int) -> None:
+        space, lost = self.buffer_bytes or 0, 0
+        while data := self._source.read(_PULL_BYTES, 0.0):
+            kept = data[: space - space % 2]
+            space -= len(kept)
+            lost += (len(data) - len(kept)) // 2
+            if kept and not self._take(kept, run):
+                return
+        if lost:
+            self._take(dropped(lost), run)
+
+    def _take(self, data: bytes, run: int) -> bool:
+        """Packetise; False when there was nothing, or the stream it belongs to has ended."""
+        with self._stream_lock:
+            if run != self._run:
+                return False
+            if not data:
+                # The sensor sends a packet every period, however little is in it.
+                self._send(self._packets.flush())
+                return False
+            if not self._settings.trigger_in:
+                data = without_triggers(data)
+            if self._mask:
+                data = self._mask.apply(data)
+            for packet in self._packets.push(data, self._settings.packet_period_us):
+                self._send(packet)
+        return True
+
+    def _send(self, packet: bytes) -> None:
+        if packet:
+            self.reply(DATA_IN, packet, zero_length=len(packet) % PACKET_BYTES == 0)

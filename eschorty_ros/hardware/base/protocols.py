@@ -1,0 +1,216 @@
+"""The interfaces of a camera, a laser and a stage, real or emulated, towards the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    # Only names: the process that guards the laser starts without numpy.
+    from eschorty_ros.core.clocks.pulses import PulseTrain
+    from eschorty_ros.core.modulation.modulation import Modulation
+    from eschorty_ros.hardware.camera.settings import CameraSettings
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceIdentity:
+    """Model, serial and firmware, for logs, diagnostics and file headers."""
+
+    model: str
+    serial: str
+    firmware: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EventChunk:
+    """Bytes that arrived together.
+
+    Parameters
+    ----------
+    data : bytes
+        Complete 16-bit EVT3 words.
+    arrival_ns : int
+        Host time at which they were received.
+    gap : bool
+        Bytes were lost between the previous chunk and this one.
+    restarted : bool
+        The stream restarts here: earlier sensor time and decoder state are void.
+    """
+
+    data: bytes
+    arrival_ns: int
+    gap: bool = False
+    restarted: bool = False
+
+
+class EventSource(Protocol):
+    """A camera that streams raw EVT3 bytes.
+
+    Attributes
+    ----------
+    width, height : int
+        Columns and rows of the sensor.
+    on_loss : callable
+        Called with one line, from any thread, when a streaming camera is lost and searched for.
+    """
+
+    width: int
+    height: int
+    on_loss: Callable[[str], None]
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Model, serial and firmware; complete after ``open``."""
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Settings as requested, the trigger input among them."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line for each oddity that ``open`` found."""
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the camera streams and answers; never waits."""
+
+    @property
+    def loss(self) -> str:
+        """Why a streaming camera is being searched for, one line; empty while it is there."""
+
+    def open(self) -> None:
+        """Find, probe and initialise the camera; may take seconds, ``close`` interrupts it."""
+
+    def start(self) -> None:
+        """Start streaming."""
+
+    def stop(self) -> None:
+        """End streaming; idempotent."""
+
+    def read(self, timeout_s: float) -> EventChunk | None:
+        """Return the next chunk, ``None`` when none came in ``timeout_s``.
+
+        Raises ``DeviceError`` when the camera is lost for good.
+        """
+
+    def set_bias(self, name: str, offset: int) -> int:
+        """Set one bias, an offset from the factory trim; returns the offset read back.
+
+        Raises ``ArgumentError`` for an unknown bias or an offset outside its range,
+        ``DeviceError`` when the camera is not open or keeps another value.
+        """
+
+    def read_biases(self) -> dict[str, int]:
+        """Return the offsets in the camera; raises ``DeviceError`` when it is not open."""
+
+    def statistics(self) -> dict[str, float]:
+        """Return counters for diagnostics, by name with unit."""
+
+    def close(self) -> None:
+        """Release the device; idempotent."""
+
+
+class LaserOutput(IntEnum):
+    """Output state; ``UNKNOWN`` counts as on."""
+
+    OFF = 0
+    ON = 1
+    UNKNOWN = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LaserReadback:
+    """What the generator says it does.
+
+    ``phase_epoch_ns`` is the time of one rising edge, ``None`` where nobody knows it: a
+    generator does not tell its phase. ``reason`` says why the output is off or
+    unknown, when the driver knows. ``warnings`` are all oddities since opening that are no
+    failure, ``counters`` go to diagnostics.
+    """
+
+    output: LaserOutput
+    modulation: Modulation
+    phase_epoch_ns: int | None
+    output_since_ns: int
+    reason: str = ""
+    warnings: tuple[str, ...] = field(default=(), compare=False)
+    counters: Mapping[str, float] = field(default_factory=dict, compare=False)
+
+
+class LaserModulator(Protocol):
+    """The generator that gates the laser. Off at construction and after every failure."""
+
+    identity: DeviceIdentity
+
+    def configure(self, modulation: Modulation) -> None:
+        """Set waveform, frequency and duty; raises ``DeviceError`` when refused."""
+
+    def arm(self) -> None:
+        """Allow the next ``enable``."""
+
+    def enable(self) -> None:
+        """Switch the output on; raises ``DeviceError`` when not armed."""
+
+    def disable(self) -> None:
+        """Switch the output off and disarm; idempotent, never raises for being off already."""
+
+    def readback(self) -> LaserReadback:
+        """Read settings and output state back."""
+
+    def close(self) -> None:
+        """Switch off and release; idempotent."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageState:
+    """One reading of the stage."""
+
+    position_mm: float
+    velocity_mm_s: float
+    t_ns: int
+    homed: bool
+    moving: bool
+    flags: tuple[str, ...] = field(default=())
+
+
+class LinearStage(Protocol):
+    """A linear stage with absolute moves that end by themselves.
+
+    Attributes
+    ----------
+    trigger : PulseTrain or None
+        Pulses for the camera's trigger input, in either direction; ``None`` when there are none.
+    """
+
+    identity: DeviceIdentity
+    trigger: PulseTrain | None
+    travel_mm: tuple[float, float]
+    speed_max_mm_s: float
+    acceleration_mm_s2: float
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the stage answers and nothing has failed; never waits."""
+
+    def home(self) -> None:
+        """Start homing; ``state().homed`` tells when it is done."""
+
+    def move_to(self, position_mm: float, speed_mm_s: float) -> None:
+        """Start an absolute move; raises ``DeviceError`` outside travel, too fast or not homed."""
+
+    def stop(self) -> None:
+        """Profiled stop; idempotent."""
+
+    def state(self, t_ns: int | None = None) -> StageState:
+        """Position, velocity, time and flags; by default at the newest time that is known.
+
+        Raises ``DeviceError`` when the stage has failed.
+        """
+
+    def statistics(self) -> dict[str, float]:
+        """Counters for diagnostics, by name with unit."""
+
+    def close(self) -> None:
+        """Stop and release; idempotent."""

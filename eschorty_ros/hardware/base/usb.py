@@ -1,0 +1,211 @@
+"""USB access of the drivers: a backend by name, one device found, its interface claimed.
+
+A backend named ``module:callable`` or ``module:callable?argument`` is imported at run time, so that
+an emulated device replaces a real one with the driver unchanged.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib
+from collections.abc import Callable
+from contextlib import suppress
+
+import usb.backend
+import usb.backend.libusb1
+import usb.core
+import usb.util
+
+from eschorty_ros.core.base.errors import (
+    ArgumentError,
+    DeviceError,
+    DeviceGoneError,
+    DeviceStallError,
+    DeviceTimeoutError,
+)
+
+_KINDS: dict[int, tuple[type[DeviceError], str]] = {
+    errno.ENODEV: (DeviceGoneError, "the device is gone; check cable and power, then reconnect"),
+    errno.ENXIO: (DeviceGoneError, "the device is gone; check cable and power, then reconnect"),
+    errno.ETIMEDOUT: (DeviceTimeoutError, "no answer in time; check that the device is on"),
+    errno.EPIPE: (DeviceStallError, "the device stalled the transfer"),
+    errno.EOVERFLOW: (DeviceError, "more data than asked for; the transfer is lost"),
+    errno.EIO: (DeviceError, "transfer failed; check cable and hub"),
+    errno.EACCES: (
+        DeviceError,
+        "permission denied; install the udev rules of docs/hardware.md and plug in again",
+    ),
+    errno.EBUSY: (
+        DeviceError,
+        "in use; close the other program, or unload the kernel driver that holds it",
+    ),
+}
+
+
+def translate(error: usb.core.USBError, what: str) -> DeviceError:
+    """Return the ``DeviceError`` for pyusb's error, by ``errno``: texts differ by platform.
+
+    Parameters
+    ----------
+    error : usb.core.USBError
+    what : str
+        Device and operation, such as ``"EVK4 00051234: reading register 0x0014"``.
+    """
+    code = error.errno if error.errno is not None else 0
+    kind, remedy = _KINDS.get(code, (DeviceError, str(error.strerror or error)))
+    return kind(f"{what}: {remedy} ({errno.errorcode.get(code, 'no error number')})")
+
+
+def open_backend(spec: str) -> usb.backend.IBackend:
+    """Return the pyusb backend that ``spec`` names.
+
+    Parameters
+    ----------
+    spec : str
+        ``libusb``: the system's libusb, else that of the package ``libusb-package``.
+        ``module:callable`` or ``module:callable?argument``: the result of ``callable()`` or
+        ``callable(argument)``.
+
+    Raises
+    ------
+    ArgumentError
+        For a name that cannot be imported.
+    DeviceError
+        Without libusb.
+    """
+    if spec == "libusb":
+        return _libusb()
+    target, _, argument = spec.partition("?")
+    module, _, name = target.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ArgumentError(
+            f"backend {spec!r}: {error}; use libusb or module:callable[?argument]"
+        ) from error
+    return factory(argument) if argument else factory()
+
+
+def _libusb() -> usb.backend.IBackend:
+    backend = usb.backend.libusb1.get_backend()
+    if backend is None:
+        with suppress(ImportError):
+            import libusb_package
+
+            backend = libusb_package.get_libusb1_backend()
+    if backend is None:
+        raise DeviceError("libusb not found; install libusb-1.0-0 (apt) or libusb-package (pip)")
+    return backend
+
+
+def find_device(
+    backend: usb.backend.IBackend,
+    *,
+    name: str,
+    matches: Callable[[usb.core.Device], bool],
+    serial: str = "",
+) -> usb.core.Device:
+    """Find and open the one device that matches; returns a new ``Device`` on every call.
+
+    Parameters
+    ----------
+    backend : usb.backend.IBackend
+    name : str
+        Name of the device in messages.
+    matches : callable
+        May read descriptors only: the device is not open yet.
+    serial : str
+        Serial string, upper or lower case; ``""`` takes the only match.
+
+    Raises
+    ------
+    DeviceGoneError
+        None matches.
+    DeviceError
+        Several match, or opening is refused.
+    """
+    try:
+        found = list(usb.core.find(find_all=True, backend=backend, custom_match=matches))
+        if serial:
+            found, seen = _with_serial(found, serial, name)
+        else:
+            seen = []
+    except usb.core.USBError as error:
+        raise translate(error, f"{name}: looking for it on the bus") from error
+    if not found:
+        which = f" with serial {serial}" if serial else ""
+        there = f"; there is {', '.join(seen)}" if seen else ""
+        raise DeviceGoneError(
+            f"{name}: no such device{which} on the bus{there}; check cable, power and serial"
+        )
+    if len(found) > 1:
+        places = ", ".join(f"bus {d.bus} address {d.address}" for d in found)
+        raise DeviceError(f"{name}: {len(found)} devices match ({places}); give the serial")
+    device = found[0]
+    try:
+        device.get_active_configuration()
+    except usb.core.USBError as error:
+        usb.util.dispose_resources(device)
+        raise translate(error, f"{name}: opening {_place(device)}") from error
+    return device
+
+
+def _place(device: usb.core.Device) -> str:
+    return f"bus {device.bus} address {device.address}"
+
+
+def _with_serial(
+    devices: list[usb.core.Device], serial: str, name: str
+) -> tuple[list[usb.core.Device], list[str]]:
+    """Return the devices with that serial, and the serials of all others."""
+    kept, seen = [], []
+    for device in devices:
+        text = _serial(device, name)
+        if text.lower() == serial.lower():
+            kept.append(device)
+        else:
+            seen.append(text or f"one without serial at {_place(device)}")
+            usb.util.dispose_resources(device)
+    return kept, seen
+
+
+def _serial(device: usb.core.Device, name: str) -> str:
+    try:
+        # pyusb reports a refused open as "no language"; opening first keeps the reason.
+        device.get_active_configuration()
+        return device.serial_number or ""
+    except usb.core.USBError as error:
+        usb.util.dispose_resources(device)
+        raise translate(error, f"{name}: opening {_place(device)}") from error
+    except ValueError:
+        return ""
+
+
+def claim(device: usb.core.Device, interface: int, name: str) -> bool:
+    """Claim the interface for this process; returns whether a kernel driver was detached.
+
+    Raises
+    ------
+    DeviceError
+        Another program holds it, or the kernel driver cannot be detached.
+    """
+    detached = False
+    try:
+        with suppress(NotImplementedError):
+            if device.is_kernel_driver_active(interface):
+                device.detach_kernel_driver(interface)
+                detached = True
+        usb.util.claim_interface(device, interface)
+    except usb.core.USBError as error:
+        raise translate(error, f"{name}: claiming interface {interface}") from error
+    return detached
+
+
+def release(device: usb.core.Device, interface: int, *, reattach: bool) -> None:
+    """Release the interface, reattach the kernel driver if asked, and close; never raises."""
+    with suppress(usb.core.USBError):
+        usb.util.release_interface(device, interface)
+    if reattach:
+        with suppress(usb.core.USBError, NotImplementedError):
+            device.attach_kernel_driver(interface)
+    usb.util.dispose_resources(device)

@@ -1,0 +1,171 @@
+"""The connection to one camera: opened, and opened again after a loss."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import usb.backend
+
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
+from eschorty_ros.hardware.base.protocols import DeviceIdentity
+from eschorty_ros.hardware.camera.bulk_reader import ClockNs
+from eschorty_ros.hardware.camera.camera_usb import NAME
+from eschorty_ros.hardware.camera.registers import Sleep
+from eschorty_ros.hardware.camera.session import Session
+from eschorty_ros.hardware.camera.settings import CameraSettings
+
+
+class EndedError(DeviceError):
+    """A wait that the end of the stream cut short."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reconnection:
+    """How often a lost camera is searched for, and how long to wait before.
+
+    Parameters
+    ----------
+    attempts : int
+        0 gives up at once.
+    first_s, longest_s : float
+        Wait before the first attempt; it doubles up to the longest.
+    """
+
+    attempts: int = 6
+    first_s: float = 0.5
+    longest_s: float = 8.0
+
+    def wait_s(self, attempt: int) -> float:
+        """Return the wait before that attempt, counted from 0."""
+        return min(self.first_s * 2.0**attempt, self.longest_s)
+
+
+class Connection:
+    """Session of one camera; thread-safe.
+
+    Parameters
+    ----------
+    backend : usb.backend.IBackend
+    clock_ns : callable
+    serial : str
+        ``""`` takes the only camera there is; after the first opening only that one is taken.
+    settings : CameraSettings
+        Written in every new session.
+    reconnection : Reconnection
+    sleep : callable
+        Waits some seconds; raises :class:`EndedError` when the stream ends.
+    settle : callable
+        Waits milliseconds, always to the end.
+
+    Attributes
+    ----------
+    session : Session or None
+        The open camera.
+    identity : DeviceIdentity
+    settings : CameraSettings
+    loss : str
+        Why the session was lost, one line; empty while there is one.
+    losses, reconnects, attempts : int
+    """
+
+    def __init__(
+        self,
+        backend: usb.backend.IBackend,
+        clock_ns: ClockNs,
+        serial: str,
+        settings: CameraSettings,
+        reconnection: Reconnection,
+        sleep: Sleep,
+        settle: Sleep,
+    ) -> None:
+        self.session: Session | None = None
+        self.identity = DeviceIdentity("Prophesee EVK4", serial)
+        self.settings = settings
+        self.loss = ""
+        self.losses = self.reconnects = self.attempts = 0
+        self._backend = backend
+        self._clock_ns = clock_ns
+        self._reconnection = reconnection
+        self._sleep = sleep
+        self._settle = settle
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def require(self, what: str) -> Session:
+        """Return the session; raises ``DeviceError``, which names ``what``, without one."""
+        session = self.session
+        if session is None:
+            raise DeviceError(f"{what}: the camera is not open; try again when it is back")
+        return session
+
+    def open(self) -> None:
+        """Open a session unless there is one; raises ``DeviceError``."""
+        if self.session is not None:
+            return
+        session = Session(
+            self._backend,
+            self.identity.serial,
+            self.settings,
+            self._clock_ns,
+            self._sleep,
+            self._settle,
+        )
+        with self._lock:
+            if not self._closed:
+                self.session = session
+                self.identity = session.identity
+                self.loss = ""
+                return
+        session.close()
+        raise EndedError(f"{NAME} was closed before it was ready")
+
+    def drop(self, error: DeviceError) -> None:
+        """Release a camera that failed."""
+        self.losses += 1
+        self.loss = str(error)
+        self._release(gone=True)
+
+    def reopen(self, start: Callable[[Session], None]) -> None:
+        """Open the same camera again and ``start`` it.
+
+        Raises
+        ------
+        EndedError
+            When the stream ends before.
+        DeviceGoneError
+            After the last attempt.
+        """
+        last = self.loss
+        for attempt in range(self._reconnection.attempts):
+            self._sleep(self._reconnection.wait_s(attempt))
+            self.attempts += 1
+            try:
+                self.open()
+                start(self.require("stream"))
+            except EndedError:
+                raise
+            except DeviceError as error:
+                last = self.loss = str(error)
+                self._release(gone=True)
+                continue
+            self.reconnects += 1
+            return
+        raise DeviceGoneError(
+            f"{NAME} {self.identity.serial}: lost, and not back after "
+            f"{self._reconnection.attempts} attempts ({last}); check cable and power, then "
+            "configure it again"
+        )
+
+    def close(self) -> None:
+        """Power down and release, for good; never raises."""
+        with self._lock:
+            self._closed = True
+        self._release(gone=False)
+
+    def _release(self, gone: bool) -> None:
+        with self._lock:
+            session, self.session = self.session, None
+        if session is not None:
+            session.close(gone=gone)

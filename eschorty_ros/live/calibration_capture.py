@@ -1,0 +1,216 @@
+"""What the reconstruction collects while it calibrates, and what can be said of it so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.errors import EschortyError, FitError
+from eschorty_ros.core.calibration.fit import fit_targets
+from eschorty_ros.core.calibration.posts import (
+    AggregateFrame,
+    KnownTarget,
+    find_posts,
+    match_posts,
+    moving_target,
+)
+from eschorty_ros.core.calibration.targets import Targets
+from eschorty_ros.core.evt3.decoder import Decoder
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.reconstruction import Profiles
+from eschorty_ros.live.packet_times import Packet
+from eschorty_ros.live.sensor_epoch import TimedProfiles
+
+_TARGETS_LEAST = 3
+_REASONS_SHOWN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """The stage moves the one target from ``start_mm`` to ``stop_mm`` and back."""
+
+    start_mm: float
+    stop_mm: float
+    speed_mm_s: float
+    range_per_stage: float
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureRequest:
+    """What is lit and for how long; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+
+    targets: tuple[KnownTarget, ...]
+    method: str = "joint"
+    capture_s: float = 1.0
+    frequency_hz: float = 0.0
+    duty: float = 0.0
+    sweep: Sweep | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What a capture shows.
+
+    Attributes
+    ----------
+    targets : Targets or None
+        Known targets that were found.
+    posts : int
+        Posts found, known or not.
+    rejected : tuple of str
+        What fits nothing, with the reason.
+    residual_px : ndarray of float64
+        Of the targets about a straight fit of k' and b'; empty below two targets.
+    """
+
+    targets: Targets | None = None
+    posts: int = 0
+    rejected: tuple[str, ...] = ()
+    residual_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+
+class Capture(Protocol):
+    """Fed by the reconstruction's worker; looked at when the light is off, or in a copy."""
+
+    frame: AggregateFrame
+    packets_lost: int
+
+    def packet(self, packet: Packet) -> None:
+        """Take the next bytes of the EVT3 stream."""
+
+    def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
+        """Take profiles whose stage positions are known."""
+
+    def find(self, frame: AggregateFrame) -> Findings:
+        """Look for the targets in a copy of the frame."""
+
+
+class _Frame:
+    """The sum of all events; decodes on its own, as it may begin anywhere in the stream."""
+
+    def __init__(self, nominal: Calibration) -> None:
+        self._nominal = nominal
+        self._decoder = Decoder(nominal.columns, nominal.rows)
+        self._next_seq: int | None = None
+        self.frame = AggregateFrame(nominal.columns, nominal.rows)
+        self.packets_lost = 0
+
+    def packet(self, packet: Packet) -> None:
+        """See ``Capture``."""
+        missing = 0 if self._next_seq is None else packet.seq - self._next_seq
+        if missing:
+            self.packets_lost += max(missing, 0)
+            self._decoder.note_gap()
+        self._next_seq = packet.seq + 1
+        self.frame.add(self._decoder.decode(packet.data))
+
+
+class PostsCapture(_Frame):
+    """Resting targets side by side.
+
+    Parameters
+    ----------
+    request : CaptureRequest
+    nominal : Calibration
+        The build as designed.
+    line_width_px : float
+    """
+
+    def __init__(self, request: CaptureRequest, nominal: Calibration, line_width_px: float) -> None:
+        super().__init__(nominal)
+        self._known = request.targets
+        self._line_width_px = line_width_px
+
+    def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
+        """See ``Capture``; profiles say nothing more about resting posts."""
+
+    def find(self, frame: AggregateFrame) -> Findings:
+        """See ``Capture``; an ambiguous picture counts as no match yet."""
+        posts = find_posts(frame, self._line_width_px)
+        match = match_posts(posts, self._known, self._nominal.model())
+        return Findings(
+            match.targets, len(posts), match.rejected, _residuals(match.targets, self._nominal)
+        )
+
+
+class SweepCapture(_Frame):
+    """One target that the stage moves along the range.
+
+    Parameters
+    ----------
+    request : CaptureRequest
+        With a sweep.
+    nominal : Calibration
+    """
+
+    def __init__(self, request: CaptureRequest, nominal: Calibration) -> None:
+        super().__init__(nominal)
+        assert request.sweep is not None
+        self._target = request.targets[0]
+        self._sweep: Sweep = request.sweep
+        self._parts: list[tuple[Profiles, NDArray[np.float64]]] = []
+
+    def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
+        """See ``Capture``."""
+        self._parts.append((timed.profiles, stage_mm))
+
+    def find(self, frame: AggregateFrame) -> Findings:
+        """See ``Capture``."""
+        parts = list(self._parts)
+        if not parts:
+            return Findings(rejected=(f"target {self._target.label}: no profile shows it",))
+        profiles = Profiles.concatenate([part for part, _ in parts])
+        targets = moving_target(
+            profiles,
+            np.concatenate([stage_mm for _, stage_mm in parts]),
+            self._target.range_mm,
+            range_per_stage=self._sweep.range_per_stage,
+        )
+        lost = profiles.profile_count - len(targets)
+        rejected = (f"{lost} profiles show no whole target, or one off the others",) * (lost > 0)
+        return Findings(targets, 1, rejected, _residuals(targets, self._nominal))
+
+
+def enough_targets(findings: Findings, wanted: int) -> Targets:
+    """Return the targets found.
+
+    Raises
+    ------
+    FitError
+        When fewer than three of them, or of what was asked for, were found; names the first
+        reasons.
+    """
+    targets = findings.targets
+    found = len(targets) if targets is not None else 0
+    if targets is not None and found >= min(_TARGETS_LEAST, wanted):
+        return targets
+    reasons = list(findings.rejected[:_REASONS_SHOWN])
+    if len(findings.rejected) > _REASONS_SHOWN:
+        reasons.append(f"and {len(findings.rejected) - _REASONS_SHOWN} more")
+    raise FitError(
+        f"{found} of {wanted} targets found among {findings.posts} posts; " + "; ".join(reasons)
+    )
+
+
+def make_capture(
+    request: CaptureRequest, nominal: Calibration, line_width_px: float
+) -> PostsCapture | SweepCapture:
+    """Make the capture that fits the request."""
+    if request.sweep is not None:
+        return SweepCapture(request, nominal)
+    return PostsCapture(request, nominal, line_width_px)
+
+
+def _residuals(targets: Targets | None, nominal: Calibration) -> NDArray[np.float64]:
+    if targets is None or len(targets) < 2:
+        return np.empty(0)
+    try:
+        fit = fit_targets(
+            targets.row, targets.range_mm, nominal.model(), sigma_row_px=targets.sigma_row_px
+        )
+    except EschortyError:
+        return np.empty(0)
+    return fit.residual_px

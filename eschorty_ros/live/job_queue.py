@@ -1,0 +1,94 @@
+"""Jobs handed from the executor's threads to one worker thread, in order."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from eschorty_ros.core.base.errors import EschortyError
+
+_POLL_S = 0.1
+
+Job = Callable[[], None]
+
+
+class Mailbox:
+    """A queue in which bulk jobs are bounded and small ones always get through.
+
+    Parameters
+    ----------
+    bulk_max : int
+        Bulk jobs that may wait.
+
+    Attributes
+    ----------
+    overflows : int
+        Bulk jobs refused because the queue was full.
+    """
+
+    def __init__(self, bulk_max: int) -> None:
+        self.overflows = 0
+        self._bulk_max = bulk_max
+        self._bulk = 0
+        self._jobs: deque[tuple[Job, bool]] = deque()
+        self._arrived = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def post(self, job: Job) -> None:
+        """Queue a small job."""
+        self._append(job, False)
+
+    def post_bulk(self, job: Job) -> bool:
+        """Queue a bulk job; ``False`` and counted when the queue is full."""
+        return self._append(job, True)
+
+    def run(self, job: Job, timeout_s: float, alive: Callable[[], bool]) -> tuple[bool, str]:
+        """Queue a small job and wait for its end, at most while ``alive()``.
+
+        Returns
+        -------
+        bool, str
+            Whether it succeeded, and why not: an ``EschortyError``'s text, or that nobody did it.
+        """
+        answered = threading.Event()
+        refusal: list[str] = []
+
+        def guarded() -> None:
+            try:
+                job()
+            except EschortyError as error:
+                refusal.append(str(error))
+            finally:
+                answered.set()
+
+        self.post(guarded)
+        end_s = time.monotonic() + timeout_s
+        while not answered.wait(min(_POLL_S, timeout_s)):
+            if not alive():
+                return False, "the node was shut down"
+            if time.monotonic() > end_s:
+                return False, f"the reconstruction did not answer within {timeout_s:g} s"
+        return not refusal, "".join(refusal)
+
+    def take(self, timeout_s: float) -> Job | None:
+        """Return the oldest job, ``None`` when none comes within ``timeout_s``."""
+        with self._arrived:
+            if not self._jobs and not self._arrived.wait_for(lambda: bool(self._jobs), timeout_s):
+                return None
+            job, bulk = self._jobs.popleft()
+            self._bulk -= bulk
+            return job
+
+    def _append(self, job: Job, bulk: bool) -> bool:
+        with self._arrived:
+            if bulk and self._bulk >= self._bulk_max:
+                self.overflows += 1
+                return False
+            self._jobs.append((job, bulk))
+            self._bulk += bulk
+            self._arrived.notify()
+            return True

@@ -1,0 +1,54 @@
+"""Cutting the camera's byte stream into packets by age and size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from eschorty_ros.core.base.errors import ArgumentError
+
+SIZE_MAX_BYTES = 256_000
+
+
+class Packetizer:
+    """Collects bytes until the packet reaches an age or a size.
+
+    Parameters
+    ----------
+    time_threshold_ns : int
+        Age of a packet's first byte at which it is complete.
+    size_threshold : int
+        Bytes of a complete packet, rounded down to 16-bit words.
+
+    Raises
+    ------
+    ArgumentError
+        When ``size_threshold`` is not 2 to 256000.
+    """
+
+    def __init__(self, time_threshold_ns: int, size_threshold: int) -> None:
+        if not 2 <= size_threshold <= SIZE_MAX_BYTES:
+            raise ArgumentError(
+                f"size_threshold is {size_threshold!r}; choose 2 to {SIZE_MAX_BYTES} bytes"
+            )
+        self._age_ns = time_threshold_ns
+        self._size = size_threshold // 2 * 2
+        self._pending = bytearray()
+        self._first_ns = 0
+
+    def push(self, data: bytes, arrival_ns: int) -> Iterator[tuple[int, bytes]]:
+        """Add ``data``, or ``b""``; yields complete packets: (first arrival, bytes)."""
+        if data and not self._pending:
+            self._first_ns = arrival_ns
+        self._pending += data
+        while len(self._pending) >= self._size:
+            yield self._first_ns, bytes(self._pending[: self._size])
+            del self._pending[: self._size]
+            self._first_ns = arrival_ns
+        if self._pending and arrival_ns - self._first_ns >= self._age_ns:
+            yield from self.flush()
+
+    def flush(self) -> Iterator[tuple[int, bytes]]:
+        """Yield the incomplete packet."""
+        if self._pending:
+            yield self._first_ns, bytes(self._pending)
+            self._pending.clear()

@@ -1,0 +1,351 @@
+"""Event packets in, profiles with ROS times out: losses, restarts and the camera's clock."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import replace
+from typing import Any
+
+from eschorty_ros.core.clocks.clock import NS_PER_US, SensorClock, StageTrack
+from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.live.packet_times import (
+    WRAP_US,
+    Packet,
+    first_time_high_us,
+    first_time_us,
+    overtaken,
+    skips_time,
+)
+from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
+
+_GAP_NS = WRAP_US * NS_PER_US // 2
+
+
+class PacketStream:
+    """Runs a ``Reconstructor`` over packets whose clock and modulation arrive separately.
+
+    Packets are held, in order and bounded, until the modulation and the clock are known. The
+    clock is exact when the camera's zero is announced, as a replay does. Without an announcement
+    within ``clock_timeout_s`` the clock is fitted to the packets' stamps and, where the stage is
+    wired to the trigger input, to its edges. Such a clock is not good to a microsecond, so the
+    modulation's phase then comes from the events (or from the laser's edges).
+
+    A packet's stamp is the time at which its first bytes arrived. The camera had collected them
+    for up to ``packet_period_s`` then, which is subtracted.
+
+    The decoder counts time from the last wrap of the stream's 24-bit time before it started. The
+    packets' stamps give the number of wraps of a stream that is joined later than its first
+    packet, or goes on after more than half a wrap without packets.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    settings : Settings
+    clock_timeout_s : float
+    packet_period_s : float
+        Time over which the camera collects events before it sends them.
+    held_max : int
+        Packets held while clock or modulation are unknown; further ones count as lost.
+
+    Attributes
+    ----------
+    packets, packets_lost, restarts : int
+        Packets reconstructed, missing by their ``seq``, and new starts of the stream.
+    packets_late : int
+        Packets left out because they came twice or after later ones; ``packets_lost`` includes
+        the latter.
+    clock_restarts : int
+        Restarts of the clock because stamps or sensor times went back.
+    announcement_expected : bool
+        Whether packets wait for an announcement of the camera's zero.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        settings: Settings,
+        clock_timeout_s: float,
+        packet_period_s: float = 0.0,
+        held_max: int = 1000,
+    ) -> None:
+        self.calibration = calibration
+        self.packets = 0
+        self.packets_lost = 0
+        self.packets_late = 0
+        self.restarts = 0
+        self.clock_restarts = 0
+        self.announcement_expected = True
+        self._packet_period_ns = round(packet_period_s * 1e9)
+        self._settings = settings
+        self._clock_timeout_s = clock_timeout_s
+        self._held: deque[Packet] = deque()
+        self._held_max = held_max
+        self._held_since_s: float | None = None
+        self._pulses: PulseTrain | None = None
+        self._epoch: SensorEpoch | None = None
+        self._epoch_used = False
+        self._laser: tuple[Modulation, int | None] | None = None
+        self._on_since_ns: int | None = None
+        self._reconstructor: Reconstructor | None = None
+        self._wraps = 0
+        self._next_seq: int | None = None
+        self._last_stamp_ns = 0
+        self._retired: Counter[str] = Counter()
+        self._out: list[TimedProfiles] = []
+
+    @property
+    def held(self) -> int:
+        """Packets that wait for clock or modulation."""
+        return len(self._held)
+
+    @property
+    def waits_for(self) -> str:
+        """What the held packets wait for, ``""`` when for nothing."""
+        if self._laser is None:
+            return "modulation"
+        return "camera clock" if self._epoch is None else ""
+
+    @property
+    def epoch(self) -> SensorEpoch | None:
+        """The stream's epoch, ``None`` while its clock is unknown."""
+        return self._epoch
+
+    @property
+    def clock_announced(self) -> bool:
+        """Whether the clock is exact because it was announced."""
+        return self._epoch is not None and self._epoch.clock.exact
+
+    @property
+    def processed_until_ns(self) -> int | None:
+        """ROS time up to which the stream has been reconstructed."""
+        # Also read by other threads than the one that processes.
+        reconstructor, epoch = self._reconstructor, self._epoch
+        newest_us = reconstructor.time_us if reconstructor is not None else None
+        line = epoch.clock.line if epoch is not None else None
+        if newest_us is None or line is None:
+            return None
+        return line.to_ns(newest_us + self._wraps * WRAP_US)
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Counters of all reconstructors of the stream, summed by name."""
+        total, reconstructor = Counter(self._retired), self._reconstructor
+        if reconstructor is not None:
+            total.update(reconstructor.counters)
+        return total
+
+    def announce_zero(self, zero_ns: int) -> None:
+        """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
+        epoch = self._epoch
+        if epoch is not None and epoch.clock.exact and epoch.clock.zero_ns == zero_ns:
+            self._epoch_used = False
+            return
+        self._retire()
+        self._begin_epoch(SensorClock(zero_ns))
+
+    def set_laser(
+        self, modulation: Modulation, epoch_ns: int | None, on_since_ns: int | None = None
+    ) -> None:
+        """Use this modulation and ROS time of one rising edge for packets processed later.
+
+        ``on_since_ns`` is when the laser was switched on, ``None`` while it is off. Its phase
+        restarts then, unless ``epoch_ns`` gives it.
+        """
+        switched_on = on_since_ns is not None and on_since_ns != self._on_since_ns
+        self._on_since_ns = on_since_ns
+        changed = (modulation, epoch_ns) != self._laser
+        self._laser = modulation, epoch_ns
+        if self._reconstructor is not None and changed:
+            self._reconstructor.set_modulation(self._modulation())
+        if self._reconstructor is not None and switched_on:
+            self._reconstructor.restart_phase()
+
+    def set_pulses(self, pulses: PulseTrain | None) -> None:
+        """Expect these pulses, or none, if the trigger input is wired to the stage."""
+        self._pulses = pulses
+        if self._epoch is not None:
+            self._epoch.set_pulses(self._expected_pulses())
+
+    def fit_edges(self, track: StageTrack, *, now: bool = False) -> None:
+        """Fit the clock to the stage's edges that are due, with ``now`` to all of them."""
+        if self._epoch is not None:
+            self._epoch.fit_edges(track, now=now)
+
+    def set_settings(self, settings: Settings) -> None:
+        """Use ``settings`` for packets processed later; the open period is closed first."""
+        if settings == self._settings:
+            return
+        self._settings = settings
+        self.set_pulses(self._pulses)
+        self._renew()
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Use ``calibration`` for packets processed later; the open period is closed first."""
+        self.calibration = calibration
+        self._renew()
+
+    def add(self, packet: Packet, now_s: float) -> None:
+        """Queue one packet that arrived at ``now_s`` of the steady clock."""
+        if self._held_since_s is None:
+            self._held_since_s = now_s
+        if len(self._held) < self._held_max:
+            self._held.append(packet)
+
+    def process(self, now_s: float) -> list[TimedProfiles]:
+        """Reconstruct the packets that need not wait; return the profiles completed since."""
+        while self._held:
+            if overtaken(self._held[0], self._next_seq, self._last_stamp_ns):
+                self._held.popleft()
+                self.packets_late += 1
+                continue
+            if self._next_seq is not None and self._held[0].seq < self._next_seq:
+                self._forget_stream()
+            if not self._ready(self._held[0], now_s):
+                break
+            self._push(self._held.popleft())
+            self._held_since_s = now_s
+        if not self._held:
+            self._held_since_s = None
+        return self._completed()
+
+    def flush(self) -> list[TimedProfiles]:
+        """Close the open period; return the profiles completed since the last call."""
+        if self._reconstructor is not None:
+            self._collect(self._reconstructor.flush())
+        return self._completed()
+
+    def _forget_stream(self) -> None:
+        self._retire()
+        self.restarts += 1
+        self._next_seq = None
+        if self._epoch_used:
+            self._epoch = None
+
+    def _ready(self, packet: Packet, now_s: float) -> bool:
+        if self._laser is None:
+            return False
+        if self._epoch is None:
+            since_s = now_s if self._held_since_s is None else self._held_since_s
+            if self.announcement_expected and now_s - since_s < self._clock_timeout_s:
+                return False
+            self._begin_epoch(SensorClock())
+        return True
+
+    def _begin_epoch(self, clock: SensorClock) -> None:
+        self._epoch = SensorEpoch(clock, self._expected_pulses())
+        self._epoch_used = False
+
+    def _expected_pulses(self) -> PulseTrain | None:
+        return self._pulses if self._settings.trigger_source == "stage" else None
+
+    def _push(self, packet: Packet) -> None:
+        missing = 0 if self._next_seq is None else packet.seq - self._next_seq
+        self.packets_lost += missing
+        time_us = self._reconstructor.time_us if self._reconstructor is not None else None
+        # Without a number left out, the host may have stalled.
+        if packet.stamp_ns - self._last_stamp_ns > _GAP_NS and (
+            missing or skips_time(packet.data, time_us)
+        ):
+            self._retire()
+            self._next_seq = None
+        if self._reconstructor is None:
+            self._wraps = self._missed_wraps(packet, first_time_high_us(packet.data))
+            self._reconstructor = Reconstructor(
+                self.calibration, self._modulation(), self._settings
+            )
+        elif missing:
+            self._reconstructor.note_gap()
+        reconstructor, before_us = self._reconstructor, self._reconstructor.settled_us
+        profiles = reconstructor.push(packet.data)
+        self._observe(packet, before_us, reconstructor)
+        self._collect(profiles)
+        self._next_seq = packet.seq + 1
+        self._last_stamp_ns = packet.stamp_ns
+        self._epoch_used = True
+        self.packets += 1
+
+    def _observe(self, packet: Packet, before_us: int | None, after: Reconstructor) -> None:
+        """Add the packet's stamp and edges to the clock."""
+        assert self._epoch is not None
+        shift_us = self._wraps * WRAP_US
+        t_us = first_time_us(packet.data, before_us, after.time_us)
+        if t_us is not None:
+            arrival_ns = packet.stamp_ns - self._packet_period_ns
+            clock = self._epoch.clock
+            if not clock.exact and not clock.goes_on(t_us + shift_us, arrival_ns):
+                self.clock_restarts += 1
+                self._begin_epoch(clock := SensorClock())
+            clock.observe(t_us + shift_us, arrival_ns)
+        edges_us, kinds = after.take_stage_edges()
+        self._epoch.edges.add(edges_us + shift_us, kinds)
+
+    def _missed_wraps(self, packet: Packet, high_us: int | None) -> int:
+        """Count the wraps before this packet that a new decoder has not seen."""
+        assert self._epoch is not None
+        clock = self._epoch.clock
+        if packet.seq == 0 or clock.line is None or high_us is None:
+            return 0
+        # In a stream that goes on, the newest time is closer to this packet than a stamp.
+        known_ns = self._last_stamp_ns if self._next_seq == packet.seq else packet.stamp_ns
+        return max(round((clock.to_us(known_ns) - high_us) / WRAP_US), 0)
+
+    def _modulation(self) -> Modulation:
+        assert self._laser is not None
+        modulation, epoch_ns = self._laser
+        if epoch_ns is None or self._epoch is None or not self._epoch.clock.exact:
+            return modulation
+        edge_us = self._epoch.clock.to_us(epoch_ns) - self._wraps * WRAP_US
+        return replace(modulation, on_edge_us=edge_us)
+
+    def _renew(self) -> None:
+        """End the reconstructor; the next packet starts one at the same time."""
+        if self._reconstructor is not None:
+            self._last_stamp_ns = self.processed_until_ns or self._last_stamp_ns
+            self._retire()
+
+    def _retire(self) -> None:
+        """End the reconstructor: close its period, keep its counters."""
+        if self._reconstructor is None:
+            return
+        self._collect(self._reconstructor.flush())
+        self._retired.update(self._reconstructor.counters)
+        self._reconstructor = None
+
+    def _collect(self, profiles: Profiles) -> None:
+        if len(profiles):
+            assert self._epoch is not None
+            self._out.append(TimedProfiles.within(self._epoch, profiles, self._wraps * WRAP_US))
+
+    def _completed(self) -> list[TimedProfiles]:
+        out, self._out = self._out, []
+        return out
+
+
+def clock_statistics(stream: PacketStream) -> dict[str, Any]:
+    """Return offset age, drift and residual of the sensor's clock, and its use of stage edges."""
+    epoch = stream.epoch
+    if epoch is None:
+        return {"clock": "unknown", "clock_restarts": stream.clock_restarts}
+    clock, fit = epoch.clock, epoch.edges.fit
+    source = "stage edges" if clock.from_edges else "packet stamps"
+    residual_ns = clock.residual_ns
+    values: dict[str, Any] = {
+        "clock": "announced" if clock.exact else f"from {source}",
+        "clock_drift_ppm": clock.drift_ppm,
+        "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
+        "clock_offset_age_s": clock.offset_age_us * 1e-6,
+        "clock_restarts": stream.clock_restarts,
+    }
+    if epoch.expects_edges:
+        values |= {
+            "stage_edges_kept": len(epoch.edges),
+            "stage_edges_dropped": epoch.edges.edges_dropped,
+            "stage_edges_used": fit.used if fit is not None else 0,
+            "stage_edges_missing": fit.missing if fit is not None else 0,
+            "stage_edges_spurious": fit.spurious if fit is not None else 0,
+            "stage_edges_residual_um": fit.residual_mm * 1e3 if fit is not None else float("nan"),
+        }
+    return values

@@ -1,0 +1,97 @@
+"""Event packets and the sensor time they begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from eschorty_ros.core.evt3 import words as w3
+
+WRAP_US = 1 << 24
+# A stream repeats its time far more often than this.
+_WORDS_SEARCHED = 8192
+# A stream without losses skips less of its own time than this between two packets.
+_STEP_US = 100_000
+# A packet at most so many numbers back that is stamped no later was overtaken in transit.
+_OVERTAKEN = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One ``EventPacket``: ``data`` is a buffer of EVT3 words, ``stamp_ns`` its arrival time."""
+
+    seq: int
+    stamp_ns: int
+    data: Any
+
+
+def first_time_high_us(data: Any) -> int | None:
+    """Return the time (us, modulo 2^24) of the first TIME_HIGH word, ``None`` without one."""
+    words = _words(data)
+    found = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
+    return int(words[found[0]] & 0xFFF) << 12 if found.size else None
+
+
+def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int | None:
+    """Return the latest known sensor time at or before a packet's first bytes.
+
+    Parameters
+    ----------
+    data : buffer of EVT3 words
+    before_us, after_us : int, optional
+        Times the decoder had reached before and after the packet; a time outside comes from a
+        broken word.
+
+    Returns
+    -------
+    int or None
+        us; ``None`` without any time.
+    """
+    t_us = _first_word_us(data, before_us)
+    if after_us is None or (t_us is not None and (before_us or 0) <= t_us <= after_us):
+        return t_us
+    return before_us
+
+
+def overtaken(packet: Packet, next_seq: int | None, last_stamp_ns: int) -> bool:
+    """Return whether a packet came twice or too late, as opposed to a restart of the stream."""
+    if next_seq is None or packet.stamp_ns > last_stamp_ns:
+        return False
+    return 0 < packet.seq < next_seq <= packet.seq + _OVERTAKEN
+
+
+def skips_time(data: Any, before_us: int | None) -> bool:
+    """Return whether part of the stream is missing between ``before_us`` and this packet.
+
+    Packets that a stalled host stamped late are continuous in sensor time. A missing part need
+    not show in ``seq``: a driver numbers what it sends, and sends nothing without a subscriber.
+    """
+    high_us = first_time_high_us(data)
+    if high_us is None or before_us is None:
+        return False
+    return _STEP_US < (high_us - (before_us & ~0xFFF)) % WRAP_US < WRAP_US - _STEP_US
+
+
+def _first_word_us(data: Any, before_us: int | None) -> int | None:
+    words = _words(data)[:_WORDS_SEARCHED]
+    low = np.flatnonzero(words >> 12 == w3.TIME_LOW)
+    high = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
+    if high.size and (low.size == 0 or high[0] < low[0]):
+        until = low[0] if low.size else words.size
+        t_us = int(words[high[high < until][-1]] & 0xFFF) << 12
+    elif low.size and before_us is not None:
+        t_us = before_us & ~0xFFF
+    else:
+        return None
+    if low.size:
+        t_us |= int(words[low[0]] & 0xFFF)
+    if before_us is None:
+        return t_us
+    return t_us + round((before_us - t_us) / WRAP_US) * WRAP_US
+
+
+def _words(data: Any) -> np.ndarray:
+    view = memoryview(data).cast("B")
+    return np.frombuffer(view[: len(view) & ~1], dtype="<u2")

@@ -1,0 +1,239 @@
+"""Packets and stage samples in, live profiles, points and scans out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.clocks.clock import NS_PER_US
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.reconstruction import Settings, add_stage, place
+from eschorty_ros.live.calibration_capture import Capture
+from eschorty_ros.live.packet_stream import PacketStream
+from eschorty_ros.live.packet_times import Packet
+from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
+from eschorty_ros.live.sensor_epoch import TimedProfiles
+from eschorty_ros.live.stage_placement import StagePlacer
+
+
+@dataclass(frozen=True, slots=True)
+class ScanReport:
+    """An assembled scan, and the losses while it was collected."""
+
+    scan: AssembledScan
+    events: int
+    packets_lost: int
+    events_dropped: int
+    points_without_stage: int
+    points_outside: int
+    points_over_limit: int
+
+    @property
+    def message(self) -> str:
+        """The losses, or why a scan without points is empty; ``""`` when nothing was lost."""
+        notes = []
+        if self.points_without_stage:
+            notes.append(f"{self.points_without_stage} points had no stage position")
+        if self.points_over_limit:
+            notes.append(f"{self.points_over_limit} points were over the scan's limit")
+        if not notes and not len(self.scan.points):
+            notes.append(self._why_empty())
+        return "; ".join(notes)
+
+    def _why_empty(self) -> str:
+        if not self.events:
+            return "no points: no events came; look at the camera, its lens cap and the laser"
+        if not self.points_outside:
+            return (
+                f"no points: nothing blinks with the laser in {self.events} events; look at the "
+                "laser's frequency, at the focus and at what the line falls on"
+            )
+        return (
+            f"no points: all {self.points_outside} lie outside start to stop; events and stage "
+            "positions are not of one time: look at the camera's and the stage's clock"
+        )
+
+
+class Pipeline:
+    """Runs packet stream, stage placement and scan buffer; used by one thread.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    settings : Settings
+    clock_timeout_s, stage_gap_s, stage_timeout_s, packet_period_s : float
+        See ``PacketStream`` and ``StagePlacer``.
+
+    Attributes
+    ----------
+    capture : Capture or None
+        Receives a calibration's events and placed profiles while it is set.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        settings: Settings,
+        clock_timeout_s: float,
+        stage_gap_s: float,
+        stage_timeout_s: float,
+        packet_period_s: float = 0.0,
+    ) -> None:
+        self.calibration = calibration
+        self.model = calibration.model()
+        self.stream = PacketStream(calibration, settings, clock_timeout_s, packet_period_s)
+        self.placer = StagePlacer(stage_gap_s, stage_timeout_s)
+        self.profiles = 0
+        self.points = 0
+        self.capture: Capture | None = None
+        self._fresh: list[TimedProfiles] = []
+        self._buffer: ScanBuffer | None = None
+        self._at_begin: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+    @property
+    def scan_id(self) -> str:
+        """Identifier of the scan being collected, ``""`` without one."""
+        return self._buffer.scan_id if self._buffer is not None else ""
+
+    def add_packet(self, packet: Packet, now_s: float) -> None:
+        """Queue a packet and reconstruct the packets that need not wait."""
+        self.stream.add(packet, now_s)
+        self._receive(self.stream.process(now_s), now_s)
+        if self.capture is not None:
+            self.capture.packet(packet)
+
+    def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
+        """Return the profiles completed and the points placed since the last call."""
+        self._receive(self.stream.process(now_s), now_s)
+        self.stream.fit_edges(self.placer.track)
+        ready = self.placer.ready(now_s)
+        if self.capture is not None:
+            for timed, stage_mm in ready:
+                self.capture.profiles(timed, stage_mm)
+        placed = [self._place(timed, mm) for timed, mm in ready]
+        for part in placed:
+            self.points += len(part)
+            if self._buffer is not None:
+                self._buffer.add(part)
+        fresh, self._fresh = self._fresh, []
+        return fresh, placed
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Use ``calibration`` for packets processed later.
+
+        Raises
+        ------
+        ArgumentError
+            While a scan is being collected: one scan has one calibration.
+        """
+        if self._buffer is not None:
+            raise ArgumentError(
+                f"scan {self._buffer.scan_id!r} is being collected; end it before changing the "
+                "calibration"
+            )
+        self.stream.set_calibration(calibration)
+        self.calibration = calibration
+        self.model = calibration.model()
+
+    def begin_scan(self, scan_id: str, start_mm: float, stop_mm: float) -> None:
+        """Start collecting; a repeated request, as after a lost answer, changes nothing.
+
+        Raises
+        ------
+        ArgumentError
+            When another scan is being collected already, or for bad limits.
+        """
+        if self._buffer is not None:
+            if self._buffer.scan_id == scan_id:
+                return
+            raise ArgumentError(
+                f"scan {self._buffer.scan_id!r} is being collected; end it before beginning "
+                f"{scan_id!r}"
+            )
+        if self.capture is not None:
+            raise ArgumentError("a calibration is running; wait for its end or cancel it")
+        self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
+        self._at_begin = self._losses()
+
+    def set_capture(self, capture: Capture | None) -> None:
+        """Start to feed a calibration's capture, or stop with ``None``.
+
+        Raises
+        ------
+        ArgumentError
+            While a scan is being collected.
+        """
+        if capture is not None and self._buffer is not None:
+            raise ArgumentError(
+                f"scan {self._buffer.scan_id!r} is being collected; calibrate after its end"
+            )
+        self.capture = capture
+
+    def close_period(self, scan_id: str, now_s: float) -> None:
+        """Begin the end of a scan: complete the open period, since the laser is off.
+
+        Raises
+        ------
+        ArgumentError
+            When ``scan_id`` is not the scan being collected.
+        """
+        if self._buffer is None or self._buffer.scan_id != scan_id:
+            raise ArgumentError(
+                f"scan {scan_id!r} is not being collected; "
+                + (f"end {self.scan_id!r} or " if self.scan_id else "")
+                + "begin it first"
+            )
+        self._receive(self.stream.flush(), now_s)
+
+    def end_scan(self) -> ScanReport:
+        """Return the scan that was collected.
+
+        Points are placed again, by the clock as fitted to the entire sweep.
+        """
+        assert self._buffer is not None
+        buffer, self._buffer = self._buffer, None
+        self.stream.fit_edges(self.placer.track, now=True)
+        scan = buffer.assemble(self._placed_again)
+        events, lost, dropped, without = np.subtract(self._losses(), self._at_begin).tolist()
+        return ScanReport(
+            scan, events, lost, dropped, without, buffer.points_outside, buffer.points_over_limit
+        )
+
+    def _receive(self, timed: list[TimedProfiles], now_s: float) -> None:
+        for part in timed:
+            self.profiles += part.profiles.profile_count
+            self._fresh.append(part)
+            self.placer.add_profiles(part, now_s)
+
+    def _place(self, timed: TimedProfiles, stage_mm: np.ndarray) -> PlacedPoints:
+        points = place(timed.profiles, self.model, stage_mm, self.calibration.stage_direction)
+        return PlacedPoints(points, timed.t_ns, timed.edge_ns, stage_mm, timed.sensor)
+
+    def _placed_again(self, part: PlacedPoints) -> PlacedPoints:
+        if part.sensor is None:
+            return part
+        t_ns, edge_ns = part.sensor.to_ns()
+        stage_mm = self.placer.track.position_mm(t_ns // NS_PER_US)
+        # The odometry is bounded: points from before its begin stay in their place.
+        known = np.isfinite(stage_mm)
+        stage_mm = np.where(known, stage_mm, part.stage_mm)
+        points = part.points.copy()
+        add_stage(points, stage_mm - part.stage_mm, self.calibration.stage_direction)
+        return PlacedPoints(
+            points,
+            np.where(known, t_ns, part.t_ns),
+            np.where(known, edge_ns, part.edge_ns),
+            stage_mm,
+            part.sensor,
+        )
+
+    def _losses(self) -> tuple[int, int, int, int]:
+        counters = self.stream.counters
+        return (
+            counters["events"],
+            self.stream.packets_lost,
+            counters["events_dropped"],
+            self.placer.points_without_stage,
+        )

@@ -1,0 +1,142 @@
+"""The clock of the sensor between two starts of the camera, and profiles timed by it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.clocks.clock import SensorClock, StageTrack
+from eschorty_ros.core.clocks.edge_clock import EdgeClock
+from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.core.reconstruction.profiles import Profiles
+
+_UNSEEN_US = -(1 << 62)
+_PULSES_MISSING = 30
+
+
+class SensorEpoch:
+    """The clock of an interval in which sensor time never goes back.
+
+    Parameters
+    ----------
+    clock : SensorClock
+    pulses : PulseTrain or None
+        Where the stage gives pulses to the camera's trigger input, if it is wired to the stage.
+
+    Attributes
+    ----------
+    clock : SensorClock
+    edges : EdgeClock
+    edges_missing : bool
+        Whether the stage has passed many pulses since the last edge that fits.
+    """
+
+    def __init__(self, clock: SensorClock, pulses: PulseTrain | None = None) -> None:
+        self.clock = clock
+        self.edges = EdgeClock(pulses)
+        self.edges_missing = False
+        self._passed_mm = 0.0
+        self._position_mm: float | None = None
+
+    @property
+    def expects_edges(self) -> bool:
+        """Whether the clock is fitted to edges of the stage."""
+        return self.edges.pulses is not None and not self.clock.exact
+
+    def set_pulses(self, pulses: PulseTrain | None) -> None:
+        """Expect other pulses from now on, or none."""
+        if pulses != self.edges.pulses:
+            self.edges = EdgeClock(pulses)
+            self.clock.adopt(None)
+
+    def fit_edges(self, track: StageTrack, *, now: bool = False) -> None:
+        """Fit the clock to the edges that are due, with ``now`` to all of them."""
+        arrivals = self.clock.arrival_line
+        if arrivals is None or not self.expects_edges:
+            return
+        if self.edges.update(track, arrivals, now=now):
+            assert self.edges.fit is not None
+            self.clock.adopt(self.edges.fit.line)
+            self._passed_mm = 0.0
+        self._count_pulses(track)
+
+    def _count_pulses(self, track: StageTrack) -> None:
+        assert self.edges.pulses is not None
+        if track.last_us is None:
+            return
+        position_mm = float(track.position_mm(np.array([track.last_us]))[0])
+        if self._position_mm is not None:
+            self._passed_mm += abs(position_mm - self._position_mm)
+        self._position_mm = position_mm
+        self.edges_missing = self._passed_mm > _PULSES_MISSING * self.edges.pulses.interval_mm
+
+    def covered(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which sensor times lie before the last fitted edge; all without edges."""
+        if not self.expects_edges:
+            return np.ones(t_us.shape, dtype=bool)
+        until_us = self.edges.until_us
+        return t_us <= (_UNSEEN_US if until_us is None else until_us)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTimes:
+    """Sensor times of points and of their periods' rising edges, int64 us, within one epoch."""
+
+    epoch: SensorEpoch
+    t_us: NDArray[np.int64]
+    edge_us: NDArray[np.int64]
+
+    def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> SensorTimes:
+        """Return the points where ``mask`` is set."""
+        return SensorTimes(self.epoch, self.t_us[mask], self.edge_us[mask])
+
+    def to_ns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the ROS times by the clock as it is now."""
+        return self.epoch.clock.to_ns(self.t_us), self.epoch.clock.to_ns(self.edge_us)
+
+
+@dataclass(frozen=True, slots=True)
+class TimedProfiles:
+    """Profiles with int64 ROS nanoseconds of each point and of its period's rising edge.
+
+    ``sensor`` holds the sensor times while the clock may still improve.
+    """
+
+    profiles: Profiles
+    t_ns: NDArray[np.int64]
+    edge_ns: NDArray[np.int64]
+    sensor: SensorTimes | None = None
+
+    @classmethod
+    def within(cls, epoch: SensorEpoch, profiles: Profiles, shift_us: int) -> TimedProfiles:
+        """Make profiles from some whose times are ``shift_us`` less than the epoch's."""
+        sensor = SensorTimes(epoch, profiles.t_us + shift_us, profiles.edge_us + shift_us)
+        return cls(profiles, *sensor.to_ns(), None if epoch.clock.exact else sensor)
+
+    def select(self, mask: NDArray[np.bool_]) -> TimedProfiles:
+        """Return the points where ``mask`` is set."""
+        sensor = None if self.sensor is None else self.sensor.select(mask)
+        return TimedProfiles(
+            self.profiles.select(mask), self.t_ns[mask], self.edge_ns[mask], sensor
+        )
+
+    def retimed(self) -> TimedProfiles:
+        """Return the same points with ROS times by the clock as it is now."""
+        if self.sensor is None:
+            return self
+        t_ns, edge_ns = self.sensor.to_ns()
+        return replace(self, t_ns=t_ns, edge_ns=edge_ns)
+
+    def earliest_ns(self) -> int:
+        """Return the ROS time of the first point by the clock as it is now."""
+        if self.sensor is None:
+            return int(self.t_ns.min())
+        return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.min()))
+
+    def covered(self) -> NDArray[np.bool_]:
+        """Return which points' times are as good as they will be while the stage moves."""
+        if self.sensor is None:
+            return np.ones(len(self.t_ns), dtype=bool)
+        return self.sensor.epoch.covered(self.sensor.t_us)

@@ -1,0 +1,113 @@
+"""Profiles wait here until the stage's position at their time is known."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.clocks.clock import NS_PER_US, StageTrack
+from eschorty_ros.live.sensor_epoch import TimedProfiles
+
+_HISTORY_US = 600_000_000
+# Odometry comes in order: a stamp further back than this comes from a clock that was set.
+_CLOCK_BACK_US = 100_000
+# A stage at rest gives no pulses, and a wire may be off: longest wait for an edge.
+_EDGE_WAIT_S = 0.3
+
+
+class StagePlacer:
+    """Joins profiles and stage positions by time; interpolates, never extrapolates.
+
+    A profile's ROS times are computed when its position is known, by the clock as it is then.
+    Where edges of the stage are expected, a profile waits until edges cover its time.
+
+    Parameters
+    ----------
+    gap_s : float
+        Longest time between two stage samples that is bridged; 0 bridges any.
+    timeout_s : float
+        Longest time (steady clock) a profile waits for a stage position.
+
+    Attributes
+    ----------
+    points_without_stage : int
+        Points discarded because no position covers their time.
+    waiting : int
+        Points that wait for a stage position.
+    track_restarts : int
+        Restarts of the odometry because its stamps went back: the clock was set, or a recording
+        is played again.
+    track : StageTrack
+        The odometry over ROS time, us, since the last restart.
+    """
+
+    def __init__(self, gap_s: float, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self.points_without_stage = 0
+        self.waiting = 0
+        self.track_restarts = 0
+        self._late_before = 0
+        self.track = StageTrack(max_gap_us=round(gap_s * 1e6) or None)
+        self._waiting: deque[tuple[float, TimedProfiles]] = deque()
+
+    @property
+    def late_samples(self) -> int:
+        """Stage samples left out because they were not later than the one before."""
+        return self._late_before + self.track.dropped
+
+    def set_gap(self, gap_s: float) -> None:
+        """Change the longest time between two samples that is bridged."""
+        self.track.max_gap_us = round(gap_s * 1e6) or None
+
+    def add_stage(self, t_ns: int, position_mm: float) -> None:
+        """Add one stage sample at ROS time ``t_ns``."""
+        t_us = t_ns // NS_PER_US
+        if self.track.last_us is not None and t_us < self.track.last_us - _CLOCK_BACK_US:
+            self._late_before += self.track.dropped
+            self.track = StageTrack(self.track.max_gap_us)
+            self.track_restarts += 1
+        self.track.append(t_us, position_mm)
+        assert self.track.last_us is not None
+        self.track.forget_before(self.track.last_us - _HISTORY_US)
+
+    def add_profiles(self, timed: TimedProfiles, now_s: float) -> None:
+        """Queue profiles that arrived at ``now_s`` of the steady clock."""
+        if len(timed.profiles):
+            self._waiting.append((now_s, timed))
+            self.waiting += len(timed.profiles)
+
+    def holds(self, until_s: float) -> bool:
+        """Return whether a profile that arrived by ``until_s`` of the steady clock waits."""
+        return bool(self._waiting) and self._waiting[0][0] <= until_s
+
+    def ready(self, now_s: float) -> list[tuple[TimedProfiles, NDArray[np.float64]]]:
+        """Return the profiles whose positions (mm, float64) are known, oldest first."""
+        placed = []
+        still: deque[tuple[float, TimedProfiles]] = deque()
+        last_us = self.track.last_us
+        for arrived_s, waiting in self._waiting:
+            expired = now_s - arrived_s > self.timeout_s
+            if not expired and (last_us is None or waiting.earliest_ns() // NS_PER_US > last_us):
+                still.append((arrived_s, waiting))
+                continue
+            timed = waiting.retimed()
+            t_us = timed.t_ns // NS_PER_US
+            early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
+            if now_s - arrived_s <= min(_EDGE_WAIT_S, self.timeout_s):
+                early |= ~timed.covered()
+            if expired:
+                self.points_without_stage += int(np.count_nonzero(early))
+            elif early.any():
+                still.append((arrived_s, timed.select(early)))
+            if early.all():
+                continue
+            position_mm = self.track.position_mm(t_us)
+            known = ~early & ~np.isnan(position_mm)
+            self.points_without_stage += int(np.count_nonzero(~early & ~known))
+            if known.any():
+                placed.append((timed.select(known), position_mm[known]))
+        self._waiting = still
+        self.waiting = sum(len(timed.profiles) for _, timed in still)
+        return placed

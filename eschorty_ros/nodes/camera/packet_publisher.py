@@ -1,0 +1,103 @@
+"""Publishing a camera's chunks as numbered event packets."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Iterable
+from typing import Any
+
+from event_camera_msgs.msg import EventPacket
+
+from eschorty_ros.core.evt3.word_count import WordCounter
+from eschorty_ros.hardware.base.protocols import EventChunk
+from eschorty_ros.live.packet_cutting import Packetizer
+from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+
+
+class PacketPublisher:
+    """Publishes one camera's stream; used by one thread at a time.
+
+    A gap skips one number, a restart resets it to 0, so that subscribers notice both. Bytes
+    without a subscriber count as a gap after the first packet.
+
+    Parameters
+    ----------
+    publisher : rclpy publisher of EventPacket
+    width, height : int
+    frame_id : str
+
+    Attributes
+    ----------
+    seq : int
+        Number of the next packet.
+    packets, published_bytes, unsubscribed_bytes : int
+        Packets and bytes published, and bytes without a subscriber.
+    words : WordCounter
+        Counts of the words in all of them.
+    """
+
+    def __init__(self, publisher: Any, width: int, height: int, frame_id: str) -> None:
+        self.seq = 0
+        self.packets = 0
+        self.published_bytes = 0
+        self.unsubscribed_bytes = 0
+        self.words = WordCounter()
+        self._publisher = publisher
+        self._width = width
+        self._height = height
+        self._frame_id = frame_id
+        self._gap = False
+        self._packetizer = Packetizer(0, 2)
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Events that the sensor reports as dropped, by name."""
+        words = self.words
+        return {
+            "sensor_drop_words": words.drop_words,
+            "erc_events_in": words.erc_events_in,
+            "erc_events_dropped": max(words.erc_events_in - words.erc_events_out, 0),
+        }
+
+    def set_thresholds(self, age_ns: int, size_bytes: int) -> None:
+        """Publish packets at this age or size."""
+        self._packetizer = Packetizer(age_ns, size_bytes)
+
+    def push(self, chunk: EventChunk | None, now_ns: int) -> None:
+        """Publish the packets that are due; ``None`` stands for a wait without data."""
+        if chunk is None:
+            self._publish(self._packetizer.push(b"", now_ns))
+            return
+        if chunk.gap or chunk.restarted:
+            self.flush()
+            self.seq = 0 if chunk.restarted else self.seq + 1
+        self.words.add(chunk.data)
+        self._publish(self._packetizer.push(chunk.data, chunk.arrival_ns))
+
+    def flush(self) -> None:
+        """Publish the last, incomplete packet."""
+        self._publish(self._packetizer.flush())
+
+    def _publish(self, payloads: Iterable[tuple[int, bytes]]) -> None:
+        for stamp_ns, payload in payloads:
+            if self._publisher.get_subscription_count() == 0:
+                self.unsubscribed_bytes += len(payload)
+                self._gap = True
+                continue
+            if self._gap and self.seq:
+                self.seq += 1
+            self._gap = False
+            message = EventPacket(
+                height=self._height,
+                width=self._width,
+                seq=self.seq,
+                encoding="evt3",
+                is_bigendian=False,
+                events=array.array("B", payload),
+            )
+            message.header.stamp = stamp_from_ns(stamp_ns)
+            message.header.frame_id = self._frame_id
+            self._publisher.publish(message)
+            self.seq += 1
+            self.packets += 1
+            self.published_bytes += len(payload)

@@ -1,0 +1,141 @@
+"""Parameters of the camera node, with the names of ``metavision_driver`` where it has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.hardware.camera.anti_flicker import FREQUENCY_HZ, AntiFlicker
+from eschorty_ros.hardware.camera.biases import BIASES, load_bias_file
+from eschorty_ros.hardware.camera.event_rate import RATE_MAX
+from eschorty_ros.hardware.camera.event_trail import THRESHOLD_US, TYPES
+from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
+from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACKET_PERIOD_US
+from eschorty_ros.hardware.camera.pixel_selection import windows_of
+from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
+from eschorty_ros.nodes.ros.parameters import Param
+
+_IGNORED = "; the emulated camera ignores it"
+_FULL_FRAME = (0, 0, WIDTH, HEIGHT)
+
+_BIAS_TABLE = tuple(
+    Param(
+        name,
+        0,
+        f"offset from the factory trim, acts on the {info.acts_on}; "
+        f"normal range {info.normal[0]} to {info.normal[1]}"
+        + (_IGNORED if name == "bias_hpf" else ""),
+        "",
+        *info.wide,
+        dynamic=True,
+    )
+    for name, info in BIASES.items()
+)
+
+EVK4_TABLE = (
+    Param("serial", "", "serial number of the camera (hex); empty: the only one there is"),
+    Param("backend", "libusb", "USB backend: libusb, or module:callable[?argument]"),
+    Param("reconnect_attempts", 6, "times a lost camera is looked for; 0: it fails", "", 0, 1000),
+    Param("bias_file", "", "file of biases, read at start where a bias_* is 0; save_biases writes"),
+    Param(
+        "bias_range",
+        "normal",
+        "ranges of the biases: wide ones may make the sensor noisy or insensitive",
+        choices=("normal", "wide"),
+    ),
+    *_BIAS_TABLE,
+    Param(
+        "mipi_frame_period",
+        PACKET_PERIOD_DEFAULT_US,
+        "period of the sensor's packets (latency), in steps of 16; -1 leaves 4000",
+        "us",
+        LEAVE,
+        PACKET_PERIOD_US[1],
+    ),
+    Param(
+        "erc_mode",
+        "na",
+        "event-rate control, off unless enabled: dropped events are counted and bias the centroid",
+        choices=("na", "disabled", "enabled"),
+    ),
+    Param("erc_rate", 100_000_000, "rate beyond which it drops", "events/s", 5_000, RATE_MAX),
+    Param("roi", _FULL_FRAME, "x, y, width, height per window; columns and rows multiply", "px"),
+    Param("hot_pixels", "", "pixels to mask, at most 64: 'x,y x,y'"),
+    Param("trail_filter", False, "filter of trailing events" + _IGNORED),
+    Param("trail_filter_type", "trail", "kind of that filter", choices=TYPES),
+    Param("trail_filter_threshold", 10_000, "its time, in steps of 1 ms", "us", *THRESHOLD_US),
+    Param(
+        "trigger_in_mode",
+        "disabled",
+        "trigger input; an EVK4 has no trigger output",
+        choices=("disabled", "external"),
+    ),
+    Param("anti_flicker", False, "filter of flicker: erases a laser in its band" + _IGNORED),
+    Param("anti_flicker_low", 50, "lower edge of its band", "Hz", *FREQUENCY_HZ),
+    Param("anti_flicker_high", 520, "upper edge of its band", "Hz", *FREQUENCY_HZ),
+    Param("anti_flicker_band_pass", False, "keep what flickers in the band instead"),
+)
+
+
+def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
+    """Return the settings of an EVK4 from the node's parameters.
+
+    Raises
+    ------
+    ArgumentError
+        For a value outside its range.
+    FormatError
+        For a malformed bias file.
+    """
+    roi = tuple(parameters["roi"])
+    enabled = parameters["erc_mode"] == "enabled"
+    return CameraSettings(
+        biases=_biases(parameters),
+        wide_biases=parameters["bias_range"] == "wide",
+        packet_period_us=parameters["mipi_frame_period"],
+        erc_rate=parameters["erc_rate"] if enabled else None,
+        anti_flicker=_anti_flicker(parameters),
+        trail_filter=parameters["trail_filter_type"] if parameters["trail_filter"] else "",
+        trail_threshold_us=parameters["trail_filter_threshold"],
+        windows=() if roi == _FULL_FRAME else windows_of(roi),
+        hot_pixels=_pixels(parameters["hot_pixels"]),
+        trigger_input=parameters["trigger_in_mode"] == "external",
+    )
+
+
+def _anti_flicker(parameters: Mapping[str, Any]) -> AntiFlicker | None:
+    """Return the band of the anti-flicker filter, ``None`` when it is off."""
+    if not parameters["anti_flicker"]:
+        return None
+    return AntiFlicker(
+        parameters["anti_flicker_low"],
+        parameters["anti_flicker_high"],
+        parameters["anti_flicker_band_pass"],
+    )
+
+
+def missing_bias_file(parameters: Mapping[str, Any]) -> str:
+    """Return one line when the bias file does not exist yet, else an empty string."""
+    path = parameters["bias_file"]
+    if not path or Path(path).exists():
+        return ""
+    return f"bias_file {path!r} does not exist yet; save_biases makes it"
+
+
+def _biases(parameters: Mapping[str, Any]) -> dict[str, int]:
+    given = {name: parameters[name] for name in BIASES if parameters[name]}
+    path = parameters["bias_file"]
+    kept = load_bias_file(path) if path and not missing_bias_file(parameters) else {}
+    return {**kept, **given}
+
+
+def _pixels(text: str) -> tuple[tuple[int, int], ...]:
+    pixels = []
+    for pair in text.split():
+        x, _, y = pair.partition(",")
+        if not (x.isdecimal() and y.isdecimal()):
+            raise ArgumentError(f"hot_pixels holds {pair!r}; write 'x,y x,y'")
+        pixels.append((int(x), int(y)))
+    return tuple(pixels)

@@ -1,0 +1,181 @@
+"""All nodes in one process, spinning beside a client's own node; the bench in another one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import rclpy
+import yaml
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.emulation.bench.process import bench_process
+from eschorty_ros.nodes.camera.node import CameraNode
+from eschorty_ros.nodes.laser.node import LaserNode
+from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
+from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.spin import make_safe, turn, undisturbed
+from eschorty_ros.nodes.scanner.node import ScannerNode
+from eschorty_ros.nodes.stage.node import StageNode
+
+NAMESPACE = "/eschorty"
+DEVICES = ("camera", "laser", "stage")
+NODES = {
+    "camera": CameraNode,
+    "laser": LaserNode,
+    "stage": StageNode,
+    "reconstruction": ReconstructionNode,
+    "scanner": ScannerNode,
+}
+THREADS = 12
+START_S = 300.0
+"""A slow machine's first start compiles for minutes."""
+_POLL_S = 0.02
+
+Tables = dict[str, dict[str, Any]]
+
+
+def lossless_events() -> Tables:
+    """Parameters that let no event get lost; an emulated camera can wait."""
+    topic = f"{NAMESPACE}/camera/events"
+    return {
+        node: {"qos_overrides": {topic: {end: {"reliability": "reliable"}}}}
+        for node, end in (("camera", "publisher"), ("reconstruction", "subscription"))
+    }
+
+
+class Composition:
+    """The running nodes and a client's node among them."""
+
+    def __init__(self, client: Node, nodes: list[Node]) -> None:
+        self.client = client
+        self._nodes = nodes
+
+    def wait_until_active(self, action: Any) -> None:
+        """Wait until every node is active and ``action``'s server is there.
+
+        Raises
+        ------
+        DeviceError
+            When a node failed or takes far too long.
+        """
+        wait(
+            lambda: self._active() and action.server_is_ready(),
+            START_S,
+            lambda: "; ".join(("the nodes are not active", *self._waiting())),
+        )
+
+    def _waiting(self) -> list[str]:
+        return [
+            f"{node.get_name()}: {reason}"
+            for node in self._nodes
+            if (reason := getattr(node, "waiting", ""))
+        ]
+
+    def _active(self) -> bool:
+        failed = [
+            f"{node.get_name()}: {reason.splitlines()[-1]}"
+            for node in self._nodes
+            if (reason := getattr(node, "failure", ""))
+        ]
+        if failed:
+            raise DeviceError("; ".join(failed))
+        return all(getattr(node, "active", True) for node in self._nodes)
+
+
+@contextlib.contextmanager
+def composition(values: Tables, bench: Mapping[str, object] | None = None) -> Iterator[Composition]:
+    """All nodes with these parameters; on leaving, whatever happened, the laser is off.
+
+    With ``bench``, options of ``eschorty-bench``, the devices are emulated by a process of its
+    own that lives as long. Unless ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own,
+    so that they meet no other instrument.
+    """
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with contextlib.ExitStack() as ending:
+        folder = Path(ending.enter_context(tempfile.TemporaryDirectory(prefix="eschorty_")))
+        tables = {name: dict(table) for name, table in values.items()}
+        if bench is not None:
+            for name in DEVICES:
+                tables.setdefault(name, {})["bench"] = str(folder / "bench")
+            ending.enter_context(bench_process(folder / "bench", bench))
+        file = folder / "parameters.yaml"
+        file.write_text(_parameter_file(tables))
+        yield ending.enter_context(_running(file))
+
+
+@contextlib.contextmanager
+def _running(parameter_file: Path) -> Iterator[Composition]:
+    nodes: list[Node] = []
+    rclpy.init(
+        args=[
+            "--ros-args",
+            *("-r", f"__ns:={NAMESPACE}"),
+            *("--params-file", str(parameter_file)),
+            *("--log-level", "warn"),
+        ],
+        domain_id=None if os.environ.get("ROS_DOMAIN_ID") else free_domain(),
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
+    executor = MultiThreadedExecutor(THREADS)
+    ending = threading.Event()
+    thread = threading.Thread(target=_spin, args=(executor, ending), name="nodes")
+    try:
+        for factory in NODES.values():
+            nodes.append(factory())
+        nodes.append(client := Node("eschorty_client"))
+        made = Composition(client, nodes)
+        for node in nodes:
+            executor.add_node(node)
+        thread.start()
+        yield made
+    finally:
+        with undisturbed():
+            make_safe(nodes)
+            ending.set()
+            # An ended context also ends callbacks that wait, such as homing.
+            rclpy.try_shutdown()
+            if thread.is_alive():
+                thread.join(5.0)
+            executor.shutdown(timeout_sec=2.0)
+            for node in nodes:
+                node.destroy_node()
+
+
+def _parameter_file(values: Tables) -> str:
+    return yaml.safe_dump(
+        {f"{NAMESPACE}/{node}": {"ros__parameters": table} for node, table in values.items()}
+    )
+
+
+def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
+    # Shutting an executor down while it spins raises in this thread, so it is asked to end.
+    try:
+        while not ending.is_set():
+            turn(executor)
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A callback that publishes while the context ends fails; that is no news.
+        if not ending.is_set():
+            raise
+
+
+def wait(condition: Callable[[], Any], limit_s: float, fault: str | Callable[[], str]) -> None:
+    """Wait for ``condition``; raises ``DeviceError`` with ``fault`` after ``limit_s``."""
+    # Polled from the main thread, so that Ctrl-C arrives at once.
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > end_s:
+            text = fault if isinstance(fault, str) else fault()
+            raise DeviceError(f"{text} after {limit_s:.0f} s; look at the log above")
+        time.sleep(_POLL_S)

@@ -1,0 +1,67 @@
+"""A ROS parameter file for real devices: what `eschorty scan --hardware` reads."""
+
+from __future__ import annotations
+
+import os
+from difflib import get_close_matches
+from typing import Any
+
+from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.base.yaml_file import read_yaml
+from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.nodes.camera import node as camera
+from eschorty_ros.nodes.laser import node as laser
+from eschorty_ros.nodes.reconstruction import parameters as reconstruction_parameters
+from eschorty_ros.nodes.ros import lifecycle
+from eschorty_ros.nodes.ros.drivers import REAL
+from eschorty_ros.nodes.ros.parameters import from_settings
+from eschorty_ros.nodes.scanner import node as scanner
+from eschorty_ros.nodes.stage import node as stage
+
+_NAMESPACE = "/eschorty/"
+_KEY = "ros__parameters"
+TABLES = {
+    "camera": camera.TABLE,
+    "laser": laser.TABLE,
+    "stage": stage.TABLE,
+    "reconstruction": (*reconstruction_parameters.TABLE, *from_settings(Settings)),
+    "scanner": scanner.TABLE,
+}
+
+
+def read_hardware(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
+    """Read parameters by node; camera, laser and stage get their real drivers unless told.
+
+    The file is what launch files and ``--params-file`` take, with whole node names:
+    ``/eschorty/laser: {ros__parameters: {high_v: 3.3}}``.
+
+    Raises
+    ------
+    FormatError
+        When the file cannot be read, or names a node or a parameter that does not exist.
+    """
+    data = read_yaml(path, FormatError) or {}
+    if not isinstance(data, dict):
+        raise FormatError(f"{path}: it holds {data!r}; write node names with their parameters")
+    tables: dict[str, dict[str, Any]] = {name: {"driver": real} for name, real in REAL.items()}
+    for full_name, table in data.items():
+        _known(path, "node", full_name, [f"{_NAMESPACE}{name}" for name in TABLES])
+        name = full_name.removeprefix(_NAMESPACE)
+        values = table.get(_KEY) if isinstance(table, dict) and set(table) == {_KEY} else None
+        if not isinstance(values, dict):
+            raise FormatError(
+                f"{path}: {full_name} is {table!r}; write parameters under {_KEY} in it"
+            )
+        names = [param.name for param in (*TABLES[name], lifecycle.AUTO_START)]
+        for parameter in values:
+            _known(path, f"parameter of {full_name}", parameter, names)
+        tables.setdefault(name, {}).update(values)
+    return tables
+
+
+def _known(path: str | os.PathLike[str], what: str, name: object, names: list[str]) -> None:
+    if name in names:
+        return
+    near = get_close_matches(str(name), names, n=1, cutoff=0.5)
+    remedy = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(names)}"
+    raise FormatError(f"{path}: {name!r} is no {what}; {remedy}")

@@ -1,0 +1,130 @@
+"""The calibration in use: told to everybody, exchanged only for one of the same instrument."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.calibration.identity import refuse_other_instrument
+from eschorty_ros.core.calibration.targets import Targets
+from eschorty_ros.core.calibration.targets_file import write_targets
+from eschorty_ros.core.optics.calibration_file import (
+    Calibration,
+    load_calibration,
+    save_calibration,
+)
+from eschorty_ros.msg import ActiveCalibration as ActiveCalibrationMessage
+from eschorty_ros.nodes.reconstruction.calibration_messages import active_message
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.srv import LoadCalibration, SaveCalibration
+
+Use = Callable[[Calibration], None]
+
+
+class ActiveCalibration:
+    """Holds the active calibration, publishes it latched, offers to load and save it.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    calibration : Calibration
+        The one at start: sensor and build that every later one must share.
+    file : str
+        Where it came from.
+    folder : str
+        Where calibrations are written; empty: ``eschorty`` in ROS's home.
+    use : callable
+        Puts a calibration to use, or raises an ``EschortyError`` and leaves all as it was.
+    """
+
+    def __init__(
+        self, node: Node, calibration: Calibration, file: str, folder: str, use: Use
+    ) -> None:
+        self.calibration = calibration
+        self.folder = Path(folder).expanduser() if folder else _home()
+        self._node = node
+        self._use = use
+        self._publisher = node.create_publisher(
+            ActiveCalibrationMessage, "reconstruction/calibration", qos.latched()
+        )
+        # One at a time: loading while a calibration is written must not mix the two.
+        group = MutuallyExclusiveCallbackGroup()
+        for kind, name, callback in (
+            (LoadCalibration, "load_calibration", self._on_load),
+            (SaveCalibration, "save_calibration", self._on_save),
+        ):
+            node.create_service(kind, f"reconstruction/{name}", callback, callback_group=group)
+        self._tell(file)
+
+    def store(self, calibration: Calibration, targets: Targets) -> str:
+        """Write the targets and ``calibration``, then put it to use; the calibration's path.
+
+        Raises
+        ------
+        EschortyError
+            When it belongs to another instrument, cannot be written or cannot be used now; the
+            active one then stays.
+        """
+        refuse_other_instrument(calibration, self.calibration)
+        path = self._default_path(calibration)
+        write_targets(targets_path(path), targets)
+        save_calibration(calibration, path)
+        self._exchange(calibration, str(path))
+        return str(path)
+
+    def _exchange(self, calibration: Calibration, file: str) -> None:
+        self._use(calibration)
+        self.calibration = calibration
+        self._tell(file)
+        self._node.get_logger().info(f"calibration {calibration.id or calibration.name}: {file}")
+
+    def _tell(self, file: str) -> None:
+        now_ns = self._node.get_clock().now().nanoseconds
+        self._publisher.publish(active_message(self.calibration, file, now_ns))
+
+    def _default_path(self, calibration: Calibration) -> Path:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ArgumentError(
+                f"cannot make calibration_folder {str(self.folder)!r} ({error.strerror}); choose "
+                "another"
+            ) from error
+        return self.folder / f"{calibration.id or calibration.name}.yaml"
+
+    def _on_load(self, request: Any, response: Any) -> Any:
+        try:
+            calibration = load_calibration(request.calibration)
+            refuse_other_instrument(calibration, self.calibration)
+            self._exchange(calibration, request.calibration)
+        except EschortyError as error:
+            response.message = str(error)
+            return response
+        response.success, response.id = True, calibration.id or ""
+        return response
+
+    def _on_save(self, request: Any, response: Any) -> Any:
+        calibration = self.calibration
+        try:
+            path = Path(request.path) if request.path else self._default_path(calibration)
+            save_calibration(calibration, path)
+        except EschortyError as error:
+            response.message = str(error)
+            return response
+        response.success, response.file = True, str(path)
+        return response
+
+
+def targets_path(calibration_path: Path) -> Path:
+    """Where the targets of a calibration fitted on the instrument lie."""
+    return calibration_path.with_name(f"{calibration_path.stem}-targets.csv")
+
+
+def _home() -> Path:
+    return Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "eschorty"

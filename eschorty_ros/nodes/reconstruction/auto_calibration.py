@@ -1,0 +1,57 @@
+"""One calibration without being asked: what the launch file runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+from eschorty_ros.action import Calibrate
+from eschorty_ros.core.calibration.targets_file import read_distances
+from eschorty_ros.core.optics.calibration_file import config_file
+from eschorty_ros.nodes.reconstruction.calibration_messages import target_message
+
+
+class AutoCalibration:
+    """Sends one goal to the ``calibrate`` action as soon as it is there.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    distances : str
+        File of what is known of the targets: a name in ``config/`` or a path.
+    method : str
+    capture_s : float
+
+    Raises
+    ------
+    FormatError, CalibrationError
+        When the file cannot be read, or there is none of that name.
+    """
+
+    def __init__(self, node: Node, distances: str, method: str, capture_s: float) -> None:
+        targets = [target_message(target) for target in read_distances(_find(distances))]
+        self._goal = Calibrate.Goal(targets=targets, method=method, capture_time=capture_s)
+        group = ReentrantCallbackGroup()
+        self._client: ActionClient[Any, Any, Any] = ActionClient(
+            node, Calibrate, "calibrate", callback_group=group
+        )
+        self._timer = node.create_timer(
+            0.1, self._send, group, Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    def _send(self) -> None:
+        if self._client.server_is_ready():
+            self._timer.cancel()
+            self._client.send_goal_async(self._goal)
+
+
+def _find(name_or_path: str) -> Path:
+    bare = os.sep not in name_or_path and "." not in name_or_path
+    return config_file(f"{name_or_path}.csv") if bare else Path(name_or_path)

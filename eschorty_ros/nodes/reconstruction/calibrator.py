@@ -1,0 +1,260 @@
+"""The ``calibrate`` action: light the targets, find them, fit, use the fit."""
+
+from __future__ import annotations
+
+import copy
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+
+from eschorty_ros.action import Calibrate
+from eschorty_ros.control.calibration_sequence import check_request, run_capture
+from eschorty_ros.control.scan_sequence import End
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
+from eschorty_ros.core.calibration.calibrate import calibrate
+from eschorty_ros.live.calibration_capture import (
+    Capture,
+    CaptureRequest,
+    Findings,
+    enough_targets,
+    make_capture,
+)
+from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
+from eschorty_ros.nodes.reconstruction.calibration_messages import fill_result, request_from_goal
+from eschorty_ros.nodes.ros.cloud_messages import image_message
+from eschorty_ros.nodes.ros.instrument_client import InstrumentClient
+from eschorty_ros.nodes.ros.spin import unless_shut_down
+from eschorty_ros.nodes.ros.transforms import OPTICAL
+
+_FEEDBACK_S = 0.2
+_LOOK_S = 0.5
+_LOOK_TIMEOUT_S = 2.0
+_LOOK_JOIN_S = 5.0
+_HAND_TIMEOUT_S = 30.0
+
+InWorker = Callable[[Callable[[], None], float], tuple[bool, str]]
+
+
+class Calibrator:
+    """One calibration at a time.
+
+    A goal that cannot be done is accepted and aborted at once, because only a result can carry
+    the reason to the client.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        The reconstruction node.
+    active : ActiveCalibration
+    in_worker : callable
+        Runs a job in the reconstruction's worker: whether it succeeded, and why not.
+    tap : callable
+        Hands the worker a capture to feed, or ``None``; called in the worker. Raises an
+        ``EschortyError`` when it cannot be done now.
+    line_width_px : callable
+        Reads the width of the line from the node's settings.
+    timeouts_s : tuple of float
+        Those of ``InstrumentClient``.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        active: ActiveCalibration,
+        in_worker: InWorker,
+        tap: Callable[[Capture | None], None],
+        line_width_px: Callable[[], float],
+        timeouts_s: tuple[float, float, float],
+    ) -> None:
+        self._node = node
+        self._active = active
+        self._nominal = active.calibration
+        self._in_worker = in_worker
+        self._tap = tap
+        self._line_width_px = line_width_px
+        self._timeouts_s = timeouts_s
+        self._client: InstrumentClient | None = None
+        self._one = threading.Lock()
+        self._idle = threading.Event()
+        self._idle.set()
+        self._ending = False
+        self._server = ActionServer(
+            node,
+            Calibrate,
+            "calibrate",
+            execute_callback=self._execute,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
+
+    @property
+    def busy(self) -> bool:
+        """Whether a calibration is under way."""
+        return not self._idle.is_set()
+
+    def safe_state(self) -> None:
+        """End a capture under way: its way out switches the laser off, its heartbeat stops."""
+        self._ending = True
+        if self._client is not None:
+            self._client.end()
+        self._idle.wait(2.0)
+
+    def _execute(self, goal: Any) -> Any:
+        if not self._one.acquire(blocking=False):
+            return self._refuse(goal, "a calibration is running; wait for its end or cancel it")
+        self._idle.clear()
+        try:
+            request = request_from_goal(goal.request)
+            check_request(request)
+            with unless_shut_down(self._node):
+                return self._calibrate(goal, request)
+            return Calibrate.Result(message="the node was shut down")
+        except EschortyError as error:
+            return self._refuse(goal, str(error))
+        finally:
+            self._idle.set()
+            self._one.release()
+
+    def _calibrate(self, goal: Any, request: CaptureRequest) -> Any:
+        capture = make_capture(request, self._nominal, self._line_width_px())
+        feedback = _Feedback(goal, request, capture, self._in_worker)
+        client = self._made_client()
+        client.prepare(lambda: bool(goal.is_cancel_requested), feedback.send)
+        outcome = run_capture(
+            client, request, lambda: self._hand(capture), lambda: self._hand(None)
+        )
+        result = Calibrate.Result(message=outcome.message)
+        if not self._node.context.ok():
+            return result
+        now_ns = self._node.get_clock().now().nanoseconds
+        result.frame = image_message(capture.frame.image(), now_ns, OPTICAL)
+        if outcome.end is End.SUCCEEDED:
+            try:
+                feedback.send("fitting")
+                findings = capture.find(capture.frame)
+                feedback.show(findings, capture.frame.events)
+                self._fit(findings, request, result)
+                if capture.packets_lost:
+                    result.verdicts = [
+                        *result.verdicts,
+                        f"{capture.packets_lost} packets of events were lost",
+                    ]
+            except EschortyError as error:
+                outcome.end, result.message = End.ABORTED, str(error)
+        return self._closed(goal, outcome.end, result)
+
+    def _fit(self, findings: Findings, request: CaptureRequest, result: Any) -> None:
+        result.rejected = list(findings.rejected)
+        targets = enough_targets(findings, len(request.targets))
+        date = datetime.now(UTC).date().isoformat()
+        report = calibrate(targets, self._nominal, request.method, date=date)  # type: ignore[arg-type]
+        file = self._active.store(report.calibration, targets)
+        fill_result(result, report, file)
+
+    def _closed(self, goal: Any, end: End, result: Any) -> Any:
+        result.success = end is End.SUCCEEDED
+        if result.success:
+            goal.succeed()
+            self._node.get_logger().info(
+                f"calibrated on {len(result.ranges)} targets, residual {result.residual_rms:.2f} "
+                f"px; {'; '.join(result.verdicts)}"
+            )
+        elif end is End.CANCELED and goal.is_cancel_requested:
+            goal.canceled()
+        else:
+            goal.abort()
+            self._node.get_logger().error(f"calibration failed: {result.message}")
+        return result
+
+    def _refuse(self, goal: Any, reason: str) -> Any:
+        self._node.get_logger().error(f"calibration refused: {reason}")
+        goal.abort()
+        return Calibrate.Result(success=False, message=reason)
+
+    def _hand(self, capture: Capture | None) -> None:
+        done, reason = self._in_worker(lambda: self._tap(capture), _HAND_TIMEOUT_S)
+        if not done:
+            raise DeviceError(f"reconstruction: {reason}")
+
+    def _made_client(self) -> InstrumentClient:
+        # Made for the first goal: until then its subscriptions would cost for nothing.
+        if self._client is None:
+            self._client = InstrumentClient(self._node, *self._timeouts_s)
+            if self._ending:
+                self._client.end()
+        return self._client
+
+
+class _Feedback:
+    """What a capture shows while it lasts, looked for in copies of its frame."""
+
+    def __init__(
+        self, goal: Any, request: CaptureRequest, capture: Capture, in_worker: InWorker
+    ) -> None:
+        self._goal = goal
+        self._request = request
+        self._capture = capture
+        self._in_worker = in_worker
+        self._begun_s = self._sent_s = self._looked_s = time.monotonic()
+        self._message = Calibrate.Feedback()
+        # Beside the sequence, whose thread keeps the laser's heartbeat.
+        self._looking = threading.Thread(target=self._look, daemon=True)
+
+    def send(self, phase: str) -> None:
+        """Publish the state when it is due, after a new look when that is due."""
+        now_s = time.monotonic()
+        if phase == self._message.phase and now_s - self._sent_s < _FEEDBACK_S:
+            return
+        message = self._message
+        if phase == "capturing" != message.phase:
+            self._begun_s = self._looked_s = now_s
+        self._sent_s = now_s
+        message.phase = phase
+        if phase == "capturing":
+            share = (now_s - self._begun_s) / self._expected_s()
+            message.progress = min(max(share, 0.0), 1.0)
+            if now_s - self._looked_s >= _LOOK_S and not self._looking.is_alive():
+                self._looked_s = now_s
+                self._looking = threading.Thread(target=self._look, daemon=True)
+                self._looking.start()
+        elif phase in ("finishing", "fitting"):
+            message.progress = 1.0
+        self._goal.publish_feedback(message)
+
+    def _look(self) -> None:
+        copies: list[AggregateFrame] = []
+        self._in_worker(lambda: copies.append(copy.deepcopy(self._capture.frame)), _LOOK_TIMEOUT_S)
+        if not copies:
+            return
+        try:
+            findings = self._capture.find(copies[0])
+        except EschortyError:
+            # A picture that is not complete yet may be ambiguous.
+            findings = Findings()
+        self._note(findings, copies[0].events)
+
+    def show(self, findings: Findings, events: int) -> None:
+        """Publish what the whole capture shows."""
+        if self._looking.is_alive():
+            self._looking.join(_LOOK_JOIN_S)
+        self._note(findings, events)
+        self._goal.publish_feedback(self._message)
+
+    def _note(self, findings: Findings, events: int) -> None:
+        self._message.events = events
+        self._message.posts = findings.posts
+        self._message.matched = len(findings.targets) if findings.targets is not None else 0
+        self._message.residuals = findings.residual_px.tolist()
+
+    def _expected_s(self) -> float:
+        sweep = self._request.sweep
+        if sweep is None:
+            return self._request.capture_s
+        return 2.0 * abs(sweep.stop_mm - sweep.start_mm) / sweep.speed_mm_s

@@ -1,0 +1,251 @@
+"""Node ``reconstruction``: event packets in, profiles, points and assembled scans out."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from event_camera_msgs.msg import EventPacket
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import TimeReference
+from tf2_msgs.msg import TFMessage
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics.calibration_file import Calibration, load_calibration
+from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.core.reconstruction.warm_up import warm_up
+from eschorty_ros.live.job_queue import Mailbox
+from eschorty_ros.live.packet_times import Packet
+from eschorty_ros.live.pipeline import Pipeline
+from eschorty_ros.msg import LaserState, PositionTrigger
+from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
+from eschorty_ros.nodes.reconstruction.auto_calibration import AutoCalibration
+from eschorty_ros.nodes.reconstruction.calibrator import Calibrator
+from eschorty_ros.nodes.reconstruction.outputs import Outputs
+from eschorty_ros.nodes.reconstruction.parameters import TABLE, modulation_override
+from eschorty_ros.nodes.reconstruction.reports import Reports
+from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
+from eschorty_ros.nodes.ros import diagnostics, qos, transforms
+from eschorty_ros.nodes.ros.conversions import laser_settings, mm_from_m, ns_from_stamp, pulse_train
+from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
+from eschorty_ros.nodes.ros.spin import run
+
+_STAGE_DEPTH = 2000
+
+
+class ReconstructionNode(Node):
+    """Callbacks queue; one worker thread computes and publishes.
+
+    Parameters are those of ``core.reconstruction.Settings`` and of ``TABLE``.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        # Before anything can fail: a half-built node is destroyed, too.
+        self._closing = threading.Event()
+        self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
+        super().__init__("reconstruction", **kwargs)
+        table = (*TABLE, *from_settings(Settings, dynamic=True))
+        self.parameters = Parameters(self, table, self._on_change)
+        self.calibration = load_calibration(self.parameters["calibration"])
+        warm_up(self.calibration, self.parameters.settings(Settings))
+        self._override = modulation_override(self.parameters)
+        self._pipeline = Pipeline(
+            self.calibration,
+            self.parameters.settings(Settings),
+            self.parameters["clock_timeout"],
+            self.parameters["stage_gap"],
+            self.parameters["stage_timeout"],
+            self.parameters["packet_period"],
+        )
+        if self._override is not None:
+            self._pipeline.stream.set_laser(self._override, None)
+        self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
+        self._mailbox = Mailbox(self.parameters["packets_max"])
+        self._reports = Reports(self, self._pipeline, self._mailbox)
+        self._calibrator = self._made_calibrator()
+        self._make_interfaces()
+        if self.parameters["auto_calibrate"]:
+            names = ("distances", "method", "capture_time")
+            self._auto = AutoCalibration(self, *(self.parameters[name] for name in names))
+        self._worker.start()
+
+    def _made_calibrator(self) -> Calibrator:
+        values = self.parameters
+        folder = values["calibration_folder"]
+        return Calibrator(
+            self,
+            ActiveCalibration(
+                self, self.calibration, values["calibration"], folder, self._use_calibration
+            ),
+            self._in_worker,
+            self._pipeline.set_capture,
+            lambda: float(values["line_width_px"]),
+            (values["node_timeout"], values["service_timeout"], values["events_timeout"]),
+        )
+
+    def _make_interfaces(self) -> None:
+        override = {"qos_overriding_options": qos.overridable()}
+        bulk = MutuallyExclusiveCallbackGroup()
+        packets = self.create_subscription(EventPacket, "camera/events", self._on_packet,
+                                           qos.events(), callback_group=bulk,
+                                           **override)  # fmt: skip
+        latched = qos.latched()
+        self._clock_source = self.create_subscription(
+            TimeReference, "camera/clock", self._on_clock, latched
+        )
+        self.create_subscription(PositionTrigger, "stage/trigger", self._on_trigger, latched)
+        self.create_subscription(
+            LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
+        )
+        odometry = self.create_subscription(
+            Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
+        )
+        self._scans = ScanServices(
+            self,
+            self._pipeline,
+            (packets, odometry),
+            self._in_worker,
+            self._lives,
+            self.parameters["stage_timeout"],
+            self._outputs.scan,
+        )
+        if self.parameters["publish_tf"]:
+            self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
+            self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
+            now_ns = self.get_clock().now().nanoseconds
+            self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(0.1, self._reports.publish_state, clock=steady)
+        self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
+
+    def safe_state(self) -> None:
+        """End a calibration under way: its way out switches the laser off."""
+        self._calibrator.safe_state()
+
+    def destroy_node(self) -> None:
+        """Stop the worker, then the node."""
+        self._closing.set()
+        if self._worker.is_alive():
+            self._worker.join(timeout=5.0)
+        super().destroy_node()
+
+    # Callbacks: queue and return.
+
+    def _on_packet(self, message: EventPacket) -> None:
+        if message.encoding != "evt3":
+            self.get_logger().error(
+                f"camera/events has encoding {message.encoding!r}; set the camera to evt3",
+                throttle_duration_sec=5.0,
+            )
+            return
+        packet = Packet(message.seq, ns_from_stamp(message.header.stamp), message.events)
+        self._mailbox.post_bulk(partial(self._take_packet, packet))
+
+    def _on_clock(self, message: TimeReference) -> None:
+        zero_ns = ns_from_stamp(message.header.stamp) - ns_from_stamp(message.time_ref)
+        self._mailbox.post(partial(self._pipeline.stream.announce_zero, zero_ns))
+
+    def _on_laser(self, message: LaserState) -> None:
+        read = None if self._override else self._read("laser/state", laser_settings, message)
+        if read is not None:
+            self._mailbox.post(partial(self._pipeline.stream.set_laser, *read))
+
+    def _on_trigger(self, message: PositionTrigger) -> None:
+        read = self._read("stage/trigger", pulse_train, message)
+        if read is not None:
+            self._mailbox.post(partial(self._pipeline.stream.set_pulses, *read))
+
+    def _read(self, topic: str, convert: Callable[[Any], tuple[Any, ...]], message: Any) -> Any:
+        """Convert a message; ``None`` and a line in the log when it is bad."""
+        try:
+            return convert(message)
+        except ArgumentError as error:
+            self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=5.0)
+            return None
+
+    def _on_stage(self, message: Odometry) -> None:
+        t_ns = ns_from_stamp(message.header.stamp)
+        position_mm = mm_from_m(message.pose.pose.position.y)
+        self._mailbox.post(partial(self._pipeline.placer.add_stage, t_ns, position_mm))
+        if self.parameters["publish_tf"]:
+            x, y, z = self.calibration.stage_direction
+            carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
+            self._tf.publish(TFMessage(transforms=[carriage]))
+
+    def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
+        """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
+        return self._mailbox.run(job, timeout_s, self._lives)
+
+    def _lives(self) -> bool:
+        """Whether the worker works; after a signal it does not, and an exit must not wait."""
+        return not self._closing.is_set() and self.context.ok()
+
+    def _use_calibration(self, calibration: Calibration) -> None:
+        def use() -> None:
+            self._pipeline.set_calibration(calibration)
+            self._outputs.set_calibration(calibration)
+            self.calibration = calibration
+
+        done, reason = self._in_worker(use)
+        if not done:
+            raise ArgumentError(f"calibration not exchanged: {reason}")
+
+    # The worker.
+
+    def _work(self) -> None:
+        while not self._closing.is_set():
+            try:
+                job = self._mailbox.take(0.02)
+                if job is not None:
+                    job()
+                self._step()
+            except Exception:
+                # The context is invalid after a signal; a failure then is no news.
+                if not self._lives():
+                    return
+                self._reports.faults += 1
+                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
+
+    def _take_packet(self, packet: Packet) -> None:
+        self._outputs.packet(packet.data)
+        stream = self._pipeline.stream
+        if stream.epoch is None:
+            stream.announcement_expected = self._clock_source.get_publisher_count() > 0
+        self._pipeline.add_packet(packet, time.monotonic())
+
+    def _step(self) -> None:
+        fresh, placed = self._pipeline.step(time.monotonic())
+        until_ns = self._pipeline.stream.processed_until_ns
+        self._outputs.profiles(fresh)
+        self._outputs.points(placed)
+        if until_ns is not None:
+            self._outputs.event_frame(until_ns)
+        self._scans.finish()
+
+    def _on_change(self, values: dict[str, Any]) -> None:
+        names = Settings.__dataclass_fields__
+        settings = Settings(**{name: values[name] for name in names if name in values})
+        override = modulation_override(values)
+        self._mailbox.post(partial(self._pipeline.stream.set_settings, settings))
+        self._mailbox.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
+        self._override = override
+        if override is not None:
+            self._mailbox.post(partial(self._pipeline.stream.set_laser, override, None))
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ReconstructionNode, threads=6)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""What the reconstruction publishes while data flow: profile, points, event frame."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import Image, PointCloud2
+
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.reconstruction import place_link
+from eschorty_ros.core.storage.cloud import join_points
+from eschorty_ros.live.event_frame import EventFrame
+from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints
+from eschorty_ros.live.sensor_epoch import TimedProfiles
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.cloud_messages import (
+    LIVE_SPAN_NS,
+    cloud_message,
+    image_message,
+    live_points,
+)
+from eschorty_ros.nodes.ros.transforms import BASE, LINK, OPTICAL
+
+_POINTS_INTERVAL_S = 0.05
+_FRAME_INTERVAL_S = 0.1
+
+
+class Outputs:
+    """Publishers of the reconstruction node; nothing is built that nobody subscribes to.
+
+    Every method but the constructor is called by the worker thread only.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    calibration : Calibration
+    profile_rate_max_hz : float
+        Profiles per second of sensor time that are published at most.
+    """
+
+    def __init__(self, node: Node, calibration: Calibration, profile_rate_max_hz: float) -> None:
+        self._model = calibration.model()
+        self._profile_spacing_ns = round(1e9 / profile_rate_max_hz)
+        override = {"qos_overriding_options": qos.overridable()}
+        self._profile = node.create_publisher(PointCloud2, "profile", qos.stream(10), **override)
+        self._points = node.create_publisher(PointCloud2, "points", qos.stream(50), **override)
+        self._scan = node.create_publisher(PointCloud2, "scan/points", qos.latched())
+        self._image = node.create_publisher(Image, "event_frame", qos.stream(2), **override)
+        self._last_profile_ns = -(1 << 62)
+        self._batch: list[PlacedPoints] = []
+        self._points_at_s = 0.0
+        self._frame: EventFrame | None = None
+        self._frame_at_s = 0.0
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Use another calibration of the same sensor."""
+        self._model = calibration.model()
+
+    def packet(self, data: Any) -> None:
+        """Let the picture see a packet, while somebody looks at it."""
+        if self._image.get_subscription_count() == 0:
+            self._frame = None
+            return
+        if self._frame is None:
+            self._frame = EventFrame(self._model.columns, self._model.rows)
+        self._frame.push(data)
+
+    def event_frame(self, stamp_ns: int) -> None:
+        """Publish the picture when it is due."""
+        now_s = time.monotonic()
+        if self._frame is not None and now_s - self._frame_at_s >= _FRAME_INTERVAL_S:
+            self._frame_at_s = now_s
+            self._image.publish(image_message(self._frame.render(), stamp_ns, OPTICAL))
+
+    def profiles(self, fresh: list[TimedProfiles]) -> None:
+        """Publish each profile, or as many as the greatest rate allows."""
+        if self._profile.get_subscription_count() == 0:
+            return
+        for timed in fresh:
+            edges_ns, starts = np.unique(timed.edge_ns, return_index=True)
+            for edge_ns, start, stop in zip(
+                edges_ns.tolist(), starts, [*starts[1:], len(timed.edge_ns)], strict=True
+            ):
+                if abs(edge_ns - self._last_profile_ns) < self._profile_spacing_ns:
+                    continue
+                self._last_profile_ns = edge_ns
+                t_ns = timed.t_ns[start:stop]
+                stamp_ns = int(t_ns.min())
+                points = place_link(timed.profiles.select(np.arange(start, stop)), self._model)
+                self._profile.publish(
+                    cloud_message(live_points(points, t_ns, stamp_ns), stamp_ns, LINK)
+                )
+
+    def points(self, placed: list[PlacedPoints]) -> None:
+        """Collect points and publish them as one cloud at most every 50 ms."""
+        if self._points.get_subscription_count() == 0:
+            self._batch.clear()
+            return
+        self._batch.extend(placed)
+        now_s = time.monotonic()
+        if not self._batch or now_s - self._points_at_s < _POINTS_INTERVAL_S:
+            return
+        self._points_at_s = now_s
+        points = join_points([part.points for part in self._batch])
+        t_ns = np.concatenate([part.t_ns for part in self._batch])
+        self._batch.clear()
+        piece = (t_ns - t_ns.min()) // LIVE_SPAN_NS
+        for index in np.unique(piece):
+            inside = piece == index
+            stamp_ns = int(t_ns[inside].min())
+            live = live_points(points[inside], t_ns[inside], stamp_ns)
+            self._points.publish(cloud_message(live, stamp_ns, BASE))
+
+    def scan(self, scan: AssembledScan, fallback_stamp_ns: int) -> None:
+        """Publish an assembled scan, also an empty one."""
+        stamp_ns = scan.stamp_ns if len(scan.points) else fallback_stamp_ns
+        self._scan.publish(cloud_message(scan.points, stamp_ns, BASE))

@@ -1,0 +1,49 @@
+"""Parameters of the reconstruction node besides ``core.reconstruction.Settings``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from eschorty_ros.control.calibration_sequence import CAPTURE_MAX_S
+from eschorty_ros.core.calibration.calibrate import METHODS
+from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
+from eschorty_ros.nodes.ros.parameters import Param
+
+TABLE = (
+    Param("calibration", "config_3", "calibration: a name in config/ or a file's path"),
+    Param("frequency", 0.0, "modulation frequency; 0 takes the laser node's settings", "Hz",
+          0.0, FREQUENCY_MAX_HZ, dynamic=True),
+    Param("duty", 0.5, "duty where frequency is given", "", 0.001, 0.999, dynamic=True),
+    Param("waveform", "square", "waveform where frequency is given",
+          choices=WAVEFORMS, dynamic=True),
+    Param("clock_timeout", 2.0, "wait for camera/clock, where somebody publishes it, before the "
+          "packets' stamps serve", "s", 0.0, 60.0),
+    Param("packet_period", 1008e-6, "time over which the camera collects events before it sends "
+          "them; metavision_driver's default is 0.004", "s", 0.0, 0.1),
+    Param("stage_gap", 0.5, "longest distance of two stage samples that is bridged; 0 bridges any",
+          "s", 0.0, 1e6, dynamic=True),
+    # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.
+    Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
+    Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
+    Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
+    Param("calibration_folder", "", "where calibrations are written; empty: eschorty in ROS's "
+          "home"),
+    Param("auto_calibrate", False, "calibrate once as soon as the other nodes are there"),
+    Param("distances", "posts", "auto_calibrate: targets, a file's name in config/ or a path"),
+    Param("method", "joint", "auto_calibrate: how it is fitted", choices=METHODS),
+    Param("capture_time", 1.0, "auto_calibrate: how long the targets are lit", "s",
+          1e-3, CAPTURE_MAX_S),
+    Param("node_timeout", 60.0, "calibration: longest wait for the other nodes", "s", 0.1, 600.0),
+    Param("service_timeout", 5.0, "calibration: longest wait for an answer", "s", 0.1, 60.0),
+    Param("events_timeout", 3.0, "calibration: longest pause of the events while the laser is on",
+          "s", 0.1, 60.0),
+    Param("publish_tf", True, "publish /tf and /tf_static"),
+)  # fmt: skip
+
+
+def modulation_override(values: Mapping[str, Any]) -> Modulation | None:
+    """Modulation the parameters give instead of the laser node's, ``None`` when they do not."""
+    if not values["frequency"]:
+        return None
+    return Modulation(values["frequency"], values["duty"], values["waveform"])

@@ -1,0 +1,98 @@
+"""What the reconstruction tells about itself: state, diagnostics, the answer to ``end_scan``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.node import Node
+
+from eschorty_ros.live.job_queue import Mailbox
+from eschorty_ros.live.packet_stream import clock_statistics
+from eschorty_ros.live.pipeline import Pipeline, ScanReport
+from eschorty_ros.msg import ReconstructionState
+from eschorty_ros.nodes.ros import diagnostics
+from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+
+
+class Reports:
+    """Reads a pipeline that another thread drives; numbers of one report may be a moment apart.
+
+    Attributes
+    ----------
+    faults : int
+        Unexpected exceptions of the worker, counted by the worker.
+    """
+
+    def __init__(self, node: Node, pipeline: Pipeline, mailbox: Mailbox) -> None:
+        self.faults = 0
+        self._node = node
+        self._pipeline = pipeline
+        self._mailbox = mailbox
+        self._state = node.create_publisher(ReconstructionState, "reconstruction/state", 10)
+        self._rate = diagnostics.Rate()
+        self._diagnostics_rate = diagnostics.Rate()
+
+    def publish_state(self) -> None:
+        """Publish ``reconstruction/state``."""
+        pipeline = self._pipeline
+        counters = pipeline.stream.counters
+        until_ns = pipeline.stream.processed_until_ns
+        state = ReconstructionState()
+        state.header.stamp = self._node.get_clock().now().to_msg()
+        if until_ns is not None:
+            state.processed_until = stamp_from_ns(until_ns)
+        state.events = counters["events"]
+        state.events_per_second = self._rate.read(counters["events"])
+        state.profiles = pipeline.profiles
+        state.points = pipeline.points
+        state.packets_lost = pipeline.stream.packets_lost
+        state.events_dropped = counters["events_dropped"]
+        state.sensor_drop_words = counters["sensor_drop_words"]
+        state.points_without_stage = pipeline.placer.points_without_stage
+        state.scan_id = pipeline.scan_id
+        state.calibration = pipeline.calibration.name
+        self._state.publish(state)
+
+    def diagnose(self) -> diagnostics.Report:
+        """Level, line and values for ``/diagnostics``."""
+        stream, placer = self._pipeline.stream, self._pipeline.placer
+        counters = stream.counters
+        values: dict[str, Any] = {
+            "packets": stream.packets,
+            "packets_lost": stream.packets_lost,
+            "packets_late": stream.packets_late,
+            "packets_refused_queue_full": self._mailbox.overflows,
+            "packets_held": stream.held,
+            "stream_restarts": stream.restarts,
+            "queue": len(self._mailbox),
+            "events_per_second": self._diagnostics_rate.read(counters["events"]),
+            **clock_statistics(stream),
+            "profiles": self._pipeline.profiles,
+            "points": self._pipeline.points,
+            "points_waiting_for_stage": placer.waiting,
+            "points_without_stage": placer.points_without_stage,
+            "stage_samples_late": placer.late_samples,
+            "stage_restarts": placer.track_restarts,
+            "faults": self.faults,
+            **{f"reconstructor_{name}": count for name, count in sorted(counters.items())},
+        }
+        if self.faults:
+            return diagnostics.ERROR, "internal errors; see the log", values
+        if stream.held:
+            return diagnostics.WARN, f"packets wait for the {stream.waits_for}", values
+        if stream.epoch is not None and stream.epoch.edges_missing:
+            return diagnostics.WARN, "no edges of the stage; check its wire to the camera", values
+        if stream.packets_lost or placer.points_without_stage:
+            return diagnostics.WARN, "packets or points were lost", values
+        return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
+
+
+def fill_end_scan(response: Any, report: ScanReport) -> None:
+    """Put a scan's figures, and what was lost, into an ``EndScan`` response."""
+    response.profiles = report.scan.profiles
+    response.points = len(report.scan.points)
+    response.events = report.events
+    response.packets_lost = report.packets_lost
+    response.events_dropped = report.events_dropped
+    response.sigma_median = report.scan.sigma_median_m
+    response.message = report.message

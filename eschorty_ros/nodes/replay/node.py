@@ -1,0 +1,283 @@
+"""Node ``replay``: a recording into the topics the camera, laser and stage would publish."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+import time
+import traceback
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from event_camera_msgs.msg import EventPacket
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import TimeReference
+
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
+from eschorty_ros.core.clocks.clock import NS_PER_US
+from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.core.storage.recording import Recording, load_recording
+from eschorty_ros.live.recorded_packets import timed_packets
+from eschorty_ros.msg import LaserState, ReconstructionState
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.conversions import m_from_mm, ns_from_stamp, stamp_from_ns
+from eschorty_ros.nodes.ros.parameters import Param, Parameters
+from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.transforms import BASE, OPTICAL, STAGE
+from eschorty_ros.srv import BeginScan, EndScan
+
+TABLE = (
+    Param("recording", "", "recording folder"),
+    Param("rate", 1.0, "speed against real time; 0 is as fast as possible", "", 0.0, 1e6),
+    Param("timeout", 30.0, "longest wait for the reconstruction, and for it to go on", "s",
+          0.1, 3600.0),
+)  # fmt: skip
+
+_PACKETS_AHEAD = 256
+_ROWS_AHEAD = 1000
+_POLL_S = 0.005
+_RESEND_S = 2.0
+
+
+class ReplayNode(Node):
+    """Plays once, has the reconstruction assemble it on ``scan/points``, and ends the process.
+
+    Times are the recording's, laid onto ROS time from now on without stretching, whatever the
+    rate. Playing stays a bounded way ahead of the reconstruction, so that nothing is lost to a
+    reliable subscription.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        # Before anything can fail: a half-built node is destroyed, too.
+        self._closing = threading.Event()
+        self._player = threading.Thread(target=self._run, name="replay", daemon=True)
+        super().__init__("replay", **kwargs)
+        self.parameters = Parameters(self, TABLE)
+        if not self.parameters["recording"]:
+            raise ArgumentError("parameter recording is empty; give a recording folder")
+        self._recording: Recording = load_recording(self.parameters["recording"])
+        self._reader = RawReader(self._recording.events_path)
+        self._events = self.create_publisher(
+            EventPacket, "camera/events", qos.stream(qos.EVENT_DEPTH)
+        )
+        self._clock_reference = self.create_publisher(TimeReference, "camera/clock", qos.latched())
+        self._laser = self.create_publisher(
+            LaserState, "laser/state", qos.latched(qos.STATE_HISTORY)
+        )
+        self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(2 * _ROWS_AHEAD))
+        self.create_subscription(ReconstructionState, "reconstruction/state", self._on_state, 10)
+        self._begin = self.create_client(BeginScan, "reconstruction/begin_scan")
+        self._end = self.create_client(EndScan, "reconstruction/end_scan")
+        self._until_ns = 0
+        self._lost = 0
+        self._advanced_s = time.monotonic()
+        self._zero_ns = 0
+        self._next_row = 0
+        self._failure: EschortyError | None = None
+        self.create_timer(0.05, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._player.start()
+
+    def destroy_node(self) -> None:
+        """End the player, then the node."""
+        self._closing.set()
+        if self._player.is_alive():
+            self._player.join(timeout=5.0)
+        super().destroy_node()
+
+    def _watch(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        if not self._player.is_alive():
+            rclpy.shutdown(context=self.context)
+
+    def _on_state(self, message: ReconstructionState) -> None:
+        until_ns = ns_from_stamp(message.processed_until)
+        if until_ns != self._until_ns:
+            self._until_ns, self._advanced_s = until_ns, time.monotonic()
+        self._lost = message.packets_lost
+
+    # The player's thread.
+
+    def _run(self) -> None:
+        try:
+            self._play()
+        except EschortyError as error:
+            self._failure = error
+        except Exception:
+            if self.context.ok() and not self._closing.is_set():
+                self._failure = DeviceError(traceback.format_exc())
+
+    def _play(self) -> None:
+        self._await_reconstruction()
+        name = f"replay-{Path(self.parameters['recording']).resolve().name}"
+        position_mm = self._recording.stage_samples["position_mm"]
+        self._zero_ns = int(self.get_clock().now().nanoseconds)
+        self._publish_clock_and_laser()
+        self._call(
+            self._begin,
+            BeginScan.Request(
+                scan_id=name,
+                start=m_from_mm(float(position_mm.min())),
+                stop=m_from_mm(float(position_mm.max())),
+            ),
+            again=True,
+        )
+        lost_before = self._lost
+        last_us = self._publish_stream()
+        self._publish_rows(np.iinfo(np.int64).max)
+        self._await_processed(last_us)
+        for warning in self._reader.warnings:
+            self.get_logger().warning(warning)
+        answer = self._call(self._end, EndScan.Request(scan_id=name))
+        self.get_logger().info(
+            f"{answer.points} points in {answer.profiles} profiles; {answer.message or 'no loss'}"
+        )
+        if self._lost != lost_before:
+            raise DeviceError(
+                f"{self._lost - lost_before} packets were lost; make the reconstruction's "
+                "subscription of camera/events reliable"
+            )
+
+    def _await_reconstruction(self) -> None:
+        publishers = (self._events, self._clock_reference, self._laser, self._odom)
+        self._advanced_s = time.monotonic()
+        self._wait(
+            lambda: (
+                all(publisher.get_subscription_count() for publisher in publishers)
+                and self._begin.service_is_ready()
+                and self._end.service_is_ready()
+            ),
+            "no reconstruction listens",
+        )
+        for end in self.get_subscriptions_info_by_topic(self._events.topic_name):
+            if end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
+                self.get_logger().warning(
+                    f"{end.node_name} takes camera/events best effort and may lose packets"
+                )
+
+    def _publish_clock_and_laser(self) -> None:
+        reference = TimeReference(source="recording")
+        reference.header.stamp = stamp_from_ns(self._zero_ns)
+        self._clock_reference.publish(reference)
+        modulation = self._recording.modulation
+        state = LaserState(
+            requested=LaserState.OUTPUT_ON,
+            output=LaserState.OUTPUT_ON,
+            waveform=modulation.waveform,
+            frequency=modulation.frequency_hz,
+            duty=modulation.duty,
+            output_since=stamp_from_ns(self._zero_ns),
+            reason="replay of a recording",
+        )
+        state.header.stamp = stamp_from_ns(self._zero_ns)
+        if modulation.on_edge_us is not None:
+            state.phase_epoch = stamp_from_ns(self._ns(modulation.on_edge_us))
+        self._laser.publish(state)
+
+    def _publish_stream(self) -> int:
+        """Publish all packets and the stage rows up to each; the last sensor time (us)."""
+        rate = self.parameters["rate"]
+        rows_us = self._recording.stage_samples["t_us"]
+        pending: list[int] = []
+        began_s = time.monotonic()
+        first_us: int | None = None
+        until_us = 0
+        for seq, packet in enumerate(timed_packets(self._reader)):
+            first_us = packet.from_us if first_us is None else first_us
+            until_us = packet.until_us
+            self._pace(began_s, (until_us - first_us) * 1e-6, rate)
+            self._publish_rows(until_us)
+            message = EventPacket(
+                height=self._reader.header.height,
+                width=self._reader.header.width,
+                seq=seq,
+                encoding="evt3",
+                events=array("B", packet.data),
+            )
+            message.header.stamp = stamp_from_ns(self._ns(packet.from_us))
+            message.header.frame_id = OPTICAL
+            self._events.publish(message)
+            pending.append(until_us)
+            ahead = pending[-_PACKETS_AHEAD] if len(pending) >= _PACKETS_AHEAD else None
+            row = self._next_row - _ROWS_AHEAD
+            if row >= 0:
+                ahead = max(min(int(rows_us[row]), until_us), ahead if ahead is not None else 0)
+            if ahead is not None:
+                self._await_processed(ahead)
+        return until_us
+
+    def _pace(self, began_s: float, elapsed_s: float, rate: float) -> None:
+        if rate > 0.0:
+            due_s = began_s + elapsed_s / rate
+            self._closing.wait(max(due_s - time.monotonic(), 0.0))
+
+    def _publish_rows(self, until_us: int) -> None:
+        """Publish the stage rows up to the first one at or after ``until_us``."""
+        rows = self._recording.stage_samples
+        while self._next_row < len(rows):
+            t_us = int(rows["t_us"][self._next_row])
+            message = Odometry(child_frame_id=STAGE)
+            message.header.frame_id = BASE
+            message.header.stamp = stamp_from_ns(self._ns(t_us))
+            position_mm = float(rows["position_mm"][self._next_row])
+            message.pose.pose.position.y = m_from_mm(position_mm)
+            message.pose.pose.orientation.w = 1.0
+            self._odom.publish(message)
+            self._next_row += 1
+            if t_us >= until_us:
+                break
+
+    def _await_processed(self, t_us: int) -> None:
+        self._advanced_s = time.monotonic()
+        self._wait(lambda: self._until_ns >= self._ns(t_us), "the reconstruction stands still")
+
+    def _ns(self, t_us: int) -> int:
+        return self._zero_ns + t_us * NS_PER_US
+
+    def _wait(self, condition: Callable[[], bool], fault: str) -> None:
+        timeout_s = self.parameters["timeout"]
+        while not condition():
+            if self._closing.wait(_POLL_S) or not self.context.ok():
+                raise DeviceError("interrupted")
+            if time.monotonic() - self._advanced_s > timeout_s:
+                raise DeviceError(f"{fault} for {timeout_s:g} s; check that it runs")
+
+    def _call(self, client: Any, request: Any, *, again: bool = False) -> Any:
+        """Answer of a service, asked ``again`` and again where that does no harm.
+
+        A server that has just discovered this node may not know yet where to send its answer.
+        """
+        self._advanced_s = time.monotonic()
+        futures: list[Any] = []
+        sent_s = -math.inf
+
+        def answered() -> bool:
+            nonlocal sent_s
+            if not futures or (again and time.monotonic() - sent_s > _RESEND_S):
+                sent_s = time.monotonic()
+                futures.append(client.call_async(request))
+            return any(future.done() for future in futures)
+
+        self._wait(answered, f"no answer of {client.srv_name}")
+        answer = next(future.result() for future in futures if future.done())
+        if not answer.success:
+            raise DeviceError(f"reconstruction: {answer.message}")
+        return answer
+
+
+def main() -> int:
+    """Play the recording."""
+    return run(ReplayNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""Point clouds and images as ROS messages, built without touching single elements in Python."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image, PointCloud2, PointField
+
+from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+
+
+def live_dtype(scan_dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Layout of a live cloud whose assembled scan has ``scan_dtype``: ``t`` is uint32 instead."""
+    names = scan_dtype.names or ()
+    return np.dtype([(name, "<u4" if name == "t" else scan_dtype[name].str) for name in names])
+
+
+LIVE_DTYPE = live_dtype(POINT_DTYPE)
+"""Point of a live cloud: metres, events used, metres, ns since the header's stamp, column.
+
+The points of an assembled scan (``POINT_DTYPE``) have ``t`` in seconds as float64: a uint32 of
+nanoseconds ends at 4.29 s, shorter than most scans.
+"""
+
+LIVE_SPAN_NS = 4_000_000_000
+"""Longest time one live cloud may span, just under the range of its uint32 ``t``."""
+
+_POINT_FIELD_TYPES = {
+    "u1": PointField.UINT8,
+    "u2": PointField.UINT16,
+    "u4": PointField.UINT32,
+    "f4": PointField.FLOAT32,
+    "f8": PointField.FLOAT64,
+}
+
+
+def _bytes_field(values: NDArray[Any]) -> array[int]:
+    """Copy an array's bytes into the one type a message field takes at full speed."""
+    data = array("B")
+    data.frombytes(np.ascontiguousarray(values).data.cast("B"))
+    return data
+
+
+def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
+    """Unorganised ``PointCloud2`` of a structured array, one field of the message per field."""
+    message = PointCloud2()
+    message.header.stamp = stamp_from_ns(stamp_ns)
+    message.header.frame_id = frame_id
+    message.height = 1
+    message.width = len(points)
+    dtype = points.dtype
+    assert dtype.names is not None
+    assert dtype.fields is not None
+    message.fields = [
+        PointField(
+            name=name,
+            offset=dtype.fields[name][1],
+            datatype=_POINT_FIELD_TYPES[dtype.fields[name][0].str[1:]],
+            count=1,
+        )
+        for name in dtype.names
+    ]
+    message.is_bigendian = False
+    message.point_step = dtype.itemsize
+    message.row_step = dtype.itemsize * len(points)
+    message.is_dense = True
+    if len(points):
+        message.data = _bytes_field(points)
+    return message
+
+
+def points_from_message(message: PointCloud2) -> NDArray[Any]:
+    """View an unorganised cloud as a structured array, fields as the message has them."""
+    codes = {datatype: "<" + code for code, datatype in _POINT_FIELD_TYPES.items()}
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in message.fields],
+            "formats": [codes[field.datatype] for field in message.fields],
+            "offsets": [field.offset for field in message.fields],
+            "itemsize": message.point_step,
+        }
+    )
+    return np.frombuffer(message.data, dtype=dtype, count=message.width * message.height)
+
+
+def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
+    """Points of an assembled scan as those of a live one, ``t`` counted from ``stamp_ns``.
+
+    All of ``t_ns`` lies within ``LIVE_SPAN_NS`` after ``stamp_ns``.
+    """
+    live = np.empty(len(scan_points), live_dtype(scan_points.dtype))
+    for name in scan_points.dtype.names or ():
+        if name != "t":
+            live[name] = scan_points[name]
+    live["t"] = t_ns - stamp_ns
+    return live
+
+
+def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
+    """Message ``mono8`` of a (rows, columns) uint8 image."""
+    message = Image()
+    message.header.stamp = stamp_from_ns(stamp_ns)
+    message.header.frame_id = frame_id
+    message.height, message.width = pixels.shape
+    message.encoding = "mono8"
+    message.is_bigendian = 0
+    message.step = message.width
+    message.data = _bytes_field(pixels)
+    return message

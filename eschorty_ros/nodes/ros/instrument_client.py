@@ -1,0 +1,350 @@
+"""Laser, stage and reconstruction as a sequence uses them: over topics, services and an action."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from action_msgs.msg import GoalStatus
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from eschorty_ros.action import MoveStage
+from eschorty_ros.control.instrument_monitor import (
+    InstrumentMonitor,
+    LaserStatus,
+    ReconstructionStatus,
+)
+from eschorty_ros.control.laser_interlock import LEASE
+from eschorty_ros.control.paced_waiting import PacedWaiting
+from eschorty_ros.control.scan_sequence import ScanFailure, ScanRequest, ScanSummary
+from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.msg import LaserState, ReconstructionState
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, ns_from_stamp
+from eschorty_ros.nodes.ros.heartbeat import Heartbeat
+from eschorty_ros.srv import BeginScan, EndScan
+
+_RESEND_S = 2.0
+# The heartbeat stops when the sequence has not ticked for so long.
+_TICK_LIMIT_S = 1.0
+# In the laser's refusals for want of a heartbeat.
+_BEAT = "/heartbeat"
+_ASSEMBLE_S = 60.0
+
+
+class InstrumentClient(PacedWaiting):
+    """Laser and stage over the other nodes' topics, services and action.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    node_timeout_s, service_timeout_s, events_timeout_s : float
+        Longest wait for the nodes to appear, for an answer, and for the events to go on.
+    services : mapping of str to service type
+        What else is needed, by name.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        node_timeout_s: float,
+        service_timeout_s: float,
+        events_timeout_s: float,
+        services: Mapping[str, Any] | None = None,
+    ) -> None:
+        self._node = node
+        super().__init__(
+            node.get_name(),
+            _subscribed_monitor(node),
+            lambda: int(node.get_clock().now().nanoseconds),
+            node.context.ok,
+            events_timeout_s,
+        )
+        needed = {
+            "laser/set_parameters": SetParameters,
+            "laser/arm": Trigger,
+            "laser/enable": SetBool,
+            **(services or {}),
+        }
+        group = ReentrantCallbackGroup()
+        self._clients = {
+            name: node.create_client(kind, name, callback_group=group)
+            for name, kind in needed.items()
+        }
+        self._stage = ActionClient(node, MoveStage, "stage/move", callback_group=group)
+        self._node_timeout_s = node_timeout_s
+        self._service_timeout_s = service_timeout_s
+        self._beating = False
+        self._heartbeat = Heartbeat(node, LEASE, self._wants_light)
+        self._sent: Any = None
+
+    def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
+        """Reset for a new sequence; both callables are used at every tick."""
+
+        def guarded(phase: str) -> None:
+            with self._living_context():
+                feedback(phase)
+
+        super().prepare(canceled, guarded)
+
+    def check_nodes(self) -> None:
+        """See ``Instrument``."""
+        begun_ns = self.monitor.until_ns
+        for there, failure in self._needed(begun_ns):
+            self.wait(there, self._node_timeout_s, failure)
+
+    def missing(self) -> str:
+        """Name what is not there yet, one thing of each node; empty when a sequence can begin."""
+        absent = [failure for there, failure in self._needed(0) if not there()]
+        named = {text.split(":")[0]: text for text in reversed(absent) if isinstance(text, str)}
+        if absent and not named:
+            # Whatever is missing keeps events from being reconstructed, so it comes first.
+            return self.monitor.why_no_progress()
+        return "; ".join(reversed(named.values()))
+
+    def _needed(self, begun_ns: int) -> list[tuple[Callable[[], bool], str | Callable[[], str]]]:
+        """List what a sequence needs, in order, each with the failure without it."""
+        servers = (
+            *((name, client.service_is_ready) for name, client in self._clients.items()),
+            ("stage/move", self._stage.server_is_ready),
+        )
+        return [
+            *((there, f"{what.split('/')[0]}: no {what}") for what, there in servers),
+            (lambda: self.monitor.stage_reports, "stage: no odometry"),
+            (lambda: self.monitor.at_rest, "stage: another move does not end"),
+            (lambda: self.monitor.laser is not None, "laser: no state"),
+            (lambda: self.monitor.until_ns > begun_ns, self.monitor.why_no_progress),
+        ]
+
+    def configure_laser(self, frequency_hz: float, duty: float) -> None:
+        """See ``Instrument``."""
+        wanted = {
+            name: float(value)
+            for name, value in (("frequency", frequency_hz), ("duty", duty))
+            if value
+        }
+        if not wanted:
+            return
+        messages = [Parameter(name, value=value).to_parameter_msg()
+                    for name, value in wanted.items()]  # fmt: skip
+        answer = self._call("laser/set_parameters", SetParameters.Request(parameters=messages))
+        for result in answer.results:
+            if not result.successful:
+                raise ScanFailure(f"laser: {result.reason}")
+
+        def applied() -> bool:
+            laser = self.monitor.laser
+            if laser is None:
+                return False
+            read = {"frequency": laser.frequency_hz, "duty": laser.duty}
+            return all(abs(read[name] - value) <= 1e-3 * value for name, value in wanted.items())
+
+        self.wait(applied, self._service_timeout_s,
+                  f"laser: its state does not show {wanted}")  # fmt: skip
+
+    def move(self, position_mm: float, speed_mm_s: float) -> None:
+        """See ``Instrument``."""
+        self.monitor.samples.clear()
+        goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
+        # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
+        self._sent = self._stage.send_goal_async(goal)
+        handle = self._answer(self._sent, "stage/move")
+        if not handle.accepted:
+            self._sent = None
+            raise ScanFailure(
+                f"stage: refused to move to {position_mm * 1e-3:g} m at {speed_mm_s * 1e-3:g} m/s"
+            )
+        future = handle.get_result_async()
+        while not future.done():
+            self.tick()
+            self.monitor.check_stage()
+        self._sent = None
+        answer = future.result()
+        if answer.status != GoalStatus.STATUS_SUCCEEDED or not answer.result.success:
+            raise ScanFailure(f"stage: {answer.result.message or 'the move did not succeed'}")
+
+    def stop_stage(self) -> None:
+        """See ``Instrument``."""
+        sent, self._sent = self._sent, None
+        if sent is None:
+            return
+        handle = self._answer(sent, "stage/move")
+        if not handle.accepted:
+            return
+        with self._living_context():
+            ended = handle.cancel_goal_async(), handle.get_result_async()
+        for future in ended:
+            self._answer(future, "stage/move")
+
+    def laser_on(self) -> None:
+        """See ``Instrument``."""
+        self.tick()
+        self._beating = True
+        self.wait(lambda: self._heartbeat.beating, self._service_timeout_s,
+                  "laser: no heartbeat of its own")  # fmt: skip
+        ends_s = time.monotonic() + self._service_timeout_s
+        while refusal := self._arm_and_enable():
+            # The heartbeats of a camera and a stage that have just started come soon.
+            if _BEAT not in refusal or time.monotonic() > ends_s:
+                raise ScanFailure(f"laser: {refusal}")
+            self.tick()
+        self.wait(lambda: self.monitor.output == LaserOutput.ON, self._service_timeout_s,
+                  "laser: its output does not read back on")  # fmt: skip
+
+    def _arm_and_enable(self) -> str:
+        """Return the laser's reason when it refuses, ``""`` when it does not."""
+        for name, request in (
+            ("laser/arm", Trigger.Request()),
+            ("laser/enable", SetBool.Request(data=True)),
+        ):
+            answer = self._call(name, request)
+            if not answer.success:
+                return str(answer.message)
+        return ""
+
+    def laser_off(self) -> None:
+        """See ``Instrument``."""
+        try:
+            if self._beating:
+                answer = self._call("laser/enable", SetBool.Request(data=False))
+                if not answer.success:
+                    raise ScanFailure(f"laser: {answer.message}")
+                self.wait(lambda: self.monitor.output == LaserOutput.OFF,
+                          self._service_timeout_s,
+                          "laser: its output does not read back off")  # fmt: skip
+        finally:
+            # Without it the laser switches itself off, should the call have failed.
+            self._beating = False
+
+    def _wants_light(self) -> bool:
+        return self._beating and self.ticked_within(_TICK_LIMIT_S)
+
+    def _answer(self, future: Any, name: str) -> Any:
+        self.wait(
+            future.done, self._service_timeout_s, f"{name.split('/')[0]}: no answer of {name}"
+        )
+        return future.result()
+
+    def _call(self, name: str, request: Any, once_within_s: float | None = None) -> Any:
+        """Return a service's answer; the request is repeated unless ``once_within_s`` is given.
+
+        A server that has just discovered this node may not know yet where to send its answer.
+        A repeated request may be carried out twice.
+        """
+        futures: list[Any] = []
+        sent_s = -math.inf
+
+        def answered() -> bool:
+            nonlocal sent_s
+            repeat = once_within_s is None or not futures
+            if repeat and time.monotonic() - sent_s > _RESEND_S:
+                sent_s = time.monotonic()
+                with self._living_context():
+                    futures.append(self._clients[name].call_async(request))
+            return any(future.done() for future in futures)
+
+        timeout_s = once_within_s or self._service_timeout_s
+        self.wait(answered, timeout_s, f"{name.split('/')[0]}: no answer of {name}")
+        return next(future.result() for future in futures if future.done())
+
+    @contextlib.contextmanager
+    def _living_context(self) -> Iterator[None]:
+        """Turn the errors of a context that a signal has ended into a ``ScanFailure``."""
+        try:
+            yield
+        except (_rclpy.RCLError, _rclpy.InvalidHandle) as error:
+            raise ScanFailure(
+                f"{self._node.get_name()}: the node was shut down: {error}"
+            ) from error
+
+
+class ScanClient(InstrumentClient):
+    """The same with the reconstruction's services; arguments as those of ``InstrumentClient``."""
+
+    def __init__(
+        self,
+        node: Node,
+        node_timeout_s: float,
+        service_timeout_s: float,
+        events_timeout_s: float,
+    ) -> None:
+        services = {
+            "reconstruction/begin_scan": BeginScan,
+            "reconstruction/end_scan": EndScan,
+        }
+        super().__init__(node, node_timeout_s, service_timeout_s, events_timeout_s, services)
+
+    def begin_scan(self, request: ScanRequest) -> None:
+        """See ``ScanInstrument``; a scan that is still open is ended and published first."""
+        state = self.monitor.reconstruction
+        if state is not None and state.scan_id:
+            self._node.get_logger().warning(f"ending {state.scan_id}, which nobody ended")
+            self.end_scan(state.scan_id)
+        begin = BeginScan.Request(
+            scan_id=request.scan_id,
+            start=m_from_mm(request.start_mm),
+            stop=m_from_mm(request.stop_mm),
+        )
+        # A cancel before the answer would leave a scan that is never ended.
+        with self.shielded():
+            answer = self._call("reconstruction/begin_scan", begin)
+        if not answer.success:
+            raise ScanFailure(f"reconstruction: {answer.message}")
+
+    def end_scan(self, scan_id: str) -> ScanSummary:
+        """See ``ScanInstrument``."""
+        request = EndScan.Request(scan_id=scan_id)
+        answer = self._call("reconstruction/end_scan", request, once_within_s=_ASSEMBLE_S)
+        if not answer.success:
+            raise ScanFailure(f"reconstruction: {answer.message}")
+        return ScanSummary(answer.profiles, answer.points, answer.events, answer.packets_lost,
+                           answer.events_dropped, answer.sigma_median, answer.message)  # fmt: skip
+
+
+def _subscribed_monitor(node: Node) -> InstrumentMonitor:
+    """Make a monitor that the other nodes' topics update."""
+    topic = node.resolve_topic_name("camera/events")
+    monitor = InstrumentMonitor(lambda: node.count_publishers(topic) > 0)
+
+    def on_laser(message: LaserState) -> None:
+        monitor.update_laser(
+            LaserStatus(message.output, message.frequency, message.duty, message.reason)
+        )
+
+    def on_reconstruction(message: ReconstructionState) -> None:
+        monitor.update_reconstruction(
+            ReconstructionStatus(
+                ns_from_stamp(message.processed_until),
+                message.events_per_second,
+                message.profiles,
+                message.points,
+                message.scan_id,
+            )
+        )
+
+    def on_stage(message: Odometry) -> None:
+        monitor.update_stage(
+            ns_from_stamp(message.header.stamp),
+            mm_from_m(message.pose.pose.position.y),
+            mm_from_m(message.twist.twist.linear.y),
+        )
+
+    # One message at a time, so that samples stay in order.
+    group = MutuallyExclusiveCallbackGroup()
+    for kind, topic_name, callback, profile in (
+        (LaserState, "laser/state", on_laser, qos.latched(qos.STATE_HISTORY)),
+        (ReconstructionState, "reconstruction/state", on_reconstruction, 10),
+        (Odometry, "stage/odom", on_stage, qos.stream()),
+    ):
+        node.create_subscription(kind, topic_name, callback, profile, callback_group=group)
+    return monitor

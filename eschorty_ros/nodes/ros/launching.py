@@ -1,0 +1,154 @@
+"""What the launch files share. Needs the packages launch and launch_ros."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from launch.actions import DeclareLaunchArgument, ExecuteProcess
+from launch.conditions import IfCondition
+from launch.substitutions import (
+    EqualsSubstitution,
+    IfElseSubstitution,
+    LaunchConfiguration,
+)
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
+from launch_ros.substitutions import ExecutableInPackage
+
+from eschorty_ros.core.base.files import config_folders
+
+NAMESPACE = "eschorty"
+EVENTS = f"/{NAMESPACE}/camera/events"
+
+Argument = tuple[str, str | None, str, list[str] | None]
+"""Name, default (``None``: must be given), description, choices."""
+
+
+def _config_file(name: str) -> Path:
+    paths = [folder / name for folder in config_folders()]
+    return next((path for path in paths if path.is_file()), Path(name))
+
+
+FAKE: Argument = (
+    "fake",
+    "true",
+    "true: real drivers at an emulated bench; false: at real devices",
+    ["true", "false"],
+)
+TRIGGER: Argument = (
+    "trigger",
+    "stage",
+    "what is wired to the camera's trigger input: none, laser or stage",
+    ["none", "laser", "stage"],
+)
+PIXELS: Argument = (
+    "pixels",
+    "paper",
+    "event pixels of an emulated camera",
+    ["paper", "ideal", "noisy", "narrow"],
+)
+PARAMETERS: Argument = (
+    "parameters",
+    str(_config_file("parameters.yaml")),
+    "YAML file of parameters by node; what it holds overrides the other arguments",
+    None,
+)
+
+
+def declare(arguments: tuple[Argument, ...]) -> list[DeclareLaunchArgument]:
+    """Launch arguments from a table."""
+    return [
+        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
+        for name, default, text, choices in arguments
+    ]
+
+
+def number(name: str) -> Any:
+    """Value of an argument as a float, also when it is written without a decimal point."""
+    return ParameterValue(LaunchConfiguration(name), value_type=float)
+
+
+def text(name: str) -> Any:
+    """Value of an argument as a string, also when it looks like a number."""
+    return ParameterValue(LaunchConfiguration(name), value_type=str)
+
+
+def truth(name: str) -> Any:
+    """Value of an argument that is true or false."""
+    return ParameterValue(LaunchConfiguration(name), value_type=bool)
+
+
+def driver(real: str) -> Any:
+    """Choose the emulated bench, or the real device's driver."""
+    return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
+
+
+def reliable(end: str) -> dict[str, Any]:
+    """Lossless events at one end; an emulated camera can wait, so nothing has to be lost."""
+    if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
+    return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
+
+
+def trigger_input() -> Any:
+    """Switch the camera's trigger input on when the argument ``trigger`` says it is wired."""
+    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
+    return IfElseSubstitution(unwired, "disabled", "external")
+
+
+def instrument(**reconstruction: Any) -> dict[str, dict[str, Any]]:
+    """Parameters of devices and reconstruction by node, from arguments that bear their names."""
+    return {
+        "camera": {
+            "driver": driver("evk4"),
+            "trigger_in_mode": trigger_input(),
+            **reliable("publisher"),
+        },
+        "laser": {"driver": driver("awg"), "frequency": number("frequency")},
+        "stage": {"driver": driver("apt")},
+        "reconstruction": {
+            "calibration": text("calibration"),
+            "trigger_source": text("trigger"),
+            **reconstruction,
+            **reliable("subscription"),
+        },
+    }
+
+
+def bench(**options: str) -> Any:
+    """Emulated devices in a process of their own when the argument ``fake`` is true.
+
+    ``options`` maps options of ``eschorty-bench`` to the launch arguments that give them.
+    """
+    command: list[Any] = [ExecutableInPackage(package="eschorty_ros", executable="bench")]
+    for option, argument in options.items():
+        command += [f"--{option}", LaunchConfiguration(argument)]
+    return ExecuteProcess(
+        cmd=command,
+        name="bench",
+        output="screen",
+        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("fake"), "true")),
+    )
+
+
+def node(executable: str, parameters: dict[str, Any]) -> Any:
+    """One of the package's nodes, named as its executable; the file has the last word."""
+    return Node(
+        package="eschorty_ros",
+        executable=executable,
+        name=executable,
+        namespace=NAMESPACE,
+        parameters=[parameters, ParameterFile(LaunchConfiguration("parameters"))],
+        output="screen",
+        emulate_tty=True,
+    )
+
+
+def rviz() -> Any:
+    """RViz with the package's view, when the argument ``rviz`` is true."""
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", str(_config_file("scan.rviz"))],
+        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("rviz"), "true")),
+    )

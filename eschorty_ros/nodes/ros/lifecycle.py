@@ -1,0 +1,210 @@
+"""What camera, laser and stage share: transitions that never fail in silence, and a safe state."""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.nodes.ros.parameters import Param, Parameters
+
+AUTO_START = Param("auto_start", True, "configure and activate without being asked")
+RETRY_S = 2.0
+
+
+class DeviceNode(LifecycleNode):
+    """Lifecycle node around one device.
+
+    A subclass fills in ``open_device``, ``start_device``, ``stop_device`` and ``close_device``;
+    the last two are idempotent, may run in any state and thread, and leave nothing switched on.
+    Configure opens, activate starts, deactivate stops, cleanup stops and closes. A failure in
+    configure closes and leaves the node unconfigured; a failure in any other transition, or
+    ``fault`` at any time, stops and closes the device and leads through error processing to
+    unconfigured. Every failure is logged: one line for an ``EschortyError``.
+
+    With ``auto_start``, a device that cannot be opened is waited for: the node stays unconfigured,
+    logs the reason when it changes, says it in ``waiting`` and tries again every 2 s. Once it was
+    active nothing starts by itself: after a failure in operation somebody has to look and to
+    configure and activate again.
+
+    Parameters
+    ----------
+    name : str
+        Node name.
+    table : iterable of Param
+        The node's parameters besides ``auto_start``.
+    on_change : callable, optional
+        See ``Parameters``.
+
+    Attributes
+    ----------
+    failure : str
+        What failed last, empty after a successful configure.
+    waiting : str
+        What keeps the node from starting and when it tries again, empty when nothing does.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        table: Iterable[Param],
+        on_change: Callable[[dict[str, Any]], None] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(name, **kwargs)
+        self.parameters = Parameters(self, (AUTO_START, *table), on_change)
+        self.failure = ""
+        self.waiting = ""
+        self._auto_starting = False
+        self._told = ""
+        self._faulted = threading.Event()
+        self._fault_guard = self.create_guard_condition(self._leave_after_fault)
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._start_timer = (
+            self.create_timer(0.0, self._auto_start, clock=self.steady_clock)
+            if self.parameters["auto_start"]
+            else None
+        )
+
+    def open_device(self) -> None:
+        """Open the device, apply the settings, make the publishers."""
+        raise NotImplementedError
+
+    def start_device(self) -> None:
+        """Begin what the node does while active."""
+        raise NotImplementedError
+
+    def stop_device(self) -> None:
+        """End it."""
+        raise NotImplementedError
+
+    def close_device(self) -> None:
+        """Release the device."""
+        raise NotImplementedError
+
+    @property
+    def state_label(self) -> str:
+        """Lifecycle state, e.g. ``active``."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def active(self) -> bool:
+        """Whether the node is active."""
+        return self.state_label == "active"
+
+    def safe_state(self) -> None:
+        """Stop and close the device whatever the node's state; uses no ROS."""
+        try:
+            self.stop_device()
+        finally:
+            self.close_device()
+
+    def fault(self, reason: str) -> None:
+        """Report that the device failed, from any thread: safe at once, unconfigured soon."""
+        known, self.failure = self.failure, reason
+        if reason != known:
+            self.get_logger().error(reason)
+        if not self._faulted.is_set():
+            self._faulted.set()
+            self._fault_guard.trigger()
+
+    def now_ns(self) -> int:
+        """Read the node's ROS time, int64 nanoseconds."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the device."""
+        self.failure = ""
+        if not self._auto_starting:
+            self.waiting = ""
+        self._faulted.clear()
+        opening = self._open_if_there if self._auto_starting else self.open_device
+        if not self._attempt("configure", opening) or self.waiting:
+            self._attempt("close", self.safe_state)
+            return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Enable the publishers, then start."""
+        result = super().on_activate(state)
+        if not self._attempt("activate", self.start_device):
+            return TransitionCallbackReturn.ERROR
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop, then disable the publishers."""
+        stopped = self._attempt("deactivate", self.stop_device)
+        result = super().on_deactivate(state)
+        return result if stopped and not self._faulted.is_set() else TransitionCallbackReturn.ERROR
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and close."""
+        closed = self._attempt("cleanup", self.safe_state)
+        result = super().on_cleanup(state)
+        return result if closed else TransitionCallbackReturn.ERROR
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and close."""
+        closed = self._attempt("shutdown", self.safe_state)
+        result = super().on_shutdown(state)
+        return result if closed else TransitionCallbackReturn.ERROR
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and close; unconfigured when that works, finalized when it does not."""
+        closed = self._attempt("error", self.safe_state)
+        super().on_deactivate(state)
+        return TransitionCallbackReturn.SUCCESS if closed else TransitionCallbackReturn.FAILURE
+
+    def _attempt(self, name: str, step: Callable[[], None]) -> bool:
+        try:
+            step()
+        except EschortyError as error:
+            self.failure = f"{name}: {error}"
+        except Exception:
+            self.failure = f"{name}: {traceback.format_exc()}"
+        else:
+            return True
+        self.get_logger().error(self.failure)
+        return False
+
+    def _auto_start(self) -> None:
+        assert self._start_timer is not None
+        configured = TransitionCallbackReturn.FAILURE
+        if self.state_label == "unconfigured":
+            self._auto_starting = True
+            configured = self.trigger_configure()
+            self._auto_starting = False
+        if self.state_label != "unconfigured" or self.failure:
+            self.waiting = ""
+        if self.waiting:
+            self._start_timer.timer_period_ns = round(RETRY_S * 1e9)
+            return
+        self._start_timer.cancel()
+        if configured == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def _open_if_there(self) -> None:
+        """Open the device; one that cannot be opened is to be waited for."""
+        try:
+            self.open_device()
+        except DeviceError as error:
+            self.waiting = f"waiting: {error}; trying again every {RETRY_S:g} s"
+            if self.waiting != self._told:
+                self.get_logger().warning(self.waiting)
+            self._told = self.waiting
+        else:
+            self.waiting = ""
+
+    def _leave_after_fault(self) -> None:
+        if not self._faulted.is_set():
+            return
+        if self.active:
+            self.trigger_deactivate()
+        elif self.state_label == "inactive":
+            self.trigger_cleanup()

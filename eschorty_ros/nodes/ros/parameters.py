@@ -1,0 +1,213 @@
+"""Table-driven ROS parameters: description, unit, range declared once; refusals with a reason."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterUninitializedException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+
+Value = bool | int | float | str | tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Param:
+    """One parameter of a node.
+
+    Parameters
+    ----------
+    name : str
+    default : bool, int, float, str or tuple of int
+        Its type is the parameter's type; an integer given for a float is taken as one.
+    description : str
+    unit : str
+        As in the contract of the ROS surface: SI.
+    minimum, maximum : float, optional
+        Inclusive bounds of a number; both or neither.
+    choices : tuple of str
+        The accepted strings; empty means any.
+    dynamic : bool
+        Whether the value may change after the node has started.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    dynamic: bool = False
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Make the ROS descriptor: description with unit, range, constraint, read-only flag."""
+        descriptor = ParameterDescriptor(
+            name=self.name,
+            description=f"{self.description} [{self.unit}]" if self.unit else self.description,
+            read_only=not self.dynamic,
+        )
+        if self.choices:
+            descriptor.additional_constraints = f"one of: {', '.join(self.choices)}"
+        if self.minimum is not None and self.maximum is not None:
+            if isinstance(self.default, float):
+                bounds = FloatingPointRange(
+                    from_value=float(self.minimum), to_value=float(self.maximum)
+                )
+                descriptor.floating_point_range = [bounds]
+            else:
+                descriptor.integer_range = [
+                    IntegerRange(from_value=int(self.minimum), to_value=int(self.maximum), step=1)
+                ]
+        return descriptor
+
+    def check(self, value: Any) -> None:
+        """Raise ``ArgumentError`` when ``value`` is not one of the choices."""
+        if self.choices and value not in self.choices:
+            raise ArgumentError(
+                f"parameter {self.name} is {value!r}; choose one of {', '.join(self.choices)}"
+            )
+
+
+def from_settings(settings_class: type[Any], *, dynamic: bool = False) -> tuple[Param, ...]:
+    """Parameters of a settings dataclass whose fields carry ``description, unit, range, choices``.
+
+    Fields whose default is not a bool, number or string are left out.
+    """
+    table = []
+    for field in dataclasses.fields(settings_class):
+        if not isinstance(field.default, bool | int | float | str):
+            continue
+        low, high = field.metadata.get("range") or (None, None)
+        table.append(
+            Param(
+                field.name,
+                field.default,
+                field.metadata.get("description", ""),
+                field.metadata.get("unit", ""),
+                low,
+                high,
+                tuple(field.metadata.get("choices") or ()),
+                dynamic,
+            )
+        )
+    return tuple(table)
+
+
+class Parameters(Mapping[str, Any]):
+    """The declared parameters of a node, read as a mapping of names to values.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    table : iterable of Param
+    on_change : callable, optional
+        Called with all values as they would be after a change, before it is accepted. It applies
+        the change; an ``EschortyError`` it raises refuses the change, and its text is the reason
+        the caller sees. Applying there, not after acceptance, lets a device refuse too.
+
+    Raises
+    ------
+    ArgumentError
+        When a value given at start has the wrong type, or is out of range or not a choice.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        table: Iterable[Param],
+        on_change: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self._node = node
+        self._table = {param.name: param for param in table}
+        self._on_change = on_change
+        for param in self._table.values():
+            _declare(node, param)
+            param.check(self[param.name])
+        if any(param.dynamic for param in self._table.values()):
+            node.add_pre_set_parameters_callback(self._coerce)
+        node.add_on_set_parameters_callback(self._validate)
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._table:
+            raise KeyError(name)
+        return self._node.get_parameter(name).value
+
+    def __iter__(self) -> Any:
+        return iter(self._table)
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def settings(self, settings_class: type[Any]) -> Any:
+        """Build the dataclass ``from_settings`` made parameters of."""
+        names = {field.name for field in dataclasses.fields(settings_class)}
+        return settings_class(**{name: value for name, value in self.items() if name in names})
+
+    def _coerce(self, proposed: list[Parameter[Any]]) -> list[Parameter[Any]]:
+        return [self._as_declared(parameter) for parameter in proposed]
+
+    def _as_declared(self, parameter: Parameter[Any]) -> Parameter[Any]:
+        declared = self._table.get(parameter.name)
+        if (
+            declared is not None
+            and isinstance(declared.default, float)
+            and type(parameter.value) is int
+        ):
+            return Parameter(parameter.name, value=float(parameter.value))
+        return parameter
+
+    def _validate(self, proposed: Sequence[Parameter[Any]]) -> SetParametersResult:
+        changes = {p.name: p.value for p in proposed if p.name in self._table}
+        if not changes:
+            return SetParametersResult(successful=True)
+        try:
+            for name, value in changes.items():
+                self._table[name].check(value)
+            if self._on_change is not None:
+                self._on_change({**self, **changes})
+        except EschortyError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def _declare(node: Node, param: Param) -> None:
+    try:
+        try:
+            node.declare_parameter(param.name, param.default, param.descriptor())
+        except InvalidParameterTypeException:
+            whole = _given_integer(node, param)
+            node.declare_parameter(param.name, whole, param.descriptor(), ignore_override=True)
+    except (
+        InvalidParameterTypeException,
+        InvalidParameterValueException,
+        ParameterUninitializedException,
+    ) as error:
+        raise ArgumentError(f"parameter {param.name} refused: {error}") from error
+
+
+def _given_integer(node: Node, param: Param) -> float:
+    """Take the whole number given at start where a float was declared."""
+    probe = ParameterDescriptor(dynamic_typing=True)
+    given = node.declare_parameter(param.name, param.default, probe).value
+    node.undeclare_parameter(param.name)
+    if isinstance(param.default, float) and type(given) is int:
+        return float(given)
+    raise ArgumentError(
+        f"parameter {param.name} is {given!r}; give a value of type "
+        f"{type(param.default).__name__}, such as {param.default!r}"
+    )

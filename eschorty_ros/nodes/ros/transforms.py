@@ -1,0 +1,46 @@
+"""Frames of the instrument: base -> stage carriage -> link -> optical."""
+
+from __future__ import annotations
+
+import math
+
+from geometry_msgs.msg import TransformStamped
+
+from eschorty_ros.core.reconstruction import stage_offset_m
+from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+
+BASE = "eschorty_base"
+STAGE = "eschorty_stage"
+LINK = "eschorty_link"
+OPTICAL = "eschorty_optical"
+
+
+def carriage(
+    t_ns: int, position_mm: float, direction: tuple[float, float, float]
+) -> TransformStamped:
+    """Place the carriage in the base at ROS time ``t_ns``: along the unit vector ``direction``."""
+    transform = _between(BASE, STAGE, t_ns)
+    offset_m = transform.transform.translation
+    offset_m.x, offset_m.y, offset_m.z = stage_offset_m(position_mm, direction).tolist()
+    return transform
+
+
+def mounts(t_ns: int) -> list[TransformStamped]:
+    """Make the static ones: carriage to link (same axes), link to optical (z forward).
+
+    The optical frame shares the link's origin: it is a change of axes, x right along increasing
+    columns, y down, z along the range axis.
+    """
+    optical = _between(LINK, OPTICAL, t_ns)
+    optical.transform.rotation.x = optical.transform.rotation.z = math.sqrt(0.5)
+    optical.transform.rotation.w = 0.0
+    return [_between(STAGE, LINK, t_ns), optical]
+
+
+def _between(parent: str, child: str, t_ns: int) -> TransformStamped:
+    transform = TransformStamped()
+    transform.header.stamp = stamp_from_ns(t_ns)
+    transform.header.frame_id = parent
+    transform.child_frame_id = child
+    transform.transform.rotation.w = 1.0
+    return transform

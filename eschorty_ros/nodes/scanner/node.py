@@ -1,0 +1,257 @@
+"""Node ``scanner``: the ``scan`` action over laser, stage and reconstruction."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+from eschorty_ros.action import Scan
+from eschorty_ros.control.scan_sequence import (
+    End,
+    ScanLimits,
+    ScanOutcome,
+    ScanRequest,
+    check_request,
+    crossing_ns,
+    run_scan,
+    sweep_progress,
+)
+from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ
+from eschorty_ros.nodes.ros import diagnostics
+from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
+from eschorty_ros.nodes.ros.instrument_client import ScanClient
+from eschorty_ros.nodes.ros.parameters import Param, Parameters
+from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+
+TABLE = (
+    Param("auto_scan", False, "do one scan as soon as the other nodes are there"),
+    Param("start", 0.01, "auto_scan: stage position where the sweep begins", "m", -1.0, 1.0),
+    Param("stop", 0.06, "auto_scan: stage position where it ends", "m", -1.0, 1.0),
+    Param("speed", 0.05, "auto_scan: stage speed", "m/s", 1e-6, 1.0),
+    Param("frequency", 0.0, "auto_scan: modulation frequency; 0 keeps the laser's", "Hz",
+          0.0, FREQUENCY_MAX_HZ),
+    Param("duty", 0.0, "auto_scan: duty; 0 keeps the laser's", "", 0.0, 0.999),
+    Param("travel_min", 0.0, "lower end of the stage's travel", "m", -1.0, 1.0),
+    Param("travel_max", 0.22, "upper end of the stage's travel", "m", -1.0, 1.0),
+    Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),
+    Param("acceleration", 2.0, "the stage's, from which the run-up follows", "m/s^2", 1e-3, 100.0),
+    Param("approach_speed", 0.1, "speed towards the start", "m/s", 1e-6, 1.0),
+    # A machine's first run compiles for some 20 s before the nodes answer.
+    Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
+    Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
+    Param("events_timeout", 3.0, "longest pause of the events while the laser is on", "s",
+          0.1, 60.0),
+    Param("drain_timeout", 10.0, "longest standstill of the reconstruction after the sweep", "s",
+          0.1, 600.0),
+)  # fmt: skip
+
+_FEEDBACK_S = 0.1
+# So long the other nodes may take to come up before anybody is told.
+_STARTING_S = 5.0
+
+
+class ScannerNode(Node):
+    """One scan at a time.
+
+    A goal that cannot be done is accepted and aborted at once, because only a result can carry
+    the reason to the client.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("scanner", **kwargs)
+        self.parameters = Parameters(self, TABLE)
+        self._limits = ScanLimits(
+            travel_mm=(
+                mm_from_m(self.parameters["travel_min"]),
+                mm_from_m(self.parameters["travel_max"]),
+            ),
+            speed_max_mm_s=mm_from_m(self.parameters["speed_max"]),
+            acceleration_mm_s2=mm_from_m(self.parameters["acceleration"]),
+            approach_mm_s=mm_from_m(self.parameters["approach_speed"]),
+            drain_timeout_s=self.parameters["drain_timeout"],
+        )
+        self._client = ScanClient(
+            self,
+            self.parameters["node_timeout"],
+            self.parameters["service_timeout"],
+            self.parameters["events_timeout"],
+        )
+        self._one_scan = threading.Lock()
+        self._idle = threading.Event()
+        self._idle.set()
+        self._scans = 0
+        self._last = "no scan yet"
+        self.waiting = ""
+        self._begun_s = time.monotonic()
+        group = ReentrantCallbackGroup()
+        self._server = ActionServer(
+            self,
+            Scan,
+            "scan",
+            execute_callback=self._execute,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            callback_group=group,
+        )
+        diagnostics.Diagnostics(self, self._report, group)
+        if self.parameters["auto_scan"]:
+            self._self_client = ActionClient(self, Scan, "scan", callback_group=group)
+            self._auto_timer = self.create_timer(
+                0.1, self._auto_scan, group, Clock(clock_type=ClockType.STEADY_TIME)
+            )
+
+    def safe_state(self) -> None:
+        """End a scan under way: its way out switches the laser off, and its heartbeat stops."""
+        self._client.end()
+        self._idle.wait(2.0)
+
+    def _execute(self, goal: Any) -> Any:
+        if not self._one_scan.acquire(blocking=False):
+            return self._refuse(goal, "a scan is running; wait for its end or cancel it")
+        self._idle.clear()
+        try:
+            return self._scan(goal)
+        finally:
+            self._idle.set()
+            self._one_scan.release()
+
+    def _scan(self, goal: Any) -> Any:
+        asked = goal.request
+        request = ScanRequest(
+            scan_id=time.strftime("scan-%Y%m%d-%H%M%S-", time.gmtime()) + f"{self._scans + 1}",
+            start_mm=mm_from_m(asked.start),
+            stop_mm=mm_from_m(asked.stop),
+            speed_mm_s=mm_from_m(asked.speed),
+            frequency_hz=float(asked.frequency),
+            duty=float(asked.duty),
+        )
+        try:
+            check_request(request, self._limits)
+        except EschortyError as error:
+            return self._refuse(goal, str(error))
+        self._scans += 1
+        self._client.prepare(lambda: bool(goal.is_cancel_requested), self._feedback(goal, request))
+        outcome = run_scan(self._client, request, self._limits)
+        result = self._result(request, outcome)
+        self._last = f"{request.scan_id}: {outcome.end.value}"
+        if result.message:
+            self._last += f": {result.message}"
+        if not self.context.ok():
+            return result
+        line = f"{self._last}; {result.points} points"
+        # Two calls: rclpy's logger refuses a call site that changes its severity.
+        if outcome.end is End.ABORTED:
+            self.get_logger().error(line)
+        else:
+            self.get_logger().info(line)
+        with unless_shut_down(self):
+            _close(goal, outcome.end)
+        return result
+
+    def _refuse(self, goal: Any, reason: str) -> Any:
+        self.get_logger().error(f"scan refused: {reason}")
+        with unless_shut_down(self):
+            goal.abort()
+        return Scan.Result(success=False, message=reason)
+
+    def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:
+        sent_s = -math.inf
+        sent_phase = ""
+        before = self._client.monitor.reconstruction
+        points_before = before.points if before is not None else 0
+        profiles_before = before.profiles if before is not None else 0
+
+        def send(phase: str) -> None:
+            nonlocal sent_s, sent_phase
+            now_s = time.monotonic()
+            if phase == sent_phase and now_s - sent_s < _FEEDBACK_S:
+                return
+            sent_s, sent_phase = now_s, phase
+            position_mm = self._client.monitor.position_mm
+            feedback = Scan.Feedback(
+                phase=phase, progress=sweep_progress(phase, position_mm, request)
+            )
+            feedback.position = m_from_mm(position_mm)
+            state = self._client.monitor.reconstruction
+            if state is not None:
+                feedback.points = max(state.points - points_before, 0)
+                feedback.profiles = max(state.profiles - profiles_before, 0)
+                feedback.events_per_second = state.events_per_second
+            with unless_shut_down(self):
+                goal.publish_feedback(feedback)
+
+        return send
+
+    def _result(self, request: ScanRequest, outcome: ScanOutcome) -> Any:
+        summary = outcome.summary
+        result = Scan.Result(
+            success=outcome.end is End.SUCCEEDED,
+            message="; ".join(text for text in (outcome.message, summary.message) if text),
+            scan_id=request.scan_id,
+            profiles=summary.profiles,
+            points=summary.points,
+            events=summary.events,
+            packets_lost=summary.packets_lost,
+            events_dropped=summary.events_dropped,
+            sigma_median=summary.sigma_median_m,
+        )
+        samples = list(self._client.monitor.samples)
+        if samples:
+            start_ns = crossing_ns(samples, request.start_mm)
+            stop_ns = crossing_ns(samples, request.stop_mm)
+            result.sweep_start = stamp_from_ns(start_ns if start_ns is not None else samples[0][0])
+            result.sweep_stop = stamp_from_ns(stop_ns if stop_ns is not None else samples[-1][0])
+        return result
+
+    def _auto_scan(self) -> None:
+        missing = self._client.missing()
+        if missing or not self._self_client.server_is_ready():
+            self._wait_for(missing or "scanner: no scan")
+            return
+        self.waiting = ""
+        self._auto_timer.cancel()
+        values = {name: self.parameters[name]
+                  for name in ("start", "stop", "speed", "frequency", "duty")}  # fmt: skip
+        self._self_client.send_goal_async(Scan.Goal(**values))
+
+    def _wait_for(self, missing: str) -> None:
+        waiting = f"waiting: {missing}; the scan begins when it is there"
+        if waiting == self.waiting or time.monotonic() - self._begun_s < _STARTING_S:
+            return
+        self.waiting = waiting
+        self.get_logger().warning(waiting)
+
+    def _report(self) -> diagnostics.Report:
+        scanning = not self._idle.is_set()
+        values = {"scans": self._scans, "scanning": scanning, "last": self._last}
+        failed = not scanning and End.ABORTED.value in self._last
+        level = diagnostics.WARN if failed else diagnostics.OK
+        return level, "scanning" if scanning else self._last, values
+
+
+def _close(goal: Any, end: End) -> None:
+    if end is End.SUCCEEDED:
+        goal.succeed()
+    elif end is End.CANCELED and goal.is_cancel_requested:
+        goal.canceled()
+    else:
+        goal.abort()
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ScannerNode, threads=6)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

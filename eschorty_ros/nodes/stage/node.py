@@ -1,0 +1,284 @@
+"""Stage node: moves as an action, odometry, and where it gives pulses."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import threading
+import time
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+
+from eschorty_ros.action import MoveStage
+from eschorty_ros.control.stage_states import new_states
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.hardware.base.protocols import LinearStage, StageState
+from eschorty_ros.msg import PositionTrigger
+from eschorty_ros.nodes.ros import diagnostics, drivers, qos
+from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
+from eschorty_ros.nodes.ros.heartbeat import Heartbeat
+from eschorty_ros.nodes.ros.lifecycle import DeviceNode
+from eschorty_ros.nodes.ros.parameters import Param
+from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+
+FEEDBACK_PERIOD_S = 0.05
+POLL_S = 0.01
+# More than DDS's heartbeat of 3 s holds: what got lost can still be repeated.
+ODOM_DEPTH = 2000
+
+TABLE = (
+    *drivers.DRIVER,
+    *drivers.STAGE_TABLE,
+    Param("odom_rate", 100.0, "rate of stage/odom", "Hz", 1.0, 500.0),
+    Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
+    Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
+    Param("home_timeout", 60.0, "longest time for homing", "s", 1.0, 600.0),
+    Param("base_frame", "eschorty_base", "frame the stage stands in"),
+    Param("stage_frame", "eschorty_stage", "frame of the carriage"),
+)
+
+
+class StageNode(DeviceNode):
+    """Action ``stage/move``; topics ``stage/odom`` and ``stage/trigger``.
+
+    Activate homes when needed. A goal that cannot be carried out (outside travel, too fast, not
+    active, another motion under way) is accepted and aborted at once, because a rejection carries
+    no text: the result's ``message`` is the reason. Spin it with several threads: a goal waits in
+    its callback.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        self._lock = threading.RLock()
+        self._busy = threading.Lock()
+        self._stage: LinearStage | None = None
+        super().__init__("stage", TABLE, **kwargs)
+        self.moves = 0
+        self._told_ns = 0
+        self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(ODOM_DEPTH))
+        self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
+        self._move = ActionServer(
+            self,
+            MoveStage,
+            "stage/move",
+            self._on_move,
+            callback_group=ReentrantCallbackGroup(),
+            goal_callback=lambda _: GoalResponse.ACCEPT,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+        ticking = MutuallyExclusiveCallbackGroup()
+        period_s = 1.0 / self.parameters["odom_rate"]
+        self.create_timer(
+            period_s, self._publish_odom, callback_group=ticking, clock=self.steady_clock
+        )
+        diagnostics.Diagnostics(self, self._report, ticking)
+        Heartbeat(self, "stage/heartbeat", self._healthy)
+
+    def open_device(self) -> None:
+        """Open the stage."""
+        with self._lock:
+            self._stage = drivers.make(drivers.STAGES, self.parameters, self.now_ns)
+            identity, trigger = self._stage.identity, self._stage.trigger
+        self._trigger.publish(self._trigger_message(trigger))
+        self.get_logger().info(f"{identity.model} {identity.serial}")
+
+    def start_device(self) -> None:
+        """Home unless homed, and wait for it."""
+        stage = self._opened()
+        if stage.state().homed:
+            return
+        stage.home()
+        limit_s = self.parameters["home_timeout"]
+        end_s = time.monotonic() + limit_s
+        while not stage.state().homed:
+            if time.monotonic() > end_s:
+                raise DeviceError(f"the stage is not homed after {limit_s:g} s; check it")
+            if not self.context.ok():
+                raise DeviceError("homing interrupted by shutdown")
+            time.sleep(POLL_S)
+
+    def stop_device(self) -> None:
+        """Profiled stop."""
+        with self._lock:
+            if self._stage is not None:
+                self._stage.stop()
+
+    def close_device(self) -> None:
+        """Release the stage."""
+        with self._lock:
+            stage, self._stage = self._stage, None
+        if stage is not None:
+            stage.close()
+
+    def destroy_node(self) -> None:
+        """Destroy the action server first: the node does not know it."""
+        # rclpy 9.1 drops the future of an answered result request twice and raises.
+        with contextlib.suppress(ValueError):
+            self._move.destroy()
+        super().destroy_node()
+
+    def _healthy(self) -> bool:
+        """Whether light is of use: the stage can be moved."""
+        stage = self._stage
+        return stage is not None and stage.healthy and self.active and not self.failure
+
+    def _opened(self) -> LinearStage:
+        stage = self._stage
+        if stage is None:
+            raise DeviceError(f"stage refused: node is {self.state_label}; configure it first")
+        return stage
+
+    def _on_move(self, goal: Any) -> MoveStage.Result:
+        if not self._busy.acquire(blocking=False):
+            return self._aborted(goal, "stage refused: another move is under way; cancel it first")
+        try:
+            return self._carry_out(goal)
+        except EschortyError as error:
+            return self._aborted(goal, str(error))
+        finally:
+            self._busy.release()
+
+    def _carry_out(self, goal: Any) -> MoveStage.Result:
+        target_mm, speed_mm_s = mm_from_m(goal.request.position), mm_from_m(goal.request.speed)
+        self._begin(target_mm, speed_mm_s)
+        state = self._follow(goal)
+        if goal.is_cancel_requested:
+            with unless_shut_down(self):
+                goal.canceled()
+            return self._result(False, "canceled: stopped", state)
+        if abs(state.position_mm - target_mm) > 1e-3:
+            raise DeviceError(
+                f"stopped at {state.position_mm:.3f} mm on the way to {target_mm:.3f} mm"
+            )
+        with unless_shut_down(self):
+            goal.succeed()
+        return self._result(True, "arrived", state)
+
+    def _begin(self, target_mm: float, speed_mm_s: float) -> None:
+        stage = self._opened()
+        if not self.active:
+            raise DeviceError(f"stage refused: node is {self.state_label}; activate it first")
+        low_mm, high_mm = stage.travel_mm
+        if not low_mm <= target_mm <= high_mm:
+            raise DeviceError(
+                f"stage refused: position {m_from_mm(target_mm):g} m is outside the travel; "
+                f"choose {m_from_mm(low_mm):g} to {m_from_mm(high_mm):g} m"
+            )
+        if not 0.0 < speed_mm_s <= stage.speed_max_mm_s:
+            raise DeviceError(
+                f"stage refused: speed {m_from_mm(speed_mm_s):g} m/s; "
+                f"choose above 0 to {m_from_mm(stage.speed_max_mm_s):g} m/s"
+            )
+        stage.move_to(target_mm, speed_mm_s)
+        self.moves += 1
+
+    def _follow(self, goal: Any) -> StageState:
+        """Wait until the stage rests; the state it rests in."""
+        feedback_s = 0.0
+        stopping = False
+        while True:
+            stage = self._opened()
+            state = stage.state()
+            if not state.moving:
+                return state
+            if goal.is_cancel_requested and not stopping:
+                stage.stop()
+                stopping = True
+            if not self.context.ok():
+                stage.stop()
+                raise DeviceError("move interrupted by shutdown")
+            if time.monotonic() - feedback_s >= FEEDBACK_PERIOD_S:
+                feedback_s = time.monotonic()
+                feedback = MoveStage.Feedback(
+                    position=m_from_mm(state.position_mm),
+                    velocity=m_from_mm(state.velocity_mm_s),
+                )
+                with unless_shut_down(self):
+                    goal.publish_feedback(feedback)
+            time.sleep(POLL_S)
+
+    def _aborted(self, goal: Any, reason: str) -> MoveStage.Result:
+        if not self.context.ok():
+            return MoveStage.Result(success=False, message=reason)
+        self.get_logger().warning(reason)
+        with unless_shut_down(self):
+            goal.abort()
+        stage, state = self._stage, None
+        with contextlib.suppress(EschortyError):
+            state = stage.state() if stage is not None else None
+        return self._result(False, reason, state)
+
+    @staticmethod
+    def _result(success: bool, message: str, state: StageState | None) -> MoveStage.Result:
+        position_m = m_from_mm(state.position_mm) if state is not None else float("nan")
+        return MoveStage.Result(success=success, message=message, position=position_m)
+
+    def _publish_odom(self) -> None:
+        stage = self._stage
+        if stage is None:
+            return
+        try:
+            states = new_states(stage, self._told_ns, round(1e9 / self.parameters["odom_rate"]))
+        except EschortyError as error:
+            self.fault(f"stage lost: {error}")
+            return
+        for state in states:
+            self._told_ns = state.t_ns
+            self._odom.publish(self._odometry(state))
+
+    def _trigger_message(self, pulses: PulseTrain | None) -> PositionTrigger:
+        message = PositionTrigger()
+        message.header.frame_id = self.parameters["base_frame"]
+        message.header.stamp = stamp_from_ns(self.now_ns())
+        if pulses is not None:
+            message.first = m_from_mm(pulses.first_mm)
+            message.interval = m_from_mm(pulses.interval_mm)
+            message.count = pulses.count
+        return message
+
+    def _odometry(self, state: StageState) -> Odometry:
+        message = Odometry(child_frame_id=self.parameters["stage_frame"])
+        message.header.frame_id = self.parameters["base_frame"]
+        message.header.stamp = stamp_from_ns(state.t_ns)
+        message.pose.pose.position.y = m_from_mm(state.position_mm)
+        message.pose.pose.orientation.w = 1.0
+        message.twist.twist.linear.y = m_from_mm(state.velocity_mm_s)
+        message.pose.covariance[7] = self.parameters["position_sigma"] ** 2
+        message.twist.covariance[7] = self.parameters["velocity_sigma"] ** 2
+        return message
+
+    def _report(self) -> diagnostics.Report:
+        stage = self._stage
+        if stage is None or self.failure:
+            level = diagnostics.ERROR if self.failure else diagnostics.OK
+            return level, self.failure or self.state_label, {"state": self.state_label}
+        try:
+            state = stage.state()
+        except EschortyError as error:
+            return diagnostics.ERROR, str(error), {"state": self.state_label}
+        values = {
+            "device": stage.identity.model,
+            "state": self.state_label,
+            "position_m": m_from_mm(state.position_mm),
+            "velocity_m_s": m_from_mm(state.velocity_mm_s),
+            "homed": state.homed,
+            "moving": state.moving,
+            "flags": " ".join(state.flags),
+            "moves": self.moves,
+            **stage.statistics(),
+        }
+        if self.active and not state.homed:
+            return diagnostics.WARN, "not homed", values
+        return diagnostics.OK, "moving" if state.moving else "at rest", values
+
+
+def main() -> None:
+    """Entry point of the stage node."""
+    sys.exit(run(StageNode, threads=4))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,155 @@
+"""When a comparator fires early because of noise.
+
+Noise at the follower's output is a Gaussian process of correlation time ``tau_f``. It is never
+drawn: a pixel whose signal is ``g`` standard deviations from a level passes it at the rate
+``r(g)``, and while the gap shrinks from ``g1`` to ``g2`` also with the probability that the noise
+at hand reaches across; both come from a table (``_noise_table``). The event is where the rates
+summed up reach an exponential number drawn once per pixel and piece of signal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from eschorty_ros.simulation.pixels._response import NOTHING, OFF, ON, UNKNOWN, _shares
+
+GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 4.5, 64.0
+"""Span of the noise table in standard deviations, and its entries per standard deviation."""
+
+# Columns of the noise table: passages per us, their sum over the gaps above, and minus the log
+# of the share of noise below the gap.
+_RATE, _SUM, _SHARE = 0, 1, 2
+_BEND = 0.15
+"""Largest bend of the gap's path within a step of the summation, standard deviations."""
+_STEPS_MAX = 4096
+
+_DECAY_STEPS, _DECAY_MAX = 32.0, 40.0
+_DECAY = np.exp(-np.arange(int(_DECAY_STEPS * _DECAY_MAX) + 1) / _DECAY_STEPS)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _decay(x):
+    """``exp(-x)`` of a positive number to 1e-6: enough where risks are summed up, and quicker."""
+    x = min(x, _DECAY_MAX)
+    entry = np.int64(x * _DECAY_STEPS + 0.5)
+    rest = x - entry * (1.0 / _DECAY_STEPS)
+    return _DECAY[np.uintp(entry)] * (1.0 - rest * (1.0 - 0.5 * rest))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _entry(gap):
+    """Row of the noise table for a gap."""
+    # By way of a signed integer: converting to an unsigned one is slow.
+    return np.uintp(np.int64((min(max(gap, GAP_MIN), GAP_MAX) - GAP_MIN) * GAP_STEPS))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cost(old, new, per_gap_us, step_us, table):
+    """Risk spent while the gap went from entry ``old`` to ``new`` at a steady pace."""
+    frozen = max(0.0, table[new, _SHARE] - table[old, _SHARE])
+    moved = (table[new, _SUM] - table[old, _SUM]) * per_gap_us
+    rested = table[new, _RATE] * step_us
+    passed = rested if old == new else moved
+    return max(passed, frozen) + 0.6 * min(passed, frozen)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _part(first, last, rest, cost):
+    """Part of a step in which ``rest`` of its ``cost`` is spent, the rate growing evenly."""
+    first, last = first + 1e-300, last + 1e-300
+    root = math.sqrt(cost * (cost * first * first + rest * (last * last - first * first)))
+    return rest * (first + last) / (cost * first + root)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gap(value, per_level, noise, per_noise, sign):
+    """Distance of y from a level in standard deviations, positive inside the band.
+
+    ``log(1 + x) / noise`` by its series: near the level it counts, far off it only has to rise.
+    """
+    x = sign * (value * per_level - 1.0)
+    return x * (1.0 + x * (x * (1 / 3) - sign * 0.5)) * per_noise
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _start(u, y, settled, tau_us, follower_us, noise, from_us):
+    """Where the summation begins and in which steps.
+
+    Returns the two exponentials at ``from_us``, the first step and what is left of the
+    exponentials after it, and their second derivatives relative to themselves.
+    """
+    a, b, follower_us = _shares(u, y, settled, tau_us, follower_us)
+    rate_a, rate_b = 1.0 / tau_us, 1.0 / follower_us
+    fade_a, fade_b = _decay(from_us * rate_a), _decay(from_us * rate_b)
+    a *= fade_a
+    b *= fade_b
+    bend_a, bend_b = rate_a * rate_a, rate_b * rate_b
+    # A step h bends the path of the gap by h^2/8 times its second derivative.
+    bend = abs(a) * bend_a + abs(b) * bend_b
+    scale = (settled + a + b) * noise
+    room = 8.0 * _BEND * scale
+    step_us = from_us
+    # As long again as the signal took to come near is mostly right and costs no exponentials.
+    if not 0.0 < bend * from_us * from_us < room:
+        step_us = min(math.sqrt(room / (bend + 1e-300)), 0.5 * tau_us)
+        fade_a, fade_b = _decay(step_us * rate_a), _decay(step_us * rate_b)
+    return a, b, step_us, fade_a, fade_b, bend_a, bend_b
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _noisy(
+    u, y, settled, tau_us, follower_us, on_level, off_level, middle, noise, table, from_us,
+    until_us, budget,
+):  # fmt: skip
+    """Time from now and polarity of the first passage of y with noise.
+
+    Sums up the risk from ``from_us`` on until it reaches ``budget``, in steps over which the gaps
+    change at a nearly steady pace. A moving signal risks to pass the nearer level only, on its
+    side of ``middle``. Returns UNKNOWN when nothing happened up to ``until_us`` and the signal
+    still moves: ask again later. The steps do not depend on ``until_us``.
+    """
+    a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(
+        u, y, settled, tau_us, follower_us, noise, from_us
+    )
+    per_noise, per_on, per_off = 1.0 / noise, 1.0 / on_level, 1.0 / off_level
+    value = settled + a + b
+    t, spent = from_us, 0.0
+    old_sign, old_gap, old = 0.0, 0.0, np.uintp(0)
+    for _ in range(_STEPS_MAX):
+        sign = 1.0 if value < middle else -1.0
+        per_level = per_on if value < middle else per_off
+        gap = _gap(value, per_level, noise, per_noise, sign)
+        entry = _entry(gap)
+        if old_sign != 0.0:
+            if sign != old_sign:
+                old_gap = GAP_MAX + 1.0
+                old = _entry(old_gap)
+            pace = step_us / (old_gap - gap)
+            cost = _cost(old, entry, pace, step_us, table)
+            if spent + cost >= budget:
+                part = _part(table[old, _RATE], table[entry, _RATE], budget - spent, cost)
+                return t - step_us * (1.0 - part), ON if sign > 0.0 else OFF
+            spent += cost
+        scale = value * noise
+        if abs(a) + abs(b) < 0.05 * scale:
+            per_other = per_off if value < middle else per_on
+            other = _entry(_gap(value, per_other, noise, per_noise, -sign))
+            rate = table[entry, _RATE] + table[other, _RATE]
+            if rate == 0.0:
+                return np.inf, NOTHING
+            return t + (budget - spent) / rate, ON if sign > 0.0 else OFF
+        if t > until_us:
+            return np.inf, UNKNOWN
+        longer = (abs(a) * bend_a + abs(b) * bend_b) * step_us * step_us < 2.0 * _BEND * scale
+        step_us = 2.0 * step_us if longer else step_us
+        fade_a = fade_a * fade_a if longer else fade_a
+        fade_b = fade_b * fade_b if longer else fade_b
+        old_sign, old_gap, old = sign, gap, entry
+        a *= fade_a
+        b *= fade_b
+        value = settled + a + b
+        t += step_us
+    return np.inf, UNKNOWN

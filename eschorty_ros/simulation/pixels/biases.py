@@ -1,0 +1,69 @@
+"""The camera's bias settings as parameters of the pixel model.
+
+A model, not a measurement: the sensor's maker says which way each bias works and gives its range,
+not what it does in numbers. Each acts by a factor ``exp(bias / scale)``, so that 0 leaves the base
+as it is and the effect is monotone. The high-pass (``bias_hpf``) is not modelled.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.simulation.pixels.parameters import PixelParameters
+
+LIMITS = {
+    "diff_on": (-85, 140),
+    "diff_off": (-35, 190),
+    "fo": (-35, 55),
+    "refr": (-20, 235),
+}
+"""Offsets the IMX636 takes."""
+
+THRESHOLD_SCALE = 120.0
+FOLLOWER_SCALE = 20.0
+REFRACTORY_SCALE = -80.0
+
+
+@dataclass(frozen=True, slots=True)
+class Biases:
+    """Offsets from the factory setting, as the camera takes them.
+
+    Parameters
+    ----------
+    diff_on, diff_off : int
+        More raises the ON or OFF threshold: fewer events, a narrower line.
+    fo : int
+        More widens the source follower: events come sooner, and more of them above some kHz.
+    refr : int
+        More shortens the refractory time: more events above 500 Hz.
+
+    Raises
+    ------
+    ArgumentError
+        For an offset outside ``LIMITS``.
+    """
+
+    diff_on: int = 0
+    diff_off: int = 0
+    fo: int = 0
+    refr: int = 0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            low, high = LIMITS[item.name]
+            if not low <= value <= high:
+                raise ArgumentError(f"{item.name} is {value!r}; choose {low} to {high}")
+
+
+def parameters_from_biases(base: PixelParameters, biases: Biases) -> PixelParameters:
+    """Parameters of the pixels of ``base`` under other biases."""
+    return replace(
+        base,
+        threshold_on=base.threshold_on * math.exp(biases.diff_on / THRESHOLD_SCALE),
+        threshold_off=base.threshold_off * math.exp(biases.diff_off / THRESHOLD_SCALE),
+        follower_hz=base.follower_hz * math.exp(biases.fo / FOLLOWER_SCALE),
+        refractory_us=max(1.0, base.refractory_us * math.exp(biases.refr / REFRACTORY_SCALE)),
+    )

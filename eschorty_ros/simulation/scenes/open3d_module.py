@@ -1,0 +1,38 @@
+"""The optional Open3D, loaded when a mesh or a window asks for it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+from types import ModuleType
+
+from eschorty_ros.core.base.errors import EschortyError
+
+
+def load_open3d(purpose: str) -> ModuleType:
+    """Import ``open3d``.
+
+    Parameters
+    ----------
+    purpose : str
+        What needs it, for the message.
+
+    Raises
+    ------
+    EschortyError
+        When it does not import.
+    """
+    with contextlib.suppress(ImportError, OSError):
+        # Open3D links libusb-1.0, which a bare machine lacks; this package brings one along.
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise EschortyError(
+            f"{purpose} needs open3d, which does not import here ({error}); "
+            "run: pip install open3d libusb-package"
+        ) from error
+    module: ModuleType = open3d
+    return module

@@ -1,0 +1,139 @@
+"""Posts at known ranges side by side along the laser line: what a build is calibrated with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.simulation.scenes.scene import UniformReflectance, sheet
+
+Array = NDArray[np.float64]
+
+RANGES_MM = (820.0, 960.0, 1110.0, 1270.0, 1440.0, 1610.0, 1770.0, 1910.0, 2050.0)
+"""A third of them in the far third of what the third build sees."""
+SLIM_MM, WIDE_MM = 12.7, 25.4
+_SLIM_WITHIN_MM = 1000.0
+_FAN_SLOPE = 0.0287
+
+
+@dataclass(frozen=True, slots=True)
+class Post:
+    """One post along the stage direction, as long as any sweep.
+
+    Parameters
+    ----------
+    range_mm : float
+        Of its front.
+    line_mm : float
+        Where its middle lies along the laser line (z).
+    size_mm : float
+        Width of a flat post, diameter of a round one.
+    round : bool
+        A cylinder instead of a flat strip that faces the sensor.
+    """
+
+    range_mm: float
+    line_mm: float
+    size_mm: float
+    round: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("range_mm", "size_mm"):
+            value = getattr(self, name)
+            if not 0.0 < value < np.inf:
+                raise ArgumentError(f"a post's {name} is {value!r}; choose a positive length")
+        if not np.isfinite(self.line_mm):
+            raise ArgumentError(f"a post's line_mm is {self.line_mm!r}; choose a finite number")
+
+    def front_mm(self, slope: Array, model: RangeModel) -> Array:
+        """Range of the first hit of rays with these slopes; NaN beside the post."""
+        depth = self.range_mm + model.b_mm
+        if not self.round:
+            beside = np.abs(slope * depth - self.line_mm) > 0.5 * self.size_mm
+            return np.where(beside, np.nan, self.range_mm)
+        radius = 0.5 * self.size_mm
+        axis = depth + radius
+        half_linear = axis + slope * self.line_mm
+        square = 1.0 + slope * slope
+        constant = axis**2 + self.line_mm**2 - radius**2
+        discriminant = half_linear**2 - square * constant
+        root = np.sqrt(np.where(discriminant >= 0.0, discriminant, np.nan))
+        # The near root as constant / (b + root): no cancellation between b and root.
+        return np.asarray(constant / (half_linear + root) - model.b_mm)
+
+    def columns(self, model: RangeModel) -> tuple[float, float]:
+        """Columns, in pixels and fractions, between which the post is seen."""
+        depth = self.range_mm + model.b_mm
+        if self.round:
+            radius = 0.5 * self.size_mm
+            axis = depth + radius
+            middle = np.arctan2(self.line_mm, axis)
+            half = np.arcsin(radius / np.hypot(axis, self.line_mm))
+            slopes = float(np.tan(middle - half)), float(np.tan(middle + half))
+        else:
+            ends = (self.line_mm - 0.5 * self.size_mm, self.line_mm + 0.5 * self.size_mm)
+            slopes = ends[0] / depth, ends[1] / depth
+        per_slope = model.k_mm / (model.pixel_um * 1e-3)
+        left, right = (model.principal_column + float(s) * per_slope for s in slopes)
+        return left, right
+
+
+def bench(ranges_mm: Sequence[float] = RANGES_MM) -> tuple[Post, ...]:
+    """Flat posts at these ranges, each in the middle of its share of the fan.
+
+    Slim and wide ones by turns, so that a blooming of the image does not pass for a size; the
+    nearest are slim, because a wide one would fill its share.
+
+    Raises
+    ------
+    ArgumentError
+        For more posts than fit side by side.
+    """
+    if len(ranges_mm) > len(RANGES_MM):
+        raise ArgumentError(
+            f"{len(ranges_mm)} posts do not fit side by side; choose {len(RANGES_MM)} at most"
+        )
+    posts = []
+    for index, range_mm in enumerate(ranges_mm):
+        slim = index % 2 == 1 or range_mm < _SLIM_WITHIN_MM
+        line_mm = (index - 0.5 * (len(ranges_mm) - 1)) * _FAN_SLOPE * range_mm
+        posts.append(Post(range_mm, line_mm, SLIM_MM if slim else WIDE_MM))
+    return tuple(posts)
+
+
+@dataclass(frozen=True)
+class Posts(UniformReflectance):
+    """Posts with nothing behind them, or with a flat backdrop.
+
+    Parameters
+    ----------
+    posts : sequence of Post
+        In any order; the nearest one in a column is seen.
+    backdrop_mm : float, optional
+        Range of the backdrop.
+    """
+
+    posts: Sequence[Post] = field(default_factory=bench)
+    backdrop_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.posts:
+            raise ArgumentError("a scene of posts has none; give at least one Post")
+
+    @property
+    def known_mm(self) -> Array:
+        """Ranges of the posts' fronts, shape (n,)."""
+        return np.array([post.range_mm for post in self.posts])
+
+    def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
+        """See :class:`~eschorty_ros.simulation.scenes.scene.Scene`; NaN between the posts."""
+        stage, slope = sheet(stage_mm, columns, model)
+        nearest = np.full(slope.shape, np.nan if self.backdrop_mm is None else self.backdrop_mm)
+        for post in self.posts:
+            nearest = np.fmin(nearest, post.front_mm(slope, model))
+        return np.repeat(nearest, stage.shape[0], axis=0)

@@ -1,0 +1,83 @@
+"""What a scene is, and what every scene needs.
+
+All scenes live in ``eschorty_base``: x is the range, y the stage direction, z the laser line.
+At stage position ``s`` the sheet is a fan of rays from ``(-b, s, 0)`` with the direction
+``(1, 0, column_slope)``, so the range of a hit is its x coordinate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.optics.range_model import RangeModel
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Scene(Protocol):
+    """A surface the laser sheet can hit."""
+
+    def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
+        """Range of the first hit of every ray.
+
+        Parameters
+        ----------
+        stage_mm : array_like, shape (n,)
+            Stage positions, mm.
+        columns : array_like, shape (m,)
+            Sensor columns.
+        model : RangeModel
+            Gives the ray origin (``b_mm``) and the slope of each column.
+
+        Returns
+        -------
+        ndarray of float64, shape (n, m)
+            mm; NaN where the ray hits nothing.
+        """
+
+    def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
+        """Reflectance (0 to 1) where the rays of :meth:`range_mm` hit, same shape."""
+
+
+def sheet(stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> tuple[Array, Array]:
+    """Stage positions as (n, 1) and ray slopes (mm of z per mm of depth) as (1, m)."""
+    stage = np.atleast_1d(np.asarray(stage_mm, dtype=np.float64))
+    return stage[:, np.newaxis], model.column_slope(np.atleast_1d(columns))[np.newaxis, :]
+
+
+class RecentRays:
+    """Result of the last query, so that range and reflectance of the same rays cost one cast."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Any, tuple[Array, NDArray[Any]]] | None = None
+
+    def get(
+        self,
+        cast: Callable[[ArrayLike, ArrayLike, RangeModel], tuple[Array, NDArray[Any]]],
+        stage_mm: ArrayLike,
+        columns: ArrayLike,
+        model: RangeModel,
+    ) -> tuple[Array, NDArray[Any]]:
+        """``cast(stage_mm, columns, model)``, its arrays made read-only."""
+        rays = (np.asarray(values, dtype=np.float64).tobytes() for values in (stage_mm, columns))
+        key = (*rays, model)
+        if self._last is None or self._last[0] != key:
+            result = cast(stage_mm, columns, model)
+            for array in result:
+                array.setflags(write=False)
+            self._last = (key, result)
+        return self._last[1]
+
+
+class UniformReflectance:
+    """A surface of one reflectance all over."""
+
+    albedo: float = 1.0
+
+    def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
+        """Give the same value to every ray, shape (n, m)."""
+        return np.full((np.size(stage_mm), np.size(columns)), self.albedo)

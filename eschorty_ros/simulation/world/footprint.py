@@ -1,0 +1,149 @@
+"""Where the laser line's thickness lies on a scene: one patch per column, two across an edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.simulation.scenes.scene import Scene
+
+Array = NDArray[np.float64]
+
+_LOOKS = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+"""Where the scene is looked at across the line, in half widths of the footprint."""
+_CENTRE = 2
+_FINE = 32
+"""Parts into which the stretch between two looks is cut to find an edge."""
+_ROW_JUMP = 0.25
+_REFLECTANCE_JUMP = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint:
+    """The line on the scene at one stage position.
+
+    Attributes
+    ----------
+    row, reflectance : float64, shape (columns,)
+        Where the middle of the line appears, and how bright; NaN where it hits nothing.
+    split : int64, shape (n,)
+        Columns across whose footprint an edge runs.
+    patch_row, patch_reflectance, low_row, high_row : float64, shape (n, 2)
+        The two patches of each of these columns, as :meth:`PixelArray.relight` takes them.
+    """
+
+    row: Array
+    reflectance: Array
+    split: NDArray[np.int64]
+    patch_row: Array
+    patch_reflectance: Array
+    low_row: Array
+    high_row: Array
+
+
+def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float) -> Footprint:
+    """Look at the scene across the line's thickness.
+
+    Rows ``d`` above the line's centre see the scene ``d / rows_per_mm_off_sheet`` behind the
+    sheet (PHYSICS section 3). Only a jump of range or reflectance makes a second patch; a smooth
+    surface counts by what its middle shows.
+
+    Parameters
+    ----------
+    scene : Scene
+    model : RangeModel
+    stage_mm : float
+    half_rows : float
+        Rows from the line's centre to where it fades.
+    """
+    columns = np.arange(model.columns)
+    at_middle = scene.range_mm(np.array([stage_mm]), columns, model)
+    seen = at_middle[np.isfinite(at_middle)]
+    # Where the middle hits nothing the scene may begin beside it, at a range nobody knows yet.
+    nearest_mm = float(seen.max()) if seen.size else float(model.range_mm(model.rows / 2))
+    half_mm = half_rows / float(model.rows_per_mm_off_sheet(nearest_mm))
+    stages = stage_mm + _LOOKS * half_mm
+    range_mm = scene.range_mm(stages, columns, model)
+    reflectance = scene.reflectance(stages, columns, model)
+    row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
+    step = _jumps(row, reflectance)
+    # The edge next to the middle, of the looks' four stretches.
+    order = np.array([1, 2, 0, 3])
+    first = order[np.argmax(step[order], axis=0)]
+    suspects = np.flatnonzero(step.any(axis=0))
+    parts = [
+        _edges(scene, model, stage_mm, stages[k : k + 2], suspects[first[suspects] == k])
+        for k in range(_LOOKS.size - 1)
+        if (first[suspects] == k).any()
+    ]
+    edge_mm, there_row, there_reflectance, split = (
+        (np.concatenate(values) for values in zip(*parts, strict=True))
+        if parts
+        else (np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+    )
+    here_row, here_reflectance = row[_CENTRE, split], reflectance[_CENTRE, split]
+    patch_row = np.column_stack((here_row, there_row))
+    with np.errstate(invalid="ignore"):
+        per_mm = model.rows_per_mm_off_sheet(model.range_mm(patch_row, split[:, np.newaxis]))
+    border = patch_row - edge_mm[:, np.newaxis] * per_mm
+    ahead = (edge_mm > 0.0)[:, np.newaxis]
+    middle = np.array([True, False])
+    # What lies ahead of the edge (+y) appears below it.
+    below = ahead != middle
+    dark = np.isnan(patch_row)
+    return Footprint(
+        row[_CENTRE],
+        reflectance[_CENTRE],
+        split,
+        patch_row,
+        np.where(dark, 0.0, np.column_stack((here_reflectance, there_reflectance))),
+        np.where(below | dark, -np.inf, border),
+        np.where(below & ~dark, border, np.inf),
+    )
+
+
+def _jumps(row: Array, reflectance: Array) -> NDArray[np.bool_]:
+    """Where neighbouring looks (first axis) differ, shape one shorter."""
+    lit = np.isfinite(row)
+    with np.errstate(invalid="ignore"):
+        far = np.abs(np.diff(row, axis=0)) > _ROW_JUMP
+        bright = np.abs(np.diff(reflectance, axis=0)) > _REFLECTANCE_JUMP
+    both = lit[1:] & lit[:-1]
+    return np.asarray((both & (far | bright)) | (lit[1:] != lit[:-1]))
+
+
+def _edges(
+    scene: Scene, model: RangeModel, stage_mm: float, stretch: Array, columns: NDArray[np.int64]
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Edges between two looks: mm ahead of the middle, row and reflectance beyond; columns.
+
+    Columns whose surface only slopes are left out.
+    """
+    stages = np.linspace(stretch[0], stretch[1], _FINE + 1)
+    range_mm = scene.range_mm(stages, columns, model)
+    row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
+    reflectance = scene.reflectance(stages, columns, model)
+    each = np.arange(columns.size)
+    lit = np.isfinite(row)
+    size = np.where(
+        lit[1:] & lit[:-1],
+        np.abs(np.diff(row, axis=0)) / _ROW_JUMP
+        + np.abs(np.diff(reflectance, axis=0)) / _REFLECTANCE_JUMP,
+        np.where(lit[1:] != lit[:-1], np.inf, 0.0),
+    )
+    at = np.argmax(size, axis=0)
+    # A slope spreads over all parts; of an edge one part holds at least half.
+    total = np.where(np.isfinite(size), size, 0.0).sum(axis=0)
+    largest = size[at, each]
+    sharp = (largest > 1.0) & (largest >= 0.5 * total)
+    edge_mm = 0.5 * (stages[at] + stages[at + 1]) - stage_mm
+    beyond = np.where(edge_mm > 0.0, at + 1, at)
+    return (
+        edge_mm[sharp],
+        row[beyond, each][sharp],
+        reflectance[beyond, each][sharp],
+        columns[sharp],
+    )

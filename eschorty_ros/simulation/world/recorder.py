@@ -1,0 +1,140 @@
+"""A simulated scan written as a recording, truth included; needs no ROS."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.clocks.motion import MotionPlan, plan_move
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import Calibration, save_calibration
+from eschorty_ros.core.storage.raw_file import RawWriter
+from eschorty_ros.core.storage.recording import (
+    CALIBRATION_FILE,
+    EVENTS_FILE,
+    LASER_FILE,
+    STAGE_FILE,
+    TRUTH_FILE,
+    Recording,
+    load_recording,
+    write_laser_yaml,
+    write_stage_csv,
+    write_truth_csv,
+)
+from eschorty_ros.simulation.pixels.pixel import PixelParameters
+from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World
+
+ACCELERATION_MM_S2 = 2000.0
+LASER_ON_US = 50_000
+LEAD_US = 50_000
+"""Laser on before the stage starts and after it has stopped; dark before and after that."""
+
+_STAGE_STEP_US = 10_000
+_CHUNK_US = 100_000
+
+
+def simulate_recording(
+    out_dir: str | os.PathLike[str],
+    scene: Scene,
+    calibration: Calibration,
+    modulation: Modulation | None = None,
+    start_mm: float = 10.0,
+    stop_mm: float = 110.0,
+    speed_mm_s: float = 50.0,
+    seed: int = 0,
+    background_hz: float = BACKGROUND_HZ,
+    parameters: PixelParameters | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Recording:
+    """Scan ``scene`` from ``start_mm`` to ``stop_mm`` and write the recording folder.
+
+    Sensor time starts at 0 in the dark; the laser comes on at 50 ms with a rising edge, the stage
+    starts 50 ms later, and both leads are repeated at the end.
+
+    Parameters
+    ----------
+    out_dir : path
+        Made when missing; files of an older recording in it are replaced.
+    scene : Scene
+    calibration : Calibration
+    modulation : Modulation, optional
+        70 Hz, duty 0.5 when left out; its ``on_edge_us`` is set here.
+    start_mm, stop_mm, speed_mm_s : float
+        The stage's trapezoidal move at 2000 mm/s^2; it may run either way.
+    seed : int
+        Same seed, same bytes.
+    background_hz : float
+        Background events per pixel and second.
+    parameters : PixelParameters, optional
+    progress : callable, optional
+        Called with the microseconds done and in total.
+
+    Returns
+    -------
+    Recording
+        The folder as :func:`load_recording` reads it.
+
+    Raises
+    ------
+    ArgumentError
+        For a value outside its range or a folder that cannot be written.
+    """
+    wave = replace(modulation or Modulation(70.0), on_edge_us=LASER_ON_US)
+    move = plan_move(
+        (LASER_ON_US + LEAD_US) * 1000, start_mm, stop_mm, speed_mm_s, ACCELERATION_MM_S2
+    )
+    off_us = move.end_ns // 1000 + LEAD_US
+    end_us = off_us + LEAD_US
+    world = World(scene, calibration, parameters, seed, background_hz)
+    world.set_laser(LASER_ON_US, True, wave)
+    world.set_laser(off_us, False)
+    # The plan rests at its first position before it starts.
+    world.set_stage(MotionPlan(0, start_mm))
+    world.set_stage(move, 0)
+    folder = _folder(out_dir)
+    writer = RawWriter(folder / EVENTS_FILE, width=world.columns, height=world.rows)
+    with _whole_or_absent(folder):
+        with writer as raw:
+            while world.now_us < end_us:
+                raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
+                if progress is not None:
+                    progress(world.now_us, end_us)
+        # One sample past the end: the last events must lie between two samples.
+        t_us = np.arange(0, end_us + 2 * _STAGE_STEP_US, _STAGE_STEP_US, dtype=np.int64)
+        write_stage_csv(folder / STAGE_FILE, t_us, move.state(t_us * 1000)[0])
+        write_laser_yaml(folder / LASER_FILE, wave)
+        save_calibration(calibration, folder / CALIBRATION_FILE)
+        truth = world.truth
+        write_truth_csv(folder / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
+    return load_recording(folder)
+
+
+@contextmanager
+def _whole_or_absent(folder: Path) -> Iterator[None]:
+    """Remove a recording, and its folder when nothing else is in it, if the block is left early."""
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE, TRUTH_FILE):
+                (folder / name).unlink(missing_ok=True)
+            folder.rmdir()
+        raise
+
+
+def _folder(out_dir: str | os.PathLike[str]) -> Path:
+    folder = Path(out_dir)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot make the folder {str(folder)!r} ({error.strerror}); choose another"
+        ) from error
+    return folder

@@ -1,0 +1,22 @@
+"""Compiling the pixel kernels before a simulated camera streams."""
+
+from __future__ import annotations
+
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.simulation.pixels.biases import Biases
+from eschorty_ros.simulation.scenes.names import named
+from eschorty_ros.simulation.world.sensor_control import SensorControl
+from eschorty_ros.simulation.world.world import World
+
+
+def warm_up(calibration: Calibration) -> None:
+    """Simulate a millisecond of a lit plane, with a change of biases, in a world of its own.
+
+    The first run on a machine compiles for some seconds; later runs load what that left in
+    numba's cache. Without it a simulated camera falls silent at its first light.
+    """
+    world = World(named("plane"), calibration)
+    world.set_laser(0, True, Modulation(1000.0, on_edge_us=0))
+    world.set_sensor(500, SensorControl(Biases(diff_on=1)))
+    world.advance(1000)

@@ -1,0 +1,97 @@
+"""Posts at known ranges as a build would see them, and the calibration made from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.calibration.fit import CalibrationFit, fit_targets
+from eschorty_ros.core.optics.optical_build import Design
+
+Array = NDArray[np.float64]
+
+SIGMA_ROW_PX = 0.3
+SIGMA_EDGE_PX = 0.3
+POSTS = 11
+POST_MM = 25.4
+MARGIN_ROWS = 15.0
+"""Posts keep this far from the sensor's edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """Magnification as a straight line in row.
+
+    Attributes
+    ----------
+    slope : float
+        Per px; Eq. 1 says ``1 / k'``.
+    zero_row : float
+        Row of magnification 0; Eq. 1 says ``-b'``.
+    """
+
+    slope: float
+    zero_row: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posts:
+    """Posts of one build; arrays of shape (POSTS,).
+
+    Attributes
+    ----------
+    range_mm, row : ndarray
+        Known range; measured row.
+    magnification : ndarray
+        From the columns a post covers and its size.
+    fit : CalibrationFit
+        k' and b' from rows and ranges, k and b at their design values.
+    line : Line
+        Through the magnifications; independent of ``fit``.
+    """
+
+    range_mm: Array
+    row: Array
+    magnification: Array
+    fit: CalibrationFit
+    line: Line
+
+
+def see_posts(build: Design, nominal: Design, rng: np.random.Generator) -> Posts:
+    """Place posts evenly in range, measure their rows and widths with noise, calibrate.
+
+    Parameters
+    ----------
+    build : Design
+        The instrument as it is.
+    nominal : Design
+        Where the fit takes its fixed k and b from.
+    rng : Generator
+
+    Returns
+    -------
+    Posts
+    """
+    model = build.model
+    near, far = model.range_mm([MARGIN_ROWS, model.rows - 1 - MARGIN_ROWS])
+    ranges = np.linspace(near, far, POSTS)
+    true_row = model.row(ranges)
+    row = true_row + rng.normal(0.0, SIGMA_ROW_PX, POSTS)
+    pixel_mm = model.pixel_um * 1e-3
+    edges = rng.normal(0.0, SIGMA_EDGE_PX, (2, POSTS))
+    columns = model.magnification(true_row) * POST_MM / pixel_mm + edges[1] - edges[0]
+    magnification = columns * pixel_mm / POST_MM
+    slope, start = np.polyfit(row, magnification, 1)
+    fit = fit_targets(row, ranges, nominal.model, sigma_row_px=SIGMA_ROW_PX)
+    return Posts(ranges, row, magnification, fit, Line(float(slope), float(-start / slope)))
+
+
+def pulls(posts: Posts, build: Design) -> Array:
+    """Error of the fitted k' and b' over the standard deviation the fit states, shape (2,)."""
+    error = [
+        posts.fit.model.k_prime_px - build.model.k_prime_px,
+        posts.fit.model.b_prime_px - build.model.b_prime_px,
+    ]
+    return np.asarray(error / np.sqrt(np.diag(posts.fit.covariance)))

@@ -1,0 +1,149 @@
+"""Points of a simulated recording against the truth: errors, gaps and gross errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.core.storage.recording import Recording
+from eschorty_ros.report.accuracy import KnownScene, true_range_mm
+
+GROSS_PX = 10.0
+"""Half the line's full width at half maximum: a row this far off is not on the line."""
+
+RIM_MM = 3.0
+"""Half the line's thickness along the stage at 1.3 m, and the stage's way within a lit phase."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanErrors:
+    """Errors of the points of one scan.
+
+    Attributes
+    ----------
+    error_mm : ndarray of float64, shape (points,)
+        Measured minus true range at each point's own stage position and column; NaN where the
+        scene holds nothing.
+    gross : ndarray of bool, shape (points,)
+        More than ``GROSS_PX`` rows off, or where the scene holds nothing.
+    inside : ndarray of bool, shape (points,)
+        ``RIM_MM`` ahead and behind along the stage the scene goes on: the line's thickness lies on
+        one surface.
+    completeness : float
+        Share of the truth's periods and columns that have a point.
+    """
+
+    error_mm: NDArray[np.float64]
+    gross: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+    completeness: float
+
+    @property
+    def median_mm(self) -> float:
+        """Median absolute error."""
+        return self.quantile_mm(0.5)
+
+    @property
+    def rmse_mm(self) -> float:
+        """Root of the mean squared error, gross errors included; NaN without points."""
+        known = self.error_mm[np.isfinite(self.error_mm)]
+        return float(np.sqrt(np.mean(known * known))) if known.size else float("nan")
+
+    @property
+    def bias_mm(self) -> float:
+        """Median of the signed error."""
+        known = self.error_mm[np.isfinite(self.error_mm)]
+        return float(np.median(known)) if known.size else float("nan")
+
+    @property
+    def gross_share(self) -> float:
+        """Gross errors among all points; NaN without points."""
+        return float(np.mean(self.gross)) if self.gross.size else float("nan")
+
+    def away_from_rims(self) -> ScanErrors:
+        """Pick the points whose line lies on one surface."""
+        at = self.inside
+        return ScanErrors(self.error_mm[at], self.gross[at], at[at], self.completeness)
+
+    def quantile_mm(self, share: float) -> float:
+        """Quantile of the absolute error; NaN without points."""
+        size = np.abs(self.error_mm[np.isfinite(self.error_mm)])
+        return float(np.quantile(size, share)) if size.size else float("nan")
+
+
+def pooled(parts: Sequence[ScanErrors]) -> ScanErrors:
+    """All points of several scans together; the completeness is the mean of theirs."""
+    return ScanErrors(
+        np.concatenate([part.error_mm for part in parts]),
+        np.concatenate([part.gross for part in parts]),
+        np.concatenate([part.inside for part in parts]),
+        float(np.mean([part.completeness for part in parts])),
+    )
+
+
+def scan_errors(
+    profiles: Profiles, recording: Recording, scene: KnownScene, every: int = 1
+) -> ScanErrors:
+    """Compare every point with the scene at its own time, the recording's truth with the points.
+
+    Parameters
+    ----------
+    profiles : Profiles
+    recording : Recording
+        With its truth; the stage is taken from it.
+    scene : KnownScene
+        What was recorded.
+    every : int
+        Look at every so many columns; the truth of all of them takes longer than the scan.
+
+    Returns
+    -------
+    ScanErrors
+    """
+    model = recording.calibration.model()
+    profiles = profiles.select(profiles.column % every == 0)
+    stage_mm = np.asarray(recording.stage.position_mm(profiles.t_us))
+    truth_mm = true_range_mm(scene, model, stage_mm, profiles.column)
+    beside_px = [
+        model.row(true_range_mm(scene, model, stage_mm + off_mm, profiles.column))
+        for off_mm in (-RIM_MM, RIM_MM)
+    ]
+    rows = model.row(truth_mm)
+    inside = np.all([np.abs(beside - rows) <= GROSS_PX for beside in beside_px], axis=0)
+    off_px = np.abs(profiles.row - rows)
+    truth = recording.truth
+    assert truth is not None, "a simulated recording has its truth"
+    truth = truth[truth["column"] % every == 0]
+    return ScanErrors(
+        profiles.range_mm - truth_mm,
+        ~(off_px <= GROSS_PX),
+        inside,
+        _completeness(profiles, truth, recording.modulation, model),
+    )
+
+
+def _completeness(
+    profiles: Profiles, truth: NDArray[np.void], modulation: Modulation, model: RangeModel
+) -> float:
+    if len(truth) == 0:
+        return float("nan")
+    expected = _keys(period_of(truth["t_us"], modulation), truth["column"], model)
+    found = _keys(period_of(profiles.t_us, modulation), profiles.column, model)
+    return float(np.mean(np.isin(expected, found)))
+
+
+def period_of(t_us: NDArray[np.int64], modulation: Modulation) -> NDArray[np.int64]:
+    """Modulation period in which a time lies, counted from the recorded rising edge."""
+    since_us = t_us - (modulation.on_edge_us or 0)
+    return np.floor(since_us / modulation.period_us).astype(np.int64)
+
+
+def _keys(period: NDArray[np.int64], column: NDArray[Any], model: RangeModel) -> NDArray[np.int64]:
+    return period * model.columns + column

@@ -1,0 +1,238 @@
+"""Is the reported sigma honest? Share of errors within one and two sigma, for every estimator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_experiments._scan_errors import period_of, scan_errors
+from eschorty_ros.core.line.centroid import METHODS
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.core.storage.recording import Recording
+from eschorty_ros.report import figures
+from eschorty_ros.report.experiment import (
+    DataTable,
+    Effort,
+    Experiment,
+    Finding,
+    Outcome,
+    Progress,
+)
+from eschorty_ros.simulation.scenes.names import Plane, Scene, named
+from eschorty_ros.simulation.world.recorder import simulate_recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCENES: dict[str, Scene] = {
+    # At an angle, so that the line meets the pixel rows in every way and not in a single one.
+    "plane": Plane(slope_column=0.1),
+    **{name: named(name) for name in ("steps", "tilted", "sphere", "leaves", "face")},
+}
+# Modulation, stage speed, and the travel that gives enough profiles.
+SWEEPS = ((70.0, 100.0, 50.0), (300.0, 200.0, 30.0), (1000.0, 300.0, 24.0))
+START_MM = 40.0
+ONE_SIGMA, TWO_SIGMA = (0.64, 0.72), (0.93, 0.97)
+THICKNESS_PX = 22.0
+"""Full width of the line's footprint, rows."""
+BEND_MM, CONTRAST = 0.8, 1.15
+"""Change of slope times distance, and of reflectance, that make an edge."""
+GATES_US = {"mean": 1000}
+"""Phase gate of the estimators that take every event of a column for the line's."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ratios:
+    """Errors over their sigmas of one estimator on one scene at one modulation."""
+
+    method: str
+    frequency_hz: float
+    scene: str
+    ratio: NDArray[np.float64]
+    mixed: NDArray[np.bool_]
+
+    def within(self, sigmas: float, mixed: bool | None = False) -> float:
+        """Share of errors within so many sigmas: on surfaces, at edges (``True``) or of all."""
+        ratio = self.ratio if mixed is None else self.ratio[self.mixed == mixed]
+        return float(np.mean(ratio <= sigmas)) if ratio.size else math.nan
+
+
+def run(effort: Effort, progress: Progress) -> Outcome:
+    """Scan every scene at every modulation, reconstruct with every estimator."""
+    measured: list[Ratios] = []
+    cases = [(scene, sweep) for sweep in SWEEPS for scene in SCENES]
+    for done, (scene, (frequency_hz, speed_mm_s, travel_mm)) in enumerate(cases):
+        progress(done / len(cases), f"{scene}, {frequency_hz:g} Hz")
+        travel = travel_mm * effort.choose(2, 1)
+        measured += _ratios(scene, frequency_hz, speed_mm_s, travel, effort)
+    pooled = [
+        _pooled([m for m in measured if (m.method, m.frequency_hz) == (method, frequency_hz)])
+        for method in METHODS
+        for frequency_hz, _, _ in SWEEPS
+    ]
+    outcome = Outcome(remarks=list(_REMARKS))
+    for one in pooled:
+        for sigmas, (low, high) in ((1, ONE_SIGMA), (2, TWO_SIGMA)):
+            name = f"{one.method}, {one.frequency_hz:g} Hz: errors within {sigmas} sigma"
+            outcome.findings.append(Finding(name, one.within(sigmas), low, high))
+    outcome.tables["sigma_all"] = _table(pooled)
+    outcome.captions["sigma_all"] = (
+        "Share of errors within one and two sigma, all scenes together: on surfaces, at edges, "
+        "and of all points"
+    )
+    outcome.tables["sigma_scenes"] = _table(measured)
+    outcome.captions["sigma_scenes"] = "The same scene by scene"
+    outcome.figures["sigma"] = _figure(pooled)
+    outcome.captions["sigma"] = (
+        "Share of errors on surfaces within a number of sigmas, all scenes together, against the "
+        "normal law"
+    )
+    return outcome
+
+
+def _pooled(parts: list[Ratios]) -> Ratios:
+    return replace(
+        parts[0],
+        scene="all",
+        ratio=np.concatenate([part.ratio for part in parts]),
+        mixed=np.concatenate([part.mixed for part in parts]),
+    )
+
+
+def _ratios(
+    scene_name: str, frequency_hz: float, speed_mm_s: float, travel_mm: float, effort: Effort
+) -> list[Ratios]:
+    scene = SCENES[scene_name]
+    columns = effort.choose(640, 160)
+    calibration = load_calibration("config_3").model_copy(
+        update={"columns": columns, "principal_column": (columns - 1) / 2}
+    )
+    found = []
+    with TemporaryDirectory() as folder:
+        recording = simulate_recording(
+            Path(folder),
+            scene,
+            calibration,
+            Modulation(frequency_hz),
+            START_MM,
+            START_MM + travel_mm,
+            speed_mm_s,
+            effort.seed,
+        )
+        period, edges = _edges(recording, scene, Settings().smoothing_half_width)
+        for method in METHODS:
+            settings = replace(Settings(), centroid=method, phase_gate_us=GATES_US.get(method, 0))
+            profiles = reconstruct_recording(recording, settings).profiles
+            errors = scan_errors(profiles, recording, scene)
+            known = np.isfinite(errors.error_mm)
+            ratio = np.abs(errors.error_mm[known]) / profiles.sigma_mm[known]
+            line = np.searchsorted(period, period_of(profiles.t_us, recording.modulation))
+            mixed = edges[line.clip(0, len(edges) - 1), profiles.column]
+            found.append(Ratios(method, frequency_hz, scene_name, ratio, mixed[known]))
+    return found
+
+
+def _edges(
+    recording: Recording, scene: Scene, reach_columns: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Periods, and the columns whose points lie across an edge of the scene in each of them.
+
+    An edge is a jump of the range or of the reflectance between places a sixth of the line's
+    thickness apart along the stage. Columns that are averaged with one on an edge count, too.
+    """
+    model = recording.calibration.model()
+    truth = recording.truth
+    assert truth is not None, "a simulated recording has its truth"
+    t_us = np.unique(truth["t_us"])
+    middle_mm = np.asarray(recording.stage.position_mm(t_us))
+    columns = np.arange(model.columns)
+    centre_mm = scene.range_mm(middle_mm, columns, model)
+    thickness_mm = THICKNESS_PX / model.rows_per_mm_off_sheet(float(np.nanmedian(centre_mm)))
+    across = np.linspace(-0.5, 0.5, 7) * abs(thickness_mm)
+    ranges_mm = np.stack([scene.range_mm(middle_mm + d, columns, model) for d in across])
+    albedo = np.stack([scene.reflectance(middle_mm + d, columns, model) for d in across])
+    bend_mm = np.abs(np.diff(ranges_mm, 2, axis=0)).max(axis=0)
+    edge = ~((bend_mm < BEND_MM) & (albedo.max(axis=0) < CONTRAST * albedo.min(axis=0)))
+    near = edge.copy()
+    for shift in range(1, reach_columns + 1):
+        near[:, shift:] |= edge[:, :-shift]
+        near[:, :-shift] |= edge[:, shift:]
+    return period_of(t_us, recording.modulation), near
+
+
+def _table(measured: list[Ratios]) -> DataTable:
+    return DataTable(
+        (
+            "estimator",
+            "frequency_hz",
+            "scene",
+            "points",
+            "within_1_sigma",
+            "within_2_sigma",
+            "at_edges",
+            "edges_within_1_sigma",
+            "edges_within_2_sigma",
+            "all_within_1_sigma",
+            "all_within_2_sigma",
+        ),
+        [
+            (
+                one.method,
+                one.frequency_hz,
+                one.scene,
+                one.ratio.size,
+                round(one.within(1.0), 3),
+                round(one.within(2.0), 3),
+                round(float(np.mean(one.mixed)), 3),
+                round(one.within(1.0, True), 3),
+                round(one.within(2.0, True), 3),
+                round(one.within(1.0, None), 3),
+                round(one.within(2.0, None), 3),
+            )
+            for one in measured
+        ],
+    )
+
+
+def _figure(pooled: list[Ratios]) -> Figure:
+    figure = figures.new_figure(12.0, 4.2)
+    sigmas = np.linspace(0.0, 3.0, 121)
+    normal = [math.erf(value / math.sqrt(2.0)) for value in sigmas]
+    for index, (frequency_hz, _, _) in enumerate(SWEEPS):
+        axes = figure.add_subplot(1, len(SWEEPS), index + 1)
+        for one in pooled:
+            if one.frequency_hz == frequency_hz:
+                ordered = np.sort(one.ratio[~one.mixed])
+                share = np.searchsorted(ordered, sigmas, side="right") / ordered.size
+                axes.plot(sigmas, share, label=one.method)
+        axes.plot(sigmas, normal, "k--", label="normal law")
+        axes.set(xlabel="|error| / sigma", ylabel="share within", title=f"{frequency_hz:g} Hz")
+        axes.set(xlim=(0.0, 3.0), ylim=(0.0, 1.0))
+        axes.grid(alpha=0.3)
+        if index == 0:
+            axes.legend(loc="lower right")
+    return figure
+
+
+_REMARKS = (
+    "The bands are for points on surfaces, all scenes together. Where an edge of range or "
+    "reflectance lies within the line's thickness (or within that of a column averaged in), a "
+    "point mixes both sides; no statistic of its events tells that a line of full width is made of "
+    "two halves, and sigma, though raised where the footprint is narrow or jumps, is too small for "
+    "many of them. The tables give their share and their coverage, and that of all points.",
+    "On a single scene the share differs: much of the error repeats from period to period, so a "
+    "flat target shows the error of a few rows only.",
+    "mean takes every event of a column for the line's and is shown with a phase gate of 1 ms. "
+    "Without it most of its error is that of one to three stray events per column, which sigma "
+    "knows: the share within two sigma is then above 98 %.",
+)
+
+EXPERIMENT = Experiment("sigma", "Is the reported sigma honest?", run)

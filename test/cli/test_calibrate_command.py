@@ -1,0 +1,204 @@
+"""`eschorty calibrate`: from targets and recordings to a file and a page."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from support import html_check
+from support.calibration_posts import NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, range_error_mm, see
+
+from eschorty_ros.cli import main
+from eschorty_ros.core.calibration.fit import PRIOR_SIGMA
+from eschorty_ros.core.calibration.targets_file import DISTANCE_COLUMNS, TARGET_COLUMNS
+from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.simulation.scenes.names import Plane
+from eschorty_ros.simulation.scenes.posts import Posts, bench
+from eschorty_ros.simulation.world.recorder import simulate_recording
+
+SEED = 16
+AS_BUILT = NOMINAL.model_copy(
+    update={"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": NOMINAL.b_prime_px + 40.0}
+)
+CHECK_MM = np.linspace(800.0, 2100.0, 131)
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["calibrate", *map(str, arguments)])
+
+
+def rms_mm(calibration, truth):
+    error = calibration.model().range_mm(truth.model().row(CHECK_MM)) - CHECK_MM
+    return float(np.sqrt(np.mean(error**2)))
+
+
+@pytest.fixture
+def targets_csv(tmp_path):
+    targets = see(np.random.default_rng(SEED), size_mm=TWO_SIZES_MM, bloom_px=4.0)
+    row = targets.row.copy()
+    row[3] += 20.0
+    lines = ["row,range_mm,width_px,size_mm"]
+    for at in range(len(targets)):
+        lines.append(f"{row[at]},{NINE_MM[at]},{targets.width_px[at]},{TWO_SIZES_MM[at]}")
+    path = tmp_path / "targets.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_targets_become_a_calibration_and_a_page(targets_csv, tmp_path):
+    out = tmp_path / "made.yaml"
+    done = run(targets_csv, "--nominal", "config_3", "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "rejected: line 5: row" in done.output
+    assert "verdict: extrapolates outside 820 to 2050 mm" in done.output
+    made = load_calibration(out)
+    assert np.abs(range_error_mm(made.model())).max() < 3.0
+    assert abs(made.k_mm - TRUTH.k_mm) < 3.0 * np.sqrt(made.covariance[0][0]) < 0.3
+    page = out.with_suffix(".html")
+    assert html_check.faults(page) == []
+    # Names may wrap after an underscore.
+    text = html_check.text(page).replace("_ ", "_")
+    for part in (made.id, "joint", "8 used of 9", "width_bias_px", "prior dominates b_mm",
+                 "lies", "sigma from the curve of the others", "Magnification"):  # fmt: skip
+        assert part in text, part
+    assert page.read_text().count("data:image/png;base64,") == 4
+
+
+def test_the_papers_method_keeps_k_and_b(targets_csv, tmp_path):
+    out = tmp_path / "made.yaml"
+    done = run(targets_csv, "--method", "paper", "--robust", "--out", out)
+    assert done.exit_code == 0, done.output
+    made = load_calibration(out)
+    assert (made.k_mm, made.b_mm) == (None, 0.0)
+    assert made.parameters_fitted == ("k_prime_px", "b_prime_px")
+    assert html_check.faults(out.with_suffix(".html")) == []
+
+
+def test_free_parameters_and_priors_are_taken(targets_csv, tmp_path):
+    out = tmp_path / "made.yaml"
+    done = run(targets_csv, "--free", "k_prime_px", "--free", "b_mm", "--prior", "b_mm=none",
+               "--out", out)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert load_calibration(out).parameters_fitted == ("k_prime_px", "b_mm")
+    one = run(targets_csv, "--free", "b_prime_px", "--out", out)
+    assert one.exit_code == 0, one.output
+
+
+def test_posts_of_a_recording_give_the_build_back(tmp_path):
+    posts = bench()
+    simulate_recording(
+        tmp_path / "rec", Posts(posts), AS_BUILT, start_mm=10.0, stop_mm=20.0, speed_mm_s=40.0,
+        seed=SEED,
+    )  # fmt: skip
+    distances = ",".join(str(post.range_mm) for post in posts)
+    out = tmp_path / "made.yaml"
+    done = run(tmp_path / "rec", "--distances", distances, "--range-sigma", 0.1, "--out", out)
+    assert done.exit_code == 0, done.output
+    after, before = rms_mm(load_calibration(out), AS_BUILT), rms_mm(NOMINAL, AS_BUILT)
+    print(f"seed {SEED}: range RMS {after:.2f} mm, {before:.1f} mm before")
+    assert after < 1.0 < 20.0 < before
+    sizes = tmp_path / "posts.csv"
+    sizes.write_text(
+        "range_mm,size_mm\n" + "".join(f"{post.range_mm},{post.size_mm}\n" for post in posts)
+    )
+    done = run(tmp_path / "rec", "--distances", sizes, "--range-sigma", 0.1, "--out", out)
+    assert done.exit_code == 0, done.output
+    with_sizes = load_calibration(out)
+    print(f"with sizes {rms_mm(with_sizes, AS_BUILT):.2f} mm, k {with_sizes.k_mm:.3f} mm")
+    assert rms_mm(with_sizes, AS_BUILT) < 1.0
+    assert with_sizes.k_mm == pytest.approx(AS_BUILT.object_scale_mm, rel=0.01)
+
+
+def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
+    small = {"columns": 48, "principal_column": 23.5}
+    nominal, as_built = NOMINAL.model_copy(update=small), AS_BUILT.model_copy(update=small)
+    save_calibration(nominal, tmp_path / "nominal.yaml")
+    folders = []
+    for start, stop in ((10.0, 310.0), (310.0, 10.0)):
+        folders.append(tmp_path / f"from_{start:.0f}")
+        simulate_recording(
+            folders[-1], Plane(1500.0, slope_stage=1.0), as_built, start_mm=start, stop_mm=stop,
+            speed_mm_s=200.0, seed=SEED,
+        )  # fmt: skip
+    out = tmp_path / "made.yaml"
+    done = run(*folders, "--moving", 1500.0, "--nominal", tmp_path / "nominal.yaml", "--out", out)
+    assert done.exit_code == 0, done.output
+    made = load_calibration(out)
+    error = made.model().range_mm(as_built.model().row([1520.0, 1800.0])) - [1520.0, 1800.0]
+    print(f"seed {SEED}: range error {error} mm at 1520 and 1800 mm")
+    assert np.abs(error).max() < 1.0
+    assert made.columns == 48
+
+
+def test_roll_and_smile_show_in_a_target_moved_by_the_stage(tmp_path):
+    small = {"columns": 192, "principal_column": 95.5}
+    bent = {"b_prime_1_px": -9.0, "b_prime_2_px": 5.0}
+    save_calibration(NOMINAL.model_copy(update=small), tmp_path / "nominal.yaml")
+    simulate_recording(
+        tmp_path / "rec", Plane(1500.0, slope_stage=1.0), AS_BUILT.model_copy(update=small | bent),
+        start_mm=10.0, stop_mm=160.0, speed_mm_s=300.0, seed=SEED,
+    )  # fmt: skip
+    out = tmp_path / "made.yaml"
+    free = [f"--free={name}" for name in ("k_prime_px", "b_prime_px", *bent)]
+    done = run(tmp_path / "rec", "--moving", 1500.0, "--nominal", tmp_path / "nominal.yaml",
+               *free, "--out", out)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    made = load_calibration(out)
+    print(f"seed {SEED}: b'1 {made.b_prime_1_px:.2f} px, b'2 {made.b_prime_2_px:.2f} px")
+    assert made.b_prime_1_px == pytest.approx(-9.0, abs=0.2)
+    assert made.b_prime_2_px == pytest.approx(5.0, abs=0.5)
+
+
+def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
+    out = tmp_path / "made.yaml"
+    out.write_text("old")
+    out.with_suffix(".html").write_text("old page")
+    bad = tmp_path / "bad.csv"
+    for text, message in (
+        ("row,range_mm\n100,900\n101,900\n", "range_mm holds 1 different ranges"),
+        ("row,range_mm\n100,900\n900,1000\n", "row of target line 3 is 900"),
+        ("row,range_mm\n100,900\n,1000\n", "line 3: row is empty"),
+        ("row,range_mm\n100,900\n100,900\n", "are the same"),
+    ):
+        bad.write_text(text)
+        done = run(bad, "--out", out)
+        assert done.exit_code == 1, done.output
+        assert message in done.stderr
+        assert done.stderr.startswith("eschorty: ")
+        assert done.stderr.count("\n") == 1
+    assert (out.read_text(), out.with_suffix(".html").read_text()) == ("old", "old page")
+    assert not any(entry.name.endswith("partial") for entry in tmp_path.iterdir())
+
+
+def test_wrong_usage_is_exit_code_2(targets_csv, tmp_path):
+    (tmp_path / "rec").mkdir()
+    for arguments, message in (
+        ((targets_csv, "--distances", "1,2"), "belong to a recording"),
+        ((targets_csv, "--prior", "b_mm"), "NAME=SIGMA"),
+        ((targets_csv, "--prior", "b_mm=much"), "NAME=SIGMA"),
+        ((targets_csv, "--out", tmp_path / "x.txt"), "ending in .yaml"),
+        ((targets_csv, "--method", "best"), "'best' is not one of"),
+        ((tmp_path / "rec",), "give --distances or --moving"),
+        ((tmp_path / "rec", "--distances", "1", "--moving", 5), "give --distances or --moving"),
+        ((), "no SOURCE"),
+    ):
+        done = run(*arguments)
+        assert done.exit_code == 2, done.output
+        assert message in done.output
+
+
+def test_the_python_example_of_the_documentation_runs(targets_csv, monkeypatch, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "calibration.md").read_text()
+    monkeypatch.chdir(targets_csv.parent)
+    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1), {})
+    assert "1 of 9 targets rejected: line 5" in capsys.readouterr().out
+    assert load_calibration("calibration.yaml").parameters_fitted[0] == "k_mm"
+
+
+def test_the_documentation_names_every_column_verdict_and_prior():
+    page = (Path(__file__).parents[2] / "docs" / "calibration.md").read_text()
+    for name in (*TARGET_COLUMNS, *DISTANCE_COLUMNS, *PRIOR_SIGMA):
+        assert name in page, name

@@ -1,0 +1,257 @@
+"""The commands as a user types them: output, files, exit codes."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
+from eschorty_ros.core.storage.cloud import POINT_DTYPE, read_cloud, write_cloud
+
+ROOT = Path(__file__).resolve().parents[2]
+NO_ROS = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("rclpy", "rosidl_runtime_py", "sensor_msgs", "std_msgs"):
+            raise ImportError(f"{name} is blocked")
+sys.meta_path.insert(0, Blocked())
+from eschorty_ros.cli import main
+main(prog_name="eschorty")
+"""
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def without_ros(*arguments):
+    """The command in a process of its own in which no ROS package can be imported."""
+    return subprocess.run(
+        [sys.executable, "-c", NO_ROS, *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A short simulated recording, made by the command itself."""
+    folder = tmp_path_factory.mktemp("cli") / "rec"
+    done = without_ros("simulate", "--scene", "steps", "--stop", 18, "--seed", 4, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """A flat cloud of five profiles."""
+    line, column = (a.ravel() for a in np.mgrid[0:5, 0:200])
+    points = np.zeros(line.size, POINT_DTYPE)
+    points["x"], points["y"], points["t"] = 1.32, line * 7e-4, line / 70.0
+    points["column"], points["sigma"], points["intensity"] = column, 7e-4, 20
+    write_cloud(tmp_path / "flat.pcd", points)
+    return tmp_path / "flat.pcd"
+
+
+@pytest.mark.parametrize("arguments", [(), *((name,) for name in COMMANDS)])
+def test_help_teaches_by_example(arguments):
+    result = run(*arguments, "--help")
+    assert result.exit_code == 0
+    assert "Examples:" in result.output or "Example:" in result.output
+    assert "eschorty" in result.output
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from eschorty_ros.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'numba', 'matplotlib', 'rclpy', 'pydantic'} & set(sys.modules)\n"
+        "sys.exit(str(heavy) if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("nonsense",),
+        ("reconstruct",),
+        ("reconstruct", "/nowhere"),
+        ("simulate", "--frequency", "fast", "--out", "x"),
+        ("design", "--theta-prime-deg", "-7", "--far-mm", "2000"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(arguments):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+def test_a_stated_failure_is_one_line_on_stderr_and_exit_code_1(tmp_path):
+    result = run("reconstruct", tmp_path)
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith("eschorty: ")
+    assert result.stderr.count("\n") == 1
+    assert "events.raw" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.EROFS, "Read-only file system", "out"), OSError(errno.ENOSPC, "No space left"),
+     NotADirectoryError(errno.ENOTDIR, "Not a directory", "file/x")],
+)  # fmt: skip
+def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
+    def refuse(_path):
+        raise error
+
+    monkeypatch.setattr("eschorty_ros.core.storage.cloud.read_cloud", refuse)
+    result = run("info", cloud)
+    assert result.exit_code == 1
+    assert result.stderr.startswith("eschorty: cannot ")
+    assert result.stderr.count("\n") == 1
+    assert str(error.strerror) in result.stderr
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_work(monkeypatch, recording, tmp_path):
+    def work(*_arguments):
+        raise AssertionError("hours of work before the refusal")
+
+    monkeypatch.setattr("eschorty_ros.core.reconstruction.reconstruct_recording", work)
+    result = run("reconstruct", recording, "--out", tmp_path / "missing" / "cloud.pcd")
+    assert result.exit_code == 1
+    assert "cannot write" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_terminal_without_a_degree_sign_still_gets_its_table():
+    done = subprocess.run(
+        [sys.executable, "-c", NO_ROS, "design"],
+        cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, text=True,
+        timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "sheet" in done.stdout
+
+
+def test_ctrl_c_is_exit_code_130(monkeypatch, cloud):
+    def interrupt(_path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("eschorty_ros.core.storage.cloud.read_cloud", interrupt)
+    result = run("info", cloud)
+    assert result.exit_code == INTERRUPTED
+    assert "interrupted" in result.stderr
+    assert "Traceback" not in result.output
+
+
+def test_simulate_then_reconstruct_without_ros(recording):
+    names = {"events.raw", "stage.csv", "laser.yaml", "calibration.yaml", "truth.csv"}
+    assert names <= {path.name for path in recording.iterdir()}
+    done = without_ros("reconstruct", recording, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert list(facts) == [
+        "events",
+        "dropped_events",
+        "profiles",
+        "points",
+        "seconds",
+        "events_per_second",
+        "sigma_median_m",
+    ]
+    points = read_cloud(recording / "cloud.pcd")
+    assert facts["points"] == len(points) > 0
+    assert facts["profiles"] >= 11  # 8 mm at 50 mm/s and 70 Hz
+    assert 1e-4 < facts["sigma_median_m"] < 2e-3
+
+
+@pytest.mark.parametrize("step", ["world.World.advance", "recorder.write_truth_csv"])
+def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step):
+    def interrupted(*_):
+        assert (tmp_path / "rec" / "events.raw").is_file()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"eschorty_ros.simulation.{step}", interrupted)
+    result = run("simulate", "--stop", 18, "--out", tmp_path / "rec")
+    assert result.exit_code == INTERRUPTED
+    assert "Traceback" not in result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_simulate_refuses_to_overwrite_a_recording(recording):
+    result = run("simulate", "--out", recording)
+    assert result.exit_code == 1
+    assert str(recording) in result.stderr
+
+
+def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
+    run("simulate", "--scene", "steps", "--stop", 18, "--seed", 4, "--out", tmp_path / "again")
+    for name in ("stage.csv", "truth.csv", "laser.yaml"):
+        assert (tmp_path / "again" / name).read_bytes() == (recording / name).read_bytes()
+    a, b = (folder / "events.raw" for folder in (tmp_path / "again", recording))
+    assert a.read_bytes().split(b"% end\n", 1)[1] == b.read_bytes().split(b"% end\n", 1)[1]
+
+
+def test_reconstruct_offers_every_setting(recording, tmp_path):
+    from eschorty_ros.core.reconstruction.settings import Settings
+
+    text = run("reconstruct", "--help").output
+    for name in Settings.__dataclass_fields__:
+        assert f"--{name.replace('_', '-')}" in text
+    out = tmp_path / "cloud.ply"
+    result = run("reconstruct", recording, "--centroid", "median", "--out", out)
+    assert result.exit_code == 0, result.output
+    assert len(read_cloud(out)) > 0
+    assert run("reconstruct", recording, "--centroid", "guess").exit_code == 2
+    assert run("reconstruct", recording, "--events-min", "0").exit_code == 2
+    assert run("reconstruct", recording, "--out", tmp_path / "cloud.xyz").exit_code == 2
+
+
+def test_info_tells_what_a_recording_and_a_raw_file_hold(recording):
+    result = run("info", recording)
+    assert result.exit_code == 0, result.output
+    for words in ("config_3", "70 Hz", "ranges", "events/s", "1280 x 720"):
+        assert words in result.output
+    assert "peak rate" in run("info", recording / "events.raw").output
+
+
+def test_info_gives_the_bounds_of_a_cloud(cloud):
+    result = run("info", cloud)
+    assert result.exit_code == 0
+    assert "1320.000 to 1320.000 mm" in result.output
+    assert "0.700 mm" in result.output
+
+
+def test_view_writes_a_picture(cloud, tmp_path):
+    result = run("view", cloud)
+    assert result.exit_code == 0, result.output
+    assert cloud.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert run("view", cloud, "--out", tmp_path / "flat.svg").exit_code == 0
+    assert (tmp_path / "flat.svg").stat().st_size > 1000
+
+
+def test_design_prints_the_nominal_build_and_plots_it(tmp_path):
+    result = run("design", "--out", tmp_path / "design.png")
+    assert result.exit_code == 0, result.output
+    assert "810.5 to 2404.8 mm" in result.output
+    assert "mm/row" in result.output
+    assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_design_finds_the_tilt_for_two_ranges():
+    result = run("design", "--near-mm", 784.6, "--far-mm", 2115.9)
+    assert result.exit_code == 0
+    assert "sensor -7.6" in result.output
+    assert run("design", "--near-mm", 900, "--far-mm", 800).exit_code == 1

@@ -1,0 +1,168 @@
+"""The order of a scan: whatever fails, light off, stage at rest, points kept."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.control.instrument_monitor import InstrumentMonitor
+from eschorty_ros.control.paced_waiting import PacedWaiting
+from eschorty_ros.control.scan_sequence import (
+    End,
+    ScanCanceled,
+    ScanFailure,
+    ScanLimits,
+    ScanRequest,
+    ScanSummary,
+    check_request,
+    crossing_ns,
+    run_scan,
+    sweep_ends_mm,
+)
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.nodes.ros.instrument_client import ScanClient
+
+LIMITS = ScanLimits((0.0, 220.0), 250.0, 2000.0, 100.0, 10.0)
+REQUEST = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
+STEPS = ("check_nodes", "configure_laser", "move", "begin_scan", "laser_on", "move")
+
+
+class RecordingInstrument:
+    """Notes every call; the ``failing`` one raises ``error``."""
+
+    def __init__(self, failing=None, error=None):
+        self.calls = []
+        self._failing = failing
+        self._error = error
+
+    def __getattr__(self, name):
+        def call(*arguments):
+            self.calls.append(name)
+            key = (name, self.calls.count(name))
+            if self._failing == key:
+                raise self._error
+            return ScanSummary(points=5) if name == "end_scan" else None
+
+        return call
+
+
+def test_order_of_a_scan():
+    instrument = RecordingInstrument()
+    outcome = run_scan(instrument, REQUEST, LIMITS)
+    assert (outcome.end, outcome.message, outcome.summary.points) == (End.SUCCEEDED, "", 5)
+    done = [name for name in instrument.calls if name not in ("report", "watch", "shield")]
+    assert done == [*STEPS, "laser_off", "drain", "end_scan"]
+
+
+@pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("move", 1),
+                                  ("begin_scan", 1), ("laser_on", 1), ("move", 2)])  # fmt: skip
+@pytest.mark.parametrize("error", [ScanFailure("stage: stuck"), ScanCanceled()])
+def test_every_interruption_ends_dark_and_at_rest(step, error):
+    instrument = RecordingInstrument(step, error)
+    outcome = run_scan(instrument, REQUEST, LIMITS)
+    canceled = isinstance(error, ScanCanceled)
+    assert outcome.end is (End.CANCELED if canceled else End.ABORTED)
+    assert outcome.message == ("canceled" if canceled else "stage: stuck")
+    after = instrument.calls[instrument.calls.index("shield") :]
+    assert [n for n in after if n in ("laser_off", "stop_stage")] == ["laser_off", "stop_stage"]
+    assert "move" not in after
+    begun = step in (("laser_on", 1), ("move", 2))
+    assert ("end_scan" in after) == begun
+    assert outcome.summary.points == (5 if begun else 0)
+
+
+@pytest.mark.parametrize("step", ["laser_off", "drain", "end_scan"])
+def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
+    instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
+    outcome = run_scan(instrument, REQUEST, LIMITS)
+    assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
+    assert [n for n in instrument.calls if n in ("laser_off", "drain", "end_scan")] == [
+        "laser_off",
+        "drain",
+        "end_scan",
+    ]
+
+
+def test_the_first_reason_stays():
+    instrument = RecordingInstrument(("move", 2), ScanFailure("camera: gone"))
+
+    def end_scan(scan_id):
+        raise ScanFailure("reconstruction: gone")
+
+    instrument.end_scan = end_scan
+    assert run_scan(instrument, REQUEST, LIMITS).message == "camera: gone"
+
+
+class Answered:
+    """A future that is done after some looks."""
+
+    def __init__(self, answer, looks):
+        self._answer, self._looks = answer, looks
+
+    def done(self):
+        self._looks -= 1
+        return self._looks < 0
+
+    def result(self):
+        return self._answer
+
+
+class CanceledClient(ScanClient):
+    """The client of a goal that is canceled while the reconstruction's answer is on its way."""
+
+    def __init__(self):
+        monitor = InstrumentMonitor(lambda: True)
+        PacedWaiting.__init__(self, "scanner", monitor, lambda: 0, lambda: True, 3.0)
+        self._service_timeout_s = 5.0
+        answer = SimpleNamespace(success=True, message="")
+        self._clients = {
+            "reconstruction/begin_scan": SimpleNamespace(
+                call_async=lambda request: Answered(answer, 3)
+            )
+        }
+        PacedWaiting.prepare(self, lambda: True, lambda phase: None)
+
+
+def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects():
+    client = CanceledClient()
+    client.begin_scan(REQUEST)
+    with pytest.raises(ScanCanceled):
+        client.tick()
+
+
+def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():
+    begin, end = sweep_ends_mm(REQUEST, LIMITS)
+    ramp = 50.0**2 / (2 * 2000.0)
+    assert begin < 20.0 - ramp
+    assert end > 40.0 + ramp
+    back = sweep_ends_mm(ScanRequest("s", 40.0, 20.0, 50.0), LIMITS)
+    assert back == (end, begin)
+    assert sweep_ends_mm(ScanRequest("s", 0.0, 220.0, 50.0), LIMITS) == (0.0, 220.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"start_mm": -1.0}, "start is -0.001 m"),
+        ({"stop_mm": 221.0}, "stop is 0.221 m"),
+        ({"stop_mm": math.nan}, "stop is nan m"),
+        ({"speed_mm_s": 0.0}, "speed is 0 m/s"),
+        ({"speed_mm_s": math.inf}, "speed is inf m/s"),
+        ({"frequency_hz": 15.9}, "frequency is 15.9 Hz"),
+        ({"duty": 1.0}, "duty is 1"),
+    ],
+)
+def test_bad_requests_are_named(change, words):
+    values = {"scan_id": "s", "start_mm": 20.0, "stop_mm": 40.0, "speed_mm_s": 50.0}
+    with pytest.raises(ArgumentError, match=words):
+        check_request(ScanRequest(**{**values, **change}), LIMITS)
+
+
+def test_crossing_time_is_interpolated_either_way():
+    samples = [(0, 0.0), (10, 0.0), (20, 10.0), (30, 20.0)]
+    assert crossing_ns(samples, 5.0) == 15
+    assert crossing_ns(samples, 20.0) == 30
+    assert crossing_ns(samples, 21.0) is None
+    assert crossing_ns([(t, -p) for t, p in samples], -5.0) == 15

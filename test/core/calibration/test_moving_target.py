@@ -1,0 +1,120 @@
+"""A target that the stage moves along the range: every profile is one more known range."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core.base.errors import ArgumentError, FitError
+from eschorty_ros.core.calibration.fit import fit_targets
+from eschorty_ros.core.calibration.posts import moving_target
+from eschorty_ros.core.calibration.targets import Targets
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.simulation.scenes.names import Plane
+from eschorty_ros.simulation.world.recorder import simulate_recording
+
+COLUMNS = 48
+NOMINAL = load_calibration("config_3").model_copy(
+    update={"columns": COLUMNS, "principal_column": 23.5}
+)
+AS_BUILT = NOMINAL.model_copy(
+    update={"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": -1102.74}
+)
+SPEED_MM_S = 100.0
+
+
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory) -> list[tuple[float, Profiles, np.ndarray]]:
+    """Profiles of a plane that the stage moves, standing at two places, forth and back at each."""
+    made = []
+    for at_zero_mm in (850.0, 1800.0):
+        for start_mm, stop_mm in ((10.0, 210.0), (210.0, 10.0)):
+            recording = simulate_recording(
+                tmp_path_factory.mktemp("sweep"), Plane(at_zero_mm, slope_stage=1.0), AS_BUILT,
+                start_mm=start_mm, stop_mm=stop_mm, speed_mm_s=SPEED_MM_S, seed=len(made),
+            )  # fmt: skip
+            profiles = reconstruct_recording(recording).profiles
+            made.append((at_zero_mm, profiles, recording.stage.position_mm(profiles.t_us)))
+    return made
+
+
+def test_sweeps_forth_and_back_give_the_geometry(sweeps):
+    parts = [moving_target(profiles, stage, zero) for zero, profiles, stage in sweeps]
+    assert all(len(part) > 0.95 * 200.0 / SPEED_MM_S * 70.0 for part in parts)
+    nominal, true = NOMINAL.model(), AS_BUILT.model()
+    true_mm = np.linspace(800.0, 2100.0, 131)
+
+    def rms_mm(targets: Targets) -> float:
+        fit = fit_targets(targets.row, targets.range_mm, nominal,
+                          sigma_row_px=targets.sigma_row_px)  # fmt: skip
+        error = fit.model.range_mm(true.row(true_mm)) - true_mm
+        return float(np.sqrt(np.mean(error**2)))
+
+    both = Targets.concatenate(parts)
+    pulls = (both.row - true.row(both.range_mm)) / both.sigma_row_px
+    forth, back = (Targets.concatenate(parts[k::2]) for k in (0, 1))
+    print(f"{len(both)} targets, pulls {pulls.mean():+.2f} +- {pulls.std():.2f}; range RMS "
+          f"{rms_mm(both):.3f} mm, {rms_mm(forth):.3f} forth, {rms_mm(back):.3f} back")  # fmt: skip
+    assert rms_mm(both) < 0.2
+    # A line that moves over the pixels is seen late: half of the difference of the directions.
+    assert rms_mm(both) < 0.5 * min(rms_mm(forth), rms_mm(back))
+    assert 0.5 < pulls.std() < 1.5
+
+
+def test_blocks_lie_side_by_side(sweeps):
+    zero, profiles, stage = sweeps[0]
+    whole = moving_target(profiles, stage, zero)
+    parts = moving_target(profiles, stage, zero, blocks=4)
+    assert len(parts) == pytest.approx(4 * len(whole), rel=0.02)
+    assert set(np.round(parts.column / 12.0 - 0.48).astype(int)) == {0, 1, 2, 3}
+
+
+def test_the_other_direction_and_part_of_the_columns(sweeps):
+    zero, profiles, stage = sweeps[0]
+    forth = moving_target(profiles, stage, zero, columns=(10, 39))
+    back = moving_target(profiles, 220.0 - stage, zero + 220.0, range_per_stage=-1.0,
+                         columns=(10, 39))  # fmt: skip
+    np.testing.assert_allclose(back.range_mm, forth.range_mm, atol=1e-9)
+    assert 15.0 < forth.column.min() <= forth.column.max() < 35.0
+
+
+def test_profiles_off_the_others_are_left_out(sweeps):
+    zero, profiles, stage = sweeps[0]
+    good = moving_target(profiles, stage, zero)
+    edges = np.unique(profiles.edge_us)[[3, 40, 41, 90]]
+    wrong = np.where(np.isin(profiles.edge_us, edges), stage + 12.0, stage)
+    kept = moving_target(profiles, wrong, zero)
+    assert len(kept) == len(good) - len(edges)
+    assert set(kept.row.tolist()) <= set(good.row.tolist())
+
+
+def test_points_without_a_stage_position_are_left_out(sweeps):
+    zero, profiles, stage = sweeps[0]
+    half = np.where(stage < 100.0, np.nan, stage)
+    assert moving_target(profiles, half, zero).range_mm.min() > zero + 99.0
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"stage_mm": np.zeros(3)}, ArgumentError, "one position for each"),
+        ({"range_per_stage": 0.0}, ArgumentError, "range_per_stage is 0"),
+        ({"range_at_zero_mm": -500.0}, ArgumentError, "at or behind the datum"),
+        ({"sigma_stage_mm": 0.0}, ArgumentError, "sigma_stage_mm is 0.0"),
+        ({"blocks": 0}, ArgumentError, "blocks is 0"),
+        ({"blocks": 30}, FitError, "too few for 30"),
+        ({"columns": (3, 5)}, FitError, "too few"),
+    ],
+)
+def test_impossible_requests_are_refused(sweeps, change, error, words):
+    zero, profiles, stage = sweeps[0]
+    given = {"stage_mm": stage, "range_at_zero_mm": zero, **change}
+    with pytest.raises(error, match=words):
+        moving_target(profiles, **given)
+
+
+def test_nothing_seen_is_refused():
+    with pytest.raises(FitError, match="half of the profiles"):
+        moving_target(Profiles.empty(), np.empty(0), 1000.0)

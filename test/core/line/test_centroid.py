@@ -1,0 +1,175 @@
+"""Column estimators against known rows, their bounds and their symmetries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import norm
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.line.centroid import METHODS, WHOLE_COLUMN_METHODS, estimate
+from eschorty_ros.core.line.row_sigma import (
+    METHOD_NOISE,
+    SIGMA_COMMON_PX,
+    SIGMA_FACTOR,
+    SIGMA_FLOOR_PX,
+)
+
+SEED = 20260
+WINDOWED = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]
+
+
+def drawn(fwhm: float, events: int, share: float, columns: int = 3000):
+    rng = np.random.default_rng(SEED)
+    truth = rng.uniform(200, 520, columns)
+    rows = rng.normal(truth[:, None], fwhm / 2.3548, (columns, events))
+    noise = rng.random((columns, events)) < share
+    rows = np.where(noise, rng.uniform(-0.5, 719.5, (columns, events)), rows)
+    rows = np.clip(np.rint(rows), 0, 719).astype(np.uint16)
+    return truth, rows.ravel(), np.arange(columns + 1) * events
+
+
+@pytest.mark.parametrize("method", ["mode_mean", "gauss_ml"])
+@pytest.mark.parametrize(
+    ("fwhm", "events", "share"),
+    [(2, 30, 0.3), (10, 30, 0.1), (20, 30, 0.0), (20, 100, 0.1), (20, 200, 0.3), (2, 200, 0.1)],
+)
+def test_error_stays_near_the_cramer_rao_bound(method, fwhm, events, share):
+    truth, rows, offsets = drawn(fwhm, events, share)
+    found = estimate(rows, offsets, method, line_width_px=fwhm)
+    sigma = fwhm / 2.3548
+    bound = np.sqrt(sigma**2 + 1 / 12) / np.sqrt(events * (1 - share))
+    error = np.quantile(np.abs(found.row - truth), 0.6827)
+    assert error < 1.1 * bound, f"seed {SEED}: {error / bound:.3f} x bound"
+
+
+@pytest.mark.parametrize("method", WINDOWED)
+@pytest.mark.parametrize("fwhm", [5, 20])
+def test_gross_errors_with_few_events_and_much_background(method, fwhm):
+    truth, rows, offsets = drawn(fwhm, 10, 0.3)
+    found = estimate(rows, offsets, method, line_width_px=fwhm)
+    gross = ~(np.abs(found.row - truth) < 2 * fwhm)
+    assert gross.mean() <= 0.015, f"seed {SEED}"
+
+
+def test_gauss_ml_is_at_the_top_of_the_likelihood():
+    """scipy's maximum over row and background share, for a Gaussian of the width given."""
+    fwhm, sigma = 12.0, 12.0 / 2.3548200450309493
+    truth, rows, offsets = drawn(fwhm, 40, 0.25, columns=60)
+    found = estimate(rows, offsets, "gauss_ml", line_width_px=fwhm)
+    for column, y in enumerate(rows.reshape(60, 40).astype(float)):
+
+        def cost(at, y=y):
+            line = 1.0 / (1.0 + np.exp(-at[1]))
+            return -np.log(line * norm.pdf(y, at[0], sigma) + (1 - line) / 720).sum()
+
+        best = minimize(cost, [truth[column], 1.0], method="Nelder-Mead", options={"xatol": 1e-6})
+        # 40 events leave the row uncertain by 0.9 px; four steps come this near to the top.
+        assert abs(found.row[column] - best.x[0]) < 0.05, f"seed {SEED}, column {column}"
+
+
+def test_gauss_ml_takes_less_from_background_than_the_mean_of_the_window():
+    truth, rows, offsets = drawn(20, 200, 0.3, columns=8000)
+    error = {
+        method: np.std(estimate(rows, offsets, method, line_width_px=20).row - truth)
+        for method in ("mode_mean", "gauss_ml")
+    }
+    assert error["gauss_ml"] < 0.99 * error["mode_mean"], f"seed {SEED}: {error}"
+
+
+def quantile_within_pixels(rows, share):
+    """Row below which ``share`` of the events lies, each row's events spread over its pixel."""
+    counts = np.bincount(rows, minlength=720)
+    edges = np.arange(721) - 0.5
+    below = np.concatenate([[0], np.cumsum(counts)]) / counts.sum()
+    at = np.flatnonzero(np.isclose(below, share, rtol=0, atol=1e-12))
+    return edges[at].mean() if at.size else np.interp(share, below, edges)
+
+
+@pytest.mark.parametrize("events", [1, 3, 8, 16, 41])
+def test_edge_mid_lies_between_the_eighths_of_the_footprint(events):
+    rng = np.random.default_rng(SEED)
+    for _ in range(50):
+        rows = np.rint(rng.normal(300, 4, events)).astype(int)
+        found = estimate(rows, [0, events], "edge_mid", line_width_px=60.0)
+        edges = quantile_within_pixels(rows, 0.125), quantile_within_pixels(rows, 0.875)
+        assert found.row[0] == pytest.approx(np.mean(edges), abs=1e-9), f"seed {SEED}: {rows}"
+
+
+def test_edge_mid_does_not_see_a_skewed_middle():
+    """A flat footprint with more events on one side: its edges stay, its mean moves."""
+    flat = np.repeat(np.arange(290, 311), 8)
+    skewed = np.concatenate([flat, np.repeat([296, 297, 298], 16)])
+    there, back = (
+        estimate(skewed, [0, skewed.size], method, line_width_px=20.0).row[0]
+        for method in ("edge_mid", "mode_mean")
+    )
+    assert abs(there - 300.0) < 0.5 * abs(back - 300.0)
+
+
+@pytest.mark.parametrize("method", WINDOWED)
+@pytest.mark.parametrize("row", [0.0, 5.0, 12.0, 719.0])
+def test_line_cut_by_the_sensor_is_not_biased(method, row):
+    """The part on the sensor has its mean up to 0.8 sigma inside; the row is the whole line's."""
+    rng = np.random.default_rng(SEED)
+    sigma, events, columns = 8.493, 100, 1500
+    rows = np.rint(rng.normal(row, sigma, (columns, 4 * events)))
+    rows = np.stack([line[(line >= 0) & (line <= 719)][:events] for line in rows]).astype(int)
+    independent = 1.0 / METHOD_NOISE["mode_mean"].factor
+    offsets = np.arange(columns + 1) * events
+    found = estimate(rows.ravel(), offsets, method, line_width_px=20.0, sigma_factor=independent)
+    error = found.row - row
+    assert found.edge.all()
+    assert abs(error.mean()) < 0.12 * sigma, f"seed {SEED}: {error.mean():.2f} px"
+    assert np.mean(np.abs(error) < 2 * found.sigma_row) > 0.95, f"seed {SEED}"
+
+
+def test_stronger_of_two_surfaces_wins():
+    rng = np.random.default_rng(SEED)
+    strong = np.rint(rng.normal(300, 4.0, (500, 60))).astype(int)
+    weak = np.rint(rng.normal(420, 4.0, (500, 40))).astype(int)
+    rows = np.hstack([weak, strong])
+    found = estimate(rows.ravel(), np.arange(501) * 100, line_width_px=10)
+    assert np.abs(found.row - 300).max() < 4.0
+
+
+def test_two_equal_separate_groups_are_left_undecided():
+    found = estimate([100, 100, 100, 600, 600, 600], [0, 6], line_width_px=5.0)
+    assert np.isnan(found.row[0])
+    assert found.ambiguous[0]
+
+
+def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
+    line = np.arange(290, 311).repeat(2)
+    sigma = {}
+    for strays in (0, 1, 3):
+        rows = np.concatenate([line, np.linspace(20, 700, strays).astype(int)])
+        found = estimate(rows, [0, rows.size], "mean")
+        error = found.row[0] - 300.0
+        assert abs(error) <= 2.0 * found.sigma_row[0], strays
+        sigma[strays] = found.sigma_row[0]
+    own = METHOD_NOISE["mean"]
+    floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2 + SIGMA_COMMON_PX**2
+    spread2 = (own.factor * SIGMA_FACTOR) ** 2 * line.var(ddof=1) / line.size
+    assert sigma[0] == pytest.approx(np.sqrt(floor2 + spread2), rel=1e-12)
+    assert sigma[0] < sigma[1] < sigma[3]
+
+
+@pytest.mark.parametrize(
+    ("rows", "offsets", "options"),
+    [
+        ([1, 720], [0, 2], {}),
+        ([-1], [0, 1], {}),
+        ([1.5], [0, 1], {}),
+        ([1], [0, 2], {}),
+        ([1, 2], [0, 2, 1, 2], {}),
+        ([1], [0, 1], {"method": "best"}),
+        ([1], [0, 1], {"line_width_px": float("nan")}),
+        ([1], [0, 1], {"height": 5000}),
+    ],
+)
+def test_bad_arguments_are_refused(rows, offsets, options):
+    with pytest.raises(ArgumentError) as caught:
+        estimate(rows, offsets, **options)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,149 @@
+"""Phase gate: what it keeps of a simulated line, what it leaves of the background, its counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.line_events import encoded
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.evt3.decoder import Decoder
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, gate_parameters
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.simulation.scenes.names import Plane
+from eschorty_ros.simulation.world.world import World
+
+SEED = 20261121
+COLUMNS = 128
+CALIBRATION = load_calibration("config_3").model_copy(update={"columns": COLUMNS})
+EDGE_US = 3_217
+PARTS = ("events_binned", "events_over_column_limit", "events_outside_sensor",
+         "events_outside_phase", "events_filtered", "events_gated", "events_held")  # fmt: skip
+
+
+def line(frequency_hz: float, duty: float = 0.5, periods: int = 24):
+    """Noiseless line on a plane: every event is signal."""
+    world = World(Plane(1320.0), CALIBRATION, seed=SEED, background_hz=0.0)
+    world.set_laser(0, True, Modulation(frequency_hz, duty, on_edge_us=EDGE_US))
+    data = world.advance(EDGE_US + round(periods * 1e6 / frequency_hz))
+    return Decoder(COLUMNS, CALIBRATION.rows).decode(data)
+
+
+def background(rate_hz: float, until_us: int, seed: int = SEED):
+    rng = np.random.default_rng(seed)
+    size = rng.poisson(rate_hz * 1e-6 * until_us * COLUMNS * CALIBRATION.rows)
+    t = np.sort(rng.integers(EDGE_US, until_us, size))
+    x = rng.integers(0, COLUMNS, size).astype(np.uint16)
+    y = rng.integers(0, CALIBRATION.rows, size).astype(np.uint16)
+    return t, x, y, rng.integers(0, 2, size).astype(np.uint8)
+
+
+def stream(parts, triggers_us=None) -> bytes:
+    t, x, y, p = (np.concatenate(values) for values in zip(*parts, strict=True))
+    order = np.lexsort((x, p, y, t))
+    return encoded((t[order], x[order], y[order], p[order]), triggers_us)
+
+
+def run(data: bytes, modulation: Modulation, gate_us: int, piece: int = 1 << 20):
+    reconstructor = Reconstructor(CALIBRATION, modulation, Settings(phase_gate_us=gate_us))
+    parts = [reconstructor.push(data[k : k + piece]) for k in range(0, len(data), piece)]
+    found = Profiles.concatenate([*parts, reconstructor.flush()])
+    counts = reconstructor.counters
+    assert counts["events"] == sum(counts[name] for name in PARTS), counts
+    return found, counts
+
+
+def phases(kind: str, frequency_hz: float, duty: float, until_us: int):
+    """Modulation and triggers for an edge that is known, triggered or to be estimated."""
+    modulation = Modulation(frequency_hz, duty)
+    if kind == "known":
+        return replace(modulation, on_edge_us=EDGE_US), None
+    if kind == "estimated":
+        return modulation, None
+    count = int((until_us - EDGE_US) * 1e-6 * frequency_hz) + 1
+    known = replace(modulation, on_edge_us=EDGE_US)
+    return modulation, np.array([known.edge_us(k) for k in range(count)])
+
+
+@pytest.mark.parametrize("kind", ["known", "trigger", "estimated"])
+@pytest.mark.parametrize(
+    ("frequency_hz", "duty", "gate_us", "cut"),
+    [(70.0, 0.5, 1000, 10.0), (70.0, 0.2, 1000, 10.0), (300.0, 0.5, 600, 4.0)],
+)
+def test_signal_stays_and_background_goes(kind, frequency_hz, duty, gate_us, cut):
+    signal = line(frequency_hz, duty)
+    end_us = int(signal.t[-1])
+    signal_part = (signal.t, signal.x, signal.y, signal.p)
+    noise_part = background(2.0, end_us)
+    modulation, triggers = phases(kind, frequency_hz, duty, end_us)
+    _, both = run(stream([signal_part, noise_part], triggers), modulation, gate_us)
+    seen = both["events"] - both["events_outside_phase"]
+    # The phase is known here whatever was estimated, so that signal and noise can be told apart.
+    exact = replace(modulation, on_edge_us=EDGE_US)
+    _, quiet = run(stream([signal_part]), exact, gate_us)
+    _, noise = run(stream([noise_part]), exact, gate_us)
+    assert quiet["events_gated"] <= 0.05 * quiet["events"], f"seed {SEED}"
+    assert (noise["events"] - noise["events_gated"]) * cut <= noise["events"], f"seed {SEED}"
+    kept = seen - both["events_gated"]
+    noise_left = (noise["events"] - noise["events_gated"]) * 1.15
+    assert kept >= 0.95 * quiet["events"], f"seed {SEED}"
+    assert kept <= quiet["events"] + noise_left, f"seed {SEED}"
+
+
+def test_gate_off_or_as_long_as_the_period_removes_nothing():
+    signal = line(1000.0, periods=10)
+    parts = [(signal.t, signal.x, signal.y, signal.p), background(5.0, int(signal.t[-1]))]
+    modulation = Modulation(1000.0, on_edge_us=EDGE_US)
+    for gate_us in (0, 1000 - LEAD_US, GATE_MAX_US):
+        found, counts = run(stream(parts), modulation, gate_us)
+        assert counts["events_gated"] == 0
+        assert len(found) == len(run(stream(parts), modulation, 0)[0])
+
+
+def test_a_sine_has_no_edges_to_gate_by():
+    assert not gate_parameters(Modulation(70.0, waveform="sine"), 1000).any()
+    with pytest.raises(ArgumentError, match="gate_us is -1; choose a whole number from 0 to"):
+        gate_parameters(Modulation(70.0), -1)
+
+
+def test_points_do_not_depend_on_how_the_bytes_are_split():
+    signal = line(70.0, periods=6)
+    parts = [(signal.t, signal.x, signal.y, signal.p), background(2.0, int(signal.t[-1]))]
+    data = stream(parts)
+    modulation = Modulation(70.0, on_edge_us=EDGE_US)
+    whole, counts = run(data, modulation, 1000)
+    assert counts["events_gated"] > 1000
+    for piece in (997, 8192):
+        split, split_counts = run(data, modulation, 1000, piece)
+        assert split_counts == counts
+        np.testing.assert_array_equal(split.row, whole.row)
+        np.testing.assert_array_equal(split.t_us, whole.t_us)
+
+
+def test_several_periods_per_profile_are_gated_each():
+    signal = line(300.0, periods=12)
+    modulation = Modulation(300.0, on_edge_us=EDGE_US)
+    settings = Settings(phase_gate_us=600, periods_per_profile=4)
+    reconstructor = Reconstructor(CALIBRATION, modulation, settings)
+    reconstructor.push(stream([(signal.t, signal.x, signal.y, signal.p)]))
+    reconstructor.flush()
+    counts = reconstructor.counters
+    assert counts["events_gated"] <= 0.05 * counts["events"], f"seed {SEED}"
+
+
+def test_few_gross_errors_are_left_in_strong_background():
+    signal = line(70.0)
+    noise = background(40.0, int(signal.t[-1]))
+    data = stream([(signal.t, signal.x, signal.y, signal.p), noise])
+    modulation = Modulation(70.0, on_edge_us=EDGE_US)
+    true_row = CALIBRATION.model().row(1320.0)
+    spread = {}
+    for gate_us in (0, 1000):
+        found, _ = run(data, modulation, gate_us)
+        error = np.abs(found.row - true_row)
+        spread[gate_us] = float(np.quantile(error, 0.95))
+    assert spread[1000] < 0.6 * spread[0], f"seed {SEED}: {spread}"

@@ -1,0 +1,125 @@
+"""The phase nobody tells is found, and kept while the generator's clock runs away."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core.evt3.decoder import Encoder, sort_readout
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.core.reconstruction.profiles import Profiles
+
+SEED = 5
+CALIBRATION = load_calibration("config_3")
+SINGLE = Settings(events_min=1, isolation_events=0, smoothing_half_width=0)
+EDGE_US = 1000
+
+
+def bursts(frequency_hz, seconds, ppm=0.0, *, per_period=32, edge_us=EDGE_US, seed=SEED):
+    """Events of 16 columns: half after each edge of a generator whose period is ``ppm`` longer."""
+    rng = np.random.default_rng(seed)
+    period_us = 1e6 / frequency_hz * (1 + ppm * 1e-6)
+    k = np.arange(int(seconds * 1e6 / period_us))
+    t, p = [], []
+    for polarity, share in ((1, 0.0), (0, 0.5)):
+        start = np.repeat(edge_us + (k + share) * period_us, per_period // 2)
+        t.append(start + rng.gamma(2.0, min(60.0, period_us / 8) / 2, start.size))
+        p.append(np.full(start.size, polarity))
+    noise = k.size * per_period // 20
+    t.append(edge_us + rng.random(noise) * k.size * period_us)
+    p.append(rng.integers(0, 2, noise))
+    t = np.rint(np.concatenate(t)).astype(np.int64)
+    y = np.clip(np.rint(rng.normal(300.0, 8.0, t.size)), 0, 719)
+    x = rng.integers(0, 16, t.size)
+    return sort_readout(
+        t, x.astype(np.uint16), y.astype(np.uint16), np.concatenate(p).astype(np.uint8)
+    )
+
+
+def noise(begin_us, end_us, count, seed=SEED):
+    rng = np.random.default_rng(seed)
+    return sort_readout(
+        rng.integers(begin_us, end_us, count),
+        rng.integers(0, 16, count).astype(np.uint16),
+        rng.integers(0, 720, count).astype(np.uint16),
+        rng.integers(0, 2, count).astype(np.uint8),
+    )
+
+
+def joined(*parts):
+    return tuple(np.concatenate(fields) for fields in zip(*parts, strict=True))
+
+
+def edges_of(subject, data, size=1 << 20):
+    parts = [subject.push(data[at : at + size]) for at in range(0, len(data), size)]
+    return np.unique(Profiles.concatenate([*parts, subject.flush()]).edge_us)
+
+
+def off(edges_us, frequency_hz, ppm, edge_us=EDGE_US):
+    """Distance from the generator's edges as a share of the period."""
+    turns = (edges_us - edge_us) / (1e6 / frequency_hz * (1 + ppm * 1e-6))
+    return turns - np.rint(turns)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "seconds", "ppm", "limit"),
+    [(1000.0, 100.0, 100.0, 0.015), (1000.0, 20.0, -100.0, 0.015), (300.0, 20.0, 100.0, 0.015),
+     (70.0, 30.0, 100.0, 0.015), (20_000.0, 2.0, 100.0, 0.09)],
+)  # fmt: skip
+def test_the_edges_follow_a_generator_with_a_clock_of_its_own(frequency_hz, seconds, ppm, limit):
+    """Untracked, 100 ppm over 100 s at 1 kHz are ten whole periods."""
+    per_period = 32 if frequency_hz > 500 else 200
+    data = Encoder().encode(*bursts(frequency_hz, seconds, ppm, per_period=per_period))
+    subject = Reconstructor(CALIBRATION, Modulation(frequency_hz), SINGLE)
+    worst = np.abs(off(edges_of(subject, data), frequency_hz, ppm)).max()
+    print(f"seed {SEED}: edges off by {worst:.4f} periods at most")
+    assert worst < limit
+    assert subject.counters["phase_relocks"] == 0
+    assert subject.counters["phase_corrections"] > 10
+
+
+@pytest.mark.parametrize("size", [1 << 20, 50_000, 977, 64])
+def test_the_edges_do_not_depend_on_how_the_stream_is_cut(size):
+    dark = noise(2_300_000, 9_000_000, 300)
+    later = bursts(1000.0, 1.0, 80.0, edge_us=9_000_411)
+    data = Encoder().encode(*joined(bursts(1000.0, 2.0, 80.0), dark, later))
+    whole = Reconstructor(CALIBRATION, Modulation(1000.0), SINGLE)
+    cut = Reconstructor(CALIBRATION, Modulation(1000.0), SINGLE)
+    np.testing.assert_array_equal(edges_of(cut, data, size), edges_of(whole, data))
+    assert cut.counters == whole.counters
+    assert cut.counters["phase_relocks"] == 1
+
+
+@pytest.mark.parametrize("pause_us", [2_000, 400_000, 20_000_000])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_a_laser_switched_off_and_on_again_has_its_new_phase(pause_us, share):
+    restart_us = EDGE_US + 1_000_000 + pause_us + round(share * 1000)
+    dark = noise(EDGE_US + 1_000_000, restart_us, pause_us // 2000)
+    data = Encoder().encode(
+        *joined(bursts(1000.0, 1.0), dark, bursts(1000.0, 1.0, edge_us=restart_us))
+    )
+    subject = Reconstructor(CALIBRATION, Modulation(1000.0), SINGLE)
+    edges = edges_of(subject, data)
+    settled = edges[edges > restart_us + 80_000]
+    assert settled.size > 900
+    assert np.abs(off(settled, 1000.0, 0.0, restart_us)).max() < 0.02
+    assert subject.counters["phase_relocks"] == 1
+    assert (np.diff(edges) > 400).all()
+
+
+def test_a_known_phase_is_not_corrected():
+    data = Encoder().encode(*bursts(1000.0, 2.0, 100.0))
+    subject = Reconstructor(CALIBRATION, Modulation(1000.0, on_edge_us=EDGE_US), SINGLE)
+    edges = edges_of(subject, data)
+    assert ((edges - EDGE_US) % 1000 == 0).all()
+    assert subject.counters["phase_corrections"] == 0
+
+
+def test_noise_moves_nothing():
+    data = Encoder().encode(*joined(bursts(1000.0, 0.5), noise(510_000, 3_000_000, 60_000)))
+    subject = Reconstructor(CALIBRATION, Modulation(1000.0), SINGLE)
+    edges = edges_of(subject, data)
+    assert np.abs(off(edges, 1000.0, 0.0)).max() < 0.02
+    assert subject.counters["phase_relocks"] == 0

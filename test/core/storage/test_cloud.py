@@ -1,0 +1,183 @@
+"""Clouds go through both file forms unchanged; other programs read them too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.core.storage.cloud import POINT_DTYPE, Points, read_cloud, write_cloud
+from eschorty_ros.simulation.scenes.open3d_module import load_open3d
+
+EXTENSIONS = [".pcd", ".ply"]
+
+
+def cloud(count: int, seed: int = 7) -> Points:
+    rng = np.random.default_rng(seed)
+    points = np.zeros(count, POINT_DTYPE)
+    for name in ("x", "y", "z", "intensity", "sigma"):
+        points[name] = rng.normal(1.0, 0.5, count)
+    points["t"] = 1e6 + np.arange(count) * 1e-6
+    points["column"] = rng.integers(0, 1280, count)
+    return points
+
+
+def coordinates(points: Points) -> np.ndarray:
+    return np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def open3d() -> ModuleType:
+    try:
+        return load_open3d("this test")
+    except EschortyError as error:
+        pytest.skip(str(error))
+
+
+def test_point_layout() -> None:
+    assert POINT_DTYPE.names == ("x", "y", "z", "intensity", "sigma", "t", "column")
+    assert POINT_DTYPE.itemsize == 30
+    assert [POINT_DTYPE[name].str for name in POINT_DTYPE.names] == ["<f4"] * 5 + ["<f8", "<u2"]
+
+
+@pytest.mark.parametrize("extension", [*EXTENSIONS, ".PCD"])
+@pytest.mark.parametrize("count", [0, 1, 10_000])
+def test_round_trip_is_bit_exact(tmp_path: Path, extension: str, count: int) -> None:
+    file = tmp_path / f"cloud{extension}"
+    write_cloud(file, cloud(count))
+    back = read_cloud(str(file))
+    assert back.dtype == POINT_DTYPE
+    assert back.tobytes() == cloud(count).tobytes()
+    back["x"] = 0.0
+    assert [entry.name for entry in tmp_path.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_nan_and_strided_points_survive(tmp_path: Path, extension: str) -> None:
+    points = cloud(20)
+    points["x"][3] = np.nan
+    points["sigma"][4] = np.inf
+    write_cloud(tmp_path / f"c{extension}", points[::2])
+    assert read_cloud(tmp_path / f"c{extension}").tobytes() == points[::2].tobytes()
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_open3d_sees_the_same_points(tmp_path: Path, extension: str, open3d: ModuleType) -> None:
+    file = tmp_path / f"cloud{extension}"
+    points = cloud(1000)
+    write_cloud(file, points)
+    expected = coordinates(read_cloud(file))
+    assert np.array_equal(expected, coordinates(points))
+    assert np.array_equal(np.asarray(open3d.io.read_point_cloud(str(file)).points), expected)
+    tensor = open3d.t.io.read_point_cloud(str(file)).point
+    assert np.array_equal(tensor["positions"].numpy(), expected)
+    assert np.array_equal(tensor["intensity"].numpy().ravel(), points["intensity"])
+    assert np.array_equal(tensor["sigma"].numpy().ravel(), points["sigma"])
+    assert np.array_equal(tensor["t"].numpy().ravel(), points["t"])
+    if extension == ".pcd":
+        # Open3D's PLY reader skips 16-bit properties.
+        assert np.array_equal(tensor["column"].numpy().ravel(), points["column"])
+
+
+def test_headers_as_written(tmp_path: Path) -> None:
+    write_cloud(tmp_path / "c.pcd", cloud(2))
+    write_cloud(tmp_path / "c.ply", cloud(2))
+    assert (tmp_path / "c.pcd").read_bytes()[:-60].decode() == (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
+        "FIELDS x y z intensity sigma t column\nSIZE 4 4 4 4 4 8 2\nTYPE F F F F F F U\n"
+        "COUNT 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
+    )
+    assert (tmp_path / "c.ply").read_bytes()[:-60].decode() == (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
+        "property float y\nproperty float z\nproperty float intensity\nproperty float sigma\n"
+        "property double t\nproperty ushort column\nend_header\n"
+    )
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_truncated_or_longer_files_are_refused(tmp_path: Path, extension: str) -> None:
+    file = tmp_path / f"c{extension}"
+    write_cloud(file, cloud(5))
+    whole = file.read_bytes()
+    for data in [whole[:cut] for cut in range(0, len(whole), 7)] + [whole[:-1], whole + b"\0"]:
+        file.write_bytes(data)
+        with pytest.raises(FormatError, match=file.name) as caught:
+            read_cloud(file)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"sigma", b"curvature"),
+        (b"DATA binary", b"DATA ascii"),
+        (b"binary_little_endian", b"ascii"),
+        (b"POINTS 5", b"POINTS -5"),
+        (b"vertex 5", b"vertex five"),
+        (b"WIDTH 5", b"WIDTH 6"),
+    ],
+)
+def test_other_layouts_are_refused(tmp_path: Path, extension: str, old: bytes, new: bytes) -> None:
+    file = tmp_path / f"c{extension}"
+    write_cloud(file, cloud(5))
+    data = file.read_bytes()
+    if old not in data:
+        assert read_cloud(file).size == 5
+        return
+    file.write_bytes(data.replace(old, new))
+    with pytest.raises(FormatError, match=file.name):
+        read_cloud(file)
+
+
+@settings(derandomize=True, max_examples=200, deadline=None)
+@given(st.sampled_from(EXTENSIONS), st.binary(max_size=200), st.integers(0, 400))
+def test_random_damage_never_ends_in_anything_but_a_stated_failure(
+    tmp_path_factory: pytest.TempPathFactory, extension: str, noise: bytes, at: int
+) -> None:
+    file = tmp_path_factory.mktemp("noise") / f"c{extension}"
+    write_cloud(file, cloud(3))
+    data = bytearray(file.read_bytes())
+    data[at : at + len(noise)] = noise
+    file.write_bytes(data)
+    try:
+        points = read_cloud(file)
+    except FormatError:
+        return
+    assert points.dtype == POINT_DTYPE
+
+
+def test_missing_file_and_wrong_arguments(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"cannot read .*gone\.pcd"):
+        read_cloud(tmp_path / "gone.pcd")
+    with pytest.raises(ArgumentError, match=r"\.xyz"):
+        write_cloud(tmp_path / "c.xyz", cloud(1))
+    with pytest.raises(ArgumentError, match=r"\.xyz"):
+        read_cloud(tmp_path / "c.xyz")
+    with pytest.raises(ArgumentError, match="dtype float64"):
+        write_cloud(tmp_path / "c.pcd", np.zeros(3))  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="shape"):
+        write_cloud(tmp_path / "c.pcd", cloud(4).reshape(2, 2))
+    with pytest.raises(ArgumentError, match="cannot write"):
+        write_cloud(tmp_path / "no" / "c.pcd", cloud(1))
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "c.pcd"
+    write_cloud(file, cloud(3))
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(ArgumentError, match="No space left"):
+        write_cloud(file, cloud(9))
+    assert read_cloud(file).size == 3
+    assert [entry.name for entry in tmp_path.iterdir()] == ["c.pcd"]

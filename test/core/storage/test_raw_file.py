@@ -1,0 +1,142 @@
+"""RAW files: old and new headers, damage that is named, files written for every reader."""
+
+from __future__ import annotations
+
+import datetime
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
+
+from support.streams import words_of
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter
+
+WORDS = words_of("8000 6064 002A 2805")
+NEW = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
+
+
+def reader_of(tmp_path: Path, content: bytes) -> RawReader:
+    path = tmp_path / "events.raw"
+    path.write_bytes(content)
+    return RawReader(path)
+
+
+def test_new_header_without_warning(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, NEW + WORDS)
+    assert b"".join(reader) == WORDS
+    assert (reader.header.width, reader.header.height, reader.header.format) == (1280, 720, "EVT3")
+    assert reader.header["evt"] == "3.0"
+    assert set(reader.header) == {"evt", "format", "geometry"}
+    assert reader.warnings == []
+
+
+def test_old_header_without_end(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, b"% Date 2020-01-01  10:00:00\n% evt 3.0\n" + WORDS)
+    assert b"".join(reader.chunks(3)) == WORDS
+    assert reader.header["Date"] == "2020-01-01 10:00:00"
+    assert [("% end" in line, "geometry" in line) for line in reader.warnings] == [
+        (True, False),
+        (False, True),
+    ]
+
+
+def test_words_that_look_like_a_header_line(tmp_path: Path) -> None:
+    data = b"% looks like a line\n"
+    assert b"".join(reader_of(tmp_path, NEW + data)) == data
+
+
+def test_chunks_have_the_size_asked_for(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, NEW + WORDS * 10)
+    assert [len(piece) for piece in reader.chunks(32)] == [32, 32, 16]
+    with pytest.raises(ArgumentError, match="size"):
+        reader.chunks(0)
+
+
+def test_odd_byte_is_a_warning(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, NEW + WORDS[:-1])
+    assert b"".join(reader) == WORDS[:-1]
+    list(reader)
+    assert len(reader.warnings) == 1
+    assert "middle of a word" in reader.warnings[0]
+
+
+def test_header_only_is_a_warning(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, NEW)
+    assert list(reader) == []
+    assert "no events" in reader.warnings[0]
+
+
+def test_stream_without_header(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, WORDS)
+    assert b"".join(reader) == WORDS
+    assert "no header" in reader.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "empty"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "no RAW header"),
+        (b"% evt 2.0\n% end\n", "EVT2, not EVT3"),
+        (b"% evt 2.1\n% end\n", "EVT21, not EVT3"),
+        (b"% format EVT21;height=720;width=1280\n% end\n", "EVT21, not EVT3"),
+        (b"% format HISTO3D;height=320;width=320\n% end\n", "HISTO3D, not EVT3"),
+        (b"% format EVT3\n% evt 2.0\n% end\n", "correct one of the two"),
+        (
+            b"% format EVT3;height=720;width=1280\n% geometry 640x480\n% end\n",
+            "1280x720 in format and 640x480 in geometry",
+        ),
+        (b"% format EVT3\n% geometry big\n% end\n", "geometry 'big'"),
+        (b"% format EVT3;width=1280\n% end\n", "format '1280xNone'"),
+        (b"% format EVT3;height=720;wid", "header line without end"),
+    ],
+)
+def test_wrong_files_are_named(tmp_path: Path, content: bytes, said: str) -> None:
+    with pytest.raises(FormatError) as failure:
+        reader_of(tmp_path, content)
+    message = str(failure.value)
+    assert said in message
+    assert "events.raw" in message
+    assert "\n" not in message
+
+
+def test_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(EschortyError, match=r"absent\.raw: No such file"):
+        RawReader(tmp_path / "absent.raw")
+    with pytest.raises(FormatError):
+        RawReader(tmp_path)
+
+
+def test_written_file_reads_back(tmp_path: Path) -> None:
+    path = tmp_path / "out.raw"
+    moment = datetime.datetime(2024, 5, 6, 7, 8, 9, tzinfo=datetime.UTC)
+    with RawWriter(path, serial="0004ABCD", date=moment) as writer:
+        writer.write(WORDS)
+        writer.write(b"")
+        writer.write(WORDS)
+    assert writer.bytes_written == 16
+    reader = RawReader(path)
+    assert b"".join(reader) == WORDS * 2
+    assert reader.warnings == []
+    header = dict(reader.header)
+    assert header["serial_number"] == "0004abcd"
+    assert header["date"] == "2024-05-06 07:08:09"
+    assert header["format"] == "EVT3;height=720;width=1280"
+    assert (header["system_ID"], header["integrator_name"]) == ("49", "Prophesee")
+    keys = [line.split()[1] for line in path.read_bytes().split(b"% end\n")[0].splitlines()]
+    assert keys == sorted(keys)
+
+
+@pytest.mark.parametrize("bad", [{"serial": "x"}, {"sensor_name": "a b"}, {"width": 0}])
+def test_bad_identity_is_refused(tmp_path: Path, bad: dict) -> None:
+    with pytest.raises(ArgumentError, match=next(iter(bad))):
+        RawWriter(tmp_path / "out.raw", **bad)
+
+
+def test_unwritable_place_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="No such file"):
+        RawWriter(tmp_path / "none" / "out.raw")

@@ -1,0 +1,226 @@
+"""Recording folders: what is written is read back, what is wrong is named in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.core.clocks.clock import StageTrack
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.core.storage.recording import (
+    TRUTH_DTYPE,
+    load_recording,
+    read_laser_yaml,
+    write_laser_yaml,
+    write_stage_csv,
+    write_truth_csv,
+)
+
+EPOCH_US = 1_760_000_000_000_000
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "events.raw").write_bytes(b"")
+    write_stage_csv(tmp_path / "stage.csv", [0, 1000, 3000], [0.0, 0.05, 0.15])
+    write_laser_yaml(tmp_path / "laser.yaml", Modulation(70.0, on_edge_us=12))
+    save_calibration(load_calibration("config_3"), tmp_path / "calibration.yaml")
+    return tmp_path
+
+
+def test_a_complete_folder(folder: Path) -> None:
+    recording = load_recording(str(folder))
+    assert recording.path == folder
+    assert recording.events_path == folder / "events.raw"
+    assert recording.modulation == Modulation(70.0, 0.5, "square", 12)
+    assert recording.calibration == load_calibration("config_3")
+    assert recording.truth is None
+    assert recording.stage_samples["t_us"].tolist() == [0, 1000, 3000]
+    assert recording.stage.position_mm([0, 500, 2000, 3000]).tolist() == [0.0, 0.025, 0.1, 0.15]
+    assert np.isnan(recording.stage.position_mm([-1, 3001])).all()
+
+
+def test_layout_of_the_written_files(folder: Path) -> None:
+    assert (folder / "stage.csv").read_text() == (
+        "t_us,position_mm\n0,0.000000\n1000,0.050000\n3000,0.150000\n"
+    )
+    assert (folder / "laser.yaml").read_text() == (
+        "frequency_hz: 70.0\nduty: 0.5\nwaveform: square\non_edge_us: 12\n"
+    )
+    write_truth_csv(folder / "truth.csv", [7, 8], np.array([0, 1279], np.uint16), [1320, 1.5])
+    assert (folder / "truth.csv").read_text() == (
+        "t_us,column,range_mm\n7,0,1320.000000\n8,1279,1.500000\n"
+    )
+
+
+def test_truth_is_read_on_first_use(folder: Path) -> None:
+    recording = load_recording(folder)
+    write_truth_csv(folder / "truth.csv", [EPOCH_US + 1], [640], [1320.123456])
+    truth = recording.truth
+    assert truth is not None
+    assert truth.dtype == TRUTH_DTYPE
+    assert truth.tolist() == [(EPOCH_US + 1, 640, 1320.123456)]
+    assert recording.truth is truth
+
+
+def test_large_truth_survives_chunked_writing(folder: Path) -> None:
+    count = 70_001
+    t_us = EPOCH_US + np.arange(count)
+    write_truth_csv(folder / "truth.csv", t_us, np.arange(count) % 1280, np.full(count, 900.5))
+    truth = load_recording(folder).truth
+    assert truth is not None
+    assert np.array_equal(truth["t_us"], t_us)
+    assert np.array_equal(truth["column"], np.arange(count) % 1280)
+
+
+def test_empty_truth_is_an_empty_table(folder: Path) -> None:
+    write_truth_csv(folder / "truth.csv", [], [], [])
+    truth = load_recording(folder).truth
+    assert truth is not None
+    assert len(truth) == 0
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(st.lists(st.floats(-1e5, 1e5), min_size=1, max_size=30))
+def test_positions_through_text_and_through_ros_metres_are_identical(
+    tmp_path_factory: pytest.TempPathFactory, positions: list[float]
+) -> None:
+    file = tmp_path_factory.mktemp("text") / "stage.csv"
+    t_us = EPOCH_US + 10 * np.arange(len(positions))
+    write_stage_csv(file, t_us, positions)
+    rows = [line.split(",") for line in file.read_text().splitlines()[1:]]
+    from_text, from_ros = StageTrack(), StageTrack()
+    from_text.append([int(row[0]) for row in rows], [float(row[1]) for row in rows])
+    from_ros.append(t_us, [position * 1e-3 * 1e3 for position in positions])
+    query = np.arange(t_us[0], t_us[-1] + 1)
+    assert from_text.position_mm(query).tobytes() == from_ros.position_mm(query).tobytes()
+
+
+@pytest.mark.parametrize("on_edge_us", [None, 0, -5, EPOCH_US])
+def test_laser_round_trip(tmp_path: Path, on_edge_us: int | None) -> None:
+    modulation = Modulation(69.99731, 0.3, "sine", on_edge_us)
+    write_laser_yaml(tmp_path / "laser.yaml", modulation)
+    assert read_laser_yaml(tmp_path / "laser.yaml") == modulation
+
+
+def test_spaces_blank_lines_and_windows_endings_are_fine(folder: Path) -> None:
+    (folder / "stage.csv").write_bytes(
+        b"\xef\xbb\xbft_us, position_mm\r\n0, 1.5\r\n\r\n9,2\r\n\r\n"
+    )
+    assert load_recording(folder).stage_samples.tolist() == [(0, 1.5), (9, 2.0)]
+
+
+def test_calibration_may_be_a_bare_name(folder: Path) -> None:
+    (folder / "calibration.yaml").write_text("config_1\n")
+    assert load_recording(folder).calibration == load_calibration("config_1")
+
+
+def edit(name: str, text: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_text(text) and None  # type: ignore[func-returns-value]
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+LASER = "frequency_hz: 70.0\nduty: 0.5\nwaveform: square\n"
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (remove("events.raw"), ["events.raw is missing", "add it"]),
+        (remove("stage.csv"), ["stage.csv is missing"]),
+        (remove("laser.yaml"), ["laser.yaml is missing"]),
+        (remove("calibration.yaml"), ["calibration.yaml is missing"]),
+        (
+            edit("stage.csv", "time,pos\n0,1\n"),
+            ["stage.csv line 1", "time,pos", "t_us,position_mm"],
+        ),
+        (edit("stage.csv", "\n"), ["stage.csv line 1", "t_us,position_mm"]),
+        (edit("stage.csv", "t_us,position_mm\n"), ["stage.csv", "no samples"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n\n5,2\n3,3\n"), ["line 5", "from 5 to 3"]),
+        (edit("stage.csv", "t_us,position_mm\n5,2\n5,3\n"), ["line 3", "from 5 to 5"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n5,abc\n"), ["line 3", "position_mm is 'abc'"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n5.5,2\n"), ["line 3", "t_us is '5.5'", "whole"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n5.0,2\n"), ["line 3", "t_us is '5.0'", "whole"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n5\n"), ["line 3", "1 cells"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n5,2,3\n"), ["line 3", "3 cells"]),
+        (edit("stage.csv", "t_us,position_mm\n0,nan\n"), ["line 2", "position_mm is nan"]),
+        (edit("stage.csv", "t_us,position_mm\n0,1\n1,1e300\n"), ["line 3", "1e+300"]),
+        (edit("stage.csv", f"t_us,position_mm\n{2**70},1\n"), ["line 2", "t_us is", "in range"]),
+        (edit("laser.yaml", LASER + "phase: 3\n"), ["laser.yaml", "phase is 3", "remove it"]),
+        (edit("laser.yaml", LASER + "on_edge_u: 3\n"), ["did you mean on_edge_us?"]),
+        (edit("laser.yaml", LASER + "on_edge_us: 3.5\n"), ["laser.yaml", "on_edge_us is 3.5"]),
+        (edit("laser.yaml", LASER.replace("70.0", "7.0")), ["laser.yaml", "frequency_hz is 7.0"]),
+        (edit("laser.yaml", LASER.replace("70.0", "fast")), ["frequency_hz is 'fast'", "number"]),
+        (edit("laser.yaml", LASER.replace("0.5", "1.5")), ["laser.yaml", "duty is 1.5"]),
+        (edit("laser.yaml", LASER.replace("square", "saw")), ["waveform is 'saw'", "square"]),
+        (edit("laser.yaml", LASER + "duty: 0.4\n"), ["laser.yaml line 4", "'duty' appears twice"]),
+        (edit("laser.yaml", ""), ["laser.yaml", "None", "frequency_hz"]),
+        (edit("calibration.yaml", "name: x\n"), ["calibration.yaml", "is missing"]),
+    ],
+)
+def test_damage_is_named_in_one_line(
+    folder: Path, damage: Callable[[Path], None], parts: list[str]
+) -> None:
+    damage(folder)
+    with pytest.raises(EschortyError) as caught:
+        load_recording(folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("t_us,column,range_mm\n1,-1,900\n", "column is '-1'"),
+        ("t_us,column,range_mm\n1,70000,900\n", "column is '70000'"),
+        ("t_us,column,range_mm\n1,5,nan\n", "range_mm is nan"),
+        ("t_us,column\n", "line 1"),
+    ],
+)
+def test_damaged_truth_is_named(folder: Path, text: str, part: str) -> None:
+    (folder / "truth.csv").write_text(text)
+    recording = load_recording(folder)
+    with pytest.raises(FormatError, match=part):
+        _ = recording.truth
+
+
+def test_binary_in_place_of_text_is_named(folder: Path) -> None:
+    (folder / "stage.csv").write_bytes(bytes(range(256)))
+    with pytest.raises(FormatError, match=r"stage\.csv.*not text"):
+        load_recording(folder)
+
+
+def test_what_is_no_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="nowhere is not a folder"):
+        load_recording(tmp_path / "nowhere")
+
+
+def test_writers_refuse_what_readers_would(tmp_path: Path) -> None:
+    file = tmp_path / "x.csv"
+    with pytest.raises(ArgumentError, match="from 5 to 5"):
+        write_stage_csv(file, [5, 5], [1.0, 2.0])
+    with pytest.raises(ArgumentError, match="one length"):
+        write_stage_csv(file, [5, 6], [1.0])
+    with pytest.raises(ArgumentError, match="position_mm is nan"):
+        write_stage_csv(file, [5], [np.nan])
+    with pytest.raises(ArgumentError, match="t_us has dtype float64"):
+        write_stage_csv(file, [5.0], [1.0])
+    with pytest.raises(ArgumentError, match="column is 70000"):
+        write_truth_csv(file, [1], [70_000], [900.0])
+    with pytest.raises(ArgumentError, match="range_mm is inf"):
+        write_truth_csv(file, [1], [7], [np.inf])
+    with pytest.raises(ArgumentError, match="cannot write"):
+        write_stage_csv(tmp_path / "absent" / "x.csv", [5], [1.0])
+    assert list(tmp_path.iterdir()) == []

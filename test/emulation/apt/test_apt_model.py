@@ -1,0 +1,120 @@
+"""The emulated stage controller, asked with thorlabs-apt-protocol's own frames."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import thorlabs_apt_protocol as oracle
+
+from eschorty_ros.emulation.apt.model import AptModel
+from eschorty_ros.emulation.apt.wire import BYTE_NS
+
+UNIT, BAY_2, RACK = 0x50, 0x22, 0x11
+SECOND = 1_000_000_000
+
+
+class Host:
+    """Frames to the model and back, in virtual time."""
+
+    def __init__(self, **model: object) -> None:
+        self.now_ns = 0
+        self.model = AptModel(lambda: self.now_ns, **model)
+
+    def ask(self, *frames: bytes, seconds: float = 0.1) -> list:
+        """What comes back within some time."""
+        for frame in frames:
+            self.model.feed(frame)
+        return self.listen(seconds)
+
+    def listen(self, seconds: float) -> list:
+        data = b""
+        end_ns = self.now_ns + round(seconds * SECOND)
+        while self.now_ns < end_ns:
+            self.now_ns += 1_000_000
+            data += self.model.step()
+        return list(oracle.Unpacker(io.BytesIO(data)))
+
+
+def test_identity_axis_and_status() -> None:
+    info, axis, status = Host().ask(
+        oracle.hw_req_info(UNIT, 1),
+        oracle.mot_req_stageaxisparams(UNIT, 1, 1),
+        oracle.mot_req_dcstatusupdate(UNIT, 1, 1),
+    )
+    assert info.model_number.startswith(b"KBD101")
+    assert axis.part_no_axis.startswith(b"DDS220")
+    assert (axis.counts_per_unit, axis.max_pos) == (20_000, 4_400_000)
+    assert status.position == 0
+    assert not status.homed
+    assert not status.channel_enabled
+
+
+def test_rack_answers_for_its_bay_only() -> None:
+    host = Host(controller="bbd30x", bay=2)
+    bays = host.ask(*(oracle.rack_req_bayused(RACK, 1, bay) for bay in range(3)))
+    assert [bay.occupied for bay in bays] == [False, True, False]
+    assert host.ask(oracle.mot_req_dcstatusupdate(0x21, 1, 1)) == []
+    (status,) = host.ask(oracle.mot_req_dcstatusupdate(BAY_2, 1, 1))
+    assert status.source == BAY_2
+
+
+def test_homing_and_a_move_follow_the_trapezoid() -> None:
+    host = Host(power_up_mm=5.0)
+    assert host.ask(oracle.mot_move_home(UNIT, 1, 1), seconds=1.0) == []
+    (homed,) = host.ask(
+        oracle.mod_set_chanenablestate(UNIT, 1, 1, 1),
+        oracle.mot_move_home(UNIT, 1, 1),
+        seconds=2.0,
+    )
+    assert homed.msg == "mot_move_homed"
+    velocity, acceleration = round(100 * 134_217.7), round(1000 * 13.744)
+    ordered_ns = host.now_ns
+    (moved,) = host.ask(
+        oracle.mot_set_velparams(UNIT, 1, 1, 0, acceleration, velocity),
+        oracle.mot_move_absolute(UNIT, 1, 1, 50 * 20_000),
+        seconds=2.0,
+    )
+    assert moved.msg == "mot_move_completed"
+    assert moved.position == 50 * 20_000
+    plan = host.model.plan()
+    assert 0 < plan.start_ns - ordered_ns < 6_000_000
+    assert (plan.end_ns - plan.start_ns) * 1e-9 == pytest.approx(0.6, abs=1e-4)
+
+
+def test_updates_ten_times_a_second_until_nobody_keeps_alive() -> None:
+    host = Host()
+    assert len(host.ask(oracle.hw_start_updatemsgs(UNIT, 1), seconds=2.05)) == 20
+    assert len(host.listen(10.0)) == 30
+    assert host.ask(oracle.mot_req_dcstatusupdate(UNIT, 1, 1), seconds=0.05) == []
+    assert len(host.ask(oracle.mot_ack_dcstatusupdate(UNIT, 1), seconds=1.0)) >= 9
+
+
+def test_bytes_take_their_time_on_the_line() -> None:
+    host = Host()
+    host.model.feed(oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    host.now_ns = 26 * BYTE_NS - 1
+    assert host.model.step() == b""
+    host.now_ns += 1
+    assert len(host.model.step()) == 20
+
+
+def test_garbage_from_the_host_is_skipped() -> None:
+    host = Host()
+    (status,) = host.ask(b"\xff\xfe\xfd" + oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    assert status.position == 0
+
+
+def test_a_restart_forgets_everything() -> None:
+    host = Host()
+    host.ask(
+        oracle.mod_set_chanenablestate(UNIT, 1, 1, 1),
+        oracle.mot_move_home(UNIT, 1, 1),
+        seconds=2.0,
+    )
+    (status,) = host.ask(oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    assert status.homed
+    host.model.reboot()
+    (status,) = host.ask(oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    assert not status.homed
+    assert not status.channel_enabled

@@ -1,0 +1,52 @@
+"""Devices of a served bench that are unplugged while drivers use them."""
+
+from __future__ import annotations
+
+import time
+
+from support.benches import bench_here
+from support.waiting import wait_until
+
+from eschorty_ros.emulation.bench.folder import STAGE_PORT, usb_spec
+from eschorty_ros.hardware.base.usb import open_backend
+from eschorty_ros.hardware.camera.evk4 import Evk4
+
+
+def test_unplugged_devices_leave_the_bus_and_the_port_and_come_back() -> None:
+    with bench_here(scene="plane") as (bench, folder):
+        bus, port = open_backend(usb_spec(folder)), folder / STAGE_PORT
+
+        def seen() -> tuple[int, bool]:
+            return len(list(bus.enumerate_devices())), port.exists()
+
+        bench.laser.gone = bench.stage.gone = True
+        wait_until(lambda: seen() == (1, False), "laser and stage gone")
+        bench.laser.replug()
+        bench.stage.gone = False
+        wait_until(lambda: seen() == (2, True), "laser and stage back")
+
+
+def test_a_streaming_camera_that_was_unplugged_restarts_its_stream() -> None:
+    with bench_here(scene="plane") as (bench, folder):
+        camera = Evk4(open_backend(usb_spec(folder)), time.monotonic_ns)
+        restarts: list[bool] = []
+
+        def starts() -> int:
+            chunk = camera.read(0.1)
+            if chunk is not None:
+                restarts.append(chunk.restarted)
+            return sum(restarts)
+
+        try:
+            camera.open()
+            camera.start()
+            wait_until(lambda: len(restarts) > 5 or starts() > 1, "events")
+            bench.camera.gone = True
+            wait_until(lambda: camera.statistics()["losses"] == 1, "the loss")
+            bench.camera.replug()
+            wait_until(lambda: starts() == 2, "the stream's second beginning")
+            statistics = camera.statistics()
+        finally:
+            camera.close()
+        assert restarts[0]
+        assert (statistics["losses"], statistics["reconnects"]) == (1, 1)

@@ -1,0 +1,176 @@
+"""The emulated bus keeps pyusb's and libusb's rules, so that drivers meet them in tests."""
+
+import array
+import errno
+import threading
+
+import pytest
+import usb.core
+import usb.util
+from support.usb_loop import IN, OUT, PACKET, Loop
+from support.waiting import DEADLINE_S
+
+from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+
+
+@pytest.fixture
+def loop():
+    return Loop()
+
+
+def opened(model, backend=None):
+    return usb.core.find(backend=backend or EmulatedBackend(lambda: [model]), idVendor=0x1234)
+
+
+def test_pyusb_reads_the_descriptors_and_strings(loop):
+    device = opened(loop)
+    assert (device.idVendor, device.idProduct, device.serial_number) == (0x1234, 0x5678, "LOOP1")
+    interface = device.get_active_configuration()[(0, 0)]
+    assert (interface.bInterfaceClass, interface.bInterfaceSubClass) == (0xFF, 0x19)
+    assert [(e.bEndpointAddress, e.wMaxPacketSize) for e in interface] == [(OUT, 64), (IN, 64)]
+
+
+def test_what_is_written_comes_back_in_both_ways_of_reading(loop):
+    device = opened(loop)
+    device.write(OUT, b"abc")
+    assert device.read(IN, 512).tobytes() == b"abc"
+    device.write(OUT, b"defg")
+    buffer = array.array("B", bytes(512))
+    assert device.read(IN, buffer) == 4
+    assert buffer[:4].tobytes() == b"defg"
+
+
+def test_a_transfer_longer_than_the_buffer_goes_on_in_the_next_read(loop):
+    device = opened(loop)
+    data = bytes(range(200))
+    device.write(OUT, data)
+    first = device.read(IN, 2 * PACKET).tobytes()
+    assert first + device.read(IN, 2 * PACKET).tobytes() == data
+    assert len(first) == 2 * PACKET
+
+
+def test_an_exact_multiple_without_an_empty_packet_blocks_a_larger_read_and_is_lost(loop):
+    loop.polite = False
+    device = opened(loop)
+    device.write(OUT, bytes(2 * PACKET))
+    with pytest.raises(usb.core.USBTimeoutError) as caught:
+        device.read(IN, 4 * PACKET)
+    assert (caught.value.errno, caught.value.backend_error_code) == (errno.ETIMEDOUT, -7)
+    device.write(OUT, b"next")
+    assert device.read(IN, 4 * PACKET).tobytes() == b"next"
+
+
+def test_an_exact_multiple_fills_the_buffer_and_leaves_its_empty_packet_for_the_next_read(loop):
+    device = opened(loop)
+    device.write(OUT, bytes(2 * PACKET))
+    assert len(device.read(IN, 2 * PACKET)) == 2 * PACKET
+    assert len(device.read(IN, 2 * PACKET)) == 0
+
+
+def test_a_packet_larger_than_the_rest_of_the_buffer_overflows_and_is_lost(loop):
+    device = opened(loop)
+    device.write(OUT, bytes(PACKET) + b"tail")
+    with pytest.raises(usb.core.USBError) as caught:
+        device.read(IN, 10)
+    assert (caught.value.errno, caught.value.backend_error_code) == (errno.EOVERFLOW, -8)
+    assert device.read(IN, PACKET).tobytes() == b"tail"
+
+
+def test_a_stalled_endpoint_refuses_until_its_halt_is_cleared(loop):
+    device = opened(loop)
+    loop.stalled.add(OUT)
+    for _ in range(2):
+        with pytest.raises(usb.core.USBError) as caught:
+            device.write(OUT, b"x")
+        assert (caught.value.errno, caught.value.backend_error_code) == (errno.EPIPE, -9)
+    device.clear_halt(OUT)
+    assert device.write(OUT, b"x") == 1
+
+
+def test_a_mute_device_times_out_in_both_directions(loop):
+    device = opened(loop)
+    loop.mute = True
+    with pytest.raises(usb.core.USBTimeoutError):
+        device.write(OUT, b"x")
+    with pytest.raises(usb.core.USBTimeoutError):
+        device.read(IN, 64)
+
+
+def test_after_replug_the_old_handle_stays_dead_and_a_new_search_finds_the_device(loop):
+    device = opened(loop)
+    device.write(OUT, b"x")
+    loop.gone = True
+    assert opened(loop) is None
+    loop.replug()
+    with pytest.raises(usb.core.USBError) as caught:
+        device.read(IN, 64)
+    assert (caught.value.errno, caught.value.backend_error_code) == (errno.ENODEV, -4)
+    fresh = opened(loop)
+    assert fresh.address != device.address
+    fresh.write(OUT, b"y")
+    assert fresh.read(IN, 64).tobytes() == b"y"
+
+
+@pytest.mark.parametrize("mute", [False, True])
+def test_unplugging_wakes_a_waiting_read(mute):
+    loop = Loop(wait=threading.Condition.wait)
+    device = opened(loop)
+    codes = []
+
+    def read():
+        try:
+            device.read(IN, 64, timeout=0)
+        except usb.core.USBError as error:
+            codes.append(error.errno)
+
+    device.write(OUT, b"x")
+    device.read(IN, 64)
+    loop.mute = mute
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    loop.gone = True
+    reader.join(DEADLINE_S)
+    assert codes == [errno.ENODEV]
+
+
+def test_two_handles_cannot_claim_one_interface_until_the_first_closes(loop):
+    backend = EmulatedBackend(lambda: [loop])
+    first, second = opened(loop, backend), opened(loop, backend)
+    usb.util.claim_interface(first, 0)
+    for attempt in (lambda: usb.util.claim_interface(second, 0), lambda: second.write(OUT, b"x")):
+        with pytest.raises(usb.core.USBError) as caught:
+            attempt()
+        assert (caught.value.errno, caught.value.backend_error_code) == (errno.EBUSY, -6)
+    usb.util.dispose_resources(first)
+    usb.util.claim_interface(second, 0)
+
+
+def test_a_read_about_to_wait_when_its_handle_closes_takes_nothing(loop):
+    backend = EmulatedBackend(lambda: [loop])
+    handle = backend.open_device(next(backend.enumerate_devices()))
+    backend.claim_interface(handle, 0)
+    loop.reply(IN, b"for the next one")
+    loop.before_transfer = lambda *_: backend.close_device(handle)
+    with pytest.raises(usb.core.USBError) as caught:
+        backend.bulk_read(handle, IN, 0, array.array("B", bytes(64)), 0)
+    assert caught.value.errno == errno.ENODEV
+    assert loop.pending(IN)
+
+
+def test_a_kernel_driver_holds_the_interface_until_detached(loop):
+    loop.kernel_driver = "usbtmc"
+    device = opened(loop)
+    with pytest.raises(usb.core.USBError, match=r"busy"):
+        usb.util.claim_interface(device, 0)
+    assert device.is_kernel_driver_active(0)
+    device.detach_kernel_driver(0)
+    usb.util.claim_interface(device, 0)
+    usb.util.release_interface(device, 0)
+    device.attach_kernel_driver(0)
+    assert loop.kernel_driver == "usbtmc"
+
+
+def test_an_unknown_control_request_stalls(loop):
+    with pytest.raises(usb.core.USBError) as caught:
+        opened(loop).ctrl_transfer(0xA1, 7, 0, 0, 24)
+    assert caught.value.errno == errno.EPIPE

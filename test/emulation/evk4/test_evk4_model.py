@@ -1,0 +1,333 @@
+"""The emulated EVK4 against the reference, with requests written out by hand."""
+
+import errno
+import struct
+
+import numpy as np
+import pytest
+import usb.core
+
+from eschorty_ros.core.evt3 import decoder as evt3
+from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.evk4.model import CONTROL_IN, CONTROL_OUT, DATA_IN, Evk4Model
+from eschorty_ros.emulation.evk4.sequences import SEQUENCES, Phase
+from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
+
+READ, WRITE = 0x10102, 0x40010102
+
+
+class Words:
+    """A source that gives prepared words, one piece per read."""
+
+    def __init__(self, *pieces):
+        self.pieces = [np.asarray(piece, "<u2").tobytes() for piece in pieces]
+        self.calls = []
+
+    def start(self):
+        self.calls.append("start")
+
+    def stop(self):
+        self.calls.append("stop")
+
+    def read(self, max_bytes, timeout_s):
+        return self.pieces.pop(0) if self.pieces else b""
+
+
+class Host:
+    """Speaks to the model over pyusb as the reference describes it."""
+
+    def __init__(self, source=None, **options):
+        self.source = source or Words()
+        self.model = Evk4Model(self.source, wait=lambda *_: False, **options)
+        self.device = usb.core.find(backend=EmulatedBackend(lambda: [self.model]))
+
+    def ask(self, property_, *words):
+        self.device.write(
+            CONTROL_OUT, struct.pack(f"<{2 + len(words)}I", property_, 4 * len(words), *words)
+        )
+        answer = self.device.read(CONTROL_IN, 1024).tobytes()
+        head = struct.unpack_from("<II", answer)
+        assert head[1] == len(answer) - 8
+        return head[0], answer[8:]
+
+    def read(self, address):
+        kind, payload = self.ask(READ, 0, address, 1)
+        assert kind == READ
+        device, echoed, value = struct.unpack("<3I", payload)
+        assert (device, echoed) == (0, address)
+        return value
+
+    def write(self, address, value):
+        kind, payload = self.ask(WRITE, 0, address, value)
+        assert (kind, struct.unpack("<3I", payload)) == (WRITE, (0, address, value))
+
+    def run(self, *names, pause=lambda ns: None):
+        for name in names:
+            for step in SEQUENCES[name]:
+                kept = self.read(step.address) & ~step.mask
+                self.write(step.address, kept & 0xFFFFFFFF | step.value)
+                pause(step.wait_ns)
+
+    def data(self):
+        return self.device.read(DATA_IN, 128 << 10).tobytes()
+
+
+def words(data):
+    return [f"{word:04X}" for word in np.frombuffer(data, "<u2")]
+
+
+def test_the_board_says_who_it_is():
+    host = Host(board=BoardIdentity(serial=0x1_0005_1234))
+    device = host.device
+    assert (device.idVendor, device.idProduct, device.speed) == (0x04B4, 0x00F5, 4)
+    interface = device.get_active_configuration()[(0, 0)]
+    assert (interface.bInterfaceClass, interface.bInterfaceSubClass) == (0xFF, 0x19)
+    assert [e.bEndpointAddress for e in interface] == [0x82, 0x02, 0x81]
+    assert host.ask(0x72) == (0x72, struct.pack("<Q", 0x1_0005_1234))
+    assert host.ask(0x79) == (0x79, struct.pack("<I", 0x030900))
+    assert host.ask(0x10000) == (0x10000, struct.pack("<I", 1))
+    assert host.ask(0x10003, 0)[1][4:].split(b"\0")[0] == b"psee,ccam5_imx636"
+    assert (host.read(0x14), host.read(0xF128) & 3) == (0xA0401806, 0)
+
+
+@pytest.mark.parametrize(
+    ("request_words", "expected"),
+    [
+        ((0x12345,), (0x80000000,)),
+        ((READ, 1, 0x14, 1), (READ | 0x80000000, 1, 0x14, errno.ENODEV)),
+        ((READ, 0, 0x15, 1), (READ | 0x80000000, 0, 0x15, errno.EINVAL)),
+        ((READ, 0, 0x14, 253), (READ | 0x80000000, 0, 0x14, errno.EINVAL)),
+        ((READ, 0), (READ | 0x80000000, 0, 0, errno.EINVAL)),
+        ((0x10001, 3), (0x80010001, 0, 0, errno.ENODEV)),
+    ],
+)
+def test_refused_requests_answer_with_the_errno(request_words, expected):
+    kind, payload = Host().ask(*request_words)
+    assert (kind, *struct.unpack(f"<{len(payload) // 4}I", payload)) == expected
+
+
+def test_a_request_whose_size_is_wrong_is_refused():
+    host = Host()
+    host.device.write(CONTROL_OUT, struct.pack("<III", READ, 99, 0))
+    answer = host.device.read(CONTROL_IN, 1024).tobytes()
+    assert struct.unpack_from("<I", answer)[0] == READ | 0x80000000
+
+
+def test_bursts_cover_consecutive_registers():
+    host = Host()
+    host.ask(WRITE, 0, 0x6800, 1, 2, 3)
+    assert struct.unpack("<5I", host.ask(READ, 0, 0x6800, 3)[1]) == (0, 0x6800, 1, 2, 3)
+
+
+def test_it_streams_only_after_init_and_start_in_order():
+    host = Host(Words([0x8000, 0x6001, 0x0001, 0x2001]))
+    host.run("start")
+    assert host.model.watch.phase is Phase.OFF
+    assert host.model.watch.violations == ["start while off"]
+    with pytest.raises(usb.core.USBTimeoutError):
+        host.data()
+    host.model.watch.violations.clear()
+    host.run("stop", "destroy", "init", "start")
+    assert host.model.watch.phase is Phase.STREAMING
+    assert words(host.data()) == ["8000", "6001", "0001", "2001"]
+    host.run("stop")
+    assert host.model.watch.phase is Phase.READY
+    host.run("start", "stop", "destroy")
+    assert host.source.calls == ["start", "stop", "start", "stop"]
+    assert host.model.watch.violations == []
+
+
+def test_a_sequence_out_of_order_is_named_and_has_no_effect():
+    host = Host()
+    for step in SEQUENCES["init"][:5]:
+        host.write(step.address, step.value)
+    host.write(0xB040, 0)
+    host.run("start")
+    assert host.model.watch.phase is Phase.OFF
+    assert host.model.watch.violations[0] == "init step 6: B004=A expected, B040=0 came"
+
+
+def test_destroy_while_streaming_ends_the_stream_and_is_noted():
+    host = Host()
+    host.run("init", "start", "destroy")
+    assert host.source.calls == ["start", "stop"]
+    assert host.model.watch.violations == ["destroy while streaming"]
+
+
+def test_short_waits_are_noted_with_a_clock():
+    now = [0]
+    host = Host(clock_ns=lambda: now[0])
+
+    def pause(ns):
+        now[0] += ns
+
+    host.run("init", pause=pause)
+    assert host.model.watch.violations == []
+    host.run("init", pause=lambda ns: pause(ns if ns != 500_000_000 else ns - 1000))
+    assert host.model.watch.violations == ["init step 2: wait 500000 us was 1 us too short"]
+
+
+def test_init_resets_the_sensor_to_its_factory_trim():
+    host = Host(factory_dacs={"bias_fo": 0x57})
+    host.run("init")
+    assert host.read(0x1004) & 0xFF == 0x57
+    host.write(0x1004, 0x11A10000 | 0x57 - 20)
+    assert dict(host.model.settings.biases)["bias_fo"] == -20
+    host.run("init")
+    assert dict(host.model.settings.biases)["bias_fo"] == 0
+
+
+def test_packets_end_where_sensor_time_passes_the_period():
+    source = Words(
+        [0x8000, 0x6064, 0x0001, 0x2001, 0x63E8, 0x2002],
+        [0x63F7, 0x2003, 0x8000, 0x67F0, 0x2004, 0x8001, 0x6000, 0x2005],
+    )
+    host = Host(source)
+    host.run("init")
+    host.write(0xB028, 0x3F8)
+    assert host.model.settings.packet_period_us == 1008
+    host.run("start")
+    assert words(host.data()) == ["8000", "6064", "0001", "2001", "63E8", "2002"]
+    assert words(host.data()) == ["63F7", "2003"]
+    assert words(host.data()) == ["8000", "67F0", "2004"]
+    assert words(host.data()) == ["8001", "6000", "2005"]
+    with pytest.raises(usb.core.USBTimeoutError):
+        host.data()
+
+
+def test_a_packet_of_whole_usb_packets_ends_with_an_empty_one():
+    full = [0x8000, 0x6001, *[0x0001] * 510]
+    host = Host(Words(full, [0x8001, 0x6000]))
+    host.run("init", "start")
+    assert len(host.data()) == 1024
+    assert words(host.data()) == ["8001", "6000"]
+
+
+def test_nothing_is_lost_or_reordered_however_the_pieces_fall():
+    rng = np.random.default_rng(5)
+    print("seed 5")
+    times = np.cumsum(rng.integers(1, 40, 20_000))
+    stream = []
+    high = -1
+    for t in times:
+        if t >> 12 != high:
+            high = t >> 12
+            stream.append(0x8000 | high)
+        stream += [0x6000 | t & 0xFFF, 0x0001, 0x2000 | int(rng.integers(1280))]
+    cuts = np.sort(rng.integers(0, len(stream), 40))
+    host = Host(Words(*np.split(np.array(stream), cuts)))
+    host.run("init", "start")
+    got = b""
+    while True:
+        try:
+            got += host.data()
+        except usb.core.USBTimeoutError:
+            if not host.source.pieces:
+                break
+    assert got == np.array(stream, "<u2").tobytes()
+
+
+def test_triggers_come_only_while_the_input_is_enabled():
+    host = Host(Words([0x8000, 0x6064, 0xA001, 0x2001], [], [0x8000, 0x6065, 0xA000, 0x2002]))
+    host.run("init", "start")
+    assert words(host.data()) == ["8000", "6064", "A001", "2001"]
+    host.write(0x7004, host.read(0x7004) & ~(1 << 10))
+    assert words(host.data()) == ["8000", "6065", "2002"]
+
+
+def test_stale_data_stays_until_it_is_read_and_time_restarts_with_a_start():
+    host = Host(Words([0x8003, 0x6001, 0x2001], [0x8000, 0x6002, 0x2002]))
+    host.model.stale(b"\x01\x20")
+    host.run("init", "start")
+    host.device.clear_halt(DATA_IN)
+    assert words(host.data()) == ["2001"]
+    assert words(host.data()) == ["8003", "6001", "2001"]
+    host.run("stop", "start")
+    assert words(host.data()) == ["8000", "6002", "2002"]
+
+
+def test_a_full_buffer_drops_and_says_how_much():
+    host = Host(Words([0x8000, 0x6064, 0x0001, 0x2001], [0x6065, 0x2002, 0x6066, 0x2003]))
+    host.model.buffer_bytes = 12
+    host.run("init", "start")
+    assert words(host.data()) == [
+        "8000", "6064", "0001", "2001", "6065", "2002", "EEDA", "F002", "F000", "7000",
+    ]  # fmt: skip
+
+
+def test_temperature_is_read_as_the_reference_says():
+    host = Host()
+    host.model.registers.temperature_c = 41.0
+    host.run("init")
+    host.write(0x4C, 0b11)
+    host.write(0x54, 0b10)
+    host.write(0x5C, 0b10)
+    host.write(0x5C, 0b11)
+    host.write(0x4C, 0b01)
+    host.write(0x4C, 0b11)
+    host.write(0x54, 1 << 12 | 0b10)
+    host.write(0x4C, 0b111)
+    values = [host.read(0x50) for _ in range(2)]
+    assert values[0] >> 11 & 1 == 0
+    assert values[1] >> 11 & 1 == 1
+    assert 0.190 * (values[1] & 0x3FF) - 56 == pytest.approx(41.0, abs=0.1)
+
+
+def test_masked_pixels_give_no_events_and_all_others_do():
+    rng = np.random.default_rng(8)
+    print("seed 8")
+    n = 30_000
+    t, p = rng.integers(0, 50, n) * 1000, rng.integers(0, 2, n, dtype=np.uint8)
+    x, y = rng.integers(0, 200, n, dtype=np.uint16), rng.integers(300, 340, n, dtype=np.uint16)
+    t, x, y, p = evt3.sort_readout(t, x, y, p)
+    stream = evt3.Encoder().encode(t, x, y, p)
+    cuts = np.sort(rng.integers(0, len(stream) // 2, 9))
+    host = Host(Words(*np.split(np.frombuffer(stream, "<u2"), cuts)))
+    host.run("init", "start")
+    host.write(0x2000, 0x0000FF00)
+    host.write(0x4000 + 4 * (310 // 32), 1 << 310 % 32)
+    host.write(0x9100, 1 << 31 | 320 << 16 | 100)
+    got = b""
+    while host.source.pieces or host.model.pending(DATA_IN):
+        got += host.data()
+    while True:
+        try:
+            got += host.data()
+        except usb.core.USBTimeoutError:
+            break
+    events = evt3.Decoder().decode(got)
+    on = ((x < 8) | (x > 15)) & (y != 310) & ~((x == 100) & (y == 320))
+    for field, expected in (("t", t), ("x", x), ("y", y), ("p", p)):
+        assert np.array_equal(getattr(events, field), expected[on])
+
+
+def test_settings_are_told_by_their_effect():
+    seen = []
+    host = Host()
+    host.model.configure = seen.append
+    host.write(0x2004, 1 << 3)
+    host.write(0x4000, 1)
+    host.write(0x9100, 1 << 31 | 7 << 16 | 9)
+    for address, value in ((0x6000, 1), (0x6008, 200), (0x600C, 4000), (0x6050, 1)):
+        host.write(address, value)
+    host.write(0xC008, 15 << 8 | 156)
+    host.write(0xC000, 1)
+    host.write(0xD004, 10_000 << 1 | 1)
+    host.write(0xD000, 1)
+    now = host.model.settings
+    assert seen[-1] == now
+    assert (now.columns_off, now.rows_off, now.pixels_off) == ({35}, {0}, {(9, 7)})
+    assert now.event_rate == (4000, 200)
+    assert now.flicker_band_hz == pytest.approx((1e6 / 1920, 1e6 / 19968))
+    assert now.noise_filter == ("stc", 10_000)
+
+
+def test_replug_comes_back_reset():
+    host = Host(Words([0x8000, 0x6001]))
+    host.run("init", "start")
+    host.model.replug()
+    assert host.source.calls == ["start", "stop"]
+    with pytest.raises(usb.core.USBError) as caught:
+        host.data()
+    assert caught.value.errno == errno.ENODEV
+    assert host.model.watch.phase is Phase.OFF

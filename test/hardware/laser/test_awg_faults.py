@@ -1,0 +1,421 @@
+"""Faults of the laser's generator: what the driver does, and what its user reads."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.awg_bench import SQUARE, AwgBench
+
+from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
+from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.hardware.laser import awg
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "laser.log"
+
+
+@pytest.fixture
+def bench(log: Path, monkeypatch: pytest.MonkeyPatch) -> AwgBench:
+    # No wait takes time here: a host that stands still must not keep a remedy from its turn.
+    monkeypatch.setattr(awg, "OFF_LIMIT_S", 600.0)
+    return AwgBench(log)
+
+
+def states(log: Path) -> list[str]:
+    return [state for _, state in truth(log)]
+
+
+@pytest.mark.fault("USB unplugged")
+def test_generator_unplugged_while_lit(bench: AwgBench, log: Path) -> None:
+    """driver: counts as on, stays refused, off as soon as it is back; user reads: laser state unknown ... switch the generator off by hand."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.gone = True
+    with pytest.raises(DeviceError, match=r"laser state unknown: .*the device is gone") as caught:
+        laser.readback()
+    assert "switch the generator off by hand" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert laser.readback().output is LaserOutput.UNKNOWN
+    with pytest.raises(DeviceError, match=r"laser state unknown: .*no such device"):
+        laser.disable()
+    laser.arm()
+    with pytest.raises(DeviceError, match="not configured"):
+        laser.enable()
+    # The cable alone was out: the generator kept its output on.
+    kept = bench.model.channels
+    bench.model.replug()
+    bench.model.channels = kept
+    assert bench.model.output
+    laser.disable()
+    assert not bench.model.output
+    assert laser.readback().output is LaserOutput.OFF
+    laser.configure(SQUARE)
+    laser.arm()
+    laser.enable()
+    assert bench.model.lit
+
+
+@pytest.mark.fault("USB unplugged")
+def test_another_generator_comes_back(bench: AwgBench) -> None:
+    """driver: refuses a generator with another serial; user reads: no such device with serial ... on the bus; there is ..."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.gone = True
+    other = AwgModel(bench.clock, serial="AWG0000000002", wait=lambda *_: False)
+    bench.models.append(other)
+    with pytest.raises(DeviceError, match=r"with serial AWG1234567890.*there is AWG0000000002"):
+        laser.disable()
+    assert not other.commands
+
+
+@pytest.mark.parametrize("endpoint", [ENDPOINT_IN, ENDPOINT_OUT])
+@pytest.mark.fault("endpoint stalls")
+def test_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None:
+    """driver: clears both endpoints, sends once more, counts; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.stalled.add(endpoint)
+    assert laser.readback().output is LaserOutput.ON
+    assert not bench.model.stalled
+    assert bench.model.lit
+    assert (laser.readback().counters["faults"], laser.readback().counters["retries"]) == (1, 1)
+
+
+@pytest.mark.fault("endpoint stalls")
+def test_second_stall_is_an_error(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """driver: no third try, off, confirmed after opening anew; user reads: ... the device stalled the transfer."""  # noqa: E501
+    laser = bench.lit_laser()
+    stuck = [True]
+    clear_halt = bench.model.clear_halt
+
+    def clears(endpoint: int) -> None:
+        if not stuck[0]:
+            clear_halt(endpoint)
+
+    def resets() -> None:
+        stuck[0] = False
+        reset()
+
+    reset = bench.model.reset
+    monkeypatch.setattr(bench.model, "clear_halt", clears)
+    monkeypatch.setattr(bench.model, "reset", resets)
+    bench.model.stalled.add(ENDPOINT_IN)
+    with pytest.raises(DeviceError, match="stalled the transfer"):
+        laser.readback()
+    assert not bench.model.output
+    assert laser.readback().output is LaserOutput.OFF
+
+
+@pytest.mark.fault("no answer, time-out")
+def test_mute_generator(bench: AwgBench, log: Path) -> None:
+    """driver: tries clear, reset, a new opening, then gives up within its bound; user reads: laser state unknown: ... no answer in time."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.mute = True
+    with pytest.raises(DeviceError, match=r"laser state unknown: .*no answer in time"):
+        laser.disable()
+    assert laser.readback().output is LaserOutput.UNKNOWN
+    assert laser.readback().counters["switch_off_failures"] == 1
+    bench.model.mute = False
+    laser.disable()
+    assert states(log) == ["OFF", "ON", "OFF"]
+
+
+@pytest.mark.parametrize("fault", ["mute", "lost_replies"])
+@pytest.mark.fault("no answer, time-out")
+def test_switching_off_waits_two_seconds_at_most(fault: str) -> None:
+    """driver: the sum of all waits of a vain switching off is bounded; user reads: laser state unknown within 2 s."""  # noqa: E501
+    waits: list[float] = []
+
+    def wait(_: threading.Condition, seconds: float | None) -> bool:
+        assert seconds is not None
+        waits.append(seconds)
+        return False
+
+    bench = AwgBench()
+    bench.model = AwgModel(bench.clock, wait=wait)
+    bench.models[:] = [bench.model]
+    laser = bench.lit_laser()
+    waits.clear()
+    if fault == "mute":
+        bench.model.mute = True
+    else:
+        bench.model.faults.lost_replies = 10**9
+    with pytest.raises(DeviceError, match="laser state unknown"):
+        laser.disable()
+    assert sum(waits) < 2.0
+
+
+@pytest.mark.fault("no answer, time-out")
+def test_replies_lost(bench: AwgBench) -> None:
+    """driver: a setting asked for is not a setting made; dark when it cannot be read back; user reads: ... no answer in time."""  # noqa: E501
+    laser = bench.ready_laser()
+    bench.model.faults.lost_replies = 2
+    with pytest.raises(DeviceError, match="no answer in time"):
+        laser.enable()
+    assert not bench.model.output
+    assert laser.readback().output is LaserOutput.OFF
+
+
+@pytest.mark.parametrize(
+    "fault", ["wrong_tags", "wrong_kinds", "short_headers", "oversized", "empty_packets"]
+)
+@pytest.mark.fault("malformed transfer")
+def test_bad_reply_header(bench: AwgBench, fault: str) -> None:
+    """driver: drops the reply, clears, asks again; user reads: nothing, faults 1 in diagnostics."""
+    laser = bench.lit_laser()
+    setattr(bench.model.faults, fault, 1)
+    assert laser.readback().output is LaserOutput.ON
+    assert bench.model.lit
+    assert laser.readback().counters["faults"] == (0 if fault == "empty_packets" else 1)
+
+
+@pytest.mark.fault("malformed transfer")
+def test_bad_reply_headers_without_end(bench: AwgBench) -> None:
+    """driver: never takes text that is out of step; dark; user reads: laser state unknown: ... a reply header has the wrong tag ..."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.faults.wrong_tags = 10**9
+    with pytest.raises(DeviceError, match=r"laser state unknown.*a reply header has the wrong tag"):
+        laser.readback()
+    assert not bench.model.output
+    assert laser.readback().output is LaserOutput.UNKNOWN
+
+
+@pytest.mark.parametrize("newline", [False, True])
+@pytest.mark.parametrize("size", [0, 1, 5])
+@pytest.mark.fault("partial reply")
+def test_reply_in_pieces(bench: AwgBench, size: int, newline: bool) -> None:
+    """driver: joins up to the end of message, strips line ends; user reads: nothing."""
+    bench.model.faults.transfer_bytes = size
+    bench.model.faults.newline = newline
+    laser = bench.lit_laser()
+    assert laser.readback().output is LaserOutput.ON
+    assert laser.readback().counters["faults"] == 0
+
+
+@pytest.mark.fault("stale reply")
+def test_stale_reply_after_a_time_out(bench: AwgBench) -> None:
+    """driver: flushes by CLEAR before it asks again, so no reply is taken for another; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.faults.late_replies = 1
+    assert laser.readback().output is LaserOutput.ON
+    assert laser.readback().counters["faults"] == 1
+    assert not bench.model._replies
+
+
+@pytest.mark.fault("stale reply")
+def test_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
+    """driver: the stale reply is no value of the kind asked for: asks again; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model._replies.append(b"SQUARE")
+    assert laser.readback().output is LaserOutput.ON
+    assert laser.readback().counters["faults"] == 1
+
+
+@pytest.mark.parametrize("errors", [None, [], ['-222,"Data out of range"', '-113,"Undefined"']])
+@pytest.mark.fault("error queue")
+def test_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
+    """driver: asks once at opening, takes silence for absent, empties what is there; user reads: a warning per entry."""  # noqa: E501
+    bench.model.errors = None if errors is None else type(bench.model.commands)(errors)
+    laser = bench.laser()
+    warnings = laser.readback().warnings
+    assert len(warnings) == len(errors or [])
+    assert all(error in text for error, text in zip(errors or [], warnings, strict=True))
+    laser.configure(SQUARE)
+    asked = [c for c in bench.model.commands if "ERR" in c]
+    assert len(asked) == 1 + len(errors or [])
+
+
+@pytest.mark.fault("error queue")
+def test_error_queue_without_end(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """driver: takes 32 entries, or none when they are garbage, and goes on; user reads: 32 warnings at most."""  # noqa: E501
+    queried = bench.model._queried
+    says = ['-350,"Queue overflow"']
+    monkeypatch.setattr(
+        bench.model, "_queried", lambda path: says[0] if "ERR" in path else queried(path)
+    )
+    bench.laser().close()
+    assert sum("ERR" in c for c in bench.model.commands) == 32
+    bench.model.commands.clear()
+    says[0] = "<?garbage"
+    laser = bench.laser()
+    assert sum("ERR" in c for c in bench.model.commands) == 1
+    laser.configure(SQUARE)
+
+
+@pytest.mark.parametrize(
+    ("path", "shows", "text"),
+    [
+        ("BASE:FREQuency", "19999", "frequency is 19999 instead of 20000"),
+        ("BASE:HIGH", "3", "high is 3 instead of 5"),
+        ("BASE:DUTY", "50", "duty is 50 instead of 30"),
+        ("LIMit:UPPer", "10", "limit_upper is 10 instead of 5"),
+        ("LIMit:ENABle", "OFF", "limit_enable is False instead of True"),
+        ("INVersion", "ON", "inversion is True instead of False"),
+        ("BASE:WAVe", "SINe", "waveform is SINE instead of SQUare"),
+        ("MODe", "AM", "mode is AM instead of CONTinue"),
+        ("LOAD", "50", "load is 50 instead of 10000"),
+    ],
+)
+@pytest.mark.fault("setting clamped or ignored")
+def test_setting_ignored_or_clamped(bench: AwgBench, path: str, shows: str, text: str) -> None:
+    """driver: compares with tolerance, refuses light; user reads: laser generator: frequency is 19999 instead of 20000; check its display ..."""  # noqa: E501
+    bench.model.faults.changed = {path: shows}
+    laser = bench.laser()
+    laser.arm()
+    with pytest.raises(DeviceError, match=text):
+        laser.configure(Modulation(20_000.0, 0.3))
+    with pytest.raises(DeviceError, match=r"not armed|not configured"):
+        laser.enable()
+    assert not bench.model.output
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("BASE:HIGH", "2.5"), ("LIMit:ENABle", "OFF"), ("BASE:FREQuency", "71"), ("LOAD", "50")],
+)
+@pytest.mark.fault("setting clamped or ignored")
+def test_panel_touched_before_light(bench: AwgBench, path: str, value: str) -> None:
+    """driver: reads every setting back before it switches on, refuses; user reads: ... instead of ...; check its display ..."""  # noqa: E501
+    laser = bench.ready_laser()
+    assert bench.model.touch(path, value)
+    with pytest.raises(DeviceError, match="instead of"):
+        laser.enable()
+    assert not bench.model.output
+
+
+@pytest.mark.fault("setting clamped or ignored")
+def test_panel_touched_while_lit(bench: AwgBench) -> None:
+    """driver: sees it at the next read-back, goes dark; user reads: high is 3 instead of 5; check its display ..."""  # noqa: E501
+    laser = bench.lit_laser()
+    assert bench.model.touch("BASE:HIGH", "3")
+    with pytest.raises(DeviceError, match="high is 3 instead of 5"):
+        laser.readback()
+    assert not bench.model.output
+    assert laser.readback().output is LaserOutput.OFF
+
+
+@pytest.mark.fault("setting clamped or ignored")
+def test_switched_on_at_the_panel(bench: AwgBench) -> None:
+    """driver: an output that is on without a command is switched off; user reads: output found on; it was not switched on from here."""  # noqa: E501
+    laser = bench.ready_laser()
+    assert bench.model.touch("OUTPut", "ON")
+    with pytest.raises(DeviceError, match="found on; it was not switched on from here"):
+        laser.readback()
+    assert not bench.model.output
+
+
+@pytest.mark.fault("generator rebooted")
+def test_rebooted_while_lit(bench: AwgBench) -> None:
+    """driver: output reads OFF, light is refused until configured anew; user reads: output found off; restarted, or switched off by hand."""  # noqa: E501
+    laser = bench.lit_laser()
+    bench.model.reboot()
+    assert laser.readback().output is LaserOutput.OFF
+    assert "restarted" in laser.readback().reason
+    laser.arm()
+    with pytest.raises(DeviceError, match="not configured"):
+        laser.enable()
+    laser.configure(SQUARE)
+    laser.arm()
+    laser.enable()
+    assert bench.model.lit
+
+
+@pytest.mark.fault("generator rebooted")
+def test_rebooted_before_light(bench: AwgBench) -> None:
+    """driver: reads back before each light, finds the maker's settings, refuses; user reads: load ... instead of ..."""  # noqa: E501
+    laser = bench.ready_laser()
+    bench.model.reboot()
+    with pytest.raises(DeviceError, match="instead of"):
+        laser.enable()
+    assert not bench.model.output
+
+
+@pytest.mark.fault("no permission, busy")
+def test_kernel_driver_and_second_program(bench: AwgBench) -> None:
+    """driver: detaches usbtmc and gives it back on close; a second program is refused; user reads: in use; close the other program ..."""  # noqa: E501
+    bench.model.kernel_driver = "usbtmc"
+    laser = bench.laser()
+    with pytest.raises(DeviceError, match="in use; close the other program"):
+        bench.laser()
+    laser.close()
+    assert bench.model.kernel_driver == "usbtmc"
+
+
+@pytest.mark.fault("no permission, busy")
+def test_no_permission(bench: AwgBench) -> None:
+    """driver: waits for permission, named; user reads: permission denied; install the udev rules of docs/hardware.md ..."""  # noqa: E501
+    bench.model.denied = True
+    with pytest.raises(DeviceError, match="permission denied; install the udev rules"):
+        bench.laser()
+    bench.model.denied = False
+    assert bench.laser().readback().output is LaserOutput.OFF
+
+
+@pytest.mark.fault("no permission, busy")
+def test_no_generator_and_two(bench: AwgBench) -> None:
+    """driver: refuses to guess; user reads: no such device on the bus; check cable ... / 2 devices match ...; give the serial."""  # noqa: E501
+    bench.models = []
+    with pytest.raises(DeviceGoneError, match="laser generator: no such device on the bus"):
+        bench.laser()
+    other = AwgModel(bench.clock, serial="AWG0000000002", wait=lambda *_: False)
+    bench.models = [bench.model, other]
+    with pytest.raises(DeviceError, match=r"2 devices match.*give the serial"):
+        bench.laser()
+    assert bench.laser(serial="AWG0000000002").identity.serial == "AWG0000000002"
+
+
+def test_faults_in_a_row_never_leave_light_behind(bench: AwgBench) -> None:
+    """Any single fault at any transfer up to light: lit as asked, or known to be unknown."""
+    outcomes = set()
+    for at in range(60):
+        for fault in ("stall_in", "stall_out", "wrong_tags", "lost_replies", "gone"):
+            outcomes.add(_struck(fault, at))
+    assert outcomes == {"lit", "unknown"}
+
+
+def _struck(fault: str, at: int) -> str:
+    bench = AwgBench()
+    laser = bench.laser()
+    left = [at]
+    execute = bench.model.bulk_out
+
+    def bulk_out(*arguments: Any) -> int:
+        left[0] -= 1
+        if left[0] == 0:
+            if fault == "stall_in":
+                bench.model.stalled.add(ENDPOINT_IN)
+            elif fault == "stall_out":
+                bench.model.stalled.add(ENDPOINT_OUT)
+            elif fault == "gone":
+                bench.model.gone = True
+            else:
+                setattr(bench.model.faults, fault, 1)
+        return execute(*arguments)
+
+    bench.model.bulk_out = bulk_out  # type: ignore[method-assign]
+    try:
+        laser.configure(SQUARE)
+        laser.arm()
+        laser.enable()
+    except DeviceError as error:
+        told = "unknown" if "laser state unknown" in str(error) else "dark"
+        assert (laser.readback().output is LaserOutput.UNKNOWN) == (told == "unknown")
+        if told == "dark":
+            assert not bench.model.output
+        return told
+    assert bench.model.lit
+    return "lit"
+
+
+def test_off_from_many_threads_is_off(bench: AwgBench, log: Path) -> None:
+    laser = bench.lit_laser()
+    threads = [threading.Thread(target=laser.disable) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert states(log) == ["OFF", "ON", "OFF"]

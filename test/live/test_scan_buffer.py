@@ -1,0 +1,159 @@
+"""Placing profiles by time, and assembling a scan."""
+
+import numpy as np
+import pytest
+from support.line_events import blank_profiles
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.storage.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.live.pipeline import ScanReport
+from eschorty_ros.live.scan_buffer import PlacedPoints, ScanBuffer
+from eschorty_ros.live.sensor_epoch import TimedProfiles
+from eschorty_ros.live.stage_placement import StagePlacer
+
+T0_NS = 1_700_000_000_000_000_123
+
+
+def placed(stage_mm, edge_ns, columns, dtype=POINT_DTYPE):
+    points = np.zeros(len(columns), dtype)
+    points["column"] = columns
+    points["sigma"] = 1e-3
+    edges = np.asarray(edge_ns, dtype=np.int64)
+    return PlacedPoints(points, edges + 10, edges, np.asarray(stage_mm, dtype=float))
+
+
+def timed(t_ns):
+    t_ns = np.asarray(t_ns, dtype=np.int64)
+    return TimedProfiles(blank_profiles(len(t_ns)), t_ns, t_ns)
+
+
+def test_reflectance_asked_for_in_the_middle_of_a_scan_is_nan_before():
+    buffer = ScanBuffer("a", 0.0, 20.0)
+    buffer.add(placed([10.0], [T0_NS], [7]))
+    buffer.add(placed([15.0], [T0_NS + 1000], [9], REFLECTANCE_DTYPE))
+    points = buffer.assemble().points
+    assert points.dtype == REFLECTANCE_DTYPE
+    assert np.isnan(points["reflectance"]).tolist() == [True, False]
+    assert points["column"].tolist() == [7, 9]
+
+
+def test_scan_is_sorted_by_period_then_column_and_limits_are_included():
+    buffer = ScanBuffer("a", 20.0, 10.0)
+    buffer.add(placed([10.0, 20.0, 9.99, 20.01], [T0_NS, T0_NS, T0_NS, T0_NS], [7, 3, 1, 2]))
+    buffer.add(placed([15.0], [T0_NS - 1000], [9]))
+    scan = buffer.assemble()
+    assert scan.points["column"].tolist() == [9, 3, 7]
+    assert scan.profiles == 2
+    assert scan.stamp_ns == T0_NS - 990
+    np.testing.assert_allclose(scan.points["t"], [0.0, 1e-6, 1e-6], atol=1e-15)
+    assert scan.sigma_median_m == pytest.approx(1e-3)
+
+
+def test_empty_scan():
+    scan = ScanBuffer("a", 0.0, 1.0).assemble()
+    assert len(scan.points) == scan.profiles == 0
+
+
+def test_points_outside_the_limits_are_counted():
+    buffer = ScanBuffer("a", 0.0, 1.0)
+    buffer.add(placed([-0.1, 0.5, 1.1, 2.0], [T0_NS] * 4, [1, 2, 3, 4]))
+    assert len(buffer.assemble().points) == 1
+    assert buffer.points_outside == 3
+
+
+@pytest.mark.parametrize(
+    ("points", "events", "without", "outside", "says"),
+    [
+        (5, 100, 0, 3, ""),
+        (0, 0, 0, 0, "no points: no events came"),
+        (0, 100, 0, 0, "no points: nothing blinks with the laser in 100 events"),
+        (0, 100, 0, 3, "no points: all 3 lie outside start to stop"),
+        (0, 100, 7, 3, "7 points had no stage position"),
+    ],
+)
+def test_a_scan_without_points_says_why(points, events, without, outside, says):
+    buffer = ScanBuffer("a", 0.0, 1.0)
+    if points:
+        buffer.add(placed([0.5] * points, [T0_NS] * points, range(points)))
+    report = ScanReport(buffer.assemble(), events, 0, 0, without, outside, 0)
+    assert report.message.startswith(says)
+    assert bool(report.message) == bool(says)
+
+
+def test_points_over_the_limit_are_counted():
+    buffer = ScanBuffer("a", 0.0, 1.0, points_max=3)
+    for _ in range(2):
+        buffer.add(placed([0.5, 0.5], [T0_NS, T0_NS], [1, 2]))
+    assert len(buffer) == 3
+    assert buffer.points_over_limit == 1
+
+
+@pytest.mark.parametrize("limits", [(np.nan, 1.0), (0.0, np.inf)])
+def test_limits_must_be_finite(limits):
+    with pytest.raises(ArgumentError, match="not finite"):
+        ScanBuffer("a", *limits)
+
+
+def test_points_wait_for_the_stage_and_are_never_extrapolated():
+    placer = StagePlacer(gap_s=0.0, timeout_s=1.0)
+    placer.add_profiles(timed([T0_NS - 1_000_000, T0_NS + 500_000, T0_NS + 2_000_000]), 0.0)
+    assert placer.ready(0.1) == []
+    placer.add_stage(T0_NS, 10.0)
+    placer.add_stage(T0_NS + 1_000_000, 11.0)
+    ((part, position_mm),) = placer.ready(0.2)
+    assert part.t_ns.tolist() == [T0_NS + 500_000]
+    np.testing.assert_allclose(position_mm, [10.5])
+    # The first was before the stage's first sample, the last still waits.
+    assert (placer.points_without_stage, placer.waiting) == (1, 1)
+    assert placer.ready(1.5) == []
+    assert (placer.points_without_stage, placer.waiting) == (2, 0)
+
+
+def test_profiles_of_the_background_after_the_end_keep_nobody_waiting():
+    placer = StagePlacer(gap_s=0.0, timeout_s=10.0)
+    placer.add_profiles(timed([T0_NS + 500_000]), 0.0)
+    placer.add_profiles(timed([T0_NS + 2_000_000]), 1.0)
+    assert placer.holds(0.5)
+    placer.add_stage(T0_NS, 10.0)
+    placer.add_stage(T0_NS + 1_000_000, 11.0)
+    placer.ready(1.1)
+    assert placer.waiting == 1
+    assert not placer.holds(0.5)
+    assert placer.holds(1.0)
+
+
+def test_a_gap_in_the_odometry_is_not_bridged():
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    placer.add_stage(T0_NS, 10.0)
+    placer.add_stage(T0_NS + 2_000_000_000, 12.0)
+    placer.add_profiles(timed([T0_NS + 1_000_000_000]), 0.0)
+    assert placer.ready(0.0) == []
+    assert placer.points_without_stage == 1
+
+
+@pytest.mark.parametrize("back_s", [1, 3600])
+def test_odometry_of_a_clock_set_back_places_by_itself_alone(back_s):
+    """A recording played again or a host clock set back: old positions are wrong."""
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    for k in range(500):
+        placer.add_stage(T0_NS + k * 10_000_000, 0.1 * k)
+    again_ns = T0_NS + 4_990_000_000 - back_s * 1_000_000_000
+    for k in range(20):
+        placer.add_stage(again_ns + k * 10_000_000, 7.0)
+    placer.add_profiles(timed([again_ns + 55_000_000]), 0.0)
+    ((part, position_mm),) = placer.ready(0.0)
+    assert position_mm.tolist() == [7.0]
+    assert len(part.t_ns) == 1
+    assert (placer.track_restarts, placer.late_samples) == (1, 0)
+
+
+def test_an_odometry_sample_a_little_late_is_left_out():
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    for t_ms, position_mm in ((0, 0.0), (10, 1.0), (9, 50.0), (20, 2.0)):
+        placer.add_stage(T0_NS + t_ms * 1_000_000, position_mm)
+    placer.add_profiles(timed([T0_NS + 15_000_000]), 0.0)
+    ((_, position_mm),) = placer.ready(0.0)
+    np.testing.assert_allclose(position_mm, [1.5])
+    assert (placer.track_restarts, placer.late_samples) == (0, 1)

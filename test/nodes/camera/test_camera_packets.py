@@ -1,0 +1,51 @@
+"""Numbers of the packets, from which subscribers notice gaps and restarts."""
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.hardware.base.protocols import EventChunk
+from eschorty_ros.nodes.camera.packet_publisher import PacketPublisher
+
+
+class Publisher:
+    """Records the numbers of the packets; ``subscribers`` is what ROS would count."""
+
+    def __init__(self):
+        self.subscribers = 1
+        self.seqs = []
+
+    def get_subscription_count(self):
+        return self.subscribers
+
+    def publish(self, message):
+        self.seqs.append(message.seq)
+
+
+def push(packets, count, **marks):
+    for k in range(count):
+        packets.push(EventChunk(b"\0\0", k, **(marks if k == 0 else {})), k)
+
+
+def test_gaps_and_restarts_show_in_the_numbers():
+    publisher = Publisher()
+    packets = PacketPublisher(publisher, 1280, 720, "f")
+    push(packets, 3)
+    push(packets, 2, gap=True)
+    push(packets, 2, restarted=True)
+    assert publisher.seqs == [0, 1, 2, 4, 5, 0, 1]
+
+
+def test_bytes_without_a_subscriber_are_a_gap_after_the_first_packet():
+    publisher = Publisher()
+    packets = PacketPublisher(publisher, 1280, 720, "f")
+    publisher.subscribers = 0
+    push(packets, 5)
+    publisher.subscribers = 1
+    push(packets, 2)
+    publisher.subscribers = 0
+    push(packets, 5)
+    publisher.subscribers = 1
+    push(packets, 2)
+    assert publisher.seqs == [0, 1, 3, 4]
+    assert packets.unsubscribed_bytes == 20

@@ -1,0 +1,262 @@
+"""The camera node on the EVK4 driver and the emulated camera."""
+
+# ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from eschorty_ros.msg import LaserState
+from event_camera_msgs.msg import EventPacket
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from support.camera_on_bench import StillBench
+from support.evk4_bench import OnDemand, plug
+from support.ros_process import Observer, wait_until
+from support.spinning import spinning
+
+from eschorty_ros.emulation.evk4.model import Evk4Model
+from eschorty_ros.hardware.camera import evk4
+from eschorty_ros.nodes.camera.node import CameraNode
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+from eschorty_ros.nodes.ros.domain import free_domain
+
+BUS = "camera_node"
+
+
+class Run:
+    """One camera node, what it says, and the camera model it drives."""
+
+    def __init__(self, observer: Observer, node: CameraNode, source: OnDemand, model: Any) -> None:
+        self.observer, self.node, self.source, self.model = observer, node, source, model
+        self.packets = observer.collect(EventPacket, "camera/events", qos.events())
+        self.reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+        self.beats = observer.collect(Header, "camera/heartbeat", qos.heartbeat())
+
+    def status(self, condition: Callable[[DiagnosticStatus], bool], what: str) -> DiagnosticStatus:
+        def found() -> DiagnosticStatus | None:
+            every = (status for array in list(self.reports) for status in array.status)
+            return next((status for status in every if condition(status)), None)
+
+        wait_until(found, what)
+        status = found()
+        assert status is not None
+        return status
+
+    def active(self) -> Run:
+        wait_until(lambda: self.node.active, "the node active")
+        wait_until(
+            lambda: self.observer.node.count_publishers("/eschorty/camera/events"), "camera/events"
+        )
+        return self
+
+    def packets_from(self, count: int) -> list[Any]:
+        """Let events come about until ``count`` more packets are here."""
+        before = len(self.packets)
+
+        def enough() -> bool:
+            self.source.give(5)
+            return len(self.packets) >= before + count
+
+        wait_until(enough, f"{count} packets")
+        return list(self.packets)[before:]
+
+
+Start = Callable[..., Run]
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
+    # The initialisation's waits are the sensor's; tested in the driver's own tests.
+    monkeypatch.setattr(evk4.Evk4, "_wait", lambda self, seconds: time.sleep(seconds / 100.0))
+    context = rclpy.Context()
+    with Observer(free_domain(), "evk4_observer") as observer:
+        rclpy.init(context=context, domain_id=observer.domain)
+        executor = SingleThreadedExecutor(context=context)
+        nodes: list[CameraNode] = []
+
+        def begin(plugged: bool = True, model: Evk4Model | None = None, **parameters: Any) -> Run:
+            source = OnDemand()
+            model = model or Evk4Model(source)
+            plug(BUS, *([model] if plugged else []))
+            overrides = {"driver": "evk4", "backend": f"evk4_bench:backend?{BUS}", **parameters}
+            node = CameraNode(
+                context=context,
+                namespace="eschorty",
+                parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
+            )
+            nodes.append(node)
+            run = Run(observer, node, source, model)
+            executor.add_node(node)
+            return run
+
+        with spinning(executor):
+            yield begin
+            for node in nodes:
+                node.safe_state()
+        for node in nodes:
+            node.destroy_node()
+        context.try_shutdown()
+
+
+def test_events_stream_with_arrival_stamps(start: Start) -> None:
+    run = start().active()
+    packets = run.packets_from(5)
+    stamps = [ns_from_stamp(packet.header.stamp) for packet in packets]
+    assert stamps == sorted(stamps)
+    assert [packet.seq for packet in run.packets] == sorted(packet.seq for packet in run.packets)
+    assert {(packet.width, packet.height) for packet in packets} == {(1280, 720)}
+    status = run.status(lambda s: s.message == "streaming", "streaming in the diagnostics")
+    values = {value.key: value.value for value in status.values}
+    assert (values["serial"], values["firmware"]) == ("00051234", "3.9.0")
+    assert {"temperature_c", "drops", "reconnects", "on_events_per_s"} <= set(values)
+    wait_until(lambda: run.beats, "a beat")
+
+
+def test_unplugged_camera_is_told_at_once_and_the_stream_restarts_at_zero(start: Start) -> None:
+    # Looked for until it is back, however late that is.
+    run = start(reconnect_attempts=1000).active()
+    run.packets_from(4)
+    run.model.gone = True
+    run.status(
+        lambda s: s.level == DiagnosticStatus.ERROR and "looking for the camera" in s.message,
+        "the loss in the diagnostics",
+    )
+    assert run.node.active
+    assert not run.node.healthy
+    wait_until(lambda: run.beats[-1].frame_id.endswith(" stopped"), "a last beat")
+    beats = len(run.beats)
+    time.sleep(0.2)
+    assert all(beat.frame_id.endswith(" stopped") for beat in run.beats[beats:])
+    run.model.replug()
+    wait_until(lambda: run.node.healthy, "the camera back")
+
+    def anew() -> list[int]:
+        """Numbers since the stream's second beginning; packets of the first may come late."""
+        run.source.give(5)
+        seqs = [packet.seq for packet in list(run.packets)]
+        begins = [k for k, seq in enumerate(seqs) if seq == 0]
+        return seqs[begins[1] :] if len(begins) > 1 else []
+
+    wait_until(lambda: len(anew()) > 3, "packets of the new stream")
+    seqs = anew()
+    assert seqs == list(range(len(seqs)))
+
+
+def test_camera_that_stays_away_ends_the_node_s_activity(start: Start) -> None:
+    run = start(reconnect_attempts=1).active()
+    run.model.gone = True
+    wait_until(lambda: run.node.state_label == "unconfigured", "the node unconfigured")
+    assert "lost, and not back after 1 attempts" in run.node.failure
+    assert "\n" not in run.node.failure
+
+
+def test_absent_camera_is_waited_for(start: Start) -> None:
+    run = start(plugged=False)
+    status = run.status(lambda s: "waiting" in s.message, "waiting in the diagnostics")
+    assert "EVK4 camera: no such device on the bus; check cable, power and serial" in status.message
+    plug(BUS, run.model)
+    run.active()
+
+
+def test_biases_are_parameters_kept_by_the_camera(start: Start, tmp_path: Path) -> None:
+    path = tmp_path / "kept.bias"
+    path.write_text("12 % bias_hpf\n-4 % bias_fo\n")
+    run = start(bias_diff_on=30, bias_fo=6, bias_file=str(path)).active()
+    names = ("bias_diff_on", "bias_fo", "bias_hpf", "bias_refr")
+    assert [run.node.parameters[name] for name in names] == [30, 6, 12, 0]
+    accepted, reason = run.observer.set_parameter("camera", "bias_refr", 40)
+    assert accepted, reason
+    assert dict(run.model.settings.biases)["bias_refr"] == 40
+    accepted, reason = run.observer.set_parameter("camera", "bias_fo", 56)
+    assert not accepted
+    assert "bias_fo is 56; choose -35 to 55" in reason
+    answer = run.observer.call(Trigger, "camera/save_biases")
+    assert answer.success, answer.message
+    assert path.read_text().splitlines()[:3] == [
+        "30  % bias_diff_on",
+        "0  % bias_diff_off",
+        "6  % bias_fo",
+    ]
+    statistics = run.observer.call(Trigger, "camera/dump_statistics")
+    assert "bias_refr 40" in statistics.message
+
+
+def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
+    run = start(
+        mipi_frame_period=2000,
+        erc_mode="enabled",
+        erc_rate=30_000_000,
+        roi=[0, 200, 1280, 300],
+        hot_pixels="3,4 5,6",
+        trail_filter=True,
+        trail_filter_threshold=5000,
+        trigger_in_mode="external",
+        anti_flicker=True,
+        anti_flicker_low=60,
+        anti_flicker_high=80,
+    ).active()
+    seen = run.model.settings
+    assert seen.packet_period_us == 2000
+    assert seen.event_rate == (6000, 200)
+    assert seen.rows_off == frozenset(range(720)) - frozenset(range(200, 500))
+    assert seen.pixels_off == {(3, 4), (5, 6)}
+    assert seen.noise_filter == ("trail", 5000)
+    assert seen.trigger_in
+    laser = run.observer.publisher(LaserState, "laser/state", qos.latched())
+    laser.publish(LaserState(waveform="square", frequency=70.0, duty=0.5))
+    status = run.status(lambda s: "anti-flicker" in s.message, "the warning")
+    assert status.level == DiagnosticStatus.WARN
+    assert "erases the laser's 70 Hz; switch it off" in status.message
+
+
+def test_a_bias_set_while_it_streams_thins_out_the_emulated_events(
+    start: Start, tmp_path: Path
+) -> None:
+    still = StillBench(tmp_path)
+    run = start(model=still.bench.camera).active()
+    words = run.node.words
+    still.light(500.0)
+
+    def on_events() -> int:
+        still.run(10, lambda: words.on + words.off)
+        before = words.on
+        still.run(50, lambda: words.on + words.off)
+        return words.on - before
+
+    counts = []
+    for offset in (-50, 0, 70, 140):
+        accepted, reason = run.observer.set_parameter("camera", "bias_diff_on", offset)
+        assert accepted, reason
+        counts.append(on_events())
+    print(counts)
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] < 0.8 * counts[1]
+    assert run.node.parameters["bias_diff_on"] == 140
+
+
+def test_what_the_rate_control_drops_is_told(start: Start, tmp_path: Path) -> None:
+    still = StillBench(tmp_path)
+    run = start(model=still.bench.camera, erc_mode="enabled", erc_rate=300_000).active()
+    words = run.node.words
+    still.light(500.0)
+    still.run(100, lambda: words.on + words.off)
+    dropped = still.statistic("rate_dropped")
+    assert dropped > still.statistic("events")
+    status = run.status(lambda s: "erc_events_dropped" in s.message, "the loss in the diagnostics")
+    assert status.level == DiagnosticStatus.WARN
+    told = {value.key: value.value for value in status.values}
+    assert 0 < int(told["erc_events_dropped"]) <= dropped
+    statistics = run.observer.call(Trigger, "camera/dump_statistics")
+    assert "erc_events_dropped" in statistics.message
+    assert "erc_rate_hz 300000" in statistics.message

@@ -1,0 +1,181 @@
+"""The reconstruction node's live topics over real DDS, fed by a replayed recording."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from eschorty_ros.msg import ReconstructionState
+from eschorty_ros.srv import BeginScan, EndScan
+from sensor_msgs.msg import Image, PointCloud2
+from support.ros_process import NodeProcess, Observer
+from support.waiting import DEADLINE_S, wait_until
+from tf2_msgs.msg import TFMessage
+
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.cloud_messages import points_from_message
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.simulation.scenes.names import named
+from eschorty_ros.simulation.world.recorder import simulate_recording
+
+RELIABLE = "qos_overrides./eschorty/camera/events.subscription.reliability"
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory):
+    """Everything the node publishes while a recording is replayed in real time, seed 4."""
+    recording = simulate_recording(
+        tmp_path_factory.mktemp("live") / "rec",
+        named("plane"),
+        load_calibration("config_3"),
+        start_mm=30.0,
+        stop_mm=45.0,
+        speed_mm_s=20.0,
+        seed=4,
+    )
+    domain = free_domain()
+    with (
+        NodeProcess(
+            "eschorty_ros.nodes.reconstruction.node",
+            {"stage_gap": 0.0, RELIABLE: "reliable"},
+            domain=domain,
+        ) as node,
+        Observer(domain) as observer,
+    ):
+        topics = {
+            name: observer.collect(kind, name, profile)
+            for name, kind, profile in (
+                ("profile", PointCloud2, qos.stream()),
+                ("points", PointCloud2, qos.stream()),
+                ("scan/points", PointCloud2, qos.latched()),
+                ("event_frame", Image, qos.stream()),
+                ("reconstruction/state", ReconstructionState, qos.stream()),
+                ("/tf", TFMessage, qos.stream()),
+                ("/tf_static", TFMessage, qos.latched()),
+                ("/diagnostics", DiagnosticArray, qos.stream()),
+            )
+        }
+        wait_until(lambda: topics["reconstruction/state"], "the node's state")
+        with NodeProcess(
+            "eschorty_ros.nodes.replay.node",
+            {"recording": recording.path, "timeout": DEADLINE_S},
+            domain=domain,
+        ) as replay:
+            try:
+                assert replay.wait() == 0, replay.output
+                wait_until(lambda: topics["scan/points"], "scan/points")
+                seen = len(topics["/diagnostics"])
+                wait_until(lambda: len(topics["/diagnostics"]) > seen, "diagnostics")
+                yield observer, topics
+            finally:
+                print(node.output, replay.output)
+
+
+def test_each_profile_is_one_period_in_the_moving_frame(live):
+    clouds = live[1]["profile"]
+    assert len(clouds) > 30
+    stamps = [ns_from_stamp(cloud.header.stamp) for cloud in clouds]
+    assert (np.diff(stamps) > 0).all()
+    for cloud in clouds:
+        assert cloud.header.frame_id == "eschorty_link"
+        points = points_from_message(cloud)
+        assert (np.diff(points["column"].astype(int)) > 0).all()
+        assert points["t"].min() == 0
+        assert points["t"].max() < 1e9 / 70
+        assert (points["y"] == 0.0).all()
+
+
+def test_live_points_are_the_scans_points(live):
+    live_clouds, scan = live[1]["points"], points_from_message(live[1]["scan/points"][-1])
+    assert {cloud.header.frame_id for cloud in live_clouds} == {"eschorty_base"}
+    together = np.concatenate([points_from_message(cloud) for cloud in live_clouds])
+    assert len(together) == len(scan)
+    for name in ("x", "y", "z", "sigma"):
+        np.testing.assert_array_equal(np.sort(together[name]), np.sort(scan[name]))
+
+
+def test_live_batches_come_at_most_twenty_times_a_second(live):
+    state = live[1]["reconstruction/state"]
+    span_s = 1e-9 * (ns_from_stamp(state[-1].header.stamp) - ns_from_stamp(state[0].header.stamp))
+    assert len(live[1]["points"]) <= 20 * span_s + 1
+
+
+def test_event_frame_shows_the_line(live):
+    frames = live[1]["event_frame"]
+    assert frames
+    frame = frames[len(frames) // 2]
+    assert (frame.height, frame.width, frame.encoding) == (720, 1280, "mono8")
+    picture = np.frombuffer(frame.data, np.uint8).reshape(720, 1280)
+    lit = picture > 100
+    assert lit.any(axis=0).mean() > 0.9
+    assert lit.mean() < 0.2
+
+
+def test_state_counts_and_advances(live):
+    states = live[1]["reconstruction/state"]
+    last = states[-1]
+    assert (last.packets_lost, last.points_without_stage, last.scan_id) == (0, 0, "")
+    assert last.calibration == "config_3"
+    assert last.points == len(points_from_message(live[1]["scan/points"][-1]))
+    until = [ns_from_stamp(state.processed_until) for state in states]
+    assert (np.diff(until) >= 0).all()
+    assert any(state.scan_id == "replay-rec" for state in states)
+
+
+def test_frames_form_one_chain(live):
+    static = {
+        t.child_frame_id: t.header.frame_id
+        for message in live[1]["/tf_static"]
+        for t in message.transforms
+    }
+    assert static == {"eschorty_link": "eschorty_stage", "eschorty_optical": "eschorty_link"}
+    # DDS repeats a burst's lost end only after its heartbeat's 3 s.
+    wait_until(
+        lambda: live[1]["/tf"][-1].transforms[0].transform.translation.y > 0.04499, "the last /tf"
+    )
+    moving = [t for message in live[1]["/tf"] for t in message.transforms]
+    assert {(t.header.frame_id, t.child_frame_id) for t in moving} == {
+        ("eschorty_base", "eschorty_stage")
+    }
+    reached = [t.transform.translation.y for t in moving]
+    assert min(reached) == pytest.approx(0.030, abs=1e-6)
+    assert max(reached) == pytest.approx(0.045, abs=1e-6)
+
+
+def test_diagnostics_name_the_counters(live):
+    status = live[1]["/diagnostics"][-1].status[0]
+    assert status.name == "eschorty/reconstruction"
+    assert status.level == b"\x00", status.message
+    values = {item.key: item.value for item in status.values}
+    assert values["clock"] == "announced"
+    assert values["packets_lost"] == values["faults"] == "0"
+
+
+def test_scan_services_refuse_with_a_reason(live):
+    observer = live[0]
+    # The replay has ended, so nobody feeds the node.
+    begin = observer.call(
+        BeginScan, "reconstruction/begin_scan", BeginScan.Request(scan_id="x", stop=1.0)
+    )
+    assert not begin.success
+    assert "nobody publishes" in begin.message
+    end = observer.call(EndScan, "reconstruction/end_scan", EndScan.Request(scan_id="x"))
+    assert not end.success
+    assert "'x' is not being collected" in end.message
+
+
+def test_bad_settings_are_refused_with_a_reason(live):
+    observer = live[0]
+    for name, value, word in (
+        ("centroid", "magic", "mode_mean"),
+        ("line_width_px", -1.0, "range"),
+        ("frequency", 3.0, "16"),
+        ("stage_gap", "soon", "type"),
+    ):
+        accepted, reason = observer.set_parameter("reconstruction", name, value)
+        assert not accepted, name
+        assert word in reason.lower(), (name, reason)
+    assert observer.set_parameter("reconstruction", "smoothing_half_width", 0) == (True, "")

@@ -1,0 +1,123 @@
+"""What a node does whose device is not there when it starts: named, retried, never a traceback."""
+
+# ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.executors import SingleThreadedExecutor
+from support.ros_process import Observer, wait_until
+from support.spinning import spinning
+
+from eschorty_ros.core.base.errors import ArgumentError, DeviceError
+from eschorty_ros.nodes.ros import diagnostics, lifecycle, qos
+from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.lifecycle import DeviceNode
+
+
+class Device:
+    """Answers of the next attempts to open; ``None`` opens."""
+
+    def __init__(self, *answers: Exception | None) -> None:
+        self.answers = list(answers)
+        self.attempts = 0
+
+    def open(self) -> None:
+        self.attempts += 1
+        answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+        if answer is not None:
+            raise answer
+
+
+class Instrument(DeviceNode):
+    """A node around ``Device``."""
+
+    def __init__(self, device: Device, **kwargs: Any) -> None:
+        self.device = device
+        self.closed = 0
+        super().__init__("instrument", (), **kwargs)
+        diagnostics.Diagnostics(self, lambda: (diagnostics.OK, self.state_label, {}))
+
+    def open_device(self) -> None:
+        self.device.open()
+
+    def start_device(self) -> None: ...
+
+    def stop_device(self) -> None: ...
+
+    def close_device(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def observer() -> Iterator[Observer]:
+    with Observer(free_domain(), "waiting_observer") as observer:
+        yield observer
+
+
+@pytest.fixture
+def run(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.setattr(lifecycle, "RETRY_S", 0.3)
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=observer.domain)
+    executor = SingleThreadedExecutor(context=context)
+    nodes: list[Instrument] = []
+
+    def start(*answers: Exception | None) -> Instrument:
+        nodes.append(Instrument(Device(*answers), context=context))
+        executor.add_node(nodes[0])
+        return nodes[0]
+
+    with spinning(executor):
+        yield start
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+
+
+def test_an_absent_device_is_waited_for_and_told_once_per_reason(run, observer, capfd) -> None:
+    reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+    absent, held = DeviceError("no camera found; plug it in"), DeviceError("camera is held")
+    node = run(*[absent] * 5, held)
+    expected = [f"waiting: {e}; trying again every 0.3 s" for e in (absent, held)]
+
+    def reported() -> bool:
+        states = [status for array in list(reports) for status in array.status]
+        return any(s.level == DiagnosticStatus.WARN and s.message == expected[1] for s in states)
+
+    wait_until(reported, "the reason in /diagnostics")
+    node.device.answers.append(None)
+    wait_until(lambda: node.active, "the node active")
+    assert node.device.attempts > 6
+    assert node.closed == node.device.attempts - 1
+    assert (node.waiting, node.failure) == ("", "")
+
+    told = [line.split("]: ")[-1] for line in capfd.readouterr().err.splitlines()]
+    assert [line for line in told if "waiting" in line] == expected
+
+
+def test_after_a_failure_in_operation_nothing_starts_by_itself(run) -> None:
+    node = run(None)
+    wait_until(lambda: node.active, "the node active")
+    node.fault("device lost: unplugged")
+    wait_until(lambda: node.state_label == "unconfigured", "the node unconfigured")
+    assert not threading.Event().wait(1.0)
+    assert node.device.attempts == 1
+    assert node.state_label == "unconfigured"
+    assert (node.waiting, node.failure) == ("", "device lost: unplugged")
+
+
+def test_a_wrong_setting_is_no_reason_to_wait(run) -> None:
+    node = run(ArgumentError("driver 'magic' is unknown"))
+    wait_until(lambda: node.failure, "the failure")
+    assert not threading.Event().wait(1.0)
+    assert node.device.attempts == 1
+    assert node.waiting == ""
+    assert "magic" in node.failure

@@ -1,0 +1,45 @@
+"""No two instruments on a host get the same ROS domain."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.nodes.ros import domain
+from eschorty_ros.nodes.ros.domain import free_domain
+
+ASK = """
+import sys
+from eschorty_ros.nodes.ros.domain import free_domain
+print(*(free_domain() for _ in range(10)), flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_a_domain_stays_its_process_s_before_anybody_is_on_it() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", ASK],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as other:
+        assert other.stdout is not None
+        theirs = [int(word) for word in other.stdout.readline().split()]
+        ours = [free_domain() for _ in range(10)]
+        other.communicate(b"\n")
+    assert len({*theirs, *ours}) == 20
+
+
+def test_a_domain_is_taken_while_any_participant_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = free_domain()
+    monkeypatch.setattr(domain, "_DOMAINS", [taken])
+    assert free_domain() == taken
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(("", 7400 + 250 * taken + 10 + 2 * 3))
+        with pytest.raises(DeviceError, match="set ROS_DOMAIN_ID"):
+            free_domain()

@@ -1,0 +1,80 @@
+"""Real drivers without devices: each node says what it waits for, and nothing breaks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from support.ros_process import NodeProcess, Observer, processes, wait_until
+
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.lifecycle import RETRY_S
+
+NODES = "eschorty_ros.nodes.{}.node"
+# An empty bus for this host's real one, which may hold a camera or a generator.
+EMPTY = "eschorty_ros.emulation.bus.usb_remote:backend?/nonexistent/usb.sock"
+DEVICES = {
+    NODES + "camera": {"driver": "evk4", "backend": EMPTY},
+    NODES + "laser": {"driver": "awg", "backend": EMPTY},
+    NODES + "stage": {"driver": "apt", "serial": "no such controller"},
+}
+SCANNER = {NODES + "reconstruction": {}, NODES + "scanner": {"auto_scan": True}}
+
+
+@pytest.fixture(scope="module")
+def observer() -> Iterator[Observer]:
+    with Observer(free_domain(), "absence_observer") as observer:
+        yield observer
+
+
+@pytest.fixture(scope="module")
+def running(observer: Observer) -> Iterator[dict[str, NodeProcess]]:
+    with processes({**DEVICES, **SCANNER}, observer.domain) as running:
+        yield running
+
+
+def test_every_node_names_what_it_waits_for(
+    observer: Observer, running: dict[str, NodeProcess]
+) -> None:
+    reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
+    waiting = ("camera", "laser", "stage", "scanner")
+
+    def told() -> dict[str, DiagnosticStatus]:
+        newest = {s.name.rsplit("/", 1)[-1]: s for array in reports for s in array.status}
+        return {name: newest[name] for name in waiting if name in newest}
+
+    wait_until(
+        lambda: (
+            len(told()) == len(waiting)
+            and all(status.message.startswith("waiting: ") for status in told().values())
+        ),
+        "every node waiting",
+    )
+    for name, status in told().items():
+        print(f"{name}: {status.message}")
+        assert status.level == DiagnosticStatus.WARN
+        assert "\n" not in status.message
+    for name in ("camera", "laser", "stage"):
+        assert f"trying again every {RETRY_S:g} s" in told()[name].message
+        assert observer.lifecycle_state(name) == "unconfigured"
+
+
+def test_it_is_logged_once_and_tried_on(running: dict[str, NodeProcess]) -> None:
+    time.sleep(2.5 * RETRY_S)
+    for name in ("camera", "laser", "stage"):
+        lines = [line for line in running[name].output.splitlines() if "waiting: " in line]
+        assert len(lines) == 1, running[name].output
+
+
+def test_ctrl_c_ends_all_with_exit_code_0(running: dict[str, NodeProcess]) -> None:
+    codes = {name: process.interrupt() for name, process in running.items()}
+    assert set(codes.values()) == {0}, codes
+    for name, process in running.items():
+        assert "Traceback" not in process.output, f"{name}: {process.output}"
+        assert "rror" not in process.output, f"{name}: {process.output}"

@@ -1,0 +1,64 @@
+"""Scans over real DDS, each node a process of its own."""
+
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from support import scan_scenarios as scenarios
+from support.benches import bench_elsewhere
+from support.ros_process import NodeProcess, processes
+
+from eschorty_ros.nodes.ros.domain import free_domain
+
+SCANNER = "eschorty_ros.nodes.scanner.node"
+
+
+@pytest.fixture(scope="module")
+def instrument(tmp_path_factory):
+    """Five node processes at a bench; the camera's death comes last."""
+    log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
+    domain = free_domain()
+    with (
+        bench_elsewhere(**scenarios.bench_settings(log)) as folder,
+        processes(scenarios.node_parameters(folder), domain) as running,
+        scenarios.bench(domain, log) as bench,
+    ):
+        yield bench, running, scenarios.node_parameters(folder)
+        for name, process in running.items():
+            print(f"--- {name}\n{process.output[-3000:]}")
+
+
+def test_full_scan(instrument):
+    scenarios.full_scan(instrument[0])
+
+
+def test_cancel(instrument):
+    scenarios.cancel_scan(instrument[0])
+
+
+def test_bad_goals_are_refused(instrument):
+    scenarios.bad_goals(instrument[0])
+
+
+def test_bad_parameters_are_refused(instrument):
+    scenarios.bad_parameters(instrument[0])
+
+
+def test_scanner_interrupted_mid_scan_leaves_the_laser_off_and_the_next_one_scans(instrument):
+    bench, running, parameters = instrument
+    first = running["scanner"]
+    scenarios.scanner_interrupted(bench, lambda: first.send(signal.SIGINT))
+    assert first.wait() == 0, first.output
+    assert "Traceback" not in first.output, first.output
+    first.kill()
+    running["scanner"] = NodeProcess(SCANNER, parameters[SCANNER], domain=bench.domain)
+    scenarios.full_scan(bench)
+
+
+def test_killed_camera_ends_the_scan(instrument):
+    bench, running, _ = instrument
+    scenarios.camera_killed(bench, lambda: running["camera"].send(signal.SIGKILL))
+    assert all(process.running() for name, process in running.items() if name != "camera")

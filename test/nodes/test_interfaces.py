@@ -1,0 +1,56 @@
+"""docs/interfaces.md has every topic, service, action and parameter as the nodes have them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from rclpy.node import Node
+from support import interface_tables as tables
+
+README = Path(__file__).resolve().parents[2] / "README.md"
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[list[Node]]:
+    with tables.every_node() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return tables.PAGE.read_text(encoding="utf-8")
+
+
+def test_the_page_has_the_topics_as_they_are(nodes, page):
+    assert tables.topic_table(nodes) in page, "run: make reference"
+
+
+def test_the_page_has_the_services_and_actions(nodes, page):
+    assert tables.service_table(nodes) in page, "run: make reference"
+
+
+def test_the_page_has_every_parameter_with_default_and_range(page):
+    assert tables.parameter_tables() in page, "run: make reference"
+
+
+def test_every_name_is_explained_and_no_other(nodes):
+    assert set(tables.topics(nodes)) == set(tables.TOPICS)
+    assert set(tables.services(nodes)) == set(tables.SERVICES)
+
+
+def test_the_parameter_tables_are_what_the_nodes_declare(nodes):
+    for node in nodes:
+        told = {param.name for param in tables.PARAMETERS[node.get_name()]}
+        declared = {name for name in node._parameters if not name.startswith("qos_overrides.")}
+        assert declared - {"use_sim_time", "start_type_description_service"} == told
+
+
+def test_the_readme_names_every_topic_of_the_instrument(nodes):
+    text = README.read_text(encoding="utf-8")
+    told_elsewhere = {"camera/clock"}
+    assert [name for name in set(tables.topics(nodes)) - told_elsewhere if name not in text] == []

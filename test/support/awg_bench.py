@@ -1,0 +1,61 @@
+"""A generator model and the driver on it, in one process, without waiting."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.emulation.awg.model import AwgModel
+from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.hardware.laser.awg import AwgLaser
+from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+
+SQUARE = Modulation(70.0, 0.5, "square")
+
+
+class Clock:
+    """Time that stands still until it is set."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**18
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+class AwgBench:
+    """A bus with one generator on it, and lasers opened on that bus; the last one made counts."""
+
+    def __init__(self, log_path: Path | None = None) -> None:
+        self.clock = Clock()
+        self.model = AwgModel(self.clock, log_path, wait=lambda *_: False)
+        self.models = [self.model]
+        _buses[:] = [self]
+
+    def settings(self, **changes: Any) -> AwgSettings:
+        return AwgSettings(**{"backend": f"{__name__}:on_the_bus", **changes})
+
+    def laser(self, **changes: Any) -> AwgLaser:
+        return AwgLaser(self.settings(**changes), self.clock)
+
+    def ready_laser(self, **changes: Any) -> AwgLaser:
+        """Return a laser that is configured and armed."""
+        laser = self.laser(**changes)
+        laser.configure(SQUARE)
+        laser.arm()
+        return laser
+
+    def lit_laser(self, **changes: Any) -> AwgLaser:
+        laser = self.ready_laser(**changes)
+        laser.enable()
+        assert self.model.lit
+        return laser
+
+
+_buses: list[AwgBench] = []
+
+
+def on_the_bus() -> EmulatedBackend:
+    """Backend of the last bench: what ``backend`` of its settings names."""
+    return EmulatedBackend(lambda: _buses[-1].models)

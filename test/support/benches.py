@@ -1,0 +1,98 @@
+"""Emulated benches for tests: in this process, or in one of their own.
+
+``python benches.py FOLDER SETTINGS``, with ``BenchSettings`` as JSON, serves one that looks at
+each scene named on standard input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from support.short_folder import short_folder
+
+from eschorty_ros.emulation.bench.cables import serving
+from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
+from eschorty_ros.emulation.bench.process import bench_process
+
+
+@contextlib.contextmanager
+def bench_here(**settings: Any) -> Iterator[tuple[Bench, Path]]:
+    """A bench of these ``BenchSettings`` in this process, and the folder it serves."""
+    bench = Bench(BenchSettings(**settings))
+    with short_folder() as folder, serving(bench, folder):
+        yield bench, folder
+
+
+@contextlib.contextmanager
+def bench_elsewhere(**options: Any) -> Iterator[Path]:
+    """The folder of a bench with these options in a process of its own."""
+    with short_folder() as folder:
+        names = {name.replace("_", "-"): value for name, value in options.items()}
+        with bench_process(folder, names):
+            yield folder
+
+
+class TurnableBench:
+    """A bench in a process of its own that can be made to look elsewhere."""
+
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        self.folder = folder
+        self._process = subprocess.Popen(
+            [sys.executable, __file__, str(folder), json.dumps(settings)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            self._answer()
+        except BaseException:
+            self._process.kill()
+            self.close()
+            raise
+
+    def look_at(self, scene: str) -> None:
+        """Put another scene in front of the camera, for the next start of its stream."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{scene}\n")
+        self._process.stdin.flush()
+        self._answer()
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
+    def _answer(self) -> None:
+        assert self._process.stdout is not None
+        answer = self._process.stdout.readline().strip()
+        assert answer == "done", answer
+
+
+@contextlib.contextmanager
+def turnable_bench(**settings: Any) -> Iterator[TurnableBench]:
+    """A bench of these ``BenchSettings`` in a process of its own."""
+    with short_folder() as folder:
+        bench = TurnableBench(folder, settings)
+        try:
+            yield bench
+        finally:
+            bench.close()
+
+
+def serve(folder: str, settings: str) -> None:
+    """Be the bench until standard input ends."""
+    bench = Bench(BenchSettings(**json.loads(settings)))
+    with serving(bench, Path(folder)):
+        print("done", flush=True)
+        for line in sys.stdin:
+            bench.look_at(line.strip())
+            print("done", flush=True)
+
+
+if __name__ == "__main__":
+    serve(*sys.argv[1:])

@@ -1,0 +1,31 @@
+"""The laser node with a way to break it from outside: ``test/break`` says how."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from typing import Any
+
+from std_msgs.msg import String
+
+from eschorty_ros.nodes.laser.node import THREADS, LaserNode
+from eschorty_ros.nodes.ros.spin import run
+
+
+class BreakableLaser(LaserNode):
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.create_subscription(String, "test/break", self._on_break, 10)
+
+    def _on_break(self, message: String) -> None:
+        if message.data == "exception":
+            raise RuntimeError("a callback that fails")
+        if message.data == "abort":
+            os.abort()
+        if message.data == "segfault":
+            ctypes.string_at(0)
+
+
+if __name__ == "__main__":
+    sys.exit(run(BreakableLaser, threads=THREADS))

@@ -1,0 +1,42 @@
+"""The Monte Carlo set-up that the calibration's numbers are stated for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from eschorty_ros.core.calibration.targets import Targets
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.simulation.scenes.measured_posts import measured_posts
+
+NOMINAL = load_calibration("config_3")
+DESIGN = NOMINAL.model()
+TRUTH = replace(DESIGN, k_mm=24.20, k_prime_px=-37100.0, b_mm=1.5, b_prime_px=-1140.0)
+NINE_MM = np.linspace(820.0, 2050.0, 9)
+TWO_SIZES_MM = np.where(np.arange(9) % 2, 25.4, 50.8)
+CHECK_MM = np.array([800.0, 1000.0, 1320.0, 1700.0, 2100.0])
+COLUMN = 1200.0
+
+
+def see(
+    rng: np.random.Generator,
+    ranges_mm: np.ndarray = NINE_MM,
+    *,
+    truth: RangeModel = TRUTH,
+    **posts: Any,
+) -> Targets:
+    """Posts of ``truth`` with noise in rows, ranges, widths and spacings."""
+    return measured_posts(truth, ranges_mm, rng, **posts)
+
+
+def range_error_mm(model: RangeModel, truth: RangeModel = TRUTH) -> np.ndarray:
+    """Error of ``model`` at `CHECK_MM`."""
+    return model.range_mm(truth.row(CHECK_MM)) - CHECK_MM
+
+
+def scale_error(model: RangeModel, truth: RangeModel = TRUTH) -> float:
+    """Relative error of a lateral length at mid-range."""
+    return float(model.lateral_mm(COLUMN, 1320.0) / truth.lateral_mm(COLUMN, 1320.0)) - 1.0

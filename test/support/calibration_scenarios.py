@@ -1,0 +1,388 @@
+"""What a calibration must do, asserted once: process tests and launch tests run these functions."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from eschorty_ros.action import Calibrate
+from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
+from eschorty_ros.srv import LoadCalibration, SaveCalibration
+from rclpy.action import ActionClient
+from std_msgs.msg import Bool
+from support.ros_process import Observer, told_after, wait_until
+from support.scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
+
+from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.report.accuracy import range_error_mm
+from eschorty_ros.simulation.scenes.names import RECEDING_MM, named
+from eschorty_ros.simulation.scenes.posts import bench as bench_of_posts
+
+CALIBRATION, AS_BUILT = "config_3", "config_3_as_built"
+KNOWN_SCENE = "steps"
+POSTS = bench_of_posts()
+# A capture that something happens in: few events.
+LONG = {"capture_time": 60.0, "frequency": SLOW_HZ}
+TRUE_MM = np.linspace(800.0, 2100.0, 131)
+
+
+def bench_settings(laser_log: Path, scene: str) -> dict[str, Any]:
+    """A bench that is not built as the calibration says."""
+    return {"scene": scene, "calibration": AS_BUILT, "seed": 7, "laser_log": str(laser_log)}
+
+
+def node_parameters(bench_folder: Path, folder: Path) -> dict[str, dict[str, Any]]:
+    """Modules and parameters of the five nodes; calibrations are written to ``folder``."""
+    return {
+        **device_parameters(bench_folder),
+        "eschorty_ros.nodes.reconstruction.node": {
+            "calibration": CALIBRATION,
+            "trigger_source": "stage",
+            "calibration_folder": folder,
+            f"{EVENTS}.subscription.reliability": "reliable",
+        },
+        "eschorty_ros.nodes.scanner.node": {},
+    }
+
+
+class CalibrationBench(Bench):
+    """The test's view of the instrument while it is calibrated."""
+
+    def __init__(self, observer: Observer, domain: int, laser_log: Path, folder: Path) -> None:
+        super().__init__(observer, domain, laser_log)
+        self.folder = folder
+        self.active = observer.collect(
+            ActiveCalibration, "reconstruction/calibration", qos.latched()
+        )
+        self.seen: list[Any] = []
+        self._calibrate = ActionClient(observer.node, Calibrate, "calibrate")
+        self._done: Any = None
+
+    def begin(self, **goal: Any) -> Any:
+        """Send a goal with the posts of the bench unless others are given; the handle."""
+        # First, as in ``start``.
+        self.observer.wait_for_answers("reconstruction", SCAN_DEADLINE_S)
+        wait_until(self._calibrate.server_is_ready, "the calibrate action", SCAN_DEADLINE_S)
+        # A list of its own: feedback of the goal before may still come.
+        seen = self.seen = []
+        values = {
+            "targets": [
+                CalibrationTarget(range=post.range_mm * 1e-3, size=post.size_mm * 1e-3)
+                for post in POSTS
+            ],
+            "capture_time": 0.5,
+            "frequency": 70.0,
+        }
+        sent = self._calibrate.send_goal_async(
+            Calibrate.Goal(**{**values, **goal}),
+            feedback_callback=lambda message: seen.append(message.feedback),
+        )
+        wait_until(sent.done, "an answer to the goal")
+        handle = sent.result()
+        self._done = handle.get_result_async()
+        return handle
+
+    def end(self) -> tuple[int, Any]:
+        """Status and result of the last calibration."""
+        wait_until(self._done.done, "the calibration's end", SCAN_DEADLINE_S)
+        return self._done.result().status, self._done.result().result
+
+    def calibrate(self, **goal: Any) -> tuple[int, Any]:
+        """Send a goal and wait for its end."""
+        self.begin(**goal)
+        return self.end()
+
+    def wait_for_capture(self) -> None:
+        """Wait until events have been captured."""
+
+        def capturing() -> bool:
+            assert not self._done.done(), self._done.result().result.message
+            return any(f.phase == "capturing" and f.events for f in list(self.seen))
+
+        wait_until(capturing, "a capture under way", SCAN_DEADLINE_S)
+
+    @property
+    def newest(self) -> Any:
+        """The active calibration as told last."""
+        wait_until(lambda: self.active, "a latched calibration", SCAN_DEADLINE_S)
+        return self.active[-1]
+
+    def wait_for_active(self, calibration_id: str) -> None:
+        """Wait until this calibration is the one told; "" is the design."""
+        wait_until(
+            lambda: self.newest.id == calibration_id, f"calibration {calibration_id!r} on its topic"
+        )
+
+    @contextlib.contextmanager
+    def nothing_changes(self) -> Iterator[None]:
+        """Within it the active calibration and the folder stay as they are."""
+        told, count = self.newest, len(self.active)
+        files = sorted(self.folder.iterdir()) if self.folder.exists() else []
+        yield
+        assert len(self.active) == count
+        assert self.newest is told
+        assert (sorted(self.folder.iterdir()) if self.folder.exists() else []) == files
+
+
+@contextlib.contextmanager
+def bench(domain: int, laser_log: Path, folder: Path) -> Iterator[CalibrationBench]:
+    """A bench over an observer of its own."""
+    with Observer(domain) as observer:
+        yield CalibrationBench(observer, domain, laser_log, folder)
+
+
+def scan_error_mm(bench: CalibrationBench) -> np.ndarray:
+    """Scan the known scene; measured minus true range of every point on it."""
+    before = len(bench.clouds)
+    status, result = bench.scan()
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    points = bench.cloud_after(before, result.points)
+    error_mm = range_error_mm(points, named(KNOWN_SCENE), load_calibration(AS_BUILT).model())
+    error_mm = error_mm[np.isfinite(error_mm)]
+    assert len(error_mm) > 10_000
+    median_mm, p95_mm = np.percentile(np.abs(error_mm), (50.0, 95.0))
+    print(f"scan: median {np.median(error_mm):+.3f} mm, |error| {median_mm:.3f}, p95 {p95_mm:.3f}")
+    return error_mm
+
+
+def uncalibrated_scan_is_off(bench: CalibrationBench) -> None:
+    """With the design's geometry a known target is off by tens of mm."""
+    assert bench.newest.id == ""
+    error_mm = scan_error_mm(bench)
+    assert 20.0 < abs(np.median(error_mm)) < 99.0
+
+
+def calibrated_scan_is_right(bench: CalibrationBench) -> None:
+    """With the calibration made before, the same target is within 1 mm."""
+    assert bench.newest.id
+    error_mm = scan_error_mm(bench)
+    assert abs(np.median(error_mm)) < 0.5
+    assert np.median(np.abs(error_mm)) < 1.0
+
+
+def nine_posts(bench: CalibrationBench, method: str) -> None:
+    """Nine posts give range within 1 mm RMS; result, file and latched message agree."""
+    status, result = bench.calibrate(method=method)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert result.success
+    assert result.message == ""
+    assert list(result.rejected) == []
+    made = load_calibration(result.file)
+    true = load_calibration(AS_BUILT).model()
+    error = made.model().range_mm(true.row(TRUE_MM)) - TRUE_MM
+    rms_mm = float(np.sqrt(np.mean(error**2)))
+    print(f"{method}: range RMS {rms_mm:.3f} mm over 0.8 to 2.1 m, residuals "
+          f"{np.round(result.residuals, 2).tolist()} px, {list(result.verdicts)}")  # fmt: skip
+    assert rms_mm < 1.0
+    assert made.id == result.calibration_id
+    assert Path(result.file).parent == bench.folder
+    assert tuple(result.parameters) == made.parameters_fitted
+    values = [getattr(made, name) for name in result.parameters]
+    np.testing.assert_allclose(result.values, values, rtol=1e-12)
+    size = len(values)
+    np.testing.assert_allclose(np.reshape(result.covariance, (size, size)), made.covariance)
+    np.testing.assert_allclose(result.ranges, [post.range_mm * 1e-3 for post in POSTS])
+    assert len(result.residuals) == len(result.rows) == len(POSTS)
+    assert any(line.startswith("identifiable") for line in result.verdicts)
+    assert (result.frame.width, result.frame.height) == (1280, 720)
+    assert result.frame.encoding == "mono8"
+    assert max(result.frame.data) == 255
+    bench.wait_for_active(made.id)
+    assert bench.newest.file == result.file
+    table = dict(zip(bench.newest.parameters, bench.newest.values, strict=True))
+    assert table["b_prime_px"] == made.b_prime_px
+    # The last feedback may come after the result.
+    wait_until(
+        lambda: any(
+            f.matched == len(POSTS) and len(f.residuals) == len(POSTS) for f in list(bench.seen)
+        ),
+        "feedback of every post",
+    )
+    bench.assert_dark_and_at_rest()
+
+
+def moving_target(bench: CalibrationBench) -> None:
+    """One target that the stage moves forth and back gives range within 1 mm RMS where it was."""
+    status, result = bench.calibrate(
+        targets=[CalibrationTarget(range=RECEDING_MM * 1e-3)],
+        sweep_speed=0.1,
+        sweep_start=0.01,
+        sweep_stop=0.07,
+        range_per_stage=1.0,
+    )
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert len(result.ranges) > 60
+    true = load_calibration(AS_BUILT).model()
+    for near_mm, far_mm, bound_mm in ((910.0, 970.0, 0.2), (850.0, 1050.0, 1.0)):
+        true_mm = np.linspace(near_mm, far_mm, 101)
+        error = load_calibration(result.file).model().range_mm(true.row(true_mm)) - true_mm
+        rms_mm = float(np.sqrt(np.mean(error**2)))
+        print(f"moved by the stage: range RMS {rms_mm:.3f} mm from {near_mm:g} to {far_mm:g} mm")
+        assert rms_mm < bound_mm
+    bench.wait_for_active(result.calibration_id)
+    bench.assert_dark_and_at_rest()
+
+
+def bad_goals(bench: CalibrationBench) -> None:
+    """Each bad value is refused by name, without any light."""
+    lines = len(bench.output_lines())
+    one = CalibrationTarget(range=1.0)
+    with bench.nothing_changes():
+        for goal, words in (
+            ({"targets": [one]}, ("targets holds 1",)),
+            ({"targets": [one, CalibrationTarget(range=-1.0)]}, ("range_mm is -1000",)),
+            ({"method": "magic"}, ("magic", "paper")),
+            ({"capture_time": 0.0}, ("capture_time", "0 s")),
+            ({"frequency": 5.0}, ("frequency", "5 Hz")),
+            ({"sweep_speed": 0.01}, ("targets holds 9", "sweep_speed")),
+        ):
+            status, result = bench.calibrate(**goal)
+            assert status == GoalStatus.STATUS_ABORTED, goal
+            assert not result.success
+            for word in words:
+                assert word in result.message, (goal, result.message)
+    assert len(bench.output_lines()) == lines
+
+
+def useless_captures(bench: CalibrationBench) -> None:
+    """Captures that show no known targets, or end early, change nothing and leave no light."""
+    with bench.nothing_changes():
+        # Targets that are not there.
+        far = [CalibrationTarget(range=r) for r in (5.0, 6.0, 7.0)]
+        status, result = bench.calibrate(targets=far)
+        assert status == GoalStatus.STATUS_ABORTED
+        assert "0 of 3 targets found among 9 posts" in result.message, result.message
+        assert len(result.rejected) == 12
+        assert result.frame.data
+        bench.assert_dark_and_at_rest()
+        # The same range twice: which is which cannot be told.
+        twice = [CalibrationTarget(range=1.0, label=label) for label in ("left", "right")]
+        status, result = bench.calibrate(targets=twice)
+        assert status == GoalStatus.STATUS_ABORTED
+        assert "left and right have the same range" in result.message, result.message
+        bench.assert_dark_and_at_rest()
+        # Canceled.
+        handle = bench.begin(**LONG)
+        bench.wait_for_capture()
+        canceled = handle.cancel_goal_async()
+        wait_until(canceled.done, "an answer to the cancel request")
+        status, result = bench.end()
+        assert status == GoalStatus.STATUS_CANCELED, result.message
+        bench.assert_dark_and_at_rest()
+        # The laser goes off.
+        interlock = bench.observer.publisher(Bool, "laser/interlock", qos.stream(10))
+        bench.begin(**LONG)
+        bench.wait_for_capture()
+        interlock.publish(Bool(data=True))
+        status, result = bench.end()
+        interlock.publish(Bool(data=False))
+        said_ns = time.time_ns()
+        wait_until(
+            lambda: told_after(bench.laser, said_ns) and not bench.laser[-1].interlock_open,
+            "the interlock closed",
+        )
+        assert status == GoalStatus.STATUS_ABORTED
+        assert "laser: went off: interlock open" in result.message, result.message
+        bench.assert_dark_and_at_rest()
+
+
+def one_thing_at_a_time(bench: CalibrationBench) -> None:
+    """No second calibration, scan or exchange while one is under way, and the other way round."""
+    with bench.nothing_changes():
+        handle = bench.begin(**LONG)
+        bench.wait_for_capture()
+        ended = handle.get_result_async()
+        _, result = bench.calibrate()
+        assert "a calibration is running" in result.message
+        _, result = bench.scan()
+        assert "a calibration is running" in result.message
+        wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
+        wait_until(ended.done, "the canceled calibration's end")
+        assert ended.result().status == GoalStatus.STATUS_CANCELED
+        handle = bench.start(**SLOW)
+        bench.wait_for_sweep(points=100)
+        _, result = bench.calibrate()
+        assert "is being collected" in result.message
+        answer = load(bench, CALIBRATION)
+        assert not answer.success
+        assert "is being collected" in answer.message
+        wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
+        status, result = bench.result()
+        assert status == GoalStatus.STATUS_CANCELED, result.message
+    bench.assert_dark_and_at_rest()
+
+
+def load(bench: CalibrationBench, name: str | Path) -> Any:
+    """The answer of ``load_calibration``."""
+    request = LoadCalibration.Request(calibration=str(name))
+    return bench.observer.call(LoadCalibration, "reconstruction/load_calibration", request)
+
+
+def save(bench: CalibrationBench, path: str | Path = "") -> Any:
+    """The answer of ``save_calibration``."""
+    request = SaveCalibration.Request(path=str(path))
+    return bench.observer.call(SaveCalibration, "reconstruction/save_calibration", request)
+
+
+def load_and_save(bench: CalibrationBench, folder: Path) -> None:
+    """Only calibrations of this instrument are loaded; files come whole or not at all."""
+    own = load_calibration(CALIBRATION)
+    with bench.nothing_changes():
+        for change, words in (
+            ({"columns": 640, "principal_column": 319.5}, ("columns", "640", "1280")),
+            ({"roi_px": (0, 100, 1280, 400)}, ("roi_px",)),
+            ({"name": "config_1"}, ("config_1", "config_3", "build")),
+        ):
+            save_calibration(own.model_copy(update=change), folder / "other.yaml")
+            answer = load(bench, folder / "other.yaml")
+            assert not answer.success
+            for word in words:
+                assert word in answer.message, answer.message
+        for name in (folder / "missing.yaml", "config_9", "config_1"):
+            answer = load(bench, name)
+            assert not answer.success
+            assert answer.message
+        (folder / "broken.yaml").write_text("name: config_3\n")
+        answer = load(bench, folder / "broken.yaml")
+        assert not answer.success
+        assert "broken.yaml" in answer.message
+        answer = save(bench, folder / "missing" / "c.yaml")
+        assert not answer.success
+        assert answer.message
+    told = bench.newest.id
+    answer = save(bench, folder / "kept.yaml")
+    assert answer.success, answer.message
+    answer = load(bench, CALIBRATION)
+    assert answer.success, answer.message
+    bench.wait_for_active("")
+    answer = load(bench, folder / "kept.yaml")
+    assert answer.success, answer.message
+    assert answer.id == told
+    bench.wait_for_active(told)
+
+
+def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
+    """The camera's process dies during a capture: aborted, named, light off, nothing changed."""
+    with bench.nothing_changes():
+        bench.begin(**LONG)
+        bench.wait_for_capture()
+        kill()
+        status, result = bench.end()
+        assert status == GoalStatus.STATUS_ABORTED
+        assert "camera" in result.message, result.message
+        bench.assert_dark_and_at_rest()
+
+
+def reconstruction_interrupted(bench: CalibrationBench, interrupt: Callable[[], Any]) -> None:
+    """The reconstruction ends during a capture: its way out, or the heartbeat's end, darkens."""
+    bench.begin(**LONG)
+    bench.wait_for_capture()
+    assert bench.output_lines()[-1] == "ON"
+    interrupt()
+    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")

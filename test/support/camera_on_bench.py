@@ -1,0 +1,114 @@
+"""A whole emulated bench in this process, under a clock that tests set."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.evt3.decoder import Decoder
+from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
+from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.hardware.camera.evk4 import Evk4
+from eschorty_ros.hardware.camera.settings import CameraSettings
+
+MS = 1_000_000
+COLUMNS = 64
+PATIENCE_S = 60.0
+
+
+class StillBench:
+    """A camera of few columns before a white plane at rest.
+
+    Parameters
+    ----------
+    folder : path
+        Takes the calibration.
+
+    Attributes
+    ----------
+    bench : Bench
+    backend : EmulatedBackend
+        The bus with its devices.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        build = load_calibration("config_3").model_copy(
+            update={"columns": COLUMNS, "principal_column": (COLUMNS - 1) / 2}
+        )
+        path = folder / "build.yaml"
+        save_calibration(build, path)
+        self._now_ns = 5_000 * MS
+        self.bench = Bench(
+            BenchSettings("plane", str(path), background_hz=0.0, trigger="none"), self.clock_ns
+        )
+        self.backend = EmulatedBackend(self.bench.usb_devices)
+
+    def clock_ns(self) -> int:
+        """Give the bench's time."""
+        return self._now_ns
+
+    def light(self, frequency_hz: float) -> None:
+        """Switch the laser on now."""
+        self.bench.physics.set_laser(self._now_ns, True, Modulation(frequency_hz))
+
+    def statistic(self, name: str) -> int:
+        """One of the bench's counts."""
+        return int(self.bench.physics.statistics()[name])
+
+    def run(self, duration_ms: int, arrived: Callable[[], int]) -> None:
+        """Let time pass; returns when as many events have ``arrived`` as left the sensor."""
+        self._now_ns += duration_ms * MS
+        end_s = time.monotonic() + PATIENCE_S
+        while not (self._caught_up() and arrived() == self.statistic("events")):
+            assert time.monotonic() < end_s, f"{arrived()} of {self.statistic('events')} came"
+            time.sleep(1e-3)
+
+    def _caught_up(self) -> bool:
+        return self.bench.physics.statistics()["behind_s"] < 1.1e-3
+
+
+class CameraOnBench(StillBench):
+    """The same with the EVK4 driver on it, and what it reads decoded.
+
+    Attributes
+    ----------
+    camera : Evk4
+    decoder : Decoder
+    times_us : list of int
+        Of all events so far.
+    """
+
+    def __init__(self, folder: Path, settings: CameraSettings | None = None) -> None:
+        super().__init__(folder)
+        self.camera = Evk4(self.backend, self.clock_ns, settings=settings, sleep=lambda _s: None)
+        self.decoder = Decoder()
+        self.times_us: list[int] = []
+        self._polarities: list[int] = []
+
+    def __enter__(self) -> CameraOnBench:
+        self.camera.open()
+        self.camera.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.camera.close()
+
+    def counts(self, duration_ms: int) -> NDArray[np.int64]:
+        """Let time pass; OFF and ON events that arrived in it."""
+        before = len(self._polarities)
+        self.run(duration_ms, self._read)
+        return np.bincount(self._polarities[before:], minlength=2)
+
+    def _read(self) -> int:
+        while (chunk := self.camera.read(0.0)) is not None:
+            events = self.decoder.decode(chunk.data)
+            self.times_us += events.t.tolist()
+            self._polarities += events.p.tolist()
+        return len(self.times_us)

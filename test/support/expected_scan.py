@@ -1,0 +1,16 @@
+"""What every scan of a simulated scene must reach, whoever runs it."""
+
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.report import accuracy
+from eschorty_ros.simulation.scenes.names import named
+
+
+def assert_accurate(points, sweep, scene="steps", calibration="config_3"):
+    """Nearly complete, median error under 0.7 mm, 95th percentile under 2.5 mm."""
+    build = load_calibration(calibration)
+    measured = accuracy.measure(points, named(scene), build.model(), sweep, build.stage_direction)
+    print(measured)
+    assert measured.completeness >= 0.98
+    assert measured.error_median_mm <= 0.7
+    assert measured.error_p95_mm <= 2.5
+    return measured

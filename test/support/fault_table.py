@@ -1,0 +1,97 @@
+"""Writes the table of docs/faults.md: what the drivers do about each fault and what users read.
+
+Every test with ``@pytest.mark.fault("<fault>")`` is a row, with a docstring
+``driver: <what it does>; user reads: <what the user reads>``.
+Usage: python test/support/fault_table.py (or make faults).
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "faults.md"
+FAULTS = (
+    "USB unplugged",
+    "endpoint stalls",
+    "no answer, time-out",
+    "malformed transfer",
+    "partial reply",
+    "stale reply",
+    "error queue",
+    "setting clamped or ignored",
+    "generator rebooted",
+    "no permission, busy",
+    "garbage between frames",
+    "bytes lost",
+    "bit flips",
+    "encoder jumps",
+    "carriage stalls",
+    "serial unplugged, silent",
+    "limit switch",
+    "completion message missing",
+    "keep-alive missing",
+    "disabled, not homed, move ignored",
+    "controller reports an error",
+    "controller rebooted",
+    "late or double reply",
+    "host stalls",
+    "two clients",
+    "shutdown at any time",
+)
+_BEGIN, _END = "<!-- made by `make faults` -->\n\n", "\n<!-- end -->"
+_DOCSTRING = re.compile(r"driver: (?P<driver>.+?)[;.] user reads: (?P<user>.+?\.\.\.|.+?)\.?$")
+
+
+@dataclass(frozen=True)
+class FaultTest:
+    """One test of a fault."""
+
+    fault: str
+    file: str
+    name: str
+    driver: str
+    user: str
+
+    @property
+    def row(self) -> str:
+        """Its line of the table."""
+        case = self.name.removeprefix("test_").replace("_", " ")
+        cells = (self.fault, case, self.file, self.driver, self.user)
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def fault_tests() -> list[FaultTest]:
+    """Every test of a fault, by reading the files; in the order of the list of faults."""
+    found = []
+    for path in sorted((ROOT / "test").rglob("test_*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef) and (fault := _fault_of(node)):
+                text = " ".join((ast.get_docstring(node) or "").split())
+                match = _DOCSTRING.match(text)
+                driver, user = match.groups() if match else ("", "")
+                found.append(FaultTest(fault, path.name, node.name, driver, user))
+    return sorted(found, key=lambda test: FAULTS.index(test.fault))
+
+
+def _fault_of(node: ast.FunctionDef) -> str:
+    for decorator in node.decorator_list:
+        if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) == "pytest.mark.fault":
+            return str(ast.literal_eval(decorator.args[0]))
+    return ""
+
+
+def page() -> str:
+    """The page with the table as the tests have it now."""
+    head, _, rest = PAGE.read_text(encoding="utf-8").partition(_BEGIN)
+    _, _, tail = rest.partition(_END)
+    lines = ["| fault | case | test | driver | user reads |", "| --- | --- | --- | --- | --- |"]
+    lines += [test.row for test in fault_tests()]
+    return head + _BEGIN + "\n".join(lines) + "\n" + _END + tail
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,295 @@
+"""Helpers of the process tests: nodes as processes of their own, in a private ROS domain."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter as ParameterMsg
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from support.spinning import spinning
+from support.waiting import DEADLINE_S, wait_until
+
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+from eschorty_ros.nodes.ros.dds import use_profile
+
+NAMESPACE = "/eschorty"
+_RESEND_S = 2.0
+# However the tests end, the kernel then ends the nodes, too; where util-linux is.
+_ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+
+
+def ros_minus_steady_ns() -> int:
+    """ROS time minus CLOCK_MONOTONIC, from the pair of readings least far apart of many."""
+    pairs = []
+    for _ in range(100):
+        before_ns, ros_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        pairs.append((after_ns - before_ns, ros_ns - (before_ns + after_ns) // 2))
+    return min(pairs)[1]
+
+
+def told_after(messages: list[Any], t_ns: int) -> bool:
+    """Whether the newest message is about a later time: what is on its way may be older news."""
+    return bool(messages) and ns_from_stamp(messages[-1].header.stamp) > t_ns
+
+
+class NodeProcess:
+    """One node running as a process of its own, until ``kill`` or the end of a ``with``.
+
+    Start it in the main thread: it ends with the thread that started it.
+
+    Parameters
+    ----------
+    module : str
+        Module to run, e.g. ``eschorty_ros.nodes.laser.node``.
+    parameters : mapping
+        Parameters of the node.
+    domain : int
+        ``ROS_DOMAIN_ID``.
+    namespace : str
+    """
+
+    def __init__(
+        self,
+        module: str,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        domain: int,
+        namespace: str = NAMESPACE,
+    ) -> None:
+        self.module = module
+        self._log = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed in kill()
+            prefix=f"{node_name(module)}_", suffix=".log"
+        )
+        command = [*_ENDING_WITH_PARENT, sys.executable, "-m", module]
+        command += ["--ros-args", "-r", f"__ns:={namespace}"]
+        for name, value in (parameters or {}).items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            command += ["-p", f"{name}:={text}"]
+        self._process = subprocess.Popen(
+            command,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            env=domain_environment(domain),
+            start_new_session=True,
+        )
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def output(self) -> str:
+        """Everything the process has printed."""
+        return Path(self._log.name).read_text(errors="replace")
+
+    def send(self, number: int) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+        """Exit code; fails with the output when the process does not end in time."""
+        try:
+            return self._process.wait(deadline_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(
+                f"{self.module} still runs after {deadline_s:g} s:\n{self.output}"
+            ) from None
+
+    def running(self) -> bool:
+        """Whether the process is still there."""
+        return self._process.poll() is None
+
+    def interrupt(self, deadline_s: float = DEADLINE_S) -> int:
+        """SIGINT, then the exit code."""
+        if self.running():
+            self.send(signal.SIGINT)
+        return self.wait(deadline_s)
+
+    def cpu_s(self) -> float:
+        """CPU time used so far, user and system."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def kill(self, patience_s: float = 20.0) -> None:
+        """SIGTERM, then SIGKILL if it still runs; always leaves nothing behind.
+
+        A killed process would leave its shared memory.
+        """
+        if self.running():
+            self._process.send_signal(signal.SIGCONT)
+            self._process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(patience_s)
+        if self.running():
+            self._process.kill()
+        self._process.wait()
+        self._log.close()
+
+
+def node_name(module: str) -> str:
+    """Name of the node that ``module`` of the package runs."""
+    return module.removeprefix("eschorty_ros.nodes.").split(".")[0]
+
+
+def domain_environment(domain: int) -> dict[str, str]:
+    """Environment of a process in ``domain``, discovering on this host only."""
+    return {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+class Observer:
+    """A test's own node, spun in a thread: collects messages, calls services.
+
+    Use it as a context manager.
+    """
+
+    def __init__(self, domain: int, name: str = "observer", namespace: str = NAMESPACE) -> None:
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        use_profile()
+        self.domain = domain
+        context = rclpy.Context()
+        with contextlib.ExitStack() as held:
+            rclpy.init(context=context, domain_id=domain)
+            held.callback(context.try_shutdown)
+            self.node = Node(name, namespace=namespace, context=context)
+            held.callback(self.node.destroy_node)
+            self._executor = SingleThreadedExecutor(context=context)
+            self._executor.add_node(self.node)
+            held.enter_context(spinning(self._executor))
+            self._held = held.pop_all()
+
+    def __enter__(self) -> Observer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
+
+    def collect(self, message_type: Any, topic: str, profile: QoSProfile) -> list[Any]:
+        """A list that grows by every message of ``topic`` from now on."""
+        messages: list[Any] = []
+        self.node.create_subscription(message_type, topic, messages.append, profile)
+        self._executor.wake()
+        return messages
+
+    def publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:
+        """A publisher that has already found a subscriber."""
+        publisher = self.node.create_publisher(message_type, topic, profile)
+        wait_until(publisher.get_subscription_count, f"a subscriber of {topic}")
+        return publisher
+
+    def call(
+        self, service_type: Any, name: str, request: Any = None, deadline_s: float = DEADLINE_S
+    ) -> Any:
+        """The service's response; the service's name begins with that of its node."""
+        with self._client(service_type, name, deadline_s) as client:
+            # A server that does not know the client yet would answer nobody.
+            self.wait_for_answers(name.split("/")[0], deadline_s)
+            future = client.call_async(request if request is not None else service_type.Request())
+            wait_until(future.done, f"answer of {name}", deadline_s)
+            return future.result()
+
+    def ask(self, service_type: Any, name: str, deadline_s: float = DEADLINE_S) -> Any:
+        """Response of a service that may be called again: a first answer can get lost.
+
+        A fresh server may not know yet where its answers go, a killed one seems to be there still.
+        """
+        futures: list[Any] = []
+        sent_s = -math.inf
+
+        def answered() -> bool:
+            nonlocal sent_s
+            if time.monotonic() - sent_s > _RESEND_S:
+                sent_s = time.monotonic()
+                futures.append(client.call_async(service_type.Request()))
+            return any(future.done() for future in futures)
+
+        with self._client(service_type, name, deadline_s) as client:
+            wait_until(answered, f"an answer of {name}", deadline_s)
+            return next(future.result() for future in futures if future.done())
+
+    @contextlib.contextmanager
+    def _client(self, service_type: Any, name: str, deadline_s: float) -> Iterator[Any]:
+        client = self.node.create_client(service_type, name)
+        try:
+            wait_until(client.service_is_ready, f"service {name}", deadline_s)
+            yield client
+        finally:
+            self.node.destroy_client(client)
+
+    def wait_for_answers(self, node: str, deadline_s: float = DEADLINE_S) -> None:
+        """Wait until ``node`` answers.
+
+        Endpoints are discovered in the order of their making, so what this observer made before
+        gets its answers, too.
+        """
+        self.ask(GetParameters, f"{node}/get_parameters", deadline_s)
+
+    def lifecycle_state(self, node: str) -> str:
+        """Label of the lifecycle state of ``node``."""
+        return str(self.ask(GetState, f"{node}/get_state").current_state.label)
+
+    def wait_for_state(self, node: str, label: str, deadline_s: float = DEADLINE_S) -> None:
+        """Wait until ``node`` reports lifecycle state ``label``."""
+        wait_until(
+            lambda: self.lifecycle_state(node) == label, f"{node} {label}", deadline_s, poll_s=0.1
+        )
+
+    def change_state(self, node: str, transition: str) -> bool:
+        """Ask ``node`` for a transition by label, e.g. ``deactivate``; whether it succeeded."""
+        request = ChangeState.Request(transition=Transition(label=transition))
+        return bool(self.call(ChangeState, f"{node}/change_state", request).success)
+
+    def set_parameter(self, node: str, name: str, value: Any) -> tuple[bool, str]:
+        """Set one parameter of ``node``: accepted, reason."""
+        message: ParameterMsg = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        result = self.call(SetParameters, f"{node}/set_parameters", request).results[0]
+        return bool(result.successful), str(result.reason)
+
+
+@contextlib.contextmanager
+def processes(
+    nodes: Mapping[str, Mapping[str, Any]], domain: int
+) -> Iterator[dict[str, NodeProcess]]:
+    """Run ``{module: parameters}`` side by side, keyed by the node's name; killed at the end."""
+    running = {
+        node_name(module): NodeProcess(module, parameters, domain=domain)
+        for module, parameters in nodes.items()
+    }
+    try:
+        yield running
+    finally:
+        for process in running.values():
+            if process.running():
+                process.send(signal.SIGTERM)
+        for process in running.values():
+            process.kill()

@@ -1,0 +1,333 @@
+"""What a scan must do, asserted once: process tests and launch tests run these same functions."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from eschorty_ros.action import Scan
+from eschorty_ros.msg import LaserState
+from nav_msgs.msg import Odometry
+from rclpy.action import ActionClient
+from sensor_msgs.msg import PointCloud2
+from support.ros_process import Observer, ros_minus_steady_ns, told_after, wait_until
+
+from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.emulation.awg.model import truth
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.cloud_messages import points_from_message
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+from eschorty_ros.report.accuracy import lit_columns, range_error_mm
+from eschorty_ros.simulation.scenes.names import Steps
+
+EVENTS = "qos_overrides./eschorty/camera/events"
+SCENE = "steps"
+EDGE_MM = 4.0
+CALIBRATION = "config_3"
+START_M, STOP_M, SPEED_M_S, FREQUENCY_HZ = 0.020, 0.040, 0.050, 70.0
+SLOW_HZ, SLOW_M_S, FAR_M = 20.0, 0.010, 0.200
+"""Of sweeps that something happens in: few events, and far from their end when it happens."""
+SLOW = {"stop": FAR_M, "speed": SLOW_M_S, "frequency": SLOW_HZ}
+SWEPT_POINTS = 30_000
+CLOCK_S = 0.01
+SCAN_DEADLINE_S = 300.0
+
+
+def bench_settings(laser_log: Path) -> dict[str, Any]:
+    """The bench that the scans are done on."""
+    return {"scene": SCENE, "calibration": CALIBRATION, "seed": 7, "laser_log": str(laser_log)}
+
+
+def device_parameters(folder: Path) -> dict[str, dict[str, Any]]:
+    """Modules and parameters of the nodes at the bench in ``folder``; its stage gives triggers."""
+    return {
+        "eschorty_ros.nodes.laser.node": {"bench": folder},
+        "eschorty_ros.nodes.stage.node": {"bench": folder},
+        "eschorty_ros.nodes.camera.node": {
+            "bench": folder,
+            "trigger_in_mode": "external",
+            f"{EVENTS}.publisher.reliability": "reliable",
+        },
+    }
+
+
+def node_parameters(folder: Path) -> dict[str, dict[str, Any]]:
+    """Modules and parameters of the five nodes of a scan at the bench in ``folder``."""
+    return {
+        **device_parameters(folder),
+        "eschorty_ros.nodes.reconstruction.node": {
+            "calibration": CALIBRATION,
+            "trigger_source": "stage",
+            f"{EVENTS}.subscription.reliability": "reliable",
+        },
+        "eschorty_ros.nodes.scanner.node": {},
+    }
+
+
+class Bench:
+    """The test's view of the instrument."""
+
+    def __init__(self, observer: Observer, domain: int, laser_log: Path) -> None:
+        self.observer = observer
+        self.domain = domain
+        self._laser_log = laser_log
+        self.clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
+        self.laser = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
+        self.odometry = observer.collect(Odometry, "stage/odom", qos.stream())
+        self._action = ActionClient(observer.node, Scan, "scan")
+        self.feedback: list[Any] = []
+        self._ended: Any = None
+
+    def start(self, **goal: float) -> Any:
+        """Send a goal; the accepted handle."""
+        # First: the action of a scanner that has just ended may still be there.
+        self.observer.wait_for_answers("scanner", SCAN_DEADLINE_S)
+        wait_until(self._action.server_is_ready, "the scan action", SCAN_DEADLINE_S)
+        # A list of its own: feedback of the goal before may still come.
+        feedback = self.feedback = []
+        values = {"start": START_M, "stop": STOP_M, "speed": SPEED_M_S, "frequency": FREQUENCY_HZ}
+        sent = self._action.send_goal_async(
+            Scan.Goal(**{**values, **goal}),
+            feedback_callback=lambda message: feedback.append(message.feedback),
+        )
+        wait_until(sent.done, "an answer to the goal")
+        handle = sent.result()
+        self._ended = handle.get_result_async()
+        return handle
+
+    def result(self) -> tuple[int, Any]:
+        """Status and result of the last goal."""
+        wait_until(self._ended.done, "the scan's end", SCAN_DEADLINE_S)
+        return self._ended.result().status, self._ended.result().result
+
+    def scan(self, **goal: float) -> tuple[int, Any]:
+        """Send a goal and wait for its end."""
+        self.start(**goal)
+        return self.result()
+
+    def wait_for_sweep(self, points: int = SWEPT_POINTS) -> None:
+        """Wait until more than so many points of the sweep have been reconstructed."""
+
+        def swept() -> bool:
+            assert not self._ended.done(), self._ended.result().result.message
+            return any(f.phase == "sweeping" and f.points > points
+                       for f in list(self.feedback))  # fmt: skip
+
+        wait_until(swept, "points of the sweep", SCAN_DEADLINE_S)
+
+    def cloud_after(self, count: int, points: int) -> np.ndarray:
+        """Cloud of so many points, published after ``count`` clouds were there.
+
+        The one of a scan that nobody ended may come before it.
+        """
+        wait_until(
+            lambda: len(self.clouds) > count and self.clouds[-1].width == points,
+            f"a cloud of {points} points on scan/points",
+        )
+        message = self.clouds[-1]
+        assert message.header.frame_id == "eschorty_base"
+        seen = points_from_message(message)
+        assert seen.dtype.names == POINT_DTYPE.names
+        _assert_in_order(seen)
+        return seen.astype(POINT_DTYPE)
+
+    def lit_part(self, points: np.ndarray) -> tuple[np.ndarray, float]:
+        """Points of the newest cloud made in the last light, and how long it lasted after them (s).
+
+        A scan also keeps what background makes of the dark, wherever the stage was then.
+        """
+        on_ns, off_ns = (t_ns for t_ns, _ in truth(self._laser_log)[-2:])
+        begun_ns = ns_from_stamp(self.clouds[-1].header.stamp) - ros_minus_steady_ns()
+        t_s = points["t"] + 1e-9 * (begun_ns - on_ns)
+        lit_s = 1e-9 * (off_ns - on_ns)
+        lit = (t_s > -CLOCK_S) & (t_s < lit_s + CLOCK_S)
+        return points[lit], lit_s - float(t_s[lit].max())
+
+    def output_lines(self) -> list[str]:
+        """ON and OFF in the order of the emulator's own log."""
+        return [output for _, output in truth(self._laser_log)]
+
+    def assert_dark_and_at_rest(self) -> None:
+        """Laser off by the emulator's own log and by the node; stage not moving."""
+        wait_until(lambda: self.output_lines()[-1] == "OFF", "OFF in the emulator's log")
+        now_ns = time.time_ns()
+        wait_until(lambda: told_after(self.laser, now_ns), "a new laser/state")
+        assert self.laser[-1].output == LaserState.OUTPUT_OFF
+        wait_until(lambda: told_after(self.odometry, now_ns), "new odometry")
+        assert self.odometry[-1].twist.twist.linear.y == 0.0
+
+
+@contextlib.contextmanager
+def bench(domain: int, laser_log: Path) -> Iterator[Bench]:
+    """A bench over an observer of its own."""
+    with Observer(domain) as observer:
+        yield Bench(observer, domain, laser_log)
+
+
+def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: float) -> None:
+    """At least ``completeness`` of the lit columns, and the project's bounds on their errors.
+
+    The errors are those of points whose whole footprint, 7 mm along the stage, lies on one level:
+    how many others a scan holds that ends somewhere depends on where.
+    """
+    model, scene = load_calibration(CALIBRATION).model(), Steps()
+    error_mm = range_error_mm(points, scene, model)
+    known = np.isfinite(error_mm)
+    share = np.count_nonzero(known) / int(lit_columns(scene, model, positions_mm).sum())
+    band_mm = scene.stage_band_mm
+    y_mm = 1e3 * points["y"]
+    whole = known & (np.abs((y_mm + 0.5 * band_mm) % band_mm - 0.5 * band_mm) > EDGE_MM)
+    signed_mm, where_mm = error_mm[whole], y_mm[whole]
+    median_mm, p95_mm = np.median(np.abs(signed_mm)), np.percentile(np.abs(signed_mm), 95.0)
+    found = f"{share:.4f} of the lit points, error median {median_mm:.3f}, p95 {p95_mm:.3f} mm"
+    print(found)
+    for begin in range(int(where_mm.min()), int(where_mm.max()) + 1, 5):
+        part = signed_mm[(where_mm >= begin) & (where_mm < begin + 5)]
+        if part.size:
+            print(f"  from {begin} mm: {part.size} points, off by {np.median(part):+.3f} mm")
+    assert share >= completeness, found
+    assert median_mm <= 0.7, found
+    assert p95_mm <= 2.5, found
+
+
+def full_scan(bench: Bench) -> None:
+    """A scan to its end gives the expected cloud."""
+    before = len(bench.clouds)
+    status, result = bench.scan()
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert result.success, result.message
+    points, _ = bench.lit_part(bench.cloud_after(before, result.points))
+    assert len(points) >= 0.99 * result.points
+    assert result.packets_lost == 0
+    periods = round((STOP_M - START_M) / SPEED_M_S * FREQUENCY_HZ)
+    positions = 1e3 * (START_M + (STOP_M - START_M) * (np.arange(periods) + 0.5) / periods)
+    assert abs(int(_profile_of(points)[-1]) + 1 - periods) <= 2
+    assert_accurate(points, positions, 0.98)
+    sweep_s = (
+        result.sweep_stop.sec - result.sweep_start.sec
+        + 1e-9 * (result.sweep_stop.nanosec - result.sweep_start.nanosec)
+    )  # fmt: skip
+    # An emulated controller that a loaded machine lets answer late shifts single positions.
+    assert math.isclose(sweep_s, (STOP_M - START_M) / SPEED_M_S, rel_tol=0.25)
+    assert [f.phase for f in bench.feedback if f.phase == "sweeping"]
+    assert 0.0 < result.sigma_median < 2e-3
+    bench.assert_dark_and_at_rest()
+
+
+def cancel_scan(bench: Bench) -> None:
+    """Cancel in the middle: light off, stage stopped, what there is published."""
+    before = len(bench.clouds)
+    handle = bench.start(**SLOW)
+    bench.wait_for_sweep()
+    canceled = handle.cancel_goal_async()
+    wait_until(canceled.done, "an answer to the cancel request")
+    status, result = bench.result()
+    assert status == GoalStatus.STATUS_CANCELED, result.message
+    assert not result.success
+    bench.assert_dark_and_at_rest()
+    assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
+    _assert_partial(bench, before, result, to_the_end=True)
+
+
+def bad_goals(bench: Bench) -> None:
+    """Each bad value is refused, its name and the remedy in the message; no light."""
+    lines = len(bench.output_lines())
+    for goal, words in (
+        ({"start": -0.01}, ("start", "-0.01", "travel")),
+        ({"stop": 0.5}, ("stop", "0.5", "travel")),
+        ({"stop": START_M}, ("start and stop",)),
+        ({"speed": 0.0}, ("speed", "m/s")),
+        ({"speed": 9.0}, ("speed", "9")),
+        ({"frequency": 5.0}, ("frequency", "5 Hz", "16")),
+        ({"frequency": 1e6}, ("frequency", "20000")),
+        ({"duty": 1.5}, ("duty", "1.5")),
+        ({"start": math.nan}, ("start", "nan")),
+    ):
+        status, result = bench.scan(**goal)
+        assert status == GoalStatus.STATUS_ABORTED, goal
+        assert not result.success
+        for word in words:
+            assert word in result.message, (goal, result.message)
+    assert len(bench.output_lines()) == lines
+
+
+def bad_parameters(bench: Bench) -> None:
+    """A bad value is refused with a reason, and the old one stays."""
+    for node, name, value, word in (
+        ("reconstruction", "centroid", "magic", "mode_mean"),
+        ("reconstruction", "events_min", 0, "range"),
+        ("reconstruction", "frequency", 5.0, "16"),
+        ("reconstruction", "calibration", "config_1", "read"),
+        ("scanner", "speed_max", 1.0, "read"),
+        ("laser", "frequency", 1.0, "range"),
+    ):
+        accepted, reason = bench.observer.set_parameter(node, name, value)
+        assert not accepted, (node, name)
+        assert word in reason, (node, name, reason)
+    accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", 5)
+    assert accepted, reason
+    accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", 4)
+    assert accepted, reason
+
+
+def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
+    """The scanner ends mid-scan: without its heartbeat the laser switches off."""
+    bench.start(**SLOW)
+    bench.wait_for_sweep()
+    assert bench.output_lines()[-1] == "ON"
+    interrupt()
+    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")
+
+
+def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
+    """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
+    before = len(bench.clouds)
+    # Slow: DDS holds everybody's messages for some seconds after a process was killed.
+    bench.start(**SLOW)
+    bench.wait_for_sweep()
+    kill()
+    killed_s = time.monotonic()
+    status, result = bench.result()
+    print(f"goal ended {time.monotonic() - killed_s:.1f} s after the camera: {result.message}")
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "camera" in result.message, result.message
+    bench.assert_dark_and_at_rest()
+    assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
+    _assert_partial(bench, before, result, to_the_end=False)
+
+
+def _assert_partial(bench: Bench, before: int, result: Any, *, to_the_end: bool) -> None:
+    """What was swept is there, ``to_the_end`` of the light or of what a camera had sent."""
+    points, light_after_s = bench.lit_part(bench.cloud_after(before, result.points))
+    assert len(points) > SWEPT_POINTS
+    begin_m, reached_m = float(points["y"].min()), float(points["y"].max())
+    assert begin_m >= START_M - 1e-6
+    assert reached_m < FAR_M - 0.005
+    first_s, last_s = float(points["t"].min()), float(points["t"].max())
+    print(f"points of {last_s - first_s:.2f} s, then light for {light_after_s:.2f} s")
+    if to_the_end:
+        # The last period is cut by the end of the light.
+        assert light_after_s < 2.0 / SLOW_HZ
+    periods = int((last_s - first_s) * SLOW_HZ) + 1
+    positions = 1e3 * (begin_m + SLOW_M_S / SLOW_HZ * np.arange(periods))
+    assert_accurate(points, positions, 0.9)
+
+
+def _profile_of(points: np.ndarray) -> np.ndarray:
+    """Number of each point's period: within one, columns ascend."""
+    return np.cumsum(np.diff(points["column"].astype(int), prepend=-1) <= 0)
+
+
+def _assert_in_order(points: np.ndarray) -> None:
+    """By period, then column; ``t`` begins at the stamp."""
+    assert points["t"].min() == 0.0
+    profile = _profile_of(points)
+    middle = np.bincount(profile, points["t"]) / np.bincount(profile)
+    assert (np.diff(middle) > 0.0).all()

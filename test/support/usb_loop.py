@@ -1,0 +1,29 @@
+"""A device that sends back what it gets: the smallest model on the emulated bus."""
+
+from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice, EndpointIdentity, UsbIdentity
+
+OUT, IN = 0x02, 0x82
+PACKET = 64
+IDENTITY = UsbIdentity(
+    0x1234,
+    0x5678,
+    interface_class=0xFF,
+    interface_subclass=0x19,
+    interface_protocol=0,
+    endpoints=(EndpointIdentity(OUT, PACKET), EndpointIdentity(IN, PACKET)),
+    serial="LOOP1",
+    manufacturer="maker",
+    product="loop",
+)
+
+
+class Loop(EmulatedUsbDevice):
+    """Gives every transfer back; ends whole packets with an empty one if ``polite``."""
+
+    def __init__(self, identity=IDENTITY, *, polite=True, wait=lambda *_: False):
+        super().__init__(identity, wait=wait)
+        self.polite = polite
+
+    def bulk_out(self, endpoint, data, timeout_ms):
+        self.reply(IN, data, zero_length=self.polite and len(data) % PACKET == 0)
+        return len(data)
