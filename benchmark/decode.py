@@ -27,9 +27,9 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / 
 
 from support.streams import line_row_events, sparse_events  # noqa: E402
 
+from eschorty_ros.core.evt3 import ActivityFilter  # noqa: E402
 from eschorty_ros.core.evt3 import decoder as evt3  # noqa: E402
-from eschorty_ros.core.evt3.activity_filter import ActivityFilter  # noqa: E402
-from eschorty_ros.core.storage.raw_file import RawReader, RawWriter  # noqa: E402
+from eschorty_ros.core.storage import RawReader, RawWriter  # noqa: E402
 
 PIECE_BYTES = 128 * 1024
 SEED = 20_240_601

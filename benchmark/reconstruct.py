@@ -22,13 +22,13 @@ from typing import Any
 import numba
 import numpy as np
 
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.core.reconstruction import paper_method as reference
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import World
 
 SEED = 1
 RANGE_MM = 1320.0

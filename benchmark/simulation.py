@@ -18,11 +18,11 @@ from __future__ import annotations
 import argparse
 import time
 
-from eschorty_ros.core.clocks.motion import plan_move
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.simulation.scenes.names import named
-from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World
+from eschorty_ros.core.clocks import plan_move
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.simulation.scenes import named
+from eschorty_ros.simulation.world import BACKGROUND_HZ, World
 
 CASES = [
     ("steps", 0, 70.0),

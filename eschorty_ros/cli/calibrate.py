@@ -12,7 +12,7 @@ import click
 from eschorty_ros.cli.calibration_sources import known, recorded
 
 if TYPE_CHECKING:
-    from eschorty_ros.core.calibration.calibrate import Method
+    from eschorty_ros.core.calibration import Method
 
 BLOCKS = 8
 """Targets side by side that a moving target gives when the fit asks for roll or smile."""
@@ -172,11 +172,8 @@ def command(
     _check_usage(sources, out, distances, moving)
     priors = _priors(prior)
     from eschorty_ros.cli.calibration_output import finish
-    from eschorty_ros.core.calibration.calibrate import calibrate
-    from eschorty_ros.core.calibration.fit import COLUMN_TERMS
-    from eschorty_ros.core.calibration.targets import Targets
-    from eschorty_ros.core.calibration.targets_file import read_targets
-    from eschorty_ros.core.optics.calibration_file import load_calibration
+    from eschorty_ros.core.calibration import COLUMN_TERMS, Targets, calibrate, read_targets
+    from eschorty_ros.core.optics import load_calibration
 
     design = load_calibration(nominal)
     made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}

@@ -14,9 +14,8 @@ from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.core.base.errors import FitError
 
 if TYPE_CHECKING:
-    from eschorty_ros.core.calibration.calibrate import Method
-    from eschorty_ros.core.calibration.posts import KnownTarget
-    from eschorty_ros.core.optics.calibration_file import Calibration
+    from eschorty_ros.core.calibration import KnownTarget, Method
+    from eschorty_ros.core.optics import Calibration
 
 CHECK_MM = np.linspace(800.0, 2100.0, 131)
 
@@ -47,8 +46,8 @@ def calibrate_simulated(
     from matplotlib.image import imsave
 
     from eschorty_ros.cli.calibration_output import finish
-    from eschorty_ros.core.calibration.calibrate import calibrate
-    from eschorty_ros.core.optics.calibration_file import load_calibration
+    from eschorty_ros.core.calibration import calibrate
+    from eschorty_ros.core.optics import load_calibration
 
     design, built = load_calibration(nominal), load_calibration(as_built)
     with ended_by_signals(), TemporaryDirectory(prefix="eschorty_") as folder:

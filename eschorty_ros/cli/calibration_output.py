@@ -10,8 +10,8 @@ import click
 
 from eschorty_ros.cli.console import show, table
 from eschorty_ros.core.base.files import atomic_write
-from eschorty_ros.core.calibration.calibrate import CalibrationReport
-from eschorty_ros.core.optics.calibration_file import save_calibration
+from eschorty_ros.core.calibration import CalibrationReport
+from eschorty_ros.core.optics import save_calibration
 from eschorty_ros.report.calibration_page import calibration_html, parameters
 from eschorty_ros.report.page import number
 

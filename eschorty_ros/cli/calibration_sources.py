@@ -11,9 +11,8 @@ from eschorty_ros.cli.console import progress_bar
 from eschorty_ros.core.base.errors import FitError
 
 if TYPE_CHECKING:
-    from eschorty_ros.core.calibration.posts import KnownTarget
-    from eschorty_ros.core.calibration.targets import Targets
-    from eschorty_ros.core.optics.calibration_file import Calibration
+    from eschorty_ros.core.calibration import KnownTarget, Targets
+    from eschorty_ros.core.optics import Calibration
 
 
 def recorded(
@@ -34,11 +33,8 @@ def recorded(
     EschortyError
         When the recording or the distances are at fault, or no post lies where they say.
     """
-    from eschorty_ros.core.calibration.recorded_targets import (
-        recorded_moving_target,
-        recorded_posts,
-    )
-    from eschorty_ros.core.storage.recording import load_recording
+    from eschorty_ros.core.calibration import recorded_moving_target, recorded_posts
+    from eschorty_ros.core.storage import load_recording
 
     recording = load_recording(source)
     with progress_bar("reading") as report:
@@ -70,9 +66,8 @@ def known(distances: str | None, range_sigma: float) -> list[KnownTarget]:
     EschortyError
         When the file cannot be read.
     """
-    from eschorty_ros.core.calibration.posts import KnownTarget
-    from eschorty_ros.core.calibration.targets_file import read_distances
-    from eschorty_ros.core.optics.calibration_file import config_file
+    from eschorty_ros.core.calibration import KnownTarget, read_distances
+    from eschorty_ros.core.optics import config_file
 
     if distances is None:
         return read_distances(config_file("posts.csv"))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from eschorty_ros.core.optics.optical_build import Design
+    from eschorty_ros.core.optics import Design
 
 
 @click.command("design")
@@ -63,7 +63,7 @@ def command(
     """  # noqa: D301
     import numpy as np
 
-    from eschorty_ros.core.optics.design import design, design_for_ranges
+    from eschorty_ros.core.optics import design, design_for_ranges
 
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")

@@ -32,7 +32,7 @@ def command(path: Path) -> None:
 
 
 def _recording(path: Path) -> None:
-    from eschorty_ros.core.storage.recording import load_recording
+    from eschorty_ros.core.storage import load_recording
 
     recording = load_recording(path)
     stage, laser = recording.stage_samples, recording.modulation
@@ -57,7 +57,7 @@ def _recording(path: Path) -> None:
 def _cloud(path: Path) -> None:
     import numpy as np
 
-    from eschorty_ros.core.storage.cloud import read_cloud
+    from eschorty_ros.core.storage import read_cloud
 
     points = read_cloud(path)
     rows = {"points": f"{len(points):,}"}
@@ -79,8 +79,8 @@ def _cloud(path: Path) -> None:
 def _raw(path: Path) -> None:
     import numpy as np
 
-    from eschorty_ros.core.evt3.decoder import Decoder
-    from eschorty_ros.core.storage.raw_file import RawReader
+    from eschorty_ros.core.evt3 import Decoder
+    from eschorty_ros.core.storage import RawReader
 
     reader = RawReader(path)
     header = reader.header

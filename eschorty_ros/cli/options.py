@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from eschorty_ros.simulation.pixels.presets import PRESETS
+from eschorty_ros.simulation.pixels import PRESETS
 
 _SWEEP = (
     click.option(

@@ -25,7 +25,7 @@ class SettingsCommand(click.Command):
 
 def setting_options() -> list[click.Parameter]:
     """One click option per field of `Settings`."""
-    from eschorty_ros.core.reconstruction.settings import Settings
+    from eschorty_ros.core.reconstruction import Settings
 
     options: list[click.Parameter] = []
     for item in fields(Settings):
@@ -77,10 +77,8 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
       eschorty reconstruct rec --json --smoothing-half-width 0
     """  # noqa: D301
     from eschorty_ros.core.base.files import check_writable
-    from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
-    from eschorty_ros.core.reconstruction.warm_up import warm_up
-    from eschorty_ros.core.storage.cloud import write_cloud
-    from eschorty_ros.core.storage.recording import load_recording
+    from eschorty_ros.core.reconstruction import Settings, reconstruct_recording, warm_up
+    from eschorty_ros.core.storage import load_recording, write_cloud
 
     target = out or recording / "cloud.pcd"
     if target.suffix not in (".pcd", ".ply"):

@@ -84,8 +84,8 @@ def command(
 
 def _check(scene: str, calibration: str) -> None:
     """Refuse what is no scene or calibration before any node starts."""
-    from eschorty_ros.core.optics.calibration_file import load_calibration
-    from eschorty_ros.simulation.scenes.names import named
+    from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.simulation.scenes import named
 
     named(scene)
     load_calibration(calibration)
@@ -93,8 +93,8 @@ def _check(scene: str, calibration: str) -> None:
 
 def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
     """Write cloud and picture, print the table; a scan that failed or is empty raises."""
-    from eschorty_ros.core.optics.calibration_file import load_calibration
-    from eschorty_ros.core.storage.cloud import write_cloud
+    from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.core.storage import write_cloud
     from eschorty_ros.report import accuracy, figures
     from eschorty_ros.simulation.scenes import names as scenes
 

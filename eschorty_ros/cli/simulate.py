@@ -51,11 +51,11 @@ def command(
     check_sweep(start, stop)
     if out.is_dir() and any(out.iterdir()):
         raise ArgumentError(f"{out} is not empty; choose a new folder")
-    from eschorty_ros.core.modulation.modulation import Modulation
-    from eschorty_ros.core.optics.calibration_file import load_calibration
-    from eschorty_ros.simulation.pixels.presets import preset
-    from eschorty_ros.simulation.scenes.names import named
-    from eschorty_ros.simulation.world.recorder import simulate_recording
+    from eschorty_ros.core.modulation import Modulation
+    from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.simulation.pixels import preset
+    from eschorty_ros.simulation.scenes import named
+    from eschorty_ros.simulation.world import simulate_recording
 
     with progress_bar("simulating") as report:
         recording = simulate_recording(

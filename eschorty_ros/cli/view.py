@@ -24,7 +24,7 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
       eschorty view scan/scan.pcd --out depth.pdf
       eschorty view scan/scan.pcd --window
     """  # noqa: D301
-    from eschorty_ros.core.storage.cloud import read_cloud
+    from eschorty_ros.core.storage import read_cloud
 
     points = read_cloud(cloud)
     if window:
@@ -40,7 +40,7 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
 def _open_window(points: object, title: str) -> None:
     import numpy as np
 
-    from eschorty_ros.simulation.scenes.open3d_module import load_open3d
+    from eschorty_ros.simulation.scenes import load_open3d
 
     open3d = load_open3d("--window")
     xyz = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)  # type: ignore[index]

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from eschorty_ros.control.scan_sequence import End, Instrument, ScanCanceled, check_laser
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.calibration.calibrate import METHODS
+from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.live.calibration_capture import CaptureRequest
 
 CAPTURE_MAX_S = 120.0

@@ -6,7 +6,7 @@ import math
 import time
 from dataclasses import dataclass, replace
 
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput, LaserReadback
 
 FREQUENCY_TOLERANCE = 1e-4

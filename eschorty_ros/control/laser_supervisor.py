@@ -10,7 +10,7 @@ from eschorty_ros.control.laser_interlock import LaserGate
 from eschorty_ros.control.laser_readback import LaserRecord, LaserSnapshot
 from eschorty_ros.control.periodic_thread import Lookout
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserModulator, LaserOutput, LaserReadback
 from eschorty_ros.hardware.base.stalls import OwnPauses
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError

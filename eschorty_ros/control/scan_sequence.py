@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Protocol
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 
 
 class ScanFailure(EschortyError):  # noqa: N818 - named as the other failures are told

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The streaming instrument without ROS: packets in, profiles and scans out."""

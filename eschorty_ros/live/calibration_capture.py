@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import EschortyError, FitError
-from eschorty_ros.core.calibration.fit import fit_targets
-from eschorty_ros.core.calibration.posts import (
+from eschorty_ros.core.calibration import (
     AggregateFrame,
     KnownTarget,
+    Targets,
     find_posts,
+    fit_targets,
     match_posts,
     moving_target,
 )
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.sensor_epoch import TimedProfiles

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.evt3.decoder import Decoder
+from eschorty_ros.core.evt3 import Decoder
 
 
 class EventFrame:

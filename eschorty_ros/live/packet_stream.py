@@ -6,10 +6,9 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import Any
 
-from eschorty_ros.core.clocks.clock import NS_PER_US, SensorClock, StageTrack
-from eschorty_ros.core.clocks.pulses import PulseTrain
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.clocks import NS_PER_US, PulseTrain, SensorClock, StageTrack
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_times import (
     WRAP_US,

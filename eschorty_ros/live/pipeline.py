@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock import NS_PER_US
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.clocks import NS_PER_US
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Settings, add_stage, place
 from eschorty_ros.live.calibration_capture import Capture
 from eschorty_ros.live.packet_stream import PacketStream

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, join_points
+from eschorty_ros.core.storage import POINT_DTYPE, join_points
 from eschorty_ros.live.sensor_epoch import SensorTimes
 
 _HALF_NM = 0.5e-6

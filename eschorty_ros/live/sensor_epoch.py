@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.clocks.clock import SensorClock, StageTrack
-from eschorty_ros.core.clocks.edge_clock import EdgeClock
-from eschorty_ros.core.clocks.pulses import PulseTrain
-from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.core.clocks import EdgeClock, PulseTrain, SensorClock, StageTrack
+from eschorty_ros.core.reconstruction import Profiles
 
 _UNSEEN_US = -(1 << 62)
 _PULSES_MISSING = 30

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.clocks.clock import NS_PER_US, StageTrack
+from eschorty_ros.core.clocks import NS_PER_US, StageTrack
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 
 _HISTORY_US = 600_000_000

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.calibration.calibrate import CalibrationReport
-from eschorty_ros.core.calibration.fit import WIDTH_BIAS
-from eschorty_ros.core.optics.range_model import depth_of_field_mm
+from eschorty_ros.core.calibration import WIDTH_BIAS, CalibrationReport
+from eschorty_ros.core.optics import depth_of_field_mm
 from eschorty_ros.report.figures import new_figure
 
 if TYPE_CHECKING:

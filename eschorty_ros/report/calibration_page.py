@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from eschorty_ros.core.calibration.calibrate import CalibrationReport
-from eschorty_ros.core.calibration.fit import COLUMN_TERMS, PARAMETERS, WIDTH_BIAS
+from eschorty_ros.core.calibration import COLUMN_TERMS, PARAMETERS, WIDTH_BIAS, CalibrationReport
 from eschorty_ros.report import calibration_figures as drawn
 from eschorty_ros.report.figures import DPI
 from eschorty_ros.report.page import number, render

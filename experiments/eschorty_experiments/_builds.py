@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
-from eschorty_ros.core.optics.design import design
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics import BUILDS, Design, design, load_calibration
 
 BEAM_MRAD = 1.0
 """Divergence of the paper's laser."""

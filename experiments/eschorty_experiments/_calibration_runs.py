@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.calibration.calibrate import calibrate
-from eschorty_ros.core.calibration.fit import (
+from eschorty_ros.core.calibration import (
     K_PRIOR_SHARE,
     PARAMETERS,
     PRIOR_SIGMA,
     WIDTH_BIAS,
     CalibrationFit,
+    Targets,
+    calibrate,
     fit,
 )
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.calibration_file import Calibration
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.simulation.scenes.measured_posts import measured_posts
+from eschorty_ros.core.optics import Calibration, RangeModel
+from eschorty_ros.simulation.scenes import measured_posts
 
 Array = NDArray[np.float64]
 

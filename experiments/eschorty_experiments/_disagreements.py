@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eschorty_experiments._builds import beam_rows
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics import Design
 from eschorty_ros.report.experiment import DataTable
 
 

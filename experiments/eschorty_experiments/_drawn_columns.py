@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.line.centroid import FWHM_PER_SIGMA, Centroids, estimate
+from eschorty_ros.core.line import FWHM_PER_SIGMA, Centroids, estimate
 
 ROWS = 720
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from eschorty_ros.core.line.centroid import METHODS, WHOLE_COLUMN_METHODS
+from eschorty_ros.core.line import METHODS, WHOLE_COLUMN_METHODS
 from eschorty_ros.report.figures import new_figure
 
 if TYPE_CHECKING:

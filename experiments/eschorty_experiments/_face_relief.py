@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from eschorty_experiments._scan_errors import ScanErrors
 from eschorty_ros.core.reconstruction import Result
-from eschorty_ros.simulation.scenes.face import EAR_OFF_MM, Face
+from eschorty_ros.simulation.scenes import EAR_OFF_MM, Face
 
 
 def face_relief(scene: Face, result: Result, errors: ScanErrors) -> tuple[float, float]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.calibration.fit import CalibrationFit, fit_targets
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.calibration import CalibrationFit, fit_targets
+from eschorty_ros.core.optics import Design
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel, load_calibration
 from eschorty_ros.report.experiment import DataTable, Effort, Finding
 
 SPEED_MM_S = 300.0

@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.evt3.decoder import Encoder, sort_readout
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.evt3 import Encoder, sort_readout
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.report.experiment import Effort
-from eschorty_ros.simulation.pixels.parameters import PixelParameters
-from eschorty_ros.simulation.world.line_bench import simulate_line
+from eschorty_ros.simulation.pixels import PixelParameters
+from eschorty_ros.simulation.world import simulate_line
 
 Array = NDArray[np.float64]
 

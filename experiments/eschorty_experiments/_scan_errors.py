@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.core.reconstruction.profiles import Profiles
-from eschorty_ros.core.storage.recording import Recording
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.reconstruction import Profiles
+from eschorty_ros.core.storage import Recording
 from eschorty_ros.report.accuracy import KnownScene, true_range_mm
 
 GROSS_PX = 10.0

@@ -10,7 +10,7 @@ import numpy as np
 from eschorty_experiments._scan_errors import ScanErrors
 from eschorty_experiments._tradeoff_runs import BACKGROUND_SHARES, SMOOTHING, Variant
 from eschorty_experiments._tradeoff_tables import Summary, pareto_front
-from eschorty_ros.core.line.centroid import METHODS
+from eschorty_ros.core.line import METHODS
 from eschorty_ros.report.figures import new_figure
 
 if TYPE_CHECKING:

@@ -11,17 +11,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from eschorty_experiments._scan_errors import ScanErrors, scan_errors
-from eschorty_ros.core.line.centroid import METHODS
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.line import METHODS
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import NOISE_FILTERS, Profiles, Reconstructor, Settings
 from eschorty_ros.core.reconstruction import paper_method as reference
-from eschorty_ros.core.reconstruction.profiles import Profiles
-from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
-from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
-from eschorty_ros.core.storage.raw_file import RawReader
-from eschorty_ros.core.storage.recording import Recording
-from eschorty_ros.simulation.scenes.names import Scene, named
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.core.storage import RawReader, Recording
+from eschorty_ros.simulation.scenes import Scene, named
+from eschorty_ros.simulation.world import simulate_recording
 
 SCENES = ("plane", "steps", "leaves")
 BACKGROUND_SHARES = (0.0, 0.05, 0.3)

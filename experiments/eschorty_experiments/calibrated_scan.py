@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import FitError
-from eschorty_ros.core.calibration.calibrate import CalibrationReport, calibrate
-from eschorty_ros.core.calibration.posts import KnownTarget
-from eschorty_ros.core.calibration.recorded_targets import recorded_moving_target, recorded_posts
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration, load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.calibration import (
+    CalibrationReport,
+    KnownTarget,
+    Targets,
+    calibrate,
+    recorded_moving_target,
+    recorded_posts,
+)
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration, RangeModel, load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
-from eschorty_ros.core.storage.recording import Recording
+from eschorty_ros.core.storage import Recording
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
@@ -29,9 +32,8 @@ from eschorty_ros.report.experiment import (
     Progress,
 )
 from eschorty_ros.report.figures import new_figure
-from eschorty_ros.simulation.scenes.names import Plane, Scene, Steps
-from eschorty_ros.simulation.scenes.posts import Posts
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.simulation.scenes import Plane, Posts, Scene, Steps
+from eschorty_ros.simulation.world import simulate_recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

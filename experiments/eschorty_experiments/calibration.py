@@ -26,7 +26,7 @@ from eschorty_experiments._calibration_runs import (
     coverage,
     outliers,
 )
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,

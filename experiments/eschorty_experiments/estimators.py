@@ -20,8 +20,7 @@ from eschorty_experiments._estimator_figures import (
     bounds_figure,
     returns_figure,
 )
-from eschorty_ros.core.line.centroid import FWHM_PER_SIGMA, METHODS, estimate
-from eschorty_ros.core.line.row_sigma import METHOD_NOISE
+from eschorty_ros.core.line import FWHM_PER_SIGMA, METHOD_NOISE, METHODS, estimate
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,

@@ -23,8 +23,7 @@ from eschorty_ros.report.experiment import (
     Progress,
 )
 from eschorty_ros.report.figures import new_figure
-from eschorty_ros.simulation.pixels.pixel import PixelParameters
-from eschorty_ros.simulation.pixels.presets import preset
+from eschorty_ros.simulation.pixels import PixelParameters, preset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,7 +15,7 @@ from eschorty_experiments._posts import (
     pulls,
     see_posts,
 )
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics import Design
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,

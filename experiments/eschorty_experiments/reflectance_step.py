@@ -29,8 +29,7 @@ from eschorty_ros.report.experiment import (
     Outcome,
     Progress,
 )
-from eschorty_ros.simulation.pixels.parameters import PixelParameters
-from eschorty_ros.simulation.pixels.presets import preset
+from eschorty_ros.simulation.pixels import PixelParameters, preset
 
 BLACK = 0.04
 """Reflectance of the black side; the paper's maximum corresponds to about this."""

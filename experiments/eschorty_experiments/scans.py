@@ -18,8 +18,8 @@ from eschorty_experiments._leaf_levels import (
     level_steps,
 )
 from eschorty_experiments._scan_errors import ScanErrors, scan_errors
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Result, reconstruct_recording
 from eschorty_ros.report import figures
 from eschorty_ros.report.experiment import (
@@ -30,9 +30,8 @@ from eschorty_ros.report.experiment import (
     Outcome,
     Progress,
 )
-from eschorty_ros.simulation.scenes.face import Face
-from eschorty_ros.simulation.scenes.leaves import Leaves
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.simulation.scenes import Face, Leaves
+from eschorty_ros.simulation.world import simulate_recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

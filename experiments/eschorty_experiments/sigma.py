@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_experiments._scan_errors import period_of, scan_errors
-from eschorty_ros.core.line.centroid import METHODS
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.line import METHODS
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
-from eschorty_ros.core.storage.recording import Recording
+from eschorty_ros.core.storage import Recording
 from eschorty_ros.report import figures
 from eschorty_ros.report.experiment import (
     DataTable,
@@ -26,8 +26,8 @@ from eschorty_ros.report.experiment import (
     Outcome,
     Progress,
 )
-from eschorty_ros.simulation.scenes.names import Plane, Scene, named
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.simulation.scenes import Plane, Scene, named
+from eschorty_ros.simulation.world import simulate_recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

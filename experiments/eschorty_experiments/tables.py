@@ -9,8 +9,7 @@ import numpy as np
 
 from eschorty_experiments._builds import BEAM_MRAD, beam_rows, builds
 from eschorty_experiments._disagreements import disagreements
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics import Design, load_calibration
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,

@@ -34,7 +34,7 @@ from eschorty_experiments._tradeoff_tables import (
     summary,
     summary_table,
 )
-from eschorty_ros.core.optics.range_model import COLUMNS
+from eschorty_ros.core.optics import COLUMNS
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,

@@ -12,12 +12,10 @@ from support import html_check
 from support.calibration_posts import NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, range_error_mm, see
 
 from eschorty_ros.cli import main
-from eschorty_ros.core.calibration.fit import PRIOR_SIGMA
-from eschorty_ros.core.calibration.targets_file import DISTANCE_COLUMNS, TARGET_COLUMNS
-from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.scenes.posts import Posts, bench
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.core.calibration import DISTANCE_COLUMNS, PRIOR_SIGMA, TARGET_COLUMNS
+from eschorty_ros.core.optics import load_calibration, save_calibration
+from eschorty_ros.simulation.scenes import Plane, Posts, bench
+from eschorty_ros.simulation.world import simulate_recording
 
 SEED = 16
 AS_BUILT = NOMINAL.model_copy(

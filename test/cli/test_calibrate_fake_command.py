@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from eschorty_ros.cli import INTERRUPTED
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.optics import load_calibration
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, read_cloud, write_cloud
+from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_ROS = """
@@ -116,7 +116,7 @@ def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
     def refuse(_path):
         raise error
 
-    monkeypatch.setattr("eschorty_ros.core.storage.cloud.read_cloud", refuse)
+    monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", refuse)
     result = run("info", cloud)
     assert result.exit_code == 1
     assert result.stderr.startswith("eschorty: cannot ")
@@ -149,7 +149,7 @@ def test_ctrl_c_is_exit_code_130(monkeypatch, cloud):
     def interrupt(_path):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("eschorty_ros.core.storage.cloud.read_cloud", interrupt)
+    monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", interrupt)
     result = run("info", cloud)
     assert result.exit_code == INTERRUPTED
     assert "interrupted" in result.stderr
@@ -205,7 +205,7 @@ def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
 
 
 def test_reconstruct_offers_every_setting(recording, tmp_path):
-    from eschorty_ros.core.reconstruction.settings import Settings
+    from eschorty_ros.core.reconstruction import Settings
 
     text = run("reconstruct", "--help").output
     for name in Settings.__dataclass_fields__:

@@ -14,7 +14,7 @@ from support.expected_scan import assert_accurate
 
 from eschorty_ros.cli import INTERRUPTED
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, read_cloud
+from eschorty_ros.core.storage import POINT_DTYPE, read_cloud
 from eschorty_ros.report.accuracy import Sweep
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")

@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from eschorty_ros.control.calibration_sequence import check_request, run_capture
 from eschorty_ros.control.scan_sequence import End, ScanCanceled, ScanFailure
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.calibration.posts import KnownTarget
+from eschorty_ros.core.calibration import KnownTarget
 from eschorty_ros.live.calibration_capture import CaptureRequest, Sweep
 
 TWO = (KnownTarget(1000.0), KnownTarget(1500.0))

@@ -14,7 +14,7 @@ from support.waiting import DEADLINE_S, wait_until
 from eschorty_ros.control.laser_interlock import LEASE, LaserGate
 from eschorty_ros.control.laser_supervisor import LaserKeeper
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 
 
 @pytest.fixture

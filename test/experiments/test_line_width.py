@@ -12,7 +12,7 @@ from eschorty_experiments._line_width import (
     swing,
 )
 
-from eschorty_ros.simulation.pixels.presets import preset
+from eschorty_ros.simulation.pixels import preset
 
 PAPER = preset("paper")
 CLOSED_FORM_PX = {

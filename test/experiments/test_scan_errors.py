@@ -9,14 +9,12 @@ import pytest
 from eschorty_experiments._leaf_levels import level_residuals, level_steps
 from eschorty_experiments._scan_errors import GROSS_PX, scan_errors
 
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
-from eschorty_ros.core.reconstruction.offline import Result
-from eschorty_ros.core.storage.cloud import POINT_DTYPE
-from eschorty_ros.simulation.scenes.leaves import SEPARATION_MM, Leaves
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Result, reconstruct_recording
+from eschorty_ros.core.storage import POINT_DTYPE
+from eschorty_ros.simulation.scenes import SEPARATION_MM, Leaves, Plane
+from eschorty_ros.simulation.world import simulate_recording
 
 SEED = 5
 MODEL = load_calibration("config_3").model()

@@ -19,8 +19,8 @@ from eschorty_experiments._tradeoff_runs import (
 from eschorty_experiments._tradeoff_tables import pareto_front
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line.centroid import METHODS
-from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
+from eschorty_ros.core.line import METHODS
+from eschorty_ros.core.reconstruction import NOISE_FILTERS, Settings
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 3

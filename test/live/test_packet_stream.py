@@ -7,10 +7,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from support.line_events import encoded, line_events
 
-from eschorty_ros.core.clocks.pulses import PulseTrain
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.clocks import PulseTrain
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import WRAP_US, Packet, first_time_high_us, first_time_us

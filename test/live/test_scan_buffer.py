@@ -7,7 +7,7 @@ from support.line_events import blank_profiles
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.live.pipeline import ScanReport
 from eschorty_ros.live.scan_buffer import PlacedPoints, ScanBuffer
 from eschorty_ros.live.sensor_epoch import TimedProfiles

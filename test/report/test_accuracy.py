@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.report import accuracy, profiles
 
 MODEL = load_calibration("config_3").model()

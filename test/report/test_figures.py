@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.report import cloud_image, figures
 
 

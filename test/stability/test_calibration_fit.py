@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import CalibrationError, FitError
-from eschorty_ros.core.calibration.fit import PARAMETERS, CalibrationFit, fit_targets
-from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.calibration import PARAMETERS, CalibrationFit, fit_targets
+from eschorty_ros.core.optics import BUILDS, RangeModel, load_calibration
 
 SEED = 13
 NOMINAL = load_calibration("nominal").model()

@@ -11,12 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.line_events import encoded
 
-from eschorty_ros.core.evt3.decoder import sort_readout
+from eschorty_ros.core.evt3 import sort_readout
+from eschorty_ros.core.line import METHOD_NOISE, METHODS, SIGMA_FLOOR_PX, estimate
 from eschorty_ros.core.line._row import _uncut
-from eschorty_ros.core.line.centroid import METHODS, estimate
-from eschorty_ros.core.line.row_sigma import METHOD_NOISE, SIGMA_FLOOR_PX
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
 
 SEED = 20

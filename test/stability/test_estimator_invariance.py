@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.line.centroid import METHODS, RETURNS, WHOLE_COLUMN_METHODS, estimate
+from eschorty_ros.core.line import METHODS, RETURNS, WHOLE_COLUMN_METHODS, estimate
 
 ROWS = 720
 WINDOWED = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.line.centroid import METHODS, RETURNS, WHOLE_COLUMN_METHODS
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.line import METHODS, RETURNS, WHOLE_COLUMN_METHODS
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 
 CALIBRATION = load_calibration("config_3")

@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.line_events import blank_profiles
 
-from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel, depth_of_field_mm
-from eschorty_ros.core.reconstruction.profiles import place
-from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.core.optics import BUILDS, RangeModel, depth_of_field_mm, load_calibration
+from eschorty_ros.core.reconstruction import place
+from eschorty_ros.core.storage import POINT_DTYPE
 
 ROWS = np.arange(720)
 POLE_DISTANCES_PX = np.array([1e-12, 1e-9, 1e-6, 1e-3, 0.5, 0.999999])

@@ -12,19 +12,15 @@ from support.line_events import blank_profiles, encoded, line_events
 from support.stage_pulses import PULSES, StagePulses
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock import SensorClock, StageTrack
-from eschorty_ros.core.clocks.clock_line import ClockLine
-from eschorty_ros.core.clocks.position_edges import fit_edges
-from eschorty_ros.core.evt3.activity_filter import ActivityFilter
-from eschorty_ros.core.evt3.decoder import Decoder, Encoder, Events, Triggers, sort_readout
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.clocks import ClockLine, SensorClock, StageTrack, fit_edges
+from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Encoder, Events, Triggers, sort_readout
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase import EdgeSchedule
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, place
 from eschorty_ros.core.reconstruction import paper_method as reference
 from eschorty_ros.core.reconstruction import reconstructor as reconstructor_module
-from eschorty_ros.core.reconstruction.profiles import Profiles, place
 
 SEED = 7
 EPOCH_US = 1_760_000_000_000_000

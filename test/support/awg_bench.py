@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg.model import AwgModel
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
 from eschorty_ros.hardware.laser.awg import AwgLaser

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.simulation.scenes.measured_posts import measured_posts
+from eschorty_ros.core.calibration import Targets
+from eschorty_ros.core.optics import RangeModel, load_calibration
+from eschorty_ros.simulation.scenes import measured_posts
 
 NOMINAL = load_calibration("config_3")
 DESIGN = NOMINAL.model()

@@ -18,11 +18,11 @@ from std_msgs.msg import Bool
 from support.ros_process import Observer, told_after, wait_until
 from support.scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
 
-from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.report.accuracy import range_error_mm
-from eschorty_ros.simulation.scenes.names import RECEDING_MM, named
-from eschorty_ros.simulation.scenes.posts import bench as bench_of_posts
+from eschorty_ros.simulation.scenes import RECEDING_MM, named
+from eschorty_ros.simulation.scenes import bench as bench_of_posts
 
 CALIBRATION, AS_BUILT = "config_3", "config_3_as_built"
 KNOWN_SCENE = "steps"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
 from eschorty_ros.hardware.camera.evk4 import Evk4

@@ -1,8 +1,8 @@
 """What every scan of a simulated scene must reach, whoever runs it."""
 
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.report import accuracy
-from eschorty_ros.simulation.scenes.names import named
+from eschorty_ros.simulation.scenes import named
 
 
 def assert_accurate(points, sweep, scene="steps", calibration="config_3"):

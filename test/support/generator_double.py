@@ -21,7 +21,7 @@ from support.short_folder import short_folder
 from support.waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput, LaserReadback
 
 MAKE = "generator_double:GeneratorLaser"

@@ -7,7 +7,7 @@ import threading
 from support.waiting import DEADLINE_S
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput, LaserReadback
 
 

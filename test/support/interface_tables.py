@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.nodes.camera import node as camera
 from eschorty_ros.nodes.laser import node as laser
 from eschorty_ros.nodes.reconstruction import node as reconstruction

@@ -8,8 +8,8 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.evt3.decoder import Encoder, sort_readout
-from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.core.evt3 import Encoder, sort_readout
+from eschorty_ros.core.reconstruction import Profiles
 
 Rows = Callable[[int, NDArray[np.int64]], NDArray[np.float64]]
 

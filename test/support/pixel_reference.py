@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from eschorty_ros.simulation.pixels.pixel import PixelParameters
+from eschorty_ros.simulation.pixels import PixelParameters
 
 
 @njit(cache=True)

@@ -18,14 +18,14 @@ from rclpy.action import ActionClient
 from sensor_msgs.msg import PointCloud2
 from support.ros_process import Observer, ros_minus_steady_ns, told_after, wait_until
 
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.emulation.awg.model import truth
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.report.accuracy import lit_columns, range_error_mm
-from eschorty_ros.simulation.scenes.names import Steps
+from eschorty_ros.simulation.scenes import Steps
 
 EVENTS = "qos_overrides./eschorty/camera/events"
 SCENE = "steps"

@@ -6,10 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from eschorty_ros.core.clocks.clock import StageTrack
-from eschorty_ros.core.clocks.clock_line import ClockLine
-from eschorty_ros.core.clocks.motion import plan_move
-from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.core.clocks import ClockLine, PulseTrain, StageTrack, plan_move
 
 SEED = 21
 EPOCH_NS = 1_760_000_000_123_456_789

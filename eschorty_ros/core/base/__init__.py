@@ -1,1 +1,1 @@
-"""TODO."""
+"""Errors, checked numbers and arrays, YAML, atomic files, compiled functions."""

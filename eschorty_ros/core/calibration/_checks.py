@@ -11,7 +11,7 @@ from eschorty_ros.core.base.arrays import positive
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration._model import COLUMN_TERMS, EVERY, WIDTH_BIAS
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 _CONTRADICTION_SIGMA = 6.0
 

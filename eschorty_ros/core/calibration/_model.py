@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 Array = NDArray[np.float64]
 Values = dict[str, float]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import number, number_or_nan, positive
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.post_finder import Post
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 Array = NDArray[np.float64]
 

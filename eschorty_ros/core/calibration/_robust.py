@@ -11,7 +11,7 @@ from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.calibration._least_squares import condition_number, covariance
 from eschorty_ros.core.calibration._model import Observed, Values, values_of
 from eschorty_ros.core.calibration._solvers import Problem, refuse_singular, search
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

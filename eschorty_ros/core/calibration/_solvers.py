@@ -20,7 +20,7 @@ from eschorty_ros.core.calibration._model import (
     Values,
     values_of,
 )
-from eschorty_ros.core.optics.range_model import POLE_MARGIN_PX, RangeModel
+from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
 
 Array = NDArray[np.float64]
 

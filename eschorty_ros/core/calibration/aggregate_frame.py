@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import exact, whole
 from eschorty_ros.core.calibration._aggregate import count_events
-from eschorty_ros.core.optics.range_model import PIXELS_MAX
+from eschorty_ros.core.optics import PIXELS_MAX
 
 
 class Pixels(Protocol):

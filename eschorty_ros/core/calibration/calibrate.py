@@ -38,8 +38,7 @@ from eschorty_ros.core.calibration.fit import (
     fit,
 )
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.calibration_file import Calibration
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import Calibration, RangeModel
 
 Array = NDArray[np.float64]
 Method = Literal["paper", "joint"]

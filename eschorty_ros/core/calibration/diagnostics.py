@@ -18,7 +18,7 @@ from eschorty_ros.core.calibration.fit import (
     fit,
 )
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 Array = NDArray[np.float64]
 

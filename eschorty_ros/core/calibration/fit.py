@@ -31,7 +31,7 @@ from eschorty_ros.core.calibration._model import (
 )
 from eschorty_ros.core.calibration._solvers import PAPER_FREE, Problem, build, solve
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 __all__ = [
     "COLUMN_TERMS",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eschorty_ros.core.base.errors import CalibrationError
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.optics import Calibration
 
 _SAME = {
     "name": "build",

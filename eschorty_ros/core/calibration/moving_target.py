@@ -11,9 +11,9 @@ from eschorty_ros.core.base.arrays import number, positive, reals, whole, whole_
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.post_finder import COLUMNS_MIN, GRID_SIGMA_PX
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.line.row_sigma import SIGMA_FLOOR_PX
-from eschorty_ros.core.optics.range_model import PIXELS_MAX
-from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.core.line import SIGMA_FLOOR_PX
+from eschorty_ros.core.optics import PIXELS_MAX
+from eschorty_ros.core.reconstruction import Profiles
 
 SIGMA_STAGE_MM = 0.01
 """How well an encoder tells where the target is."""

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import number, whole
 from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
-from eschorty_ros.core.line.centroid import HALF_WIDTH_PER_FWHM
-from eschorty_ros.core.line.row_sigma import SIGMA_FLOOR_PX
+from eschorty_ros.core.line import HALF_WIDTH_PER_FWHM, SIGMA_FLOOR_PX
 
 Array = NDArray[np.float64]
 

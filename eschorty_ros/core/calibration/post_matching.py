@@ -11,7 +11,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.calibration._post_lines import KnownTarget, LineSearch
 from eschorty_ros.core.calibration.post_finder import Post
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 _HINT_COLUMNS = 20.0
 _HINT_ROWS = 30.0

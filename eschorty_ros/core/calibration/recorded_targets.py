@@ -15,11 +15,10 @@ from eschorty_ros.core.calibration.posts import (
     moving_target,
 )
 from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.optics.calibration_file import Calibration
-from eschorty_ros.core.reconstruction.offline import reconstruct_recording
-from eschorty_ros.core.storage.raw_file import RawReader
-from eschorty_ros.core.storage.recording import Recording
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.storage import RawReader, Recording
 
 _CHUNK_BYTES = 1 << 20
 

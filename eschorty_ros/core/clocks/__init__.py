@@ -1,1 +1,36 @@
-"""TODO."""
+"""Sensor time, host time and stage position, each as a function of the others."""
+
+from eschorty_ros.core.clocks.clock import (
+    NM_PER_MM,
+    NS_PER_US,
+    POSITION_LIMIT_MM,
+    SensorClock,
+    StageTrack,
+    quantise_nm,
+)
+from eschorty_ros.core.clocks.clock_line import ClockLine
+from eschorty_ros.core.clocks.edge_clock import EdgeClock
+from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
+from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks.motion_fit import MotionFit
+from eschorty_ros.core.clocks.position_edges import fit_edges
+from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
+
+__all__ = [
+    "ClockLine",
+    "EdgeClock",
+    "LowerEnvelope",
+    "MotionFit",
+    "MotionPlan",
+    "NM_PER_MM",
+    "NS_PER_US",
+    "POSITION_LIMIT_MM",
+    "PulseTrain",
+    "SensorClock",
+    "StageTrack",
+    "fit_edges",
+    "leading_edges",
+    "plan_move",
+    "plan_stop",
+    "quantise_nm",
+]

@@ -1,1 +1,36 @@
-"""TODO."""
+"""Rows to ranges and back (Eqs. 1 to 4), the design of a build and its file."""
+
+from eschorty_ros.core.optics.calibration_file import (
+    BUILDS,
+    PARAMETERS,
+    Calibration,
+    config_file,
+    load_calibration,
+    save_calibration,
+)
+from eschorty_ros.core.optics.design import design, design_for_ranges
+from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics.range_model import (
+    COLUMNS,
+    PIXELS_MAX,
+    POLE_MARGIN_PX,
+    RangeModel,
+    depth_of_field_mm,
+)
+
+__all__ = [
+    "BUILDS",
+    "COLUMNS",
+    "Calibration",
+    "Design",
+    "PARAMETERS",
+    "PIXELS_MAX",
+    "POLE_MARGIN_PX",
+    "RangeModel",
+    "config_file",
+    "depth_of_field_mm",
+    "design",
+    "design_for_ranges",
+    "load_calibration",
+    "save_calibration",
+]

@@ -1,8 +1,6 @@
-"""From the camera's bytes to profiles and points: the names other parts of the package use."""
+"""From the camera's bytes to profiles and points."""
 
-from __future__ import annotations
-
-from eschorty_ros.core.reconstruction.offline import Result, reconstruct_recording
+from eschorty_ros.core.reconstruction.offline import Result, reconstruct_recording, stage_speed_mm_s
 from eschorty_ros.core.reconstruction.profiles import (
     Profiles,
     add_stage,
@@ -11,9 +9,11 @@ from eschorty_ros.core.reconstruction.profiles import (
     stage_offset_m,
 )
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
-from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
+from eschorty_ros.core.reconstruction.warm_up import warm_up
 
 __all__ = [
+    "NOISE_FILTERS",
     "Profiles",
     "Reconstructor",
     "Result",
@@ -23,4 +23,6 @@ __all__ = [
     "place_link",
     "reconstruct_recording",
     "stage_offset_m",
+    "stage_speed_mm_s",
+    "warm_up",
 ]

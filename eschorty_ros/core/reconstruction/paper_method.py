@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.arrays import TIME_LIMIT, octets, whole, whole_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import words as w3
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 
 

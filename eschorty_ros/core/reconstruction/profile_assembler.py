@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import exact, whole
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.line import CLIPPED, OWN_PER_WIDTH2, check_method, half_width_fixed, noise_of
 from eschorty_ros.core.line import _binning as binning
 from eschorty_ros.core.line._centroid import (
     COUNTERS,
@@ -18,11 +19,9 @@ from eschorty_ros.core.line._centroid import (
 from eschorty_ros.core.line._row import likelihood_size
 from eschorty_ros.core.line._smoothing import Smoothing
 from eschorty_ros.core.line._window import BLOCK, ROW_BITS, ROW_LAST
-from eschorty_ros.core.line.centroid import check_method, half_width_fixed
-from eschorty_ros.core.line.row_sigma import CLIPPED, OWN_PER_WIDTH2, noise_of
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import gate_parameters
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, reals, selection, vector, whole
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
 _DTYPES = {
     "period": np.int64,

@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, octets
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.activity_filter import ActivityFilter
-from eschorty_ros.core.evt3.decoder import Decoder, Events, Triggers
+from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
+from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.line._window import TIME_LIMIT_US
-from eschorty_ros.core.line.reflectance import relative_reflectance
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HeldEvents
-from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase import EDGES_MAX
 from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.modulation.phase_lock import FLUSH_US, PhaseLock
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings

@@ -7,8 +7,14 @@ from typing import Any
 
 from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line.centroid import METHODS, RETURNS, check_method
-from eschorty_ros.core.line.row_sigma import SIGMA_COMMON_PX, SIGMA_FACTOR, SIGMA_FLOOR_PX
+from eschorty_ros.core.line import (
+    METHODS,
+    RETURNS,
+    SIGMA_COMMON_PX,
+    SIGMA_FACTOR,
+    SIGMA_FLOOR_PX,
+    check_method,
+)
 from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US
 
 NOISE_FILTERS = ("none", "activity")

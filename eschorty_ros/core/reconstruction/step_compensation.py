@@ -16,9 +16,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.line import ROOT_12, events_per_row
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction._step import _middles, _step_shifts
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings

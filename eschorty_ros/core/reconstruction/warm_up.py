@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from eschorty_ros.core.evt3.decoder import Encoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.settings import Settings
 

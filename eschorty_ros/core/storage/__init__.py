@@ -1,1 +1,48 @@
-"""TODO."""
+"""Prophesee RAW files, recordings and clouds."""
+
+from eschorty_ros.core.storage.cloud import (
+    POINT_DTYPE,
+    REFLECTANCE_DTYPE,
+    Points,
+    join_points,
+    read_cloud,
+    write_cloud,
+)
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter
+from eschorty_ros.core.storage.recording import (
+    CALIBRATION_FILE,
+    EVENTS_FILE,
+    LASER_FILE,
+    STAGE_FILE,
+    TRUTH_DTYPE,
+    TRUTH_FILE,
+    Recording,
+    load_recording,
+    read_laser_yaml,
+    write_laser_yaml,
+    write_stage_csv,
+    write_truth_csv,
+)
+
+__all__ = [
+    "CALIBRATION_FILE",
+    "EVENTS_FILE",
+    "LASER_FILE",
+    "POINT_DTYPE",
+    "Points",
+    "REFLECTANCE_DTYPE",
+    "RawReader",
+    "RawWriter",
+    "Recording",
+    "STAGE_FILE",
+    "TRUTH_DTYPE",
+    "TRUTH_FILE",
+    "join_points",
+    "load_recording",
+    "read_cloud",
+    "read_laser_yaml",
+    "write_cloud",
+    "write_laser_yaml",
+    "write_stage_csv",
+    "write_truth_csv",
+]

@@ -22,9 +22,9 @@ from eschorty_ros.core.base.arrays import as_array, file_path
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
-from eschorty_ros.core.clocks.clock import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration, load_calibration
+from eschorty_ros.core.clocks import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration, load_calibration
 
 EVENTS_FILE = "events.raw"
 STAGE_FILE = "stage.csv"

@@ -1,1 +1,1 @@
-"""TODO."""
+"""An emulated Thorlabs stage controller."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks import MotionPlan, plan_move, plan_stop
 from eschorty_ros.hardware.stage.apt_messages import Scale
 
 SAMPLING_NS = 102_400

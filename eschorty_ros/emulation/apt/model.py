@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from eschorty_ros.core.clocks.motion import MotionPlan
+from eschorty_ros.core.clocks import MotionPlan
 from eschorty_ros.emulation.apt.axis import EMERGENCY_MM_S2, Axis, stage_data
 from eschorty_ros.emulation.apt.frames import HostFrames, answer
 from eschorty_ros.emulation.apt.memory import ASKING, SETTING, Memory

@@ -1,1 +1,1 @@
-"""TODO."""
+"""An emulated UTG900E-like waveform generator."""

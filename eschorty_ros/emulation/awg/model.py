@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
 from eschorty_ros.emulation.awg.commands import ChannelState, find_command
 from eschorty_ros.emulation.awg.faults import AwgFaults
 from eschorty_ros.emulation.bus.usb_device import (

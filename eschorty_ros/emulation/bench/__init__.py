@@ -1,1 +1,1 @@
-"""TODO."""
+"""All emulated devices around one simulated world."""

@@ -16,11 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.clocks import MotionPlan
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.bench.imperfections import Imperfections
-from eschorty_ros.simulation.world.sensor_control import SensorControl
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.simulation.world import SensorControl, World
 
 TRIGGERS = ("none", "laser", "stage")
 

@@ -19,8 +19,8 @@ from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench.folder import default_folder, stage_port, usb_spec
 from eschorty_ros.emulation.bench.imperfections import Imperfections
 from eschorty_ros.emulation.bench.physics import TRIGGERS
-from eschorty_ros.simulation.pixels.presets import PRESETS
-from eschorty_ros.simulation.world.world import BACKGROUND_HZ
+from eschorty_ros.simulation.pixels import PRESETS
+from eschorty_ros.simulation.world import BACKGROUND_HZ
 
 _LOCK_FILE = "lock"
 _POLL_S = 0.1

@@ -1,1 +1,1 @@
-"""TODO."""
+"""An emulated Prophesee EVK4."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from eschorty_ros.emulation.evk4.settings import SensorSettings
-from eschorty_ros.simulation.pixels.biases import LIMITS, Biases
-from eschorty_ros.simulation.readout.readout import EventRate
-from eschorty_ros.simulation.world.sensor_control import SensorControl
+from eschorty_ros.simulation.pixels import LIMITS, Biases
+from eschorty_ros.simulation.readout import EventRate
+from eschorty_ros.simulation.world import SensorControl
 
 
 def sensor_control(settings: SensorSettings) -> SensorControl:

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The three device protocols, USB access and the measure of stalls."""

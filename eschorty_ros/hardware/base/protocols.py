@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     # Only names: the process that guards the laser starts without numpy.
-    from eschorty_ros.core.clocks.pulses import PulseTrain
-    from eschorty_ros.core.modulation.modulation import Modulation
+    from eschorty_ros.core.clocks import PulseTrain
+    from eschorty_ros.core.modulation import Modulation
     from eschorty_ros.hardware.camera.settings import CameraSettings
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import usb.core
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import (
     DeviceIdentity,
     LaserModulator,

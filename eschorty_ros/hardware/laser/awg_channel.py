@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceGoneError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, Value
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The process that owns the generator and outlives the laser node."""

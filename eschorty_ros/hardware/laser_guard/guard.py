@@ -22,7 +22,7 @@ from dataclasses import replace
 from typing import Any
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserModulator, LaserOutput
 from eschorty_ros.hardware.base.stalls import OwnPauses
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError

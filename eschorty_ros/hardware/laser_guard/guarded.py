@@ -22,7 +22,7 @@ from eschorty_ros.core.base.errors import (
     DeviceTimeoutError,
     EschortyError,
 )
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserReadback
 from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.laser_guard.messages import (

@@ -13,7 +13,7 @@ from typing import Any
 
 from eschorty_ros.core.base import errors
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput, LaserReadback
 
 MESSAGE_MAX_BYTES = 65536

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceTimeoutError
-from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.hardware.base.protocols import DeviceIdentity
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_link import AptLink

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, DeviceTimeoutError
-from eschorty_ros.core.clocks.motion import plan_move
+from eschorty_ros.core.clocks import plan_move
 from eschorty_ros.hardware.base.protocols import StageState
 from eschorty_ros.hardware.stage import apt_messages as apt
 from eschorty_ros.hardware.stage.apt_link import AptLink

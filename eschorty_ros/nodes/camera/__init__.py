@@ -1,1 +1,1 @@
-"""TODO."""
+"""Node `camera`."""

@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
-from eschorty_ros.core.evt3.word_count import WordCounter
+from eschorty_ros.core.evt3 import WordCounter
 from eschorty_ros.hardware.base.protocols import EventSource
 from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES

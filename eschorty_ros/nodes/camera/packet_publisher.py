@@ -8,7 +8,7 @@ from typing import Any
 
 from event_camera_msgs.msg import EventPacket
 
-from eschorty_ros.core.evt3.word_count import WordCounter
+from eschorty_ros.core.evt3 import WordCounter
 from eschorty_ros.hardware.base.protocols import EventChunk
 from eschorty_ros.live.packet_cutting import Packetizer
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns

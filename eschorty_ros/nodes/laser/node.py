@@ -17,12 +17,7 @@ from eschorty_ros.control.laser_interlock import LEASE, LaserGate
 from eschorty_ros.control.laser_readback import LaserSnapshot
 from eschorty_ros.control.laser_supervisor import LaserKeeper
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
-from eschorty_ros.core.modulation.modulation import (
-    FREQUENCY_MAX_HZ,
-    FREQUENCY_MIN_HZ,
-    WAVEFORMS,
-    Modulation,
-)
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, WAVEFORMS, Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos

@@ -1,1 +1,1 @@
-"""TODO."""
+"""All nodes in one process, for the command line."""

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from rclpy.action import ActionClient
 
 from eschorty_ros.action import Calibrate
-from eschorty_ros.core.calibration.posts import KnownTarget
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.calibration.targets_file import read_targets
-from eschorty_ros.core.optics.calibration_file import Calibration, load_calibration
+from eschorty_ros.core.calibration import KnownTarget, Targets, read_targets
+from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.nodes.one_process.action_job import (
     Feedback,
     bench_options,

@@ -8,7 +8,7 @@ from typing import Any
 
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.base.yaml_file import read_yaml
-from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.nodes.camera import node as camera
 from eschorty_ros.nodes.laser import node as laser
 from eschorty_ros.nodes.reconstruction import parameters as reconstruction_parameters

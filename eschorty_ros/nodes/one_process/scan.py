@@ -13,7 +13,7 @@ from rclpy.action import ActionClient
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.action import Scan
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.nodes.one_process.action_job import (
     Feedback,
     bench_options,

@@ -11,14 +11,8 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.calibration.identity import refuse_other_instrument
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.calibration.targets_file import write_targets
-from eschorty_ros.core.optics.calibration_file import (
-    Calibration,
-    load_calibration,
-    save_calibration,
-)
+from eschorty_ros.core.calibration import Targets, refuse_other_instrument, write_targets
+from eschorty_ros.core.optics import Calibration, load_calibration, save_calibration
 from eschorty_ros.msg import ActiveCalibration as ActiveCalibrationMessage
 from eschorty_ros.nodes.reconstruction.calibration_messages import active_message
 from eschorty_ros.nodes.ros import qos

@@ -13,8 +13,8 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from eschorty_ros.action import Calibrate
-from eschorty_ros.core.calibration.targets_file import read_distances
-from eschorty_ros.core.optics.calibration_file import config_file
+from eschorty_ros.core.calibration import read_distances
+from eschorty_ros.core.optics import config_file
 from eschorty_ros.nodes.reconstruction.calibration_messages import target_message
 
 

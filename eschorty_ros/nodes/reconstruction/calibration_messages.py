@@ -9,9 +9,8 @@ import numpy as np
 import yaml
 
 from eschorty_ros.action import Calibrate
-from eschorty_ros.core.calibration.calibrate import CalibrationReport
-from eschorty_ros.core.calibration.posts import KnownTarget
-from eschorty_ros.core.optics.calibration_file import PARAMETERS, Calibration
+from eschorty_ros.core.calibration import CalibrationReport, KnownTarget
+from eschorty_ros.core.optics import PARAMETERS, Calibration
 from eschorty_ros.live.calibration_capture import CaptureRequest, Sweep
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns

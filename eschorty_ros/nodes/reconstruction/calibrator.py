@@ -17,8 +17,7 @@ from eschorty_ros.action import Calibrate
 from eschorty_ros.control.calibration_sequence import check_request, run_capture
 from eschorty_ros.control.scan_sequence import End
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
-from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
-from eschorty_ros.core.calibration.calibrate import calibrate
+from eschorty_ros.core.calibration import AggregateFrame, calibrate
 from eschorty_ros.live.calibration_capture import (
     Capture,
     CaptureRequest,

@@ -20,9 +20,8 @@ from sensor_msgs.msg import TimeReference
 from tf2_msgs.msg import TFMessage
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.calibration_file import Calibration, load_calibration
-from eschorty_ros.core.reconstruction import Settings
-from eschorty_ros.core.reconstruction.warm_up import warm_up
+from eschorty_ros.core.optics import Calibration, load_calibration
+from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.live.job_queue import Mailbox
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline

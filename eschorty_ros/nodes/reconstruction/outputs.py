@@ -9,9 +9,9 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
-from eschorty_ros.core.optics.calibration_file import Calibration
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import place_link
-from eschorty_ros.core.storage.cloud import join_points
+from eschorty_ros.core.storage import join_points
 from eschorty_ros.live.event_frame import EventFrame
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles

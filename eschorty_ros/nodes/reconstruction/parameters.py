@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from eschorty_ros.control.calibration_sequence import CAPTURE_MAX_S
-from eschorty_ros.core.calibration.calibrate import METHODS
-from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
+from eschorty_ros.core.calibration import METHODS
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, WAVEFORMS, Modulation
 from eschorty_ros.nodes.ros.parameters import Param
 
 TABLE = (

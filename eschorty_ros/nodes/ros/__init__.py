@@ -1,1 +1,1 @@
-"""TODO."""
+"""What the nodes share."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
-from eschorty_ros.core.storage.cloud import POINT_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from builtin_interfaces.msg import Time
 
-from eschorty_ros.core.clocks.pulses import PulseTrain
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.clocks import PulseTrain
+from eschorty_ros.core.modulation import Modulation
 
 _NS_PER_S = 1_000_000_000
 

@@ -27,7 +27,7 @@ from eschorty_ros.control.scan_sequence import (
     sweep_progress,
 )
 from eschorty_ros.core.base.errors import EschortyError
-from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ
 from eschorty_ros.nodes.ros import diagnostics
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
 from eschorty_ros.nodes.ros.instrument_client import ScanClient

@@ -15,7 +15,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from eschorty_ros.action import MoveStage
 from eschorty_ros.control.stage_states import new_states
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
-from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos

@@ -1,1 +1,31 @@
-"""TODO."""
+"""What the laser sheet can hit: analytic surfaces and meshes by name."""
+
+from eschorty_ros.simulation.scenes.face import EAR_OFF_MM, Face
+from eschorty_ros.simulation.scenes.leaves import LEVELS, SEPARATION_MM, Leaves
+from eschorty_ros.simulation.scenes.measured_posts import measured_posts
+from eschorty_ros.simulation.scenes.mesh import Mesh
+from eschorty_ros.simulation.scenes.names import NAMES, RECEDING_MM, Plane, Sphere, Steps, named
+from eschorty_ros.simulation.scenes.open3d_module import load_open3d
+from eschorty_ros.simulation.scenes.posts import Post, Posts, bench
+from eschorty_ros.simulation.scenes.scene import Scene
+
+__all__ = [
+    "EAR_OFF_MM",
+    "Face",
+    "LEVELS",
+    "Leaves",
+    "Mesh",
+    "NAMES",
+    "Plane",
+    "Post",
+    "Posts",
+    "RECEDING_MM",
+    "SEPARATION_MM",
+    "Scene",
+    "Sphere",
+    "Steps",
+    "bench",
+    "load_open3d",
+    "measured_posts",
+    "named",
+]

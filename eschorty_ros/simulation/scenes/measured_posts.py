@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.calibration import Targets
+from eschorty_ros.core.optics import RangeModel
 
 SIGMA_ROW_PX = 0.3
 SIGMA_RANGE_MM = 1.0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes.open3d_module import load_open3d
 from eschorty_ros.simulation.scenes.scene import Array, UniformReflectance, sheet
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes.scene import Array, UniformReflectance, sheet
 
 

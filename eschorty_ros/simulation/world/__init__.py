@@ -1,1 +1,24 @@
-"""TODO."""
+"""Scene, laser, stage and pixels over sensor time: bytes out, with the truth known."""
+
+from eschorty_ros.simulation.world.footprint import footprint
+from eschorty_ros.simulation.world.line_bench import LineEvents, simulate_line
+from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.simulation.world.sensor_control import SensorControl
+from eschorty_ros.simulation.world.timeline import Gate, LaserTimeline, StageTimeline
+from eschorty_ros.simulation.world.warm_up import warm_up
+from eschorty_ros.simulation.world.world import BACKGROUND_HZ, STEP_MM, World
+
+__all__ = [
+    "BACKGROUND_HZ",
+    "Gate",
+    "LaserTimeline",
+    "LineEvents",
+    "STEP_MM",
+    "SensorControl",
+    "StageTimeline",
+    "World",
+    "footprint",
+    "simulate_line",
+    "simulate_recording",
+    "warm_up",
+]

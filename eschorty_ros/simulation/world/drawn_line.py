@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.simulation.pixels.pixel import PixelArray
-from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.simulation.pixels import PixelArray
+from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.footprint import footprint
 
 _ROW_STEP = 0.02

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.simulation.scenes import Scene
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.simulation.pixels.pixel import PixelArray, PixelParameters, unpack
-from eschorty_ros.simulation.readout.readout import Readout, ReadoutParameters
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.simulation.pixels import PixelArray, PixelParameters, unpack
+from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.world.timeline import LaserTimeline
 
 

@@ -11,24 +11,24 @@ from pathlib import Path
 import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan, plan_move
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration, save_calibration
-from eschorty_ros.core.storage.raw_file import RawWriter
-from eschorty_ros.core.storage.recording import (
+from eschorty_ros.core.clocks import MotionPlan, plan_move
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration, save_calibration
+from eschorty_ros.core.storage import (
     CALIBRATION_FILE,
     EVENTS_FILE,
     LASER_FILE,
     STAGE_FILE,
     TRUTH_FILE,
+    RawWriter,
     Recording,
     load_recording,
     write_laser_yaml,
     write_stage_csv,
     write_truth_csv,
 )
-from eschorty_ros.simulation.pixels.pixel import PixelParameters
-from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.simulation.pixels import PixelParameters
+from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World
 
 ACCELERATION_MM_S2 = 2000.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
-from eschorty_ros.simulation.pixels.biases import Biases
-from eschorty_ros.simulation.readout.readout import EventRate
+from eschorty_ros.simulation.pixels import Biases
+from eschorty_ros.simulation.readout import EventRate
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.clocks import MotionPlan
+from eschorty_ros.core.modulation import Modulation
 
 SINE_STEPS = 12
 """Steps of constant light in which a sine rises, and in which it falls."""

@@ -7,9 +7,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.core.storage.recording import TRUTH_DTYPE
-from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.storage import TRUTH_DTYPE
+from eschorty_ros.simulation.scenes import Scene
 
 _PHASES_KEPT = 1_000_000
 _AT_ONCE = 256

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration
-from eschorty_ros.simulation.pixels.biases import Biases
-from eschorty_ros.simulation.scenes.names import named
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration
+from eschorty_ros.simulation.pixels import Biases
+from eschorty_ros.simulation.scenes import named
 from eschorty_ros.simulation.world.sensor_control import SensorControl
 from eschorty_ros.simulation.world.world import World
 

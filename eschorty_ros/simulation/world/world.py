@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan
-from eschorty_ros.core.evt3.decoder import Encoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import Calibration
-from eschorty_ros.simulation.pixels.biases import parameters_from_biases
-from eschorty_ros.simulation.pixels.pixel import PixelArray, PixelParameters, unpack
-from eschorty_ros.simulation.readout.readout import Readout, ReadoutParameters
-from eschorty_ros.simulation.scenes.scene import Scene
+from eschorty_ros.core.clocks import MotionPlan
+from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration
+from eschorty_ros.simulation.pixels import (
+    PixelArray,
+    PixelParameters,
+    parameters_from_biases,
+    unpack,
+)
+from eschorty_ros.simulation.readout import Readout, ReadoutParameters
+from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.drawn_line import DrawnLine
 from eschorty_ros.simulation.world.sensor_control import ControlTimeline, SensorControl
 from eschorty_ros.simulation.world.timeline import LaserTimeline, StageTimeline

@@ -10,10 +10,8 @@ import pytest
 from support.calibration_posts import DESIGN, NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, see
 
 from eschorty_ros.core.base.errors import ArgumentError, FitError
-from eschorty_ros.core.calibration.calibrate import calibrate
-from eschorty_ros.core.calibration.fit import PRIOR_SIGMA, WIDTH_BIAS, fit
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
+from eschorty_ros.core.calibration import PRIOR_SIGMA, WIDTH_BIAS, Targets, calibrate, fit
+from eschorty_ros.core.optics import load_calibration, save_calibration
 
 SEED = 15
 ALL_ROWS_MM = np.concatenate([np.linspace(790.0, 1500.0, 8), np.linspace(1720.0, 2090.0, 6)])

@@ -18,17 +18,16 @@ from support.calibration_posts import (
     see,
 )
 
-from eschorty_ros.core.calibration.calibrate import calibrate
-from eschorty_ros.core.calibration.fit import (
+from eschorty_ros.core.calibration import (
     K_PRIOR_SHARE,
     PARAMETERS,
     PRIOR_SIGMA,
     WIDTH_BIAS,
+    Targets,
+    calibrate,
     fit,
 )
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import BUILDS, RangeModel, load_calibration
 
 SEED = 14
 PRIORS = {"k_mm": K_PRIOR_SHARE * DESIGN.k_mm, **PRIOR_SIGMA}

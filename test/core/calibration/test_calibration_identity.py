@@ -3,12 +3,8 @@
 import pytest
 
 from eschorty_ros.core.base.errors import CalibrationError
-from eschorty_ros.core.calibration.identity import refuse_other_instrument
-from eschorty_ros.core.optics.calibration_file import (
-    Calibration,
-    load_calibration,
-    save_calibration,
-)
+from eschorty_ros.core.calibration import refuse_other_instrument
+from eschorty_ros.core.optics import Calibration, load_calibration, save_calibration
 
 ACTIVE = load_calibration("config_3")
 

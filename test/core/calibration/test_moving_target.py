@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError, FitError
-from eschorty_ros.core.calibration.fit import fit_targets
-from eschorty_ros.core.calibration.posts import moving_target
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import reconstruct_recording
-from eschorty_ros.core.reconstruction.profiles import Profiles
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.core.calibration import Targets, fit_targets, moving_target
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import simulate_recording
 
 COLUMNS = 48
 NOMINAL = load_calibration("config_3").model_copy(

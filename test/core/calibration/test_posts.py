@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError, FitError
-from eschorty_ros.core.calibration.fit import fit_targets
-from eschorty_ros.core.calibration.posts import (
+from eschorty_ros.core.calibration import (
     AggregateFrame,
     KnownTarget,
     Post,
     find_posts,
+    fit_targets,
     match_posts,
 )
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.simulation.scenes.posts import Posts, bench
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.simulation.scenes import Posts, bench
+from eschorty_ros.simulation.world import World
 
 NOMINAL = load_calibration("config_3").model()
 AS_BUILT = replace(NOMINAL, k_prime_px=0.96 * NOMINAL.k_prime_px, b_prime_px=-1102.74)

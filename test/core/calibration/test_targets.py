@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.calibration.targets import SIGMA_ROW_PX, Targets
+from eschorty_ros.core.calibration import SIGMA_ROW_PX, Targets
 
 
 def test_one_number_stands_for_all_targets():

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.calibration.targets import Targets
-from eschorty_ros.core.calibration.targets_file import read_distances, read_targets, write_targets
+from eschorty_ros.core.calibration import Targets, read_distances, read_targets, write_targets
 
 
 def written(tmp_path, text, name="targets.csv"):

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock import SensorClock, StageTrack, quantise_nm
-from eschorty_ros.core.clocks.clock_line import ClockLine
+from eschorty_ros.core.clocks import ClockLine, SensorClock, StageTrack, quantise_nm
 
 EPOCH_US = 1_760_000_000_000_000
 EPOCH_NS = EPOCH_US * 1000

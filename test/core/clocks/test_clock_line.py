@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock_line import ClockLine
+from eschorty_ros.core.clocks import ClockLine
 
 EPOCH_US = 1_760_000_000_000_000
 TIMES = st.integers(-(2**48), 2**48)

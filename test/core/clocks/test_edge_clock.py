@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from support.stage_pulses import PULSES, StagePulses
 
-from eschorty_ros.core.clocks.clock import StageTrack
-from eschorty_ros.core.clocks.edge_clock import EdgeClock
+from eschorty_ros.core.clocks import EdgeClock, StageTrack
 
 RISING = np.ones(1, np.uint8)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope, _lower_hull
+from eschorty_ros.core.clocks import LowerEnvelope
+from eschorty_ros.core.clocks.lower_envelope import _lower_hull
 
 SEED = 12
 EPOCH_NS = 1_760_000_000_123_456_789

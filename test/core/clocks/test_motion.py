@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks import MotionPlan, plan_move, plan_stop
 
 EPOCH_NS = 1_760_000_000_000_000_000
 positions = st.floats(-220.0, 220.0)

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from support.stage_pulses import EPOCH_NS, PULSES, SEED, StagePulses
 
-from eschorty_ros.core.clocks.clock import StageTrack
-from eschorty_ros.core.clocks.position_edges import fit_edges
-from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
+from eschorty_ros.core.clocks import PulseTrain, StageTrack, fit_edges, leading_edges
 
 
 @pytest.mark.parametrize("late_ms", [-2.0, 0.3, 4.0, 9.0, 25.0])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.evt3.word_count import WordCounter
+from eschorty_ros.core.evt3 import Decoder, WordCounter
 
 
 def words(*values: int) -> bytes:

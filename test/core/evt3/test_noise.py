@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.activity_filter import ActivityFilter
-from eschorty_ros.core.evt3.decoder import Events, Triggers
+from eschorty_ros.core.evt3 import ActivityFilter, Events, Triggers
 
 NO_TRIGGERS = Triggers(np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.uint8))
 

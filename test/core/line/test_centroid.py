@@ -8,12 +8,14 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line.centroid import METHODS, WHOLE_COLUMN_METHODS, estimate
-from eschorty_ros.core.line.row_sigma import (
+from eschorty_ros.core.line import (
     METHOD_NOISE,
+    METHODS,
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
+    WHOLE_COLUMN_METHODS,
+    estimate,
 )
 
 SEED = 20260

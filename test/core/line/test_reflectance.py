@@ -6,21 +6,20 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.decoder import Encoder, sort_readout
-from eschorty_ros.core.line.reflectance import ROOT_12, relative_reflectance
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import Reconstructor, Settings
-from eschorty_ros.core.reconstruction.profiles import Profiles, place_link
-from eschorty_ros.core.storage.cloud import (
+from eschorty_ros.core.evt3 import Encoder, sort_readout
+from eschorty_ros.core.line import ROOT_12, relative_reflectance
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, place_link
+from eschorty_ros.core.storage import (
     POINT_DTYPE,
     REFLECTANCE_DTYPE,
     join_points,
     read_cloud,
     write_cloud,
 )
-from eschorty_ros.simulation.pixels.pixel import PixelParameters
-from eschorty_ros.simulation.world.line_bench import simulate_line
+from eschorty_ros.simulation.pixels import PixelParameters
+from eschorty_ros.simulation.world import simulate_line
 
 SEED = 20261121
 SIGMA_PX = 4.1

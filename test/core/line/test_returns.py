@@ -7,10 +7,10 @@ import pytest
 from support.line_events import encoded, line_events
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.decoder import sort_readout
-from eschorty_ros.core.line.centroid import RETURNS, estimate
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.evt3 import sort_readout
+from eschorty_ros.core.line import RETURNS, estimate
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import (
     Profiles,
     Reconstructor,

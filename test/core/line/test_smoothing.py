@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line.smoothing import smooth
+from eschorty_ros.core.line import smooth
 
 
 def test_linear_slope_is_unbiased_everywhere():

@@ -10,12 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.modulation.modulation import (
-    FREQUENCY_MAX_HZ,
-    FREQUENCY_MIN_HZ,
-    WAVEFORMS,
-    Modulation,
-)
+from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, WAVEFORMS, Modulation
 
 EPOCH_US = 1_760_000_000_000_000
 

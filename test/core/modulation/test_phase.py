@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.line_events import line_events
 
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase import EdgeSchedule
 from eschorty_ros.core.modulation.phase_estimate import decide_window, estimate_phase
 

@@ -9,13 +9,13 @@ import pytest
 from support.line_events import encoded
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, gate_parameters
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import World
 
 SEED = 20261121
 COLUMNS = 128

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from eschorty_ros.core.evt3.decoder import Encoder, sort_readout
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import Reconstructor, Settings
-from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.core.evt3 import Encoder, sort_readout
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 
 SEED = 5
 CALIBRATION = load_calibration("config_3")

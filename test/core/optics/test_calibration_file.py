@@ -14,12 +14,7 @@ from pydantic import ValidationError
 
 from eschorty_ros.core.base import files
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
-from eschorty_ros.core.optics.calibration_file import (
-    BUILDS,
-    Calibration,
-    load_calibration,
-    save_calibration,
-)
+from eschorty_ros.core.optics import BUILDS, Calibration, load_calibration, save_calibration
 
 ROOT = Path(__file__).resolve().parents[3]
 PRINTED = {

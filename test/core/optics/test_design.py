@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
-from eschorty_ros.core.optics.design import design, design_for_ranges
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics import BUILDS, Design, design, design_for_ranges, load_calibration
 
 LENS = {"focal_length_mm": 24.0, "f_number": 2.0, "theta_deg": 85.87}
 RANGES_MM = [800.0, 1000.0, 1320.0, 1700.0, 2100.0, 2414.0]

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.calibration_file import BUILDS, load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
+from eschorty_ros.core.optics import BUILDS, RangeModel, load_calibration
 
 ROWS = np.arange(720)
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from support.line_events import encoded, line_events
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.decoder import Encoder, sort_readout
-from eschorty_ros.core.line.row_sigma import METHOD_NOISE, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.evt3 import Encoder, sort_readout
+from eschorty_ros.core.line import METHOD_NOISE, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import (
     Profiles,
     Reconstructor,

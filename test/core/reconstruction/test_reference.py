@@ -7,9 +7,9 @@ import pytest
 from support.line_events import encoded, line_events
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3.decoder import Decoder, Encoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.evt3 import Decoder, Encoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.core.reconstruction import paper_method as reference
 

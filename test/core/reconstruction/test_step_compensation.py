@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 from eschorty_experiments._crossing import SPEED_MM_S, Crossing, crossing
 
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import (
+    Profiles,
+    Reconstructor,
+    Settings,
+    reconstruct_recording,
+    stage_speed_mm_s,
+)
 from eschorty_ros.core.reconstruction._step import _shift
-from eschorty_ros.core.reconstruction.offline import reconstruct_recording, stage_speed_mm_s
-from eschorty_ros.core.reconstruction.profiles import Profiles
-from eschorty_ros.simulation.pixels.parameters import PixelParameters
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.simulation.pixels import PixelParameters
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import simulate_recording
 
 SEED = 20261121
 PARAMETERS = PixelParameters()

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, Points, read_cloud, write_cloud
-from eschorty_ros.simulation.scenes.open3d_module import load_open3d
+from eschorty_ros.core.storage import POINT_DTYPE, Points, read_cloud, write_cloud
+from eschorty_ros.simulation.scenes import load_open3d
 
 EXTENSIONS = [".pcd", ".ply"]
 

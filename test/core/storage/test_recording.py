@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
-from eschorty_ros.core.clocks.clock import StageTrack
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration, save_calibration
-from eschorty_ros.core.storage.recording import (
+from eschorty_ros.core.clocks import StageTrack
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration, save_calibration
+from eschorty_ros.core.storage import (
     TRUTH_DTYPE,
     load_recording,
     read_laser_yaml,

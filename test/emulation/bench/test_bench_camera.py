@@ -12,8 +12,8 @@ from eschorty_ros.emulation.evk4.control import sensor_control
 from eschorty_ros.emulation.evk4.model import Evk4Model
 from eschorty_ros.hardware.camera.biases import BIASES
 from eschorty_ros.hardware.camera.settings import CameraSettings
-from eschorty_ros.simulation.pixels.biases import Biases
-from eschorty_ros.simulation.world.sensor_control import SensorControl
+from eschorty_ros.simulation.pixels import Biases
+from eschorty_ros.simulation.world import SensorControl
 
 OFF, ON = 0, 1
 

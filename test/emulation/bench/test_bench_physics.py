@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan, plan_move
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.clocks import MotionPlan, plan_move
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.emulation.bench.imperfections import Imperfections
 from eschorty_ros.emulation.bench.physics import Physics
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import World
 
 SEED = 20240611
 MS = 1_000_000

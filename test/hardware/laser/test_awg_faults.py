@@ -10,7 +10,7 @@ import pytest
 from support.awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser import awg

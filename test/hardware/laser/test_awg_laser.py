@@ -13,7 +13,7 @@ import pytest
 from support.awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg.model import ENDPOINT_OUT, truth
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser.awg import AwgLaser, open_laser

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.awg_bench import AwgBench
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg.faults import AwgFaults
 from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT
 from eschorty_ros.hardware.base.protocols import LaserOutput

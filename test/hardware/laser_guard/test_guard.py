@@ -21,7 +21,7 @@ from support.hours import Hours
 from support.waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.laser_guard import guard, guarded

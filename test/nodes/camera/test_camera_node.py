@@ -15,8 +15,8 @@ from rclpy.qos import ReliabilityPolicy
 from support.benches import bench_here
 from support.ros_process import Observer, processes, wait_until
 
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.bench.devices import Bench
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp

@@ -13,13 +13,13 @@ from support.ros_process import NodeProcess, Observer
 from support.waiting import DEADLINE_S, wait_until
 from tf2_msgs.msg import TFMessage
 
-from eschorty_ros.core.optics.calibration_file import load_calibration
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.domain import free_domain
-from eschorty_ros.simulation.scenes.names import named
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.simulation.scenes import named
+from eschorty_ros.simulation.world import simulate_recording
 
 RELIABLE = "qos_overrides./eschorty/camera/events.subscription.reliability"
 

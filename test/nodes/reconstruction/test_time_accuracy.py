@@ -10,11 +10,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from support.line_events import line_events
 from support.stage_pulses import EPOCH_NS, PULSES, StagePulses
 
-from eschorty_ros.core.evt3.decoder import Encoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction import Reconstructor, Settings
-from eschorty_ros.core.reconstruction.profiles import Profiles
+from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_stream import clock_statistics
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline

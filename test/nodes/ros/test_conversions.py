@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.storage.cloud import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.nodes.ros import transforms
 from eschorty_ros.nodes.ros.cloud_messages import (
     LIVE_DTYPE,

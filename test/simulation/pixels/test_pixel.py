@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.simulation.pixels import PixelArray, PixelParameters, unpack
 from eschorty_ros.simulation.pixels._response import OFF, ON, _advanced, _noiseless
-from eschorty_ros.simulation.pixels.pixel import PixelArray, PixelParameters, unpack
 
 SEED = 7
 CENTRE = 40.0

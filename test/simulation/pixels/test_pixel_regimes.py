@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.pixel_reference import stepped
 
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.simulation.pixels.pixel import PixelParameters
-from eschorty_ros.simulation.world.line_bench import LineEvents, simulate_line
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.simulation.pixels import PixelParameters
+from eschorty_ros.simulation.world import LineEvents, simulate_line
 
 SEED = 5
 ROWS, CENTRE = 81, 40.0

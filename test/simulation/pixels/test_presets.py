@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.simulation.pixels.parameters import PixelParameters
-from eschorty_ros.simulation.pixels.presets import PRESETS, preset
-from eschorty_ros.simulation.world.line_bench import LineEvents, simulate_line
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.simulation.pixels import PRESETS, PixelParameters, preset
+from eschorty_ros.simulation.world import LineEvents, simulate_line
 
 SEED = 9
 

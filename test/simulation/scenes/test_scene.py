@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.simulation.scenes.names import NAMES, Plane, Sphere, Steps, named
-from eschorty_ros.simulation.scenes.open3d_module import load_open3d
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.simulation.scenes import NAMES, Plane, Sphere, Steps, load_open3d, named
 
 MODEL = load_calibration("config_3").model_copy(update={"b_mm": 7.0}).model()
 STAGE = np.linspace(0.0, 100.0, 41)
@@ -132,7 +131,7 @@ def open3d():
 
 def test_mesh_agrees_with_the_analytic_plane() -> None:
     open3d()
-    from eschorty_ros.simulation.scenes.mesh import Mesh
+    from eschorty_ros.simulation.scenes import Mesh
 
     plane = Plane(1320.0, slope_stage=0.5, slope_column=-0.4, pivot_mm=50.0)
     y, z = np.array([-500.0, 500.0, 500.0, -500.0]), np.array([-900.0, -900.0, 900.0, 900.0])

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.simulation.scenes.names import named
-from eschorty_ros.simulation.scenes.posts import Post, Posts, bench
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.simulation.scenes import Post, Posts, bench, named
 
 CALIBRATION = load_calibration("config_3").model_copy(update={"b_mm": 7.0})
 MODEL = CALIBRATION.model()

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.simulation.scenes.face import EAR_OFF_MM, Face
-from eschorty_ros.simulation.scenes.leaves import LEVELS, SEPARATION_MM, Leaves
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.simulation.scenes import EAR_OFF_MM, LEVELS, SEPARATION_MM, Face, Leaves
 
 STAGE = np.arange(0.0, 200.0, 0.5)
 COLUMNS = np.arange(0, 1280, 2)

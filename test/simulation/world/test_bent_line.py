@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction.offline import reconstruct_recording
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.recorder import simulate_recording
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import simulate_recording
 
 BENT = load_calibration("config_3").model_copy(
     update={

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from eschorty_ros.core.clocks.motion import MotionPlan
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.optics.range_model import RangeModel
-from eschorty_ros.simulation.scenes.names import Plane, Sphere, named
-from eschorty_ros.simulation.world.footprint import footprint
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.core.clocks import MotionPlan
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import RangeModel, load_calibration
+from eschorty_ros.simulation.scenes import Plane, Sphere, named
+from eschorty_ros.simulation.world import World, footprint
 
 SEED = 2
 CALIBRATION = load_calibration("config_3").model_copy(

@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import plan_move
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.simulation.pixels.biases import Biases
-from eschorty_ros.simulation.pixels.parameters import PixelParameters
-from eschorty_ros.simulation.pixels.pixel import PixelArray
-from eschorty_ros.simulation.pixels.presets import preset
-from eschorty_ros.simulation.readout.readout import EventRate
-from eschorty_ros.simulation.scenes.names import Plane
-from eschorty_ros.simulation.world.sensor_control import SensorControl
-from eschorty_ros.simulation.world.world import World
+from eschorty_ros.core.clocks import plan_move
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.simulation.pixels import Biases, PixelArray, PixelParameters, preset
+from eschorty_ros.simulation.readout import EventRate
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import SensorControl, World
 
 SEED = 12
 SMALL = load_calibration("config_3").model_copy(update={"columns": 64, "principal_column": 31.5})

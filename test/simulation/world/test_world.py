@@ -9,18 +9,23 @@ import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.motion import MotionPlan, plan_move
-from eschorty_ros.core.evt3.decoder import Decoder
-from eschorty_ros.core.modulation.modulation import Modulation
-from eschorty_ros.core.optics.calibration_file import load_calibration
-from eschorty_ros.core.reconstruction.offline import reconstruct_recording
-from eschorty_ros.core.storage.recording import load_recording
+from eschorty_ros.core.clocks import MotionPlan, plan_move
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.storage import load_recording
 from eschorty_ros.report.accuracy import stage_and_range_mm
-from eschorty_ros.simulation.pixels.pixel import PixelParameters
-from eschorty_ros.simulation.scenes.names import Plane, Sphere, Steps
-from eschorty_ros.simulation.world.recorder import simulate_recording
-from eschorty_ros.simulation.world.timeline import Gate, LaserTimeline, StageTimeline
-from eschorty_ros.simulation.world.world import STEP_MM, World
+from eschorty_ros.simulation.pixels import PixelParameters
+from eschorty_ros.simulation.scenes import Plane, Sphere, Steps
+from eschorty_ros.simulation.world import (
+    STEP_MM,
+    Gate,
+    LaserTimeline,
+    StageTimeline,
+    World,
+    simulate_recording,
+)
 
 SEED = 11
 FULL = load_calibration("config_3")
