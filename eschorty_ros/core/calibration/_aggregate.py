@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from numba import int64, njit, types, uint16, uint32
+from numba import int64, types, uint16, uint32
+
+from eschorty_ros.core.base.kernel import kernel
 
 COUNT_MAX = (1 << 32) - 1
 
 _U2 = types.Array(uint16, 1, "C", readonly=True)
 
 
-@njit(int64(uint32[:, ::1], _U2, _U2), cache=True, nogil=True)
+@kernel(int64(uint32[:, ::1], _U2, _U2))
 def count_events(counts, x, y):
     """Add each event to its pixel; how many lay outside. A full pixel stays full."""
     rows, columns = counts.shape

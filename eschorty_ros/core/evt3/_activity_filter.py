@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import int32, int64, njit, types, uint8, uint16, uint64
+from numba import int32, int64, types, uint8, uint16, uint64
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3._decode import EVENT_ARRAYS
 
 COLUMN_BITS = 3
@@ -23,7 +24,7 @@ _U2 = types.Array(uint16, 1, "C", readonly=True)
 _U1 = types.Array(uint8, 1, "C", readonly=True)
 
 
-@njit((int32[::1], int64[::1], int64), cache=True, nogil=True)
+@kernel((int32[::1], int64[::1], int64))
 def _rebase(cells, s, t):
     """Move the origin to ``t``; cell times older than 32 bits can tell become 'never'."""
     shift = (t - s[ORIGIN_US]) << _PIXEL_BITS
@@ -33,7 +34,7 @@ def _rebase(cells, s, t):
     s[ORIGIN_US] = t
 
 
-@njit(types.boolean(int32[::1], uint64, uint64, int64), cache=True, nogil=True)
+@kernel(types.boolean(int32[::1], uint64, uint64, int64))
 def _neighbours_fresh(cells, cell, pitch, oldest):
     """Whether any of the 8 cells around ``cell`` holds a time of ``oldest`` or later."""
     one = np.uint64(1)
@@ -51,12 +52,10 @@ def _neighbours_fresh(cells, cell, pitch, oldest):
     )
 
 
-@njit(
+@kernel(
     types.Tuple((uint64, uint64))(
         _I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], int64[::1], int64, int64, int64, int64
-    ),
-    cache=True,
-    nogil=True,
+    )
 )
 def _filter(t_in, x_in, y_in, p_in, out, cells, s, window, width, height, pitch_cells):
     """Compact the supported events into ``out``; returns kept and outside counts."""

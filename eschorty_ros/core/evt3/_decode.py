@@ -10,10 +10,11 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import from_dtype, int64, njit, types, uint8, uint16, uint64
+from numba import from_dtype, int64, types, uint8, uint16, uint64
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import octets, whole
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import ctz64, popcount64
 
@@ -342,7 +343,7 @@ EVENT_ARRAYS = types.NamedTuple((int64[::1], uint16[::1], uint16[::1], uint8[::1
 _TRIGGERS = types.NamedTuple((int64[::1], uint8[::1], uint8[::1]), _TriggerArrays)
 
 
-@njit(uint64(uint16), cache=True, nogil=True)
+@kernel(uint64(uint16))
 def _event_count(word):
     """Return the number of events in a word."""
     kind = np.uint32(word) >> np.uint32(12)
@@ -355,7 +356,7 @@ def _event_count(word):
     return np.uint64(0)
 
 
-@njit(types.UniTuple(uint64, 2)(_WORDS), cache=True, nogil=True)
+@kernel(types.UniTuple(uint64, 2)(_WORDS))
 def _bounds(words):
     """Return upper bounds of the numbers of events and triggers in ``words``."""
     events = np.uint64(0)
@@ -367,7 +368,7 @@ def _bounds(words):
     return events, triggers
 
 
-@njit(uint64(_WORDS, _C), cache=True, nogil=True)
+@kernel(uint64(_WORDS, _C))
 def _skip_to_time(words, c):
     """Return the index of the first TIME_HIGH; count what lies before."""
     i = np.uint64(0)
@@ -380,7 +381,7 @@ def _skip_to_time(words, c):
     return i
 
 
-@njit((_S, _C, int64), cache=True, nogil=True)
+@kernel((_S, _C, int64))
 def _jump(s, c, q):
     """Take TIME_HIGH ``q`` by the half-range rule: further back than 2048 is a wrap."""
     step = q - s.high
@@ -395,7 +396,7 @@ def _jump(s, c, q):
     s.low = 0
 
 
-@njit(int64(_S, _C, int64, int64), cache=True, nogil=True)
+@kernel(int64(_S, _C, int64, int64))
 def _time_high(s, c, q, floor):
     """Apply TIME_HIGH ``q``; return the new current time, never below ``floor``.
 
@@ -443,7 +444,7 @@ def _time_high(s, c, q, floor):
     return max(floor, s.epoch_us + s.low)
 
 
-@njit((_S, _C, int64), cache=True, nogil=True)
+@kernel((_S, _C, int64))
 def _begin_others(s, c, subtype):
     c.others_words += 1
     if subtype == w3.DROPPED_TIME_LOW:
@@ -457,7 +458,7 @@ def _begin_others(s, c, subtype):
     s.others_payload = 0
 
 
-@njit(uint64(_WORDS, uint64, _S, _C), cache=True, nogil=True)
+@kernel(uint64(_WORDS, uint64, _S, _C))
 def _continue_others(words, i, s, c):
     """Collect F, F, 7 of a pending OTHERS from word ``i`` on; return the next word's index."""
     while i < np.uint64(words.size) and s.others_parts > 0:
@@ -486,7 +487,7 @@ def _continue_others(words, i, s, c):
     return i
 
 
-@njit(uint64(uint64, uint64, _S, _C, EVENT_ARRAYS, uint64), cache=True, nogil=True)
+@kernel(uint64(uint64, uint64, _S, _C, EVENT_ARRAYS, uint64))
 def _vector(mask, bits, s, c, out, n):
     """Emit a vector of ``bits`` pixels at the base with every check; return the event count."""
     base = s.base
@@ -518,9 +519,7 @@ def _vector(mask, bits, s, c, out, n):
     return n
 
 
-@njit(
-    types.UniTuple(uint64, 2)(_WORDS, uint64, _S, _C, EVENT_ARRAYS, uint64), cache=True, nogil=True
-)
+@kernel(types.UniTuple(uint64, 2)(_WORDS, uint64, _S, _C, EVENT_ARRAYS, uint64))
 def _triple_by_words(words, i, s, c, out, n):
     """Emit vector words one at a time until their triple is complete, broken or cut.
 
@@ -545,7 +544,7 @@ def _triple_by_words(words, i, s, c, out, n):
     return i, n
 
 
-@njit((_C, int64, int64), cache=True, nogil=True)
+@kernel((_C, int64, int64))
 def _drop_x(c, row, limit):
     """Count an ADDR_X that gave no event."""
     c.events_dropped += 1
@@ -557,11 +556,7 @@ def _drop_x(c, row, limit):
     c.events_without_y += 1
 
 
-@njit(
-    types.UniTuple(uint64, 2)(_WORDS, int64, int64, _S, _C, EVENT_ARRAYS, _TRIGGERS),
-    cache=True,
-    nogil=True,
-)
+@kernel(types.UniTuple(uint64, 2)(_WORDS, int64, int64, _S, _C, EVENT_ARRAYS, _TRIGGERS))
 def _decode(words, width, height, s, c, out, triggers):
     """Decode all ``words``; return the numbers of events and triggers written.
 

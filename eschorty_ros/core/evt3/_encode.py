@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import int64, njit, types, uint8, uint16, uint64
+from numba import int64, types, uint8, uint16, uint64
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import words as w3
 
 # Encoder state, one int64 each.
@@ -19,7 +20,7 @@ _U2 = types.Array(uint16, 1, "C", readonly=True)
 _U1 = types.Array(uint8, 1, "C", readonly=True)
 
 
-@njit(uint64(int64, types.boolean, int64[::1], uint16[::1], uint64), cache=True, nogil=True)
+@kernel(uint64(int64, types.boolean, int64[::1], uint16[::1], uint64))
 def _put_time(t, idle, s, words, n):
     """Words that bring the stream's time to ``t``: every TIME_HIGH on the way, then TIME_LOW.
 
@@ -46,7 +47,7 @@ def _put_time(t, idle, s, words, n):
     return n
 
 
-@njit(types.Tuple((uint64, types.uint32))(_U2, uint64, uint64, int64), cache=True, nogil=True)
+@kernel(types.Tuple((uint64, types.uint32))(_U2, uint64, uint64, int64))
 def _group(x, k, end, base):
     """Events from ``k`` on that fit one 32-pixel group at ``base``, x rising.
 
@@ -66,11 +67,7 @@ def _group(x, k, end, base):
     return count, mask
 
 
-@njit(
-    uint64(uint64, uint64, _U2, int64, int64, int64, int64[::1], uint16[::1], uint64),
-    cache=True,
-    nogil=True,
-)
+@kernel(uint64(uint64, uint64, _U2, int64, int64, int64, int64[::1], uint16[::1], uint64))
 def _put_row(k, end, x, y, p, width, s, words, n):
     """Events ``k`` to ``end``, of one time, row, polarity; as vectors where shorter."""
     if s[_Y] != y:
@@ -106,7 +103,7 @@ def _put_row(k, end, x, y, p, width, s, words, n):
     return n
 
 
-@njit(uint64(_I8, _U2, _U2, _U1, _I8, _U2, int64, int64[::1], uint16[::1]), cache=True, nogil=True)
+@kernel(uint64(_I8, _U2, _U2, _U1, _I8, _U2, int64, int64[::1], uint16[::1]))
 def _encode(t, x, y, p, mark_t, marks, width, s, words):
     """Merge events and ready-made words by time (these first); returns the number of words."""
     n = np.uint64(0)
@@ -143,7 +140,7 @@ def _encode(t, x, y, p, mark_t, marks, width, s, words):
     return n
 
 
-@njit(int64(_I8, int64), cache=True, nogil=True)
+@kernel(int64(_I8, int64))
 def _first_fall(t, last):
     """Index of the first time below its predecessor, or -1."""
     for k in range(t.size):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from numba import int64, njit, types, uint16
+from numba import int64, types, uint16
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import popcount64
 
@@ -15,7 +16,7 @@ SIZE = 9
 _U2 = types.Array(uint16, 1, "C", readonly=True)
 
 
-@njit(types.void(_U2, int64[::1]), cache=True, nogil=True)
+@kernel(types.void(_U2, int64[::1]))
 def count_words(words, counts):
     """Add up events by polarity, triggers and the sensor's own loss reports."""
     polarity = counts[POLARITY]

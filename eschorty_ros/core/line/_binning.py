@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line._centroid import (
     Columns,
     Estimator,
@@ -85,7 +85,7 @@ class Progress(NamedTuple):
     edge: int
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _append(events, first, limit_us, columns, rows, gate, state, counters):
     """Append events before ``limit_us`` that the gate lets through; returns the first left."""
     t, x, y, p = events
@@ -125,7 +125,7 @@ def _append(events, first, limit_us, columns, rows, gate, state, counters):
     return np.int64(i)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _adapted_half(half, spread, half_max):
     """Window for the next period: 1.3 x the width that this period's rows show, averaged."""
     if spread.freedom < _WIDTH_MIN_DOF:
@@ -134,7 +134,7 @@ def _adapted_half(half, spread, half_max):
     return np.int64(min(max(np.rint(0.5 * (half + wanted)), _HALF_MIN), half_max))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _emit(rows, smoothing, state, points):
     """Write the period's points behind ``state.points``, by column, nearest return first."""
     planes, columns = rows.row.shape
@@ -158,7 +158,7 @@ def _emit(rows, smoothing, state, points):
     state.points = i
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _close(assembly, state, counters):
     """Turn the open period into points."""
     columns, estimator, smoothing, rows, scratch, points = assembly
@@ -170,7 +170,7 @@ def _close(assembly, state, counters):
     _emit(rows, smoothing, state, points)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bin(events, edges, progress, drain, gate, assembly, state, counters):
     """Merge events with edges from ``progress`` on.
 

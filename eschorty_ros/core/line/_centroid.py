@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line._mode import (
     AMBIGUOUS,
     FOUND,
@@ -137,12 +137,12 @@ def empty_rows(returns: int, columns: int) -> Rows:
     return Rows(*reals, events, mean_dt_us, cut, ambiguous)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _is_windowed(method):
     return method != MEAN and method != MEDIAN
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _search(column, half, estimator):
     """Search a column for its window, without a seed."""
     if not _is_windowed(estimator.method):
@@ -158,7 +158,7 @@ def _search(column, half, estimator):
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _find(column, half, estimator, seed):
     """Find a column's window; ``seed`` is a row to begin at, fixed point, or negative."""
     if seed >= 0:
@@ -170,7 +170,7 @@ def _find(column, half, estimator, seed):
     return _search(column, half, estimator)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _all_returns(column, half, estimator, found):
     """Look for a second return beside the one that was found.
 
@@ -183,7 +183,7 @@ def _all_returns(column, half, estimator, found):
     return _second_return(column, half, estimator.rows, estimator.events_min, found.window)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _row(column, window, other, half, estimator, scratch):
     """Row of a return.
 
@@ -202,7 +202,7 @@ def _row(column, window, other, half, estimator, scratch):
     return _gauss_ml(column, window, first, last, half, estimator.rows, scratch.likelihood)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _judge(row, variance, own, window, half, estimator):
     """Row, its own variance and whether the edge of the sensor cuts its window."""
     rows, noise = estimator.rows, estimator.noise
@@ -214,7 +214,7 @@ def _judge(row, variance, own, window, half, estimator):
     return Row(row, sigma2, False)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _chosen(returns, found):
     """Windows to report, nearest (least row) first; the same twice when it is one."""
     a, b = found.window, found.other
@@ -224,7 +224,7 @@ def _chosen(returns, found):
     return (far, near) if returns == LAST else (near, far)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _estimate_columns(columns, half, estimator, out, scratch, counters):
     """Estimate every column's rows and empty the columns."""
     out.row[:] = np.nan

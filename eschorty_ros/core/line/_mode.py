@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line._window import (
     FRACTION,
     FRACTION_BITS,
@@ -50,7 +50,7 @@ class Returns(NamedTuple):
     other: Window
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _densest_pairwise(column, radius, avoid, gap):
     best = np.int64(0)
     lowest = np.int64(ROW_LAST)
@@ -69,7 +69,7 @@ def _densest_pairwise(column, radius, avoid, gap):
     return Densest(best, lowest, highest)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _densest_histogram(column, radius, avoid, gap):
     size = 1 << ROW_BITS
     below = np.zeros(size + 1, np.int64)
@@ -91,7 +91,7 @@ def _densest_histogram(column, radius, avoid, gap):
     return Densest(best, lowest, highest)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _densest(column, half, avoid, gap):
     """Most events in a box of half the window's width around one of them.
 
@@ -103,7 +103,7 @@ def _densest(column, half, avoid, gap):
     return _densest_histogram(column, radius, avoid, gap)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _side(centre, other):
     """Rows nearer to ``centre`` than to ``other`` (fixed point); the row between is in neither."""
     both = centre + other
@@ -112,14 +112,14 @@ def _side(centre, other):
     return max((both >> (FRACTION_BITS + 1)) + 1, 0), ROW_LAST
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _follow(column, half, seed, avoid):
     """Mean shift from ``seed`` that keeps to its side of ``avoid`` (both fixed point)."""
     first, last = _side(seed, avoid)
     return _mean_shift(column, seed, half, first, last)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _settle(column, half, densest, avoid):
     """Follow two equally dense rows and choose without preferring a direction.
 
@@ -145,13 +145,13 @@ def _settle(column, half, densest, avoid):
     return Returns(AMBIGUOUS, True, a, b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mode_search(column, half):
     """Densest window, then mean shift."""
     return _settle(column, half, _densest(column, half, _NOWHERE, 0), _NOWHERE)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _stands_out(count, n, half, rows):
     """Whether ``count`` of ``n`` events exceed what the others would put into the window.
 
@@ -165,7 +165,7 @@ def _stands_out(count, n, half, rows):
     return excess > 0.0 and excess * excess > 16.0 * expected
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _beyond_chance(count, others, half, rows):
     """Whether background alone hardly ever puts ``count`` events into any window of a column.
 
@@ -180,13 +180,13 @@ def _beyond_chance(count, others, half, rows):
     return improbable > np.log(_FALSE_SECOND * max(2.0 * rows / width, 1.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _box_count(column, centre, half):
     low, high = _limits(centre, half >> 1, 0, ROW_LAST)
     return _window_count(column, low, high)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _apart(column, half, a, b):
     """Both windows again, each kept to its side of the middle, where they would overlap."""
     if abs(a.centre - b.centre) > 2 * half:
@@ -195,7 +195,7 @@ def _apart(column, half, a, b):
     return own, _follow(column, half, b.centre, a.centre)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _second_return(column, half, rows, events_min, a):
     """Look for another surface than that of window ``a``.
 

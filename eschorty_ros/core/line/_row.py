@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line._sigma import _sigma2
 from eschorty_ros.core.line._window import (
     FRACTION,
@@ -61,7 +61,7 @@ def likelihood_size(half: int) -> int:
     return int(np.ceil(_REACH * half)) + FRACTION
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _median_row(column, counts):
     """Middle row, or the mean of the two middle rows; ``counts`` is zeroed scratch of 1024."""
     n = column.events
@@ -86,7 +86,7 @@ def _median_row(column, counts):
     return (lower + upper) / 2.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _quantile_edge(counts, low, high, step, total):
     """Row from which on ``total / _EDGE_PART`` events lie behind, going from low to high.
 
@@ -109,7 +109,7 @@ def _quantile_edge(counts, low, high, step, total):
     return (row + other) / 2.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _edge_midpoint(column, low, high, counts):
     """Middle between the rows below and above which an eighth of the events of low..high lies."""
     total = np.int64(0)
@@ -124,7 +124,7 @@ def _edge_midpoint(column, low, high, counts):
     return (below + above) / 2.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fill_likelihood(table, half):
     """Return ``exp(d^2 / 2 sigma^2)`` for distances of 0, 1, 2... fixed-point steps from the line.
 
@@ -137,7 +137,7 @@ def _fill_likelihood(table, half):
     return table[:size]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gauss_ml(column, window, first, last, half, rows, table):
     """Row of greatest likelihood for a Gaussian of known width on uniform background.
 
@@ -171,14 +171,14 @@ def _gauss_ml(column, window, first, last, half, rows, table):
     return (centre + shift) / FRACTION
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mean(window):
     """Mean row of a window's events."""
     events = window.sums.events
     return (events * window.first + window.sums.d) / events
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _variance(sums):
     """Sample variance; the numerator is an exact integer, so a constant column gives 0."""
     n = sums.events
@@ -187,7 +187,7 @@ def _variance(sums):
     return (n * sums.d2 - sums.d * sums.d) / (float(n) * (n - 1))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _uncut_step(mean, centre, sigma):
     """Newton's next centre, not behind 0, of a Gaussian whose part beyond 0 has this mean.
 
@@ -199,7 +199,7 @@ def _uncut_step(mean, centre, sigma):
     return max(centre + (mean - centre - sigma * hazard) / ratio, 0.0), ratio
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _uncut(mean, variance, count, sigma_max):
     """Centre and sigma of a Gaussian whose ``count`` events beyond 0 have this mean and variance.
 
@@ -224,7 +224,7 @@ def _uncut(mean, variance, count, sigma_max):
     return Uncut(centre, sigma, ratio, centre - known)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _uncut_row(row, sigma2, variance, window, half, rows, noise):
     """Row and its variance where the edge of the sensor may cut the window.
 
@@ -253,7 +253,7 @@ def _uncut_row(row, sigma2, variance, window, half, rows, noise):
     return Row(min(max(row, -0.5), rows - 0.5), max(sigma2, wider2), True)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _whole_sigma2(row, variance, own, count, rows, noise):
     """Row estimated from a whole column and its variance."""
     sigma2 = _sigma2(variance, own, count, row, rows, noise)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line._window import FRACTION
 
 # A line that jumps further lies on another surface: its last place says nothing any more.
@@ -29,7 +29,7 @@ class Noise(NamedTuple):
     median: bool
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _excess_events(excess, count, row, rows):
     """Number of background events, evenly spread over the rows, behind ``excess`` variance.
 
@@ -41,7 +41,7 @@ def _excess_events(excess, count, row, rows):
     return excess * count / square, offset * offset / square
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sigma2(variance, own, count, row, rows, noise):
     """Variance of one column's row, px squared, without what its neighbours share.
 
@@ -66,7 +66,7 @@ def _sigma2(variance, own, count, row, rows, noise):
     return sigma2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _common2(centre, last, noise):
     """Variance that neighbouring columns share, from the line's way since the last profile.
 
@@ -79,7 +79,7 @@ def _common2(centre, last, noise):
     return noise.common**2 + noise.motion**2 * moved + (_JUMP * moved) ** 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _clipped2(variance, own, noise):
     """Variance of a row whose footprint is narrower than the line.
 

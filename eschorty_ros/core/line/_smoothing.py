@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
 
 ISOLATION_REACH = 2
 
@@ -26,7 +27,7 @@ class Smoothing(NamedTuple):
     sigma2: NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _nearest(row, c, target):
     """Plane of column ``c`` whose row is nearest to ``target``; the first when none is."""
     best = 0
@@ -36,7 +37,7 @@ def _nearest(row, c, target):
     return best
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _partner(row, k, c, other):
     """Offset and plane of the return of column ``other`` that shows the surface of ``k`` of ``c``.
 
@@ -48,7 +49,7 @@ def _partner(row, k, c, other):
     return row[plane, other] - row[k, c], plane
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _smooth(row, sigma2, common2, smoothing):
     """Mean over symmetric pairs of columns; returns how many points were averaged.
 
@@ -91,7 +92,7 @@ def _smooth(row, sigma2, common2, smoothing):
     return smoothed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _is_isolated(row, k, c, gate):
     planes, columns = row.shape
     for other in range(max(c - ISOLATION_REACH, 0), min(c + ISOLATION_REACH + 1, columns)):
@@ -101,7 +102,7 @@ def _is_isolated(row, k, c, gate):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _reject_isolated(row, events, smoothing):
     """Make weak points without a neighbour near in rows NaN; returns their number."""
     isolated = smoothing.isolated

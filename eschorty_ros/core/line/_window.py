@@ -14,8 +14,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
 
 ROW_BITS = 10
 ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
@@ -59,7 +60,7 @@ class Window(NamedTuple):
     centre: int
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _padded(packed, start, count):
     """Fill the last block behind ``count`` entries; returns the column."""
     blocks = (count + BLOCK - 1) // BLOCK
@@ -68,7 +69,7 @@ def _padded(packed, start, count):
     return Column(packed, start, count, blocks)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _window_sums(column, low, high):
     """Count, sum of d, of d squared (d = row - low) and of times over rows low..high.
 
@@ -103,7 +104,7 @@ def _window_sums(column, low, high):
     return Sums(count, sum_d, sum_d2, sum_time)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _window_count(column, low, high):
     packed = column.packed
     base = np.uint32(low)
@@ -122,7 +123,7 @@ def _window_count(column, low, high):
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _limits(centre, half, first, last):
     """First and last whole row within ``half`` of ``centre`` (both fixed point), in first..last."""
     low = (centre - half + FRACTION - 1) >> FRACTION_BITS
@@ -130,13 +131,13 @@ def _limits(centre, half, first, last):
     return max(low, first), min(high, last)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _whole_column(column):
     """Window over all rows; its mean is not a window's centre and given as -1."""
     return Window(np.int64(0), np.int64(ROW_LAST), _window_sums(column, 0, ROW_LAST), np.int64(-1))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mean_shift(column, centre, half, first, last):
     """Move a window to the mean of its events, ``ITERATIONS_MAX`` times at most.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
+from eschorty_ros.core.base.kernel import kernel
 
 # Predicted edges without a trigger before any trigger is taken as the new phase.
 MISSED_MAX = 3
@@ -13,7 +13,7 @@ COUNTERS = ("triggers_used", "triggers_spurious", "edges_bridged", "phase_locks"
 C_USED, C_SPURIOUS, C_BRIDGED, C_LOCKS = range(len(COUNTERS))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rounded(whole, rest, denominator):
     """``whole + rest / denominator`` to the nearest integer, half to even."""
     twice = 2 * rest
@@ -22,7 +22,7 @@ def _rounded(whole, rest, denominator):
     return whole
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _schedule(state, step, part, denominator, every, triggers, first, watermark, edges, indices, c):
     """Edges that are certain once everything before ``watermark`` is known.
 

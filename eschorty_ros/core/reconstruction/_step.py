@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from eschorty_ros.core.base.kernel import kernel
 
 _REACH = 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _shift(before, now, after):
     """How far the footprint's centroid moved towards the rows the surface comes from, px.
 
@@ -29,7 +30,7 @@ def _shift(before, now, after):
     return size if after >= before else -size
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _middle(widths, column, lit_only, scratch):
     """Median of the columns around ``column``; with ``lit_only`` of those that have a point."""
     n = 0
@@ -48,14 +49,14 @@ def _middle(widths, column, lit_only, scratch):
     return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _middles(widths, scratch, out):
     """Median of the columns around each column, those without a point counting as 0."""
     for c in range(widths.size):
         out[c] = _middle(widths, c, False, scratch)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _between(row_before, row_after, back, ahead):
     """Row on the line between two neighbours in time, or of the only one; NaN without any."""
     if np.isnan(row_before):
@@ -65,7 +66,7 @@ def _between(row_before, row_after, back, ahead):
     return (row_before * ahead + row_after * back) / (back + ahead)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _step_shifts(
     column, back, ahead, widths, middles, rows, present, newest, place, sign, width_gate, row_gate,
     scratch, out,

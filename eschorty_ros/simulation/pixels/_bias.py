@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.simulation.pixels._passage import GAP_MAX
 from eschorty_ros.simulation.pixels._pixel import HELD, WAITS
 from eschorty_ros.simulation.pixels._response import _advanced, _earliest_us
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rebias(pixels, spans, due, t_us, before, after):
     """Anchor every pixel anew at ``t_us``, up to which ``_run_columns`` has been.
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from eschorty_ros.core.base.kernel import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mix(value):
     """One round of splitmix64: 64 well mixed bits from a counter."""
     value = np.uint64(value) + np.uint64(0x9E3779B97F4A7C15)
@@ -17,7 +18,7 @@ def _mix(value):
     return value ^ (value >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bits(t_us, column, row, seed, purpose):
     """64 random bits that belong to what a pixel does at a time."""
     place = np.uint64((column << 12) | row) * np.uint64(0xD6E8FEB86659FD93)
@@ -25,7 +26,7 @@ def _bits(t_us, column, row, seed, purpose):
     return _mix((place ^ np.uint64(seed)) + salt + np.uint64(np.int64(t_us * 1024.0)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gaussian(bits):
     """Sum of four 16-bit numbers, as a Gaussian of standard deviation 1 cut at 3.5."""
     low = np.uint64(0x0000FFFF0000FFFF)
@@ -34,7 +35,7 @@ def _gaussian(bits):
     return (np.float64(total) - 131070.0) * (math.sqrt(3.0) / 65536.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _uniform(bits):
     """Number between 0 and 1, neither included."""
     return (np.float64(bits >> np.uint64(11)) + 0.5) * 2.0**-53

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from eschorty_ros.core.base.kernel import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _window(patch, sigma, least, rows):
     """Rows [lo, hi) in which a patch adds at least ``least``; (0, 0) for none."""
     line_row, contrast = patch[0], patch[1]
@@ -21,7 +22,7 @@ def _window(patch, sigma, least, rows):
     return (lo, min(rows, last + 1)) if lo <= last else (0, 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_patch(light, lo, hi, patch, sigma):
     """Add a patch of the footprint to ``light`` in rows [lo, hi): a Gaussian by recurrence.
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.simulation.pixels._response import NOTHING, OFF, ON, UNKNOWN, _shares
 
 GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 4.5, 64.0
@@ -30,7 +30,7 @@ _DECAY_STEPS, _DECAY_MAX = 32.0, 40.0
 _DECAY = np.exp(-np.arange(int(_DECAY_STEPS * _DECAY_MAX) + 1) / _DECAY_STEPS)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _decay(x):
     """``exp(-x)`` of a positive number to 1e-6: enough where risks are summed up, and quicker."""
     x = min(x, _DECAY_MAX)
@@ -39,14 +39,14 @@ def _decay(x):
     return _DECAY[np.uintp(entry)] * (1.0 - rest * (1.0 - 0.5 * rest))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _entry(gap):
     """Row of the noise table for a gap."""
     # By way of a signed integer: converting to an unsigned one is slow.
     return np.uintp(np.int64((min(max(gap, GAP_MIN), GAP_MAX) - GAP_MIN) * GAP_STEPS))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cost(old, new, per_gap_us, step_us, table):
     """Risk spent while the gap went from entry ``old`` to ``new`` at a steady pace."""
     frozen = max(0.0, table[new, _SHARE] - table[old, _SHARE])
@@ -56,7 +56,7 @@ def _cost(old, new, per_gap_us, step_us, table):
     return max(passed, frozen) + 0.6 * min(passed, frozen)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _part(first, last, rest, cost):
     """Part of a step in which ``rest`` of its ``cost`` is spent, the rate growing evenly."""
     first, last = first + 1e-300, last + 1e-300
@@ -64,7 +64,7 @@ def _part(first, last, rest, cost):
     return rest * (first + last) / (cost * first + root)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gap(value, per_level, noise, per_noise, sign):
     """Distance of y from a level in standard deviations, positive inside the band.
 
@@ -74,7 +74,7 @@ def _gap(value, per_level, noise, per_noise, sign):
     return x * (1.0 + x * (x * (1 / 3) - sign * 0.5)) * per_noise
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _start(u, y, settled, tau_us, follower_us, noise, from_us):
     """Where the summation begins and in which steps.
 
@@ -99,7 +99,7 @@ def _start(u, y, settled, tau_us, follower_us, noise, from_us):
     return a, b, step_us, fade_a, fade_b, bend_a, bend_b
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _noisy(
     u, y, settled, tau_us, follower_us, on_level, off_level, middle, noise, table, from_us,
     until_us, budget,

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.simulation.pixels._draw import _bits, _gaussian, _mix, _uniform
 from eschorty_ros.simulation.pixels._light import _add_patch, _window
 from eschorty_ros.simulation.pixels._passage import GAP_MAX, _noisy
@@ -47,13 +47,13 @@ _AT_REST = 0.1
 """Lag of y behind u that counts as none, standard deviations of the noise."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _key(t_us, column, row, polarity):
     """Event as one sortable integer: whole microsecond from ``t_us`` on, row, polarity, column."""
     return (np.int64(np.ceil(t_us)) << 22) | (row << 12) | (polarity << 11) | column
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
     """Let rows [lo, hi) do what is due up to ``until_us``, then give them the light ``light``.
 
@@ -145,7 +145,7 @@ def _live(pixels, column, lo, hi, until_us, light, model, tables, seed, out, n):
     return n, earliest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _foresee(pixels, column, lo, hi, model, tables, seed):
     """Look up the next event of the rows [lo, hi) just lit that set out from rest.
 
@@ -170,7 +170,7 @@ def _foresee(pixels, column, lo, hi, model, tables, seed):
             pixel.t_next = t + after_us
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _relight(
     pixels, spans, due, columns, begin, patches, light, optics, model, tables, t_us, seed,
     out, n,
@@ -227,7 +227,7 @@ def _relight(
     return columns.size, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _trim(pixels, column, spans):
     """Leave out rows with nothing pending at both ends: a line that moved on is not revisited."""
     lo, hi = spans[column, 2], spans[column, 3]
@@ -238,7 +238,7 @@ def _trim(pixels, column, spans):
     spans[column, 2], spans[column, 3] = lo, hi
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _run_columns(pixels, spans, due, begin, until_us, model, tables, seed, out, n):
     """Everything that is due up to ``until_us`` in the columns from ``begin`` on.
 
@@ -259,7 +259,7 @@ def _run_columns(pixels, spans, due, begin, until_us, model, tables, seed, out, 
     return pixels.shape[0], n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _background(process, per_us, shares, hot, until_us, columns, rows, seed, out, n):
     """Poisson events over the whole sensor; ``process`` = time of the next one, count so far.
 

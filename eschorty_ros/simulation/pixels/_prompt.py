@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.simulation.pixels._response import OFF, ON, UNKNOWN
 
 WAY_STEPS, WAY_MAX = 64, 0.9
@@ -25,7 +25,7 @@ DRAW_STEPS, PACE_STEPS = 512, 32
 _EARLY, _LATE = 2.5, 0.5
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _between(table, row, column):
     """Value of a table at fractional indices, linear between its entries."""
     whole_row, whole_column = np.int64(row), np.int64(column)
@@ -37,20 +37,20 @@ def _between(table, row, column):
     return low + up * (high - low)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _inside(index, end):
     """``index`` where it lies from 0 to below ``end``, else 0."""
     return index if 0.0 <= index < end else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gone(u, per_way, level, x):
     """Square root of the part of the way to where y is ``exp(x)`` times ``level``."""
     value = level * (1.0 + x * (1.0 + x * (0.5 + x * (1 / 6 + x * (1 / 24)))))
     return math.sqrt((u - value) * per_way)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _prompt(u, settled, tau_us, follower_us, on_level, off_level, noise, ways, gaps, draw):
     """Time from now and polarity of the first passage of a signal at rest that moves away.
 

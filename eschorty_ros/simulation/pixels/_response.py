@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from eschorty_ros.core.base.kernel import kernel
 
 # An exponential this far gone is below half a unit in the last place of what it is added to.
 _SETTLED = 38.0
@@ -20,7 +21,7 @@ _SETTLED = 38.0
 ON, OFF, NOTHING, UNKNOWN = 1, 0, -1, -2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _shares(u, y, settled, tau_us, follower_us):
     """``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
     apart = 1.0 - follower_us / tau_us
@@ -31,7 +32,7 @@ def _shares(u, y, settled, tau_us, follower_us):
     return a, y - settled - a, follower_us
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _advanced(u, y, settled, tau_us, follower_us, t_us):
     """Photoreceptor and follower after ``t_us`` of constant light."""
     if t_us > _SETTLED * tau_us and t_us > _SETTLED * follower_us:
@@ -52,7 +53,7 @@ def _advanced(u, y, settled, tau_us, follower_us, t_us):
     return settled + way * fade, settled + (y - settled) * lag + way * share
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fade(x):
     """``exp(-x)`` to 2e-6: enough where risks are summed up, and quicker."""
     if not -0.5 < x < 0.5:
@@ -64,7 +65,7 @@ def _fade(x):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _solve(settled, a, b, tau_us, follower_us, level, lo_us, hi_us):
     """Time in [lo, hi] at which the monotone y passes ``level``: Newton kept inside a bracket."""
     sign = 1.0 if settled + a * math.exp(-lo_us / tau_us) + b * math.exp(
@@ -88,7 +89,7 @@ def _solve(settled, a, b, tau_us, follower_us, level, lo_us, hi_us):
     return t
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _noiseless(u, y, settled, tau_us, follower_us, on_level, off_level):
     """Time from now and polarity of the first passage of y; NOTHING when there is none."""
     if y <= on_level:
@@ -118,7 +119,7 @@ def _noiseless(u, y, settled, tau_us, follower_us, on_level, off_level):
     return np.inf, NOTHING
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _earliest_us(u, y, settled, t_us, tau_us, follower_us, on_level, off_level, reach):
     """A time before which nothing can happen: where y comes within ``reach`` of a level.
 

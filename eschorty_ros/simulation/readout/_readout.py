@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
+from eschorty_ros.core.base.kernel import kernel
 
 # State: time at which the arbiter is free (ns), rows in the queue, place of the first of them,
 # events waiting, period of the rate control (-1 for none begun), events that came to it and that
@@ -25,7 +25,7 @@ from numba import njit
 S_SIZE = 12
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _drop(t_us, note_us, state, drops):
     """Count an event that the arbiter has no room for; the first of a time span is told."""
     state[S_DROPPED] += 1
@@ -35,7 +35,7 @@ def _drop(t_us, note_us, state, drops):
         state[S_NOTES] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _end_period(period_us, state, periods):
     """Tell what came and what passed in the period of the rate control that ends."""
     if state[S_CAME] > 0:
@@ -46,7 +46,7 @@ def _end_period(period_us, state, periods):
     state[S_CAME], state[S_PASSED], state[S_PERIOD] = 0, 0, -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _serve(
     until_us, row_ns, period_us, events_max, state, queue, heads, links, keys, out, periods, n
 ):
@@ -87,7 +87,7 @@ def _serve(
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _read_out(
     requests, until_us, row_ns, period_us, events_max, note_us, state, queue, heads, links, keys,
     out, drops, periods,

@@ -1,0 +1,69 @@
+"""The decorator of compiled functions: one set of options, and a cache that notices every change.
+
+numba's cache looks at the time and size of the file a function stands in. A kernel is also made of
+the kernels that it calls and of the constants it reads from other files, and an installer may keep
+the time of a file. So the stamp of a kernel's cache is a digest of all of these.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+
+def kernel(*arguments: Any, **options: Any) -> Any:
+    """Compile a function with numba: cached, without the GIL, division as numpy divides.
+
+    ``@kernel`` compiles at the first call, ``@kernel(signature, ...)`` at import and for these
+    signatures only. Keyword options are those of ``numba.njit``.
+    """
+    if len(arguments) == 1 and callable(arguments[0]) and hasattr(arguments[0], "__code__"):
+        return _compiled(arguments[0], (), options)
+    return lambda function: _compiled(function, arguments, options)
+
+
+def _compiled(function: Callable[..., Any], signatures: tuple[Any, ...], options: Any) -> Any:
+    dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    # numba has no public way to say what a cached function depends on.
+    dispatcher._cache._cache_file._source_stamp = dispatcher.source_digest = _digest(function)
+    for signature in signatures:
+        dispatcher.compile(signature)
+    if signatures:
+        dispatcher.disable_compile()
+    return dispatcher
+
+
+def _digest(function: Callable[..., Any]) -> str:
+    """Return a digest of the function's file and of all it uses from other files."""
+    parts = [_file_digest(function.__code__.co_filename)]
+    for name in sorted(set(_names(function.__code__))):
+        value = function.__globals__.get(name)
+        if isinstance(value, ModuleType):
+            if value.__name__.startswith(__name__.partition(".")[0]):
+                parts.append(_file_digest(str(value.__file__)))
+        elif hasattr(value, "source_digest"):
+            parts.append(f"{name}={value.source_digest}")
+        elif hasattr(value, "_fields"):
+            parts.append(f"{name}={value._fields}")
+        elif isinstance(value, bool | int | float | str | tuple | np.generic | np.ndarray):
+            parts.append(f"{name}={value!r}")
+    return hashlib.blake2b(";".join(parts).encode(), digest_size=16).hexdigest()
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+@cache
+def _file_digest(path: str) -> str:
+    return hashlib.blake2b(Path(path).read_bytes(), digest_size=16).hexdigest()

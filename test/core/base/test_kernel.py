@@ -1,0 +1,52 @@
+"""Compiled code is as new as all that it was made of."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+CALLEE = """
+from eschorty_ros.core.base.kernel import kernel
+
+FACTOR = {factor}
+
+@kernel
+def _scaled(x):
+    return {scale} * x
+"""
+CALLER = """
+from callee import FACTOR, _scaled
+from eschorty_ros.core.base.kernel import kernel
+
+@kernel{signature}
+def _total(x):
+    return _scaled(x) + FACTOR
+
+print(_total(1))
+"""
+
+
+@pytest.mark.parametrize("signature", ["", "('int64(int64)')"])
+def test_a_change_in_another_file_reaches_the_kernels_that_use_it(tmp_path, signature):
+    """Time and size of every file stay as they were, as after some installers."""
+    (tmp_path / "caller.py").write_text(CALLER.format(signature=signature))
+
+    def result(factor, scale):
+        callee = tmp_path / "callee.py"
+        callee.write_text(CALLEE.format(factor=factor, scale=scale))
+        os.utime(callee, (0, 0))
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+            "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+        command = [sys.executable, str(tmp_path / "caller.py")]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    assert result(factor=10, scale=2) == 12
+    assert result(factor=20, scale=2) == 22
+    assert result(factor=20, scale=3) == 23
+    assert len(list(tmp_path.glob("cache/*/*_total*.nbi"))) == 1
