@@ -6,8 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.calibration import WIDTH_BIAS, CalibrationReport
 from eschorty_ros.core.optics import depth_of_field_mm
 from eschorty_ros.report.figures import new_figure
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 SIGMA_ROW_PX = 0.3
 """Centroid error of a measurement that the range sigma is drawn for."""

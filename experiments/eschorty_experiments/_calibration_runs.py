@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.calibration import (
     K_PRIOR_SHARE,
     PARAMETERS,
@@ -20,8 +20,6 @@ from eschorty_ros.core.calibration import (
 )
 from eschorty_ros.core.optics import Calibration, RangeModel
 from eschorty_ros.simulation.scenes import measured_posts
-
-Array = NDArray[np.float64]
 
 CHECK_MM = np.array([800.0, 1000.0, 1320.0, 1700.0, 2100.0])
 FINE_MM = np.linspace(790.0, 2110.0, 34)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.calibration import CalibrationFit, fit_targets
 from eschorty_ros.core.optics import Design
-
-Array = NDArray[np.float64]
 
 SIGMA_ROW_PX = 0.3
 SIGMA_EDGE_PX = 0.3

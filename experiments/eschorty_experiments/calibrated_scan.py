@@ -8,8 +8,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.calibration import (
     CalibrationReport,
@@ -37,8 +37,6 @@ from eschorty_ros.simulation.world import simulate_recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 DESIGN, AS_BUILT = "config_3", "config_3_as_built"
 FREQUENCY_HZ, SPEED_MM_S = 70.0, 50.0

@@ -20,6 +20,7 @@ from eschorty_ros.core.base.numbers import (
 )
 
 __all__ = [
+    "Array",
     "SMALLEST",
     "TIME_LIMIT",
     "as_array",
@@ -38,6 +39,9 @@ __all__ = [
     "whole",
     "whole_vector",
 ]
+
+Array = NDArray[np.float64]
+"""float64 values of any shape."""
 
 
 def reals(name: str, values: ArrayLike) -> NDArray[np.float64]:

@@ -7,9 +7,8 @@ parameters may differ in unit by any factor and no condition number is ever squa
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from eschorty_ros.core.base.arrays import Array
 
 RANK_TOLERANCE = 1e-12
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
-Array = NDArray[np.float64]
 Values = dict[str, float]
 
 PARAMETERS = ("k_mm", "k_prime_px", "b_mm", "b_prime_px")

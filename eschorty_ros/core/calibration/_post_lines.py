@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import number, number_or_nan, positive
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.post_finder import Post
 from eschorty_ros.core.optics import RangeModel
-
-Array = NDArray[np.float64]
 
 SCALE_TOLERANCE = 0.15
 """By this share kk' may differ from the nominal build's."""

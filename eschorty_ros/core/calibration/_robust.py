@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.calibration._least_squares import condition_number, covariance
 from eschorty_ros.core.calibration._model import Observed, Values, values_of
 from eschorty_ros.core.calibration._solvers import Problem, refuse_singular, search
 from eschorty_ros.core.optics import RangeModel
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 TARGETS_MIN = 5

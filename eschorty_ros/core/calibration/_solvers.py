@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration._least_squares import condition_number
 from eschorty_ros.core.calibration._model import (
@@ -21,8 +21,6 @@ from eschorty_ros.core.calibration._model import (
     values_of,
 )
 from eschorty_ros.core.optics import POLE_MARGIN_PX, RangeModel
-
-Array = NDArray[np.float64]
 
 PAPER_FREE = ("k_prime_px", "b_prime_px")
 """What the paper fits: k and b stay at their design values."""

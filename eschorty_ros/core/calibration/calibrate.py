@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.calibration._checks import (
     check_targets,
@@ -40,7 +41,6 @@ from eschorty_ros.core.calibration.fit import (
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import Calibration, RangeModel
 
-Array = NDArray[np.float64]
 Method = Literal["paper", "joint"]
 
 METHODS: tuple[Method, ...] = ("paper", "joint")

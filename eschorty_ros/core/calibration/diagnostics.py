@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.calibration._model import COLUMN_TERMS, WIDTH_BIAS, Observed
 from eschorty_ros.core.calibration._solvers import Problem, solve
@@ -19,8 +19,6 @@ from eschorty_ros.core.calibration.fit import (
 )
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
-
-Array = NDArray[np.float64]
 
 PRIOR_SHARE = math.sqrt(0.5)
 """Above this ratio of standard deviations a prior tells more than the targets."""

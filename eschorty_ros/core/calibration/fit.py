@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import broadcast, reals
+from eschorty_ros.core.base.arrays import Array, broadcast, reals
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.calibration._checks import (
     check_targets,
@@ -45,8 +45,6 @@ __all__ = [
     "fit",
     "fit_targets",
 ]
-
-Array = NDArray[np.float64]
 
 CONDITION_WARNING = 1e3
 PRIOR_SIGMA = {

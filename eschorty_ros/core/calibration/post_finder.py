@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import number, whole
+from eschorty_ros.core.base.arrays import Array, number, whole
 from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
 from eschorty_ros.core.line import HALF_WIDTH_PER_FWHM, SIGMA_FLOOR_PX
-
-Array = NDArray[np.float64]
 
 LINE_WIDTH_PX = 20.0
 COLUMNS_MIN = 8

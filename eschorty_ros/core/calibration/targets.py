@@ -9,10 +9,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import reals, selection, short
+from eschorty_ros.core.base.arrays import Array, reals, selection, short
 from eschorty_ros.core.base.errors import ArgumentError
-
-Array = NDArray[np.float64]
 
 SIGMA_ROW_PX = 0.3
 """Standard deviation of a centroid when nothing better is known."""

@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, number, positive, times, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, number, positive, times, whole
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks.clock import POSITION_LIMIT_MM
 from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
-
-Array = NDArray[np.float64]
 
 _LEGS_MAX = 64
 _READINGS_MAX = 10_000

@@ -16,10 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, number, vector, whole_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, number, vector, whole_vector
 from eschorty_ros.core.base.errors import ArgumentError
-
-Array = NDArray[np.float64]
 
 ROOT_12 = math.sqrt(12.0)
 """Full width over standard deviation of evenly spread rows."""

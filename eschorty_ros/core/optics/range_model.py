@@ -10,12 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import broadcast, number, positive, reals, whole
+from eschorty_ros.core.base.arrays import Array, broadcast, number, positive, reals, whole
 from eschorty_ros.core.base.errors import ArgumentError
-
-Array = NDArray[np.float64]
 
 POLE_MARGIN_PX = 1.0
 PIXEL_UM = 4.86

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes.scene import UniformReflectance, sheet
-
-Array = NDArray[np.float64]
 
 RANGES_MM = (820.0, 960.0, 1110.0, 1270.0, 1440.0, 1610.0, 1770.0, 1910.0, 2050.0)
 """A third of them in the far third of what the third build sees."""

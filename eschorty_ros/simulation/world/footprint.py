@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes import Scene
-
-Array = NDArray[np.float64]
 
 _LOOKS = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Where the scene is looked at across the line, in half widths of the footprint."""
