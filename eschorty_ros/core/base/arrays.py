@@ -20,9 +20,9 @@ from eschorty_ros.core.base.numbers import (
 )
 
 __all__ = [
-    "Array",
     "SMALLEST",
     "TIME_LIMIT",
+    "Array",
     "as_array",
     "broadcast",
     "exact",

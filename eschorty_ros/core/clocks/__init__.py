@@ -17,14 +17,14 @@ from eschorty_ros.core.clocks.position_edges import fit_edges
 from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
 
 __all__ = [
+    "NM_PER_MM",
+    "NS_PER_US",
+    "POSITION_LIMIT_MM",
     "ClockLine",
     "EdgeClock",
     "LowerEnvelope",
     "MotionFit",
     "MotionPlan",
-    "NM_PER_MM",
-    "NS_PER_US",
-    "POSITION_LIMIT_MM",
     "PulseTrain",
     "SensorClock",
     "StageTrack",

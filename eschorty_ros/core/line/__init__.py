@@ -25,7 +25,6 @@ from eschorty_ros.core.line.smoothing import smooth
 
 __all__ = [
     "CLIPPED",
-    "Centroids",
     "FWHM_PER_SIGMA",
     "HALF_WIDTH_PER_FWHM",
     "METHODS",
@@ -37,6 +36,7 @@ __all__ = [
     "SIGMA_FACTOR",
     "SIGMA_FLOOR_PX",
     "WHOLE_COLUMN_METHODS",
+    "Centroids",
     "check_method",
     "estimate",
     "events_per_row",

@@ -7,4 +7,4 @@ from eschorty_ros.core.modulation.modulation import (
     Modulation,
 )
 
-__all__ = ["FREQUENCY_MAX_HZ", "FREQUENCY_MIN_HZ", "Modulation", "WAVEFORMS"]
+__all__ = ["FREQUENCY_MAX_HZ", "FREQUENCY_MIN_HZ", "WAVEFORMS", "Modulation"]

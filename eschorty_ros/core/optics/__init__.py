@@ -21,11 +21,11 @@ from eschorty_ros.core.optics.range_model import (
 __all__ = [
     "BUILDS",
     "COLUMNS",
-    "Calibration",
-    "Design",
     "PARAMETERS",
     "PIXELS_MAX",
     "POLE_MARGIN_PX",
+    "Calibration",
+    "Design",
     "RangeModel",
     "config_file",
     "depth_of_field_mm",

@@ -6,9 +6,9 @@ from eschorty_ros.simulation.pixels.pixel import PixelArray, unpack
 from eschorty_ros.simulation.pixels.presets import PRESETS, preset
 
 __all__ = [
-    "Biases",
     "LIMITS",
     "PRESETS",
+    "Biases",
     "PixelArray",
     "PixelParameters",
     "parameters_from_biases",

@@ -10,10 +10,10 @@ from eschorty_ros.simulation.world.world import BACKGROUND_HZ, STEP_MM, World
 
 __all__ = [
     "BACKGROUND_HZ",
+    "STEP_MM",
     "Gate",
     "LaserTimeline",
     "LineEvents",
-    "STEP_MM",
     "SensorControl",
     "StageTimeline",
     "World",
