@@ -124,5 +124,5 @@ $(SETUP): $(BUILD)/interfaces.stamp
 	  echo 'export PATH="$(VENV)/bin:$(PREFIX)/bin:$$PATH"'; \
 	  echo 'export AMENT_PREFIX_PATH="$(PREFIX):$(UNDERLAY)"'; \
 	  echo 'export LD_LIBRARY_PATH="$(PREFIX)/lib$${LD_LIBRARY_PATH:+:$$LD_LIBRARY_PATH}"'; \
-	  echo "export PYTHONPATH=\"$(ROOT):$$site\$${PYTHONPATH:+:\$$PYTHONPATH}\""; \
+	  echo "export PYTHONPATH=\"$(ROOT):$(ROOT)/experiments:$$site\$${PYTHONPATH:+:\$$PYTHONPATH}\""; \
 	  echo 'export NUMBA_CACHE_DIR="$(BUILD)/numba"'; } > $@

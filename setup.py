@@ -33,6 +33,7 @@ setup(
     ],
     install_requires=REQUIREMENTS,
     extras_require={
+        "report": [f"eschorty-experiments @ {(HERE / 'experiments').absolute().as_uri()}"],
         "mesh": ["open3d>=0.19", "libusb-package"],
         # LGPL: several transfers in flight; without it the camera is read one transfer at a time.
         "usb-async": ["libusb1>=3.1"],

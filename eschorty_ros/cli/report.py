@@ -6,13 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from eschorty_experiments import NAMES
 
 from eschorty_ros.cli.console import progress_bar, show, table
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 
 if TYPE_CHECKING:
     from eschorty_ros.report.sections import Section
+
+try:
+    from eschorty_experiments import NAMES
+except ModuleNotFoundError:
+    NAMES = ()
 
 
 @click.command("report")
@@ -55,6 +59,11 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
       1  an experiment failed, or the folder cannot be written
       2  wrong usage, such as an unknown NAME
     """  # noqa: D301
+    if not NAMES:
+        raise EschortyError(
+            "the experiments are not installed; run `pip install '.[report]'` in the source folder "
+            "of eschorty_ros"
+        )
     from eschorty_experiments import load
 
     from eschorty_ros.report.experiment import Effort
