@@ -25,7 +25,7 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "test" / "support")]
 
-from support.streams import line_row_events, sparse_events  # noqa: E402
+from streams import line_row_events, sparse_events  # noqa: E402
 
 from eschorty_ros.core.evt3 import ActivityFilter  # noqa: E402
 from eschorty_ros.core.evt3 import decoder as evt3  # noqa: E402

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import html_check
 import numpy as np
 import pytest
+from calibration_posts import NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, range_error_mm, see
 from click.testing import CliRunner
-from support import html_check
-from support.calibration_posts import NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, range_error_mm, see
 
 from eschorty_ros.cli import main
 from eschorty_ros.core.calibration import DISTANCE_COLUMNS, PRIOR_SIGMA, TARGET_COLUMNS

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.expected_scan import assert_accurate
+from expected_scan import assert_accurate
 
 from eschorty_ros.cli import INTERRUPTED
 from eschorty_ros.core.base.errors import DeviceError

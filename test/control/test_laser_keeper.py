@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from support.held_laser import HeldLaser
-from support.hours import Hours
-from support.waiting import DEADLINE_S, wait_until
+from held_laser import HeldLaser
+from hours import Hours
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.control.laser_interlock import LEASE, LaserGate
 from eschorty_ros.control.laser_supervisor import LaserKeeper

@@ -1,7 +1,7 @@
 """Which states of the stage are told, whatever its clock does."""
 
 import pytest
-from support.apt_bench import AptBench
+from apt_bench import AptBench
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

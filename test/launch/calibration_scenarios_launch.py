@@ -9,9 +9,9 @@ import tempfile
 import unittest
 from pathlib import Path
 
+import calibration_scenarios as scenarios
 import launch_testing.actions
-from support import calibration_scenarios as scenarios
-from support.launch_processes import TestShutdown, bench_action, node_process
+from launch_processes import TestShutdown, bench_action, node_process
 
 import launch
 from eschorty_ros.nodes.ros.domain import free_domain

@@ -10,8 +10,8 @@ import unittest
 from pathlib import Path
 
 import launch_testing.actions
-from support import scan_scenarios as scenarios
-from support.launch_processes import TestShutdown, bench_action, node_process
+import scan_scenarios as scenarios
+from launch_processes import TestShutdown, bench_action, node_process
 
 import launch
 from eschorty_ros.nodes.ros.domain import free_domain

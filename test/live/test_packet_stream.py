@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from support.line_events import encoded, line_events
+from line_events import encoded, line_events
 
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.core.evt3 import Decoder

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.line_events import blank_profiles
+from line_events import blank_profiles
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

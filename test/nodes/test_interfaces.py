@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+import interface_tables as tables
 from rclpy.node import Node
-from support import interface_tables as tables
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 

@@ -5,10 +5,10 @@ import re
 from pathlib import Path
 
 import eschorty_experiments as experiments
+import html_check
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from support import html_check
 
 from eschorty_ros.cli import main
 from eschorty_ros.report.experiment import DataTable, Experiment, Finding, Outcome

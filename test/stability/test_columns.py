@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.line_events import encoded
+from line_events import encoded
 
 from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.line import METHOD_NOISE, METHODS, SIGMA_FLOOR_PX, estimate

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hostile import calibrating, columns, posts, ranging, stored, streams, timing
 from hostile.kinds import Call
 from hostile.surface import parameters, public_callables
-from support.hostile import calibrating, columns, posts, ranging, stored, streams, timing
 
 from eschorty_ros.core.base.errors import EschortyError
 

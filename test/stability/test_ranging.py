@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.line_events import blank_profiles
+from line_events import blank_profiles
 
 from eschorty_ros.core.optics import BUILDS, RangeModel, depth_of_field_mm, load_calibration
 from eschorty_ros.core.reconstruction import place

@@ -8,8 +8,8 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
-from support.line_events import blank_profiles, encoded, line_events
-from support.stage_pulses import PULSES, StagePulses
+from line_events import blank_profiles, encoded, line_events
+from stage_pulses import PULSES, StagePulses
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import ClockLine, SensorClock, StageTrack, fit_edges

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from support.short_folder import short_folder
+from short_folder import short_folder
 
 from eschorty_ros.emulation.awg.model import AwgModel, truth
 from eschorty_ros.emulation.bus.usb_server import UsbServer

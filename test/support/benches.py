@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from support.short_folder import short_folder
+from short_folder import short_folder
 
 from eschorty_ros.emulation.bench.cables import serving
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings

@@ -14,9 +14,9 @@ from eschorty_ros.action import Calibrate
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
 from rclpy.action import ActionClient
+from ros_process import Observer, told_after, wait_until
+from scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
 from std_msgs.msg import Bool
-from support.ros_process import Observer, told_after, wait_until
-from support.scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
 
 from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.nodes.ros import qos

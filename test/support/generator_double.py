@@ -17,8 +17,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from support.short_folder import short_folder
-from support.waiting import DEADLINE_S, wait_until
+from short_folder import short_folder
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation

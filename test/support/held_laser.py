@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from support.waiting import DEADLINE_S
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation

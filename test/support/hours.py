@@ -6,7 +6,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from support.waiting import wait_until
+from waiting import wait_until
 
 from eschorty_ros.hardware.base import stalls as own_pauses
 

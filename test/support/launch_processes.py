@@ -11,7 +11,7 @@ from typing import Any
 
 import launch_testing
 from launch.actions import ExecuteProcess
-from support.ros_process import NAMESPACE, domain_environment
+from ros_process import NAMESPACE, domain_environment
 
 from eschorty_ros.emulation.bench.process import bench_command
 

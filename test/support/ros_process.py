@@ -24,8 +24,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from support.spinning import spinning
-from support.waiting import DEADLINE_S, wait_until
+from spinning import spinning
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.dds import use_profile

@@ -15,8 +15,8 @@ from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
+from ros_process import Observer, ros_minus_steady_ns, told_after, wait_until
 from sensor_msgs.msg import PointCloud2
-from support.ros_process import Observer, ros_minus_steady_ns, told_after, wait_until
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import POINT_DTYPE

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.calibration_posts import DESIGN, NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, see
+from calibration_posts import DESIGN, NINE_MM, NOMINAL, TRUTH, TWO_SIZES_MM, see
 
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration import PRIOR_SIGMA, WIDTH_BIAS, Targets, calibrate, fit

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from support.calibration_posts import (
+from calibration_posts import (
     CHECK_MM,
     DESIGN,
     NINE_MM,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from support.stage_pulses import PULSES, StagePulses
+from stage_pulses import PULSES, StagePulses
 
 from eschorty_ros.core.clocks import EdgeClock, StageTrack
 

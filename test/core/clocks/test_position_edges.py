@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.stage_pulses import EPOCH_NS, PULSES, SEED, StagePulses
+from stage_pulses import EPOCH_NS, PULSES, SEED, StagePulses
 
 from eschorty_ros.core.clocks import PulseTrain, StageTrack, fit_edges, leading_edges
 

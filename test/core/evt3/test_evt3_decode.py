@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 
-from support.evt3_oracle import SlowDecoder
-from support.streams import RECORDING_SHARES, recording_like_words, words_of
+from evt3_oracle import SlowDecoder
+from streams import RECORDING_SHARES, recording_like_words, words_of
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import decoder as evt3

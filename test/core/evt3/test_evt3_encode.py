@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 
-from support.streams import line_row_events, sparse_events
+from streams import line_row_events, sparse_events
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import decoder as evt3

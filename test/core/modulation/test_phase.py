@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from support.line_events import line_events
+from line_events import line_events
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase import EdgeSchedule

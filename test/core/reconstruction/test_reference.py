@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.line_events import encoded, line_events
+from line_events import encoded, line_events
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder, Encoder

@@ -10,7 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 
-from support.streams import words_of
+from streams import words_of
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
 from eschorty_ros.core.storage import RawReader, RawWriter

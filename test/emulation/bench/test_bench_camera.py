@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.camera_on_bench import CameraOnBench
+from camera_on_bench import CameraOnBench
 
 from eschorty_ros.emulation.evk4.control import sensor_control
 from eschorty_ros.emulation.evk4.model import Evk4Model

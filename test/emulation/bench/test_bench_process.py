@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.waiting import DEADLINE_S, wait_until
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.bench.folder import (

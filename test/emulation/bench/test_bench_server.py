@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-from support.benches import bench_here
-from support.waiting import wait_until
+from benches import bench_here
+from waiting import wait_until
 
 from eschorty_ros.emulation.bench.folder import STAGE_PORT, usb_spec
 from eschorty_ros.hardware.base.usb import open_backend

@@ -1,6 +1,6 @@
 """docs/faults.md has every test of a fault."""
 
-from support import fault_table
+import fault_table
 
 
 def test_every_fault_test_says_what_the_driver_does_and_what_the_user_reads():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import serial
-from support.waiting import DEADLINE_S, wait_until
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.bus.pty_port import PtyPort

@@ -7,8 +7,8 @@ import threading
 import pytest
 import usb.core
 import usb.util
-from support.usb_loop import IN, OUT, PACKET, Loop
-from support.waiting import DEADLINE_S
+from usb_loop import IN, OUT, PACKET, Loop
+from waiting import DEADLINE_S
 
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
 

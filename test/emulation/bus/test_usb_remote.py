@@ -11,9 +11,9 @@ import time
 import pytest
 import usb.core
 import usb.util
-from support.short_folder import short_folder
-from support.usb_loop import IN, OUT, PACKET, Loop
-from support.waiting import DEADLINE_S
+from short_folder import short_folder
+from usb_loop import IN, OUT, PACKET, Loop
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.bus import usb_remote

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import usb.backend.libusb1
 import usb.core
-from support.usb_loop import IDENTITY, OUT, Loop
+from usb_loop import IDENTITY, OUT, Loop
 
 from eschorty_ros.core.base.errors import (
     ArgumentError,

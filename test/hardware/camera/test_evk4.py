@@ -6,7 +6,7 @@ import threading
 import time
 
 import pytest
-from support.evk4_bench import PATIENCE_S, SERIAL, OnDemand, Rig, until
+from evk4_bench import PATIENCE_S, SERIAL, OnDemand, Rig, until
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceGoneError
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from support.evk4_bench import PATIENCE_S, OnDemand, Rig, until
+from evk4_bench import PATIENCE_S, OnDemand, Rig, until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.bus.usb_pipe import UsbFault

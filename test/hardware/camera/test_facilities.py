@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.camera_register_file import RegisterFile
+from camera_register_file import RegisterFile
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, FormatError
 from eschorty_ros.hardware.camera import event_rate, event_trail, monitors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.camera_register_file import RegisterFile
+from camera_register_file import RegisterFile
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.hardware.camera import imx636

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from awg_bench import AwgBench
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.awg_bench import AwgBench
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation

@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import generator_double
 import pytest
-from support import generator_double
-from support.generator_double import MAKE, Generator
-from support.hours import Hours
-from support.waiting import DEADLINE_S, wait_until
+from generator_double import MAKE, Generator
+from hours import Hours
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation

@@ -6,7 +6,7 @@ import itertools
 import random
 
 import pytest
-from support.apt_bench import AptBench
+from apt_bench import AptBench
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage import apt_messages

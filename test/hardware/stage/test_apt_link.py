@@ -6,7 +6,7 @@ import errno
 import threading
 
 import pytest
-from support.waiting import DEADLINE_S
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage.apt_link import AptLink

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import serial
-from support.waiting import DEADLINE_S, wait_until
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.apt.model import AptModel

@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 import pytest
-from support.apt_bench import EPOCH_NS, AptBench
+from apt_bench import EPOCH_NS, AptBench
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.hardware.stage.apt_setup import AptSettings

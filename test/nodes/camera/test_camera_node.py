@@ -10,10 +10,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from benches import bench_here
 from event_camera_msgs.msg import EventPacket
 from rclpy.qos import ReliabilityPolicy
-from support.benches import bench_here
-from support.ros_process import Observer, processes, wait_until
+from ros_process import Observer, processes, wait_until
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation

@@ -12,17 +12,17 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from camera_on_bench import StillBench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
 from event_camera_msgs.msg import EventPacket
+from evk4_bench import OnDemand, plug
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from ros_process import Observer, wait_until
+from spinning import spinning
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
-from support.camera_on_bench import StillBench
-from support.evk4_bench import OnDemand, plug
-from support.ros_process import Observer, wait_until
-from support.spinning import spinning
 
 from eschorty_ros.emulation.evk4.model import Evk4Model
 from eschorty_ros.hardware.camera import evk4

@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from event_camera_msgs.msg import EventPacket
-from support.evk4_bench import OnDemand
-from support.ros_process import NodeProcess, Observer, processes, wait_until
-from support.short_folder import short_folder
+from evk4_bench import OnDemand
+from ros_process import NodeProcess, Observer, processes, wait_until
+from short_folder import short_folder
 
 from eschorty_ros.emulation.bus.usb_server import UsbServer
 from eschorty_ros.emulation.evk4.model import Evk4Model

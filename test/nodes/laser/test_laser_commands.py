@@ -11,14 +11,14 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import rclpy
 from eschorty_ros.msg import LaserState
+from held_laser import HeldLaser
 from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor
+from ros_process import NAMESPACE, Observer, wait_until
+from spinning import spinning
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
-from support.held_laser import HeldLaser
-from support.ros_process import NAMESPACE, Observer, wait_until
-from support.spinning import spinning
-from support.waiting import DEADLINE_S
+from waiting import DEADLINE_S
 
 from eschorty_ros.control.laser_interlock import LEASE
 from eschorty_ros.nodes.laser.node import THREADS, LaserNode

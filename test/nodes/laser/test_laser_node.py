@@ -13,11 +13,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from awg_process import AwgProcess
 from eschorty_ros.msg import LaserState
+from ros_process import NodeProcess, Observer, ros_minus_steady_ns, told_after, wait_until
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
-from support.awg_process import AwgProcess
-from support.ros_process import NodeProcess, Observer, ros_minus_steady_ns, told_after, wait_until
 
 from eschorty_ros.control.laser_interlock import LEASE
 from eschorty_ros.emulation.awg.model import truth

@@ -18,12 +18,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from awg_process import AwgProcess
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
+from ros_process import NodeProcess, Observer, told_after, wait_until
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
-from support.awg_process import AwgProcess
-from support.ros_process import NodeProcess, Observer, told_after, wait_until
 
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain

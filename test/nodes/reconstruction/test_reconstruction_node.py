@@ -8,10 +8,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
+from ros_process import NodeProcess, Observer
 from sensor_msgs.msg import Image, PointCloud2
-from support.ros_process import NodeProcess, Observer
-from support.waiting import DEADLINE_S, wait_until
 from tf2_msgs.msg import TFMessage
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.nodes.ros import qos

@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from support.line_events import line_events
-from support.stage_pulses import EPOCH_NS, PULSES, StagePulses
+from line_events import line_events
+from stage_pulses import EPOCH_NS, PULSES, StagePulses
 
 from eschorty_ros.core.evt3 import Encoder
 from eschorty_ros.core.modulation import Modulation

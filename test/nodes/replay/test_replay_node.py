@@ -5,9 +5,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from ros_process import NodeProcess, Observer
 from sensor_msgs.msg import PointCloud2
-from support.ros_process import NodeProcess, Observer
-from support.waiting import DEADLINE_S, wait_until
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording

@@ -11,12 +11,12 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from benches import bench_here
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
-from support.benches import bench_here
-from support.ros_process import Observer, wait_until
-from support.spinning import spinning
+from ros_process import Observer, wait_until
+from spinning import spinning
 
 from eschorty_ros.emulation.bench.devices import Bench
 from eschorty_ros.nodes.laser.node import LaserNode

@@ -13,8 +13,8 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
-from support.ros_process import Observer, wait_until
-from support.spinning import spinning
+from ros_process import Observer, wait_until
+from spinning import spinning
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.nodes.ros import diagnostics, lifecycle, qos

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from support.waiting import DEADLINE_S
+from waiting import DEADLINE_S
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

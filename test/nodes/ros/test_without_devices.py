@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from support.ros_process import NodeProcess, Observer, processes, wait_until
+from ros_process import NodeProcess, Observer, processes, wait_until
 
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain

@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from support import calibration_scenarios as scenarios
-from support.benches import turnable_bench
-from support.ros_process import NodeProcess, processes
+import calibration_scenarios as scenarios
+from benches import turnable_bench
+from ros_process import NodeProcess, processes
 
 from eschorty_ros.nodes.ros.domain import free_domain
 

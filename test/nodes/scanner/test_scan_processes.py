@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from support import scan_scenarios as scenarios
-from support.benches import bench_elsewhere
-from support.ros_process import NodeProcess, processes
+import scan_scenarios as scenarios
+from benches import bench_elsewhere
+from ros_process import NodeProcess, processes
 
 from eschorty_ros.nodes.ros.domain import free_domain
 

@@ -19,7 +19,7 @@ from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import PositionTrigger
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
-from support.ros_process import NodeProcess, Observer, wait_until
+from ros_process import NodeProcess, Observer, wait_until
 
 from eschorty_ros.emulation.apt.model import AptModel
 from eschorty_ros.emulation.bus.pty_port import PtyPort

@@ -13,12 +13,12 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from action_msgs.msg import GoalStatus
+from benches import bench_here
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import PositionTrigger
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
-from support.benches import bench_here
-from support.ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
+from ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
 
 from eschorty_ros.emulation.bench.devices import Bench
 from eschorty_ros.nodes.ros import qos

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from support.pixel_reference import stepped
+from pixel_reference import stepped
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixels import PixelParameters

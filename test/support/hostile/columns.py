@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from support.line_events import blank_profiles
+from line_events import blank_profiles
 
 from eschorty_ros.core.line import centroid, reflectance, row_sigma, smoothing
 from eschorty_ros.core.reconstruction import paper_method as reference

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from support.line_events import blank_profiles
+from line_events import blank_profiles
 
 from eschorty_ros.core.calibration import (
     aggregate_frame,
