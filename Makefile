@@ -5,6 +5,8 @@
 # make faults the fault table of docs/faults.md again, from its tests
 # make reference the tables of docs/interfaces.md again, from the nodes
 # make test   every test
+# make quick  the tests of the pure parts: no processes, no ROS
+# make picture docs/architecture.png again
 # make check  lint, types, import contracts
 #
 # Everything is set up on the way: .venv with pinned packages, interfaces in .build/install.
@@ -41,34 +43,37 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-# numba sees changes of a file, not of what the file imports: its cache goes when a kernel changes.
-KERNELS := $(shell grep -rl --include='*.py' 'import.*njit' eschorty_ros)
-
-.PHONY: help setup scan report tradeoff faults reference test check lint format types contracts clean
+.PHONY: help setup scan report tradeoff faults reference picture test quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 setup: $(SETUP)
 
-scan: $(SETUP) $(BUILD)/kernels.stamp
+scan: $(SETUP)
 	@$(ENTER) eschorty scan --out scan $(SCAN)
 
-report: $(SETUP) $(BUILD)/kernels.stamp
+report: $(SETUP)
 	@$(ENTER) eschorty report --out report $(REPORT)
 
-tradeoff: $(SETUP) $(BUILD)/kernels.stamp
+tradeoff: $(SETUP)
 	@$(ENTER) eschorty report --out report --only tradeoff
 	@$(ENTER) python -m eschorty_experiments.readme_table report/tradeoff-changes.csv README.md
 
 faults: $(SETUP)
 	@$(ENTER) python test/support/fault_table.py
 
-reference: $(SETUP) $(BUILD)/kernels.stamp
+reference: $(SETUP)
 	@$(ENTER) python test/support/interface_tables.py
 
-test: $(SETUP) $(BUILD)/kernels.stamp $(BUILD)/test.stamp
+test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
+
+quick: $(SETUP) $(BUILD)/test.stamp
+	@$(ENTER) pytest test/core test/live test/control
+
+picture: $(BUILD)/test.stamp
+	@$(VENV)/bin/python docs/architecture.py
 
 check: lint types contracts
 
@@ -102,9 +107,6 @@ $(BUILD)/interfaces.stamp: $(BUILD)/run.stamp $(INTERFACES)
 	@for package in $(EXTERNAL); do $(MAKE) --no-print-directory build-package SOURCE=external_msgs/$$package NAME=$$package; done
 	@$(MAKE) --no-print-directory build-package SOURCE=. NAME=eschorty_ros
 	@touch $@
-
-$(BUILD)/kernels.stamp: $(KERNELS)
-	@rm -rf $(BUILD)/numba && mkdir -p $(BUILD) && touch $@
 
 .PHONY: build-package
 build-package:

@@ -116,7 +116,7 @@ def selection(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
 
 
 def octets(name: str, data: Any) -> memoryview:
-    """``data`` as bytes; arrays of anything wider are refused, not reinterpreted."""
+    """Return ``data`` as bytes; arrays of anything wider are refused, not reinterpreted."""
     try:
         view = memoryview(data)
     except TypeError:
@@ -127,7 +127,7 @@ def octets(name: str, data: Any) -> memoryview:
 
 
 def broadcast(names: str, *arrays: NDArray[Any]) -> tuple[int, ...]:
-    """Common shape of ``arrays``."""
+    """Return common shape of ``arrays``."""
     try:
         return np.broadcast_shapes(*(array.shape for array in arrays))
     except ValueError:

@@ -107,7 +107,7 @@ class Observed:
         return np.where(self.known, self.seen - expected, 0.0)
 
     def derivative(self, p: Values, names: Sequence[str]) -> Array:
-        """Expected channels by the named parameters, shape (n, 3, p)."""
+        """Return expected channels by the named parameters, shape (n, 3, p)."""
         depth = self.range_mm + p["b_mm"]
         made = np.zeros((len(self), CHANNELS, len(names)))
         for index, name in enumerate(names):

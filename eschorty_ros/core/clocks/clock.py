@@ -169,7 +169,7 @@ class SensorClock:
 
     With ``zero_ns`` given (announced by the camera) the relation is fixed and exact. Without it
     offset and drift are the lower envelope of the packets' arrivals over a sliding window, see
-    :class:`~eschorty_ros.core.clocks.lower_envelope.LowerEnvelope`, until a better relation is known from
+    `LowerEnvelope`, until a better relation is known from
     trigger edges (:meth:`adopt`).
 
     The estimate may step at an observation, never between two of them: times converted between

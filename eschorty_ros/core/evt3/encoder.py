@@ -163,7 +163,7 @@ class Encoder:
             )
 
     def _high_words(self, start_us: int, end_us: int) -> int:
-        """Number of TIME_HIGH words up to ``end_us``."""
+        """Return number of TIME_HIGH words up to ``end_us``."""
         begun_us = start_us if self._state[T_US] == NONE else int(self._state[T_US])
         if end_us - begun_us > _IDLE_MAX_US:
             raise ArgumentError(
@@ -174,7 +174,7 @@ class Encoder:
 
 
 def _reports(rate_counts: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Times of the rate control's reports, and per report the events before and after it."""
+    """Return times of the rate control's reports, and per report the events before and after it."""
     given = np.asarray(() if rate_counts is None else rate_counts)
     if given.size == 0:
         return np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)

@@ -31,7 +31,7 @@ class Noise(NamedTuple):
 
 @kernel
 def _excess_events(excess, count, row, rows):
-    """Number of background events, evenly spread over the rows, behind ``excess`` variance.
+    """Return number of background events, evenly spread over the rows, behind ``excess`` variance.
 
     Returns also the share of their mean square distance that they have in common, as most lie on
     one side of a line away from the middle.

@@ -47,7 +47,7 @@ class Calibration(Schema):
     """Everything that turns rows and columns of one build into millimetres.
 
     The keys are those of ``calibration.yaml``, with the unit in the name. Signs as in
-    :class:`~eschorty_ros.core.optics.range_model.RangeModel`; the sign of ``theta_prime_deg`` tells the side
+    `RangeModel`; the sign of ``theta_prime_deg`` tells the side
     to which the sensor is tilted. ``k_mm`` left out means ``focal_length_mm / sin(theta_deg)``,
     unrounded. ``roi_px`` is the window that the camera reads out, ``[first column, first row,
     columns, rows]``; left out it is the whole sensor. ``b_prime_1_px`` and ``b_prime_2_px`` are

@@ -254,5 +254,5 @@ class RemoteBackend(DescriptorBackend):
 
 
 def backend(path: str) -> RemoteBackend:
-    """Make the backend for ``open_backend("eschorty_ros.emulation.bus.usb_remote:backend?PATH")``."""
+    """Return the backend whose bus is served at the socket ``path``."""
     return RemoteBackend(path)

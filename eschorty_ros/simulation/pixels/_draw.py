@@ -37,5 +37,5 @@ def _gaussian(bits):
 
 @kernel
 def _uniform(bits):
-    """Number between 0 and 1, neither included."""
+    """Return number between 0 and 1, neither included."""
     return (np.float64(bits >> np.uint64(11)) + 0.5) * 2.0**-53

@@ -23,7 +23,7 @@ ON, OFF, NOTHING, UNKNOWN = 1, 0, -1, -2
 
 @kernel
 def _shares(u, y, settled, tau_us, follower_us):
-    """``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
+    """Return ``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
     apart = 1.0 - follower_us / tau_us
     # Equal time constants have no such form; a part in a million apart they have, to 1e-6.
     if abs(apart) < 1e-6:
@@ -121,7 +121,7 @@ def _noiseless(u, y, settled, tau_us, follower_us, on_level, off_level):
 
 @kernel
 def _earliest_us(u, y, settled, t_us, tau_us, follower_us, on_level, off_level, reach):
-    """A time before which nothing can happen: where y comes within ``reach`` of a level.
+    """Return a time before which nothing can happen: where y comes within ``reach`` of a level.
 
     ``inf`` when no level is near. ``reach`` is the largest gap the noise table knows, as a factor.
     """

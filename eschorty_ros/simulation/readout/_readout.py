@@ -137,6 +137,6 @@ def _read_out(
     n = _serve(
         until_us, row_ns, period_us, events_max, state, queue, heads, links, keys, out, periods, n
     )
-    if period_us > 0 and 0 <= state[S_PERIOD] and (state[S_PERIOD] + 1) * period_us < until_us:
+    if period_us > 0 and state[S_PERIOD] >= 0 and (state[S_PERIOD] + 1) * period_us < until_us:
         _end_period(period_us, state, periods)
     return n
