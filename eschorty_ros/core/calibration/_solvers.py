@@ -75,7 +75,7 @@ class Problem:
         return np.array([values[name] for name in self.names])
 
     def residual(self, free: Array) -> Array | None:
-        """Return expected minus seen over the standard deviation; ``None`` for no possible build."""
+        """Return expected minus seen in standard deviations; ``None`` for no possible build."""
         p = self.values(free)
         signs = p["k_mm"] > 0.0 > p["k_prime_px"] and p["b_prime_px"] <= -POLE_MARGIN_PX
         seen = self.observed.residual(p) if signs else None
