@@ -1,4 +1,4 @@
-"""The other ends of a bench's cables, in a folder where drivers find them."""
+"""Serving a bench's devices on a USB socket and a serial port."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _SWITCH_S = 5e-4
 
 @contextlib.contextmanager
 def serving(bench: Bench, folder: Path) -> Iterator[UsbServer]:
-    """Serve a bench in an existing folder while inside.
+    """Serve a bench in an existing folder inside the context.
 
-    The file ``ready`` holds this process's id while everything is there.
+    The file ``ready`` holds this process's id while socket and port exist.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def serving(bench: Bench, folder: Path) -> Iterator[UsbServer]:
     with (
         UsbServer(folder / USB_SOCKET, bench.usb_devices) as usb,
         PtyPort(bench.stage, folder / STAGE_PORT, lock=bench.physics.lock),
-        _short_turns(),
+        _short_switch_interval(),
     ):
         try:
             ready.with_suffix(".new").write_text(f"{os.getpid()}\n")
@@ -42,8 +42,8 @@ def serving(bench: Bench, folder: Path) -> Iterator[UsbServer]:
 
 
 @contextlib.contextmanager
-def _short_turns() -> Iterator[None]:
-    """Within it answers, short and urgent, come soon beside the simulation's long turns."""
+def _short_switch_interval() -> Iterator[None]:
+    """Let threads switch often inside the context: answers must not wait for the simulation."""
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
     try:

@@ -1,4 +1,4 @@
-"""A whole bench in one process: camera, generator and stage models around one simulated world."""
+"""The bench in one process: camera, generator and stage models around one simulated world."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from eschorty_ros.simulation.world import BACKGROUND_HZ, World, warm_up
 
 @dataclass(frozen=True, slots=True)
 class BenchSettings:
-    """What stands on the bench and how it is wired.
+    """Scene, optical build, pixels and wiring of the bench.
 
     Attributes
     ----------
     scene : str
         A scene's name or a mesh file.
     calibration : str
-        The optical build as it really is, a name or a file.
+        The actual optical build, a name or a file.
     pixels : str
         Preset of the event pixels.
     seed : int
@@ -38,7 +38,7 @@ class BenchSettings:
         What is wired to the camera's trigger input.
     flaws : Imperfections
     laser_log : str
-        File that gets one line per change of the generator's output; empty for none.
+        File with one line per change of the generator's output; empty for none.
     """
 
     scene: str = "steps"
@@ -52,7 +52,7 @@ class BenchSettings:
 
 
 class Bench:
-    """Models of camera, generator and stage that act on each other as the real ones do.
+    """Models of camera, generator and stage that act on each other as real ones do.
 
     Parameters
     ----------
@@ -87,15 +87,15 @@ class Bench:
         self.stage = AptModel(clock_ns, on_plan=self.physics.set_stage)
         self.laser = AwgModel(clock_ns, log_path=settings.laser_log or None)
         self.laser.on_change = self.physics.set_laser
-        # A command and the world's present exclude each other.
+        # No command may run while the world advances to the present.
         self.laser.mutex = self.physics.lock
         self.camera = Evk4Model(self.physics)
         self.camera.configure = lambda settings: self.physics.set_sensor(sensor_control(settings))
 
     def look_at(self, scene: str) -> None:
-        """Put another scene in front of the camera, for the next start of its stream."""
+        """Set the scene from the next start of the stream on."""
         self._scene = named(scene)
 
     def usb_devices(self) -> list[EmulatedUsbDevice]:
-        """Give what is on the USB bus."""
+        """Return the devices on the USB bus."""
         return [self.camera, self.laser]

@@ -1,4 +1,4 @@
-"""Where a bench puts the other ends of its cables, and where drivers find them."""
+"""Names of a bench's socket and port, and the folder where drivers find them."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ READY_FILE = "ready"
 
 
 def default_folder() -> Path:
-    """Folder of this user's bench in this ROS domain."""
+    """Return the folder of this user's bench in this ROS domain."""
     base = os.environ.get("XDG_RUNTIME_DIR") or f"{tempfile.gettempdir()}/eschorty-{os.getuid()}"
     return Path(base) / f"eschorty-bench-{os.environ.get('ROS_DOMAIN_ID') or 0}"
 
 
 def bench_folder(name: str) -> Path:
-    """Folder called ``name``; an empty name is the default one."""
+    """Return the folder ``name``, or the default one for an empty name."""
     return Path(name) if name else default_folder()
 
 
 def usb_spec(folder: Path) -> str:
-    """Name the bench's USB bus for ``hardware.usb.open_backend``."""
+    """Return the name of the bench's USB bus for ``hardware.base.usb.open_backend``."""
     return f"eschorty_ros.emulation.bus.usb_remote:backend?{folder / USB_SOCKET}"
 
 
 def stage_port(folder: Path) -> str:
-    """Name the serial port of the bench's stage."""
+    """Return the serial port of the bench's stage."""
     return str(folder / STAGE_PORT)

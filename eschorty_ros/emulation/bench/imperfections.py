@@ -1,4 +1,4 @@
-"""Where the emulated bench is not ideal."""
+"""Deviations of the emulated bench from an ideal one."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ _PPB = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """Where the bench is not ideal.
+    """Deviations of the bench from an ideal one.
 
     Parameters
     ----------
     sensor_ppm, generator_ppm : float
-        How much faster than bench time the sensor's and the generator's clock run.
+        Rate error of the sensor's and the generator's clock.
     usb_jitter_ms : float
-        The camera's bytes arrive late by up to so much, evenly distributed.
+        Largest delay of the camera's bytes, uniformly distributed from 0.
     missing_edges : float
         Share of the trigger edges that the camera does not see.
     seed : int
-        Of jitter and missing edges.
+        Seed of jitter and missing edges.
 
     Raises
     ------
@@ -48,10 +48,10 @@ class Imperfections:
 
     @property
     def sensor_rate(self) -> Fraction:
-        """Sensor time that passes per bench time."""
+        """Return sensor time per bench time."""
         return 1 + Fraction(round(self.sensor_ppm * 1000), _PPB)
 
     @property
     def generator_rate(self) -> Fraction:
-        """Generator time that passes per bench time."""
+        """Return generator time per bench time."""
         return 1 + Fraction(round(self.generator_ppm * 1000), _PPB)

@@ -1,9 +1,8 @@
-"""What the emulated devices do to each other: laser and stage light the scene, the sensor sees it.
+"""The physics between the emulated devices: laser and stage light the scene, the sensor sees it.
 
 Laser and stage act in bench time, int64 nanoseconds of the bench's clock. The sensor has a clock of
 its own, which starts at 0 with every start of the stream and may run fast or slow. The world is
-simulated on demand, never beyond the bench's present: when the machine is slow, bytes come late,
-and never other ones.
+simulated on demand, never beyond the bench's present: on a slow machine the same bytes come later.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ Pulses = Callable[[int, int], list[tuple[int, bool]]]
 """Edges of the stage's trigger output from one bench time (ns) to before another: time, rising."""
 
 PACKET_US = 1_008
-"""The sensor hands out what it has once in so much of its time."""
+"""Period of the sensor's output in its own time."""
 
 _PACKETS_AT_ONCE = 4
 _PACKET_S = PACKET_US * 1e-6
@@ -50,14 +49,15 @@ class _Control:
 class Physics:
     """Scene, laser and stage as the sensor sees them; the source of the camera's bytes.
 
-    Whoever lets a device act holds ``lock`` from reading the bench's clock until the change is
-    told, and calls :meth:`collect_pulses` before: then every change is known before the world
-    gets there. ``read``, ``start`` and ``stop`` belong to the camera.
+    A caller that makes a device act holds ``lock`` from reading the bench's clock until it has
+    called ``set_laser``, ``set_stage`` or ``set_sensor``, and calls :meth:`collect_pulses` before:
+    every change is then known before the world reaches it. The camera calls ``read``, ``start``
+    and ``stop``.
 
     Parameters
     ----------
     make_world : callable
-        Makes the world anew for each start of the stream.
+        Makes a new world for each start of the stream.
     clock_ns : callable
         The bench's clock.
     imperfections : Imperfections
@@ -70,7 +70,7 @@ class Physics:
     ----------
     lock : threading.RLock
     late_changes : int
-        Changes told too late to be seen when they happened.
+        Changes set after the world had passed their time.
     edges, edges_missed : int
         Trigger edges on the wire, and those of them that the camera does not see.
 
@@ -107,52 +107,52 @@ class Physics:
         self._light = _Light(clock_ns(), False, None)
         self._plan = MotionPlan(clock_ns(), 0.0)
         self._control = _Control(clock_ns(), SensorControl())
-        self._news: deque[_Light | MotionPlan | _Control] = deque()
+        self._changes: deque[_Light | MotionPlan | _Control] = deque()
         self._stage_edges: deque[tuple[int, bool]] = deque()
         self._collected_ns = 0
-        self._on_the_way: deque[tuple[int, bytes]] = deque()
+        self._in_transit: deque[tuple[int, bytes]] = deque()
         self._rest = b""
         self._running = threading.Event()
 
     def set_laser(self, since_ns: int, on: bool, modulation: Modulation | None) -> None:
-        """Learn that the output is so from ``since_ns`` on; a rising edge lies there."""
+        """Set the laser's output from ``since_ns`` on, where a rising edge lies."""
         with self.lock:
             self._light = _Light(since_ns, on, modulation)
-            self._news.append(self._light)
+            self._changes.append(self._light)
 
     def set_stage(self, plan: MotionPlan) -> None:
-        """Learn that the carriage follows ``plan`` from its start on."""
+        """Set the carriage's motion from the start of ``plan`` on."""
         with self.lock:
             self._plan = plan
-            self._news.append(plan)
+            self._changes.append(plan)
 
     def set_sensor(self, control: SensorControl) -> None:
-        """Learn that the sensor is set so from now on."""
+        """Set the sensor from now on."""
         with self.lock:
             self._control = _Control(self.clock_ns(), control)
-            self._news.append(self._control)
+            self._changes.append(self._control)
 
     def collect_pulses(self) -> None:
-        """Take the stage's trigger edges up to now; a later command changes only later ones."""
+        """Collect the stage's trigger edges up to now, before a command changes later ones."""
         if self._trigger != "stage" or self._pulses is None:
             return
         with self.lock:
             now_ns = self.clock_ns()
             if now_ns <= self._collected_ns:
                 return
-            # Asked for a thousand times a second: a carriage at rest gives no pulses.
+            # This runs a thousand times a second: skip a carriage at rest, which gives no pulses.
             if self._collected_ns <= self._plan.end_ns + _PULSE_MAX_NS:
                 self._stage_edges.extend(self._pulses(self._collected_ns, now_ns))
             self._collected_ns = now_ns
 
     def start(self) -> None:
-        """Begin streaming; the sensor's clock reads 0 now."""
-        # Before the lock: laser and stage go on acting while the world is made.
+        """Start streaming; the sensor's clock starts at 0."""
+        # Outside the lock: laser and stage go on while the world is made.
         world = self._make_world()
         with self._simulating, self.lock:
             self.collect_pulses()
             self._stage_edges.clear()
-            self._news.clear()
+            self._changes.clear()
             self._zero_ns = self._collected_ns = self.clock_ns()
             self._world = world
             if self._trigger == "laser":
@@ -162,21 +162,21 @@ class Physics:
             self._apply_light(world, self._light)
             self._apply_plan(world, self._plan)
             world.set_sensor(0, self._control.control)
-            self._on_the_way.clear()
+            self._in_transit.clear()
             self._rest = b""
             self._running.set()
 
     def stop(self) -> None:
-        """End streaming; a waiting ``read`` returns; idempotent."""
+        """Stop streaming; a waiting ``read`` returns; idempotent."""
         self._running.clear()
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        """Return what the sensor has sent by now, ``b""`` when nothing comes in ``timeout_s``."""
+        """Return the bytes sent by now, ``b""`` when none come in ``timeout_s``."""
         deadline_s = time.monotonic() + timeout_s
         while True:
             with self._simulating:
                 if self._running.is_set():
-                    while self._simulate() and not self._on_the_way:
+                    while self._simulate() and not self._in_transit:
                         pass
                     self._deliver()
                 data, self._rest = self._rest[:max_bytes], self._rest[max_bytes:]
@@ -186,7 +186,7 @@ class Physics:
             time.sleep(min(_PACKET_S, left_s))
 
     def statistics(self) -> dict[str, float]:
-        """Count events, those the rate control dropped, lag, late changes and trigger edges."""
+        """Return counts of events, dropped events, late changes and trigger edges, and the lag."""
         world = self._world
         behind_ns = 0
         if world is not None and self._running.is_set():
@@ -201,15 +201,15 @@ class Physics:
         }
 
     def _simulate(self) -> bool:
-        """Advance the world by one piece towards the present; whether there was one."""
+        """Advance the world by at most four packets; returns whether it advanced."""
         world = self._world
         assert world is not None
         with self.lock:
             self.collect_pulses()
             horizon_ns = self.clock_ns()
-            news = list(self._news)
-            self._news.clear()
-        for change in news:
+            changes = list(self._changes)
+            self._changes.clear()
+        for change in changes:
             if isinstance(change, _Light):
                 self._apply_light(world, change)
             elif isinstance(change, _Control):
@@ -222,13 +222,13 @@ class Physics:
         data = world.advance(world.now_us + min(packets, _PACKETS_AT_ONCE) * PACKET_US)
         if data:
             late_ns = round(self._usb_chance.uniform(0.0, self._flaws.usb_jitter_ms) * 1e6)
-            self._on_the_way.append((horizon_ns + late_ns, data))
+            self._in_transit.append((horizon_ns + late_ns, data))
         return True
 
     def _deliver(self) -> None:
-        """Hand over what has arrived, in the order it was sent."""
-        while self._on_the_way and self._on_the_way[0][0] <= self.clock_ns():
-            self._rest += self._on_the_way.popleft()[1]
+        """Deliver the bytes that have arrived, in the order of sending."""
+        while self._in_transit and self._in_transit[0][0] <= self.clock_ns():
+            self._rest += self._in_transit.popleft()[1]
 
     def _apply_light(self, world: World, light: _Light) -> None:
         since_us = self._from_us(world, light.since_ns)
@@ -251,7 +251,7 @@ class Physics:
         return self._seen(edges)
 
     def _seen(self, edges: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
-        """Leave out the edges that the camera misses."""
+        """Return the edges without those that the camera misses."""
         seen = [edge for edge in edges if self._chance_of_edge() >= self._flaws.missing_edges]
         self.edges += len(edges)
         self.edges_missed += len(edges) - len(seen)
@@ -261,7 +261,7 @@ class Physics:
         return self._edge_chance.random() if self._flaws.missing_edges else 1.0
 
     def _from_us(self, world: World, t_ns: int) -> int:
-        """Sensor time of ``t_ns``, not before what is simulated; counts what came too late."""
+        """Return the sensor time of ``t_ns``, not before the world's; counts late changes."""
         t_us = self._sensor_us(t_ns)
         if t_us < world.now_us and world.now_us > 0:
             self.late_changes += 1

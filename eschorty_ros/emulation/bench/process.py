@@ -1,4 +1,4 @@
-"""Starting a bench as a process of its own, and ending it."""
+"""Starting and ending a bench in its own process."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.bench.folder import READY_FILE
 
 START_S = 300.0
-"""A machine's first start compiles for some 20 s, a slow one's for minutes."""
+"""The first start on a machine compiles kernels, for 20 s to some minutes."""
 
 _END_S = 20.0
 _POLL_S = 0.02
 
 
 def bench_command(folder: Path, options: Mapping[str, object]) -> list[str]:
-    """Command line of a bench; ``options`` are those of ``eschorty-bench``, without dashes."""
+    """Return the command line of a bench with options of ``eschorty-bench``, without dashes."""
     command = [sys.executable, "-m", "eschorty_ros.emulation.bench.server", str(folder)]
     for name, value in options.items():
         command += [f"--{name}", str(value)]
@@ -29,14 +29,14 @@ def bench_command(folder: Path, options: Mapping[str, object]) -> list[str]:
 
 @contextlib.contextmanager
 def bench_process(folder: Path, options: Mapping[str, object]) -> Iterator[subprocess.Popen[str]]:
-    """Run a bench in ``folder`` while inside; it is ready on entry.
+    """Run a bench in ``folder`` inside the context; it is ready on entry.
 
     Raises
     ------
     DeviceError
-        When the bench does not get ready; the message is its own.
+        When the bench does not start; with the message of the bench.
     """
-    # In a session of its own: Ctrl-C is for the nodes, which must reach their devices to the end.
+    # In a session of its own, so that Ctrl-C reaches the nodes only: they need their devices.
     process = subprocess.Popen(
         bench_command(folder, options),
         stdin=subprocess.DEVNULL,
@@ -58,7 +58,7 @@ def bench_process(folder: Path, options: Mapping[str, object]) -> Iterator[subpr
 
 
 def _ready(process: subprocess.Popen[str], folder: Path) -> bool:
-    """Whether this bench, and no other one in the folder, is ready."""
+    """Return whether the ready file in the folder is this bench's."""
     try:
         return (folder / READY_FILE).read_text().strip() == str(process.pid)
     except OSError:
@@ -69,8 +69,8 @@ def _wait_until_ready(process: subprocess.Popen[str], folder: Path) -> None:
     end_s = time.monotonic() + START_S
     while not _ready(process, folder):
         if process.poll() is not None:
-            said = process.communicate()[1].strip().splitlines()
-            reason = said[-1] if said else f"exit code {process.returncode}"
+            lines = process.communicate()[1].strip().splitlines()
+            reason = lines[-1] if lines else f"exit code {process.returncode}"
             raise DeviceError(f"the bench ended: {reason.removeprefix('eschorty-bench: ')}")
         if time.monotonic() > end_s:
             raise DeviceError(f"the bench is not ready after {START_S:.0f} s; see {folder}")

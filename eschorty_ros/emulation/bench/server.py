@@ -1,4 +1,4 @@
-"""The bench as a process of its own: the other ends of the USB and serial cables."""
+"""The command ``eschorty-bench``: the emulated bench as a process."""
 
 from __future__ import annotations
 
@@ -27,45 +27,45 @@ _POLL_S = 0.1
 _LINGER_S = 3.0
 
 
-class _Ending:
-    """What a signal asks for: out at once while setting up, an orderly end later."""
+class _Termination:
+    """Ends the process at a signal: at once while it sets up, in order while it serves."""
 
     def __init__(self) -> None:
-        # Now: by the time the bench is made its parent may be gone.
+        # Read first: the parent may end while the bench is being made.
         self._parent = os.getppid()
-        # No event: a signal handler that sets one while it is waited for may wait for ever.
-        self._asked = False
+        # A flag: a signal handler that sets an Event while it is waited for may deadlock.
+        self._requested = False
         self._serving = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._ask)
+            signal.signal(number, self._request)
 
     def wait(self) -> None:
-        """Wait for a signal or for the end of the process that started this one."""
+        """Wait for a signal or for the end of the parent process."""
         self._serving = True
-        while not self._asked and os.getppid() == self._parent:
+        while not self._requested and os.getppid() == self._parent:
             time.sleep(_POLL_S)
 
-    def _ask(self, *_: object) -> None:
-        self._asked = True
+    def _request(self, *_: object) -> None:
+        self._requested = True
         if not self._serving:
             sys.exit(0)
 
 
 def serve(folder: Path, settings: BenchSettings) -> None:
-    """Make the bench and serve it in ``folder`` until a signal or the end of the parent process.
+    """Serve a bench in ``folder`` until a signal or the end of the parent process.
 
     Raises
     ------
     EschortyError
         When the folder cannot be used, another bench uses it, or the settings are refused.
     """
-    ending = _Ending()
-    with _folder_of_its_own(folder):
+    termination = _Termination()
+    with _locked(folder):
         bench = Bench(settings)
         with serving(bench, folder) as usb:
             _announce(folder, settings)
-            ending.wait()
-            # Ctrl-C reaches the nodes, too: on their way out they need their devices.
+            termination.wait()
+            # Ctrl-C reaches the nodes, too, which need their devices while they end.
             end_s = time.monotonic() + _LINGER_S
             while usb.clients and time.monotonic() < end_s:
                 time.sleep(_POLL_S)
@@ -80,7 +80,7 @@ def _announce(folder: Path, settings: BenchSettings) -> None:
 
 
 @contextlib.contextmanager
-def _folder_of_its_own(folder: Path) -> Iterator[None]:
+def _locked(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         lock = (folder / _LOCK_FILE).open("w")
@@ -103,19 +103,19 @@ def _folder_of_its_own(folder: Path) -> Iterator[None]:
 )
 @click.argument("folder", required=False, type=click.Path(file_okay=False, path_type=Path))
 @click.option("--scene", default="steps", show_default=True,
-              help="What the camera sees: a scene's name or a mesh file.")  # fmt: skip
+              help="Scene before the camera: a name or a mesh file.")  # fmt: skip
 @click.option("--calibration", default="config_3", show_default=True,
-              help="The optical build as it really is: a name in config/ or a file.")  # fmt: skip
+              help="The actual optical build: a name in config/ or a file.")  # fmt: skip
 @click.option("--pixels", type=click.Choice(tuple(PRESETS)), default="paper", show_default=True,
               help="Preset of the event pixels.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
-              help="Of pixels, noise and whatever else is drawn.")  # fmt: skip
+              help="Seed of pixels, noise, jitter and missing edges.")  # fmt: skip
 @click.option("--background", type=click.FloatRange(0.0, 100.0), default=BACKGROUND_HZ,
               show_default=True, help="Background events of one pixel, Hz.")  # fmt: skip
 @click.option("--trigger", type=click.Choice(TRIGGERS), default="stage", show_default=True,
-              help="What is wired to the camera's trigger input.")  # fmt: skip
+              help="Source wired to the camera's trigger input.")  # fmt: skip
 @click.option("--missing-edges", type=click.FloatRange(0.0, 1.0), default=0.0, show_default=True,
-              help="Share of the trigger edges that the camera does not see.")  # fmt: skip
+              help="Share of the trigger edges that the camera misses.")  # fmt: skip
 @click.option("--sensor-ppm", type=float, default=0.0, show_default=True,
               help="How much too fast the camera's clock runs.")  # fmt: skip
 @click.option("--generator-ppm", type=float, default=0.0, show_default=True,
@@ -142,11 +142,11 @@ def command(
     """Emulate camera, generator and stage at the far ends of their cables.
 
     FOLDER gets a Unix socket for the USB bus (usb.sock), a serial port of the stage (stage) and,
-    once everything is there, the file ready. Without FOLDER it is the folder in which nodes with
-    driver "fake" look: one for each user and ROS_DOMAIN_ID.
+    when both exist, the file ready. Without FOLDER it is the one in which nodes with driver
+    "fake" look: one for each user and ROS_DOMAIN_ID.
 
-    The drivers that talk to it are those of the real devices. It ends with Ctrl-C, SIGTERM, or
-    when the process that started it ends; clients still there get 3 s to leave.
+    The drivers on it are those of the real devices. It ends with Ctrl-C, SIGTERM, or with the
+    process that started it; connected clients get 3 s to close.
 
     \b
     Examples:

@@ -20,35 +20,35 @@ _READ_BYTES = 4096
 
 
 class SerialModel(Protocol):
-    """A device at the end of a serial line, in time of its own clock."""
+    """A device on a serial line, with a clock of its own."""
 
     gone: bool
 
     def feed(self, data: bytes) -> None:
-        """Take bytes of the host."""
+        """Receive bytes from the host."""
 
     def step(self) -> bytes:
-        """Carry on until now; the bytes the host gets."""
+        """Advance to the present; returns the bytes for the host."""
 
 
 class PtyPort:
-    """Serves a model on a pseudo-terminal whose changing name hides behind a fixed link.
+    """Serves a model on a pseudo-terminal, under a fixed link to its changing name.
 
-    While the model is ``gone`` there is no port and an open one hangs up, as when a USB adapter is
-    unplugged.
+    While the model is ``gone`` there is no port, and an open one hangs up, as with an unplugged
+    USB adapter.
 
     Parameters
     ----------
     model : SerialModel
     link : path
-        Where the port is to be found; one left behind is replaced.
+        Path of the port; an old link is replaced.
     lock : threading.RLock, optional
         Held while the model acts.
 
     Raises
     ------
     DeviceError
-        The link cannot be made.
+        When the link cannot be made.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class PtyPort:
         self.close()
 
     def close(self) -> None:
-        """Take the port away; idempotent."""
+        """Remove the port; idempotent."""
         self._ending.set()
         self._thread.join()
 
     def _plug_in(self) -> tuple[int, int]:
         host, device = pty.openpty()
-        # Else the line discipline eats carriage returns and 0x11, which is an APT address.
+        # Otherwise the line discipline removes carriage returns and 0x11, an APT address.
         tty.setraw(device, termios.TCSANOW)
         os.set_blocking(host, False)
         try:
@@ -106,7 +106,7 @@ class PtyPort:
                 if self._model.gone:
                     self._unplug()
                     self._ending.wait(_TICK_S)
-                    # Its time goes on: this may be the moment in which it is plugged in again.
+                    # The model goes on in time and may be plugged in again.
                     with self._lock:
                         self._model.step()
                     continue
@@ -117,7 +117,7 @@ class PtyPort:
             self._unplug()
 
     def _exchange(self, host: int) -> None:
-        """Wait for bytes for a tick; the device end is held open, so that there is no hang-up."""
+        """Exchange bytes for one tick; the device end stays open, which prevents a hang-up."""
         data = b""
         if select.select([host], [], [], _TICK_S)[0]:
             data = os.read(host, _READ_BYTES)
@@ -131,5 +131,5 @@ class PtyPort:
             except OSError as error:
                 if error.errno != errno.EAGAIN:
                     raise
-                # Nobody reads: a serial line without flow control loses what does not fit.
+                # A serial line without flow control loses what the host does not read.
                 return

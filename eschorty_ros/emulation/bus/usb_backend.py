@@ -1,4 +1,4 @@
-"""A pyusb backend over devices in memory: ``usb.core.find(backend=EmulatedBackend(...))``."""
+"""A pyusb backend for devices in memory: ``usb.core.find(backend=EmulatedBackend(...))``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from eschorty_ros.emulation.bus.usb_pipe import UsbFault
 
 Buffer = array.array | bytearray | memoryview
 
-# What libusb calls the same faults.
+# libusb's codes of the same errors.
 _LIBUSB_CODES = {
     errno.EIO: -1,
     errno.EINVAL: -2,
@@ -35,13 +35,13 @@ _LIBUSB_CODES = {
 
 
 def raise_usb_error(code: int) -> NoReturn:
-    """Raise what pyusb raises over libusb for this error number."""
+    """Raise the error that pyusb raises on libusb for this error number."""
     kind = usb.core.USBTimeoutError if code == errno.ETIMEDOUT else usb.core.USBError
     raise kind(os.strerror(code), _LIBUSB_CODES.get(code, -99), code)
 
 
 class Handle:
-    """A device as listed or opened; dead for good once it was unplugged or closed."""
+    """A device as listed or opened; invalid once it was unplugged or closed."""
 
     def __init__(self, device: EmulatedUsbDevice):
         self.device = device
@@ -55,26 +55,26 @@ class Handle:
         return self.device.identity
 
     def live(self) -> EmulatedUsbDevice:
-        """Give the device; raises when it is not the one that was opened any more."""
+        """Return the device; raises when it was closed, unplugged or plugged in again."""
         if self.closed or self.device.gone or self.device.address != self.address:
             raise UsbFault(errno.ENODEV)
         return self.device
 
 
 class EmulatedBackend(DescriptorBackend):
-    """pyusb's backend interface over models.
+    """pyusb's backend interface for models.
 
     Parameters
     ----------
     models : callable
-        Gives the devices that are on the bus now.
+        Returns the devices on the bus.
     """
 
     def __init__(self, models: Callable[[], Sequence[EmulatedUsbDevice]]):
         self._models = models
 
     def enumerate_devices(self) -> Iterator[Handle]:
-        """Devices on the bus; unplugged ones are not listed."""
+        """List the devices on the bus, without unplugged ones."""
         return (Handle(device) for device in self._models() if not device.gone)
 
     def open_device(self, dev: Handle) -> Handle:
@@ -90,11 +90,11 @@ class EmulatedBackend(DescriptorBackend):
         dev_handle.device.free(dev_handle)
 
     def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
-        """Take the only configuration."""
+        """Accept the only configuration."""
         self._run(dev_handle.live)
 
     def get_configuration(self, dev_handle: Handle) -> int:
-        """Tell the only configuration."""
+        """Return the only configuration."""
         self._run(dev_handle.live)
         return 1
 
@@ -113,7 +113,7 @@ class EmulatedBackend(DescriptorBackend):
             device.claims[intf] = dev_handle
 
     def release_interface(self, dev_handle: Handle, intf: int) -> None:
-        """Give the interface back."""
+        """Release the interface."""
         self._owned(dev_handle, intf).free(dev_handle)
 
     def bulk_write(self, dev_handle: Handle, ep: int, intf: int, data: Buffer, timeout: int) -> int:
@@ -181,7 +181,7 @@ class EmulatedBackend(DescriptorBackend):
             device.reset()
 
     def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
-        """Tell whether a kernel driver holds the interface."""
+        """Return whether a kernel driver holds the interface."""
         return bool(self._run(dev_handle.live).kernel_driver)
 
     def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
@@ -199,7 +199,7 @@ class EmulatedBackend(DescriptorBackend):
         device.kernel_driver, device.detached_driver = device.detached_driver, None
 
     def _owned(self, handle: Handle, interface: int) -> EmulatedUsbDevice:
-        """Give the live device, unless somebody else claimed the interface."""
+        """Return the device; raises when another handle claimed the interface."""
         device = self._run(handle.live)
         if device.claims.get(interface, handle) is not handle:
             raise_usb_error(errno.EBUSY)

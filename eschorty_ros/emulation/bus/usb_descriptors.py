@@ -1,4 +1,4 @@
-"""USB descriptors as pyusb reads them from a backend: plain fields."""
+"""USB descriptors as pyusb reads them from a backend."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from eschorty_ros.emulation.bus.usb_device import BULK, SPEED_SUPER, UsbIdentity
 
 
 def _device(identity: UsbIdentity, bus: int, address: int) -> SimpleNamespace:
-    """Describe the device as it sits on the bus."""
     return SimpleNamespace(
         bLength=18,
         bDescriptorType=1,
@@ -36,7 +35,6 @@ def _device(identity: UsbIdentity, bus: int, address: int) -> SimpleNamespace:
 
 
 def _configuration(identity: UsbIdentity) -> SimpleNamespace:
-    """Describe the only configuration."""
     return SimpleNamespace(
         bLength=9,
         bDescriptorType=2,
@@ -51,7 +49,6 @@ def _configuration(identity: UsbIdentity) -> SimpleNamespace:
 
 
 def _interface(identity: UsbIdentity) -> SimpleNamespace:
-    """Describe the only interface."""
     return SimpleNamespace(
         bLength=9,
         bDescriptorType=4,
@@ -67,7 +64,6 @@ def _interface(identity: UsbIdentity) -> SimpleNamespace:
 
 
 def _endpoint(identity: UsbIdentity, index: int) -> SimpleNamespace:
-    """Describe the bulk endpoint at this place in the list."""
     endpoint = identity.endpoints[index]
     return SimpleNamespace(
         bLength=7,
@@ -83,19 +79,19 @@ def _endpoint(identity: UsbIdentity, index: int) -> SimpleNamespace:
 
 
 class Described(Protocol):
-    """A device as a bus lists it."""
+    """A device in the list of a bus."""
 
     @property
     def identity(self) -> UsbIdentity:
-        """Its descriptors."""
+        """Return its descriptors."""
 
     @property
     def bus(self) -> int:
-        """Number of the bus."""
+        """Return the number of the bus."""
 
     @property
     def address(self) -> int:
-        """Address on the bus."""
+        """Return its address."""
 
 
 class DescriptorBackend(usb.backend.IBackend):
@@ -105,21 +101,21 @@ class DescriptorBackend(usb.backend.IBackend):
     """
 
     def get_parent(self, dev: Described) -> None:
-        """No hub in between."""
+        """Return ``None``: there is no hub."""
 
     def get_device_descriptor(self, dev: Described) -> SimpleNamespace:
-        """Describe the device."""
+        """Return the device's descriptor."""
         return _device(dev.identity, dev.bus, dev.address)
 
     def get_configuration_descriptor(self, dev: Described, config: int) -> SimpleNamespace:
-        """Describe the only configuration."""
+        """Return the descriptor of the only configuration."""
         _only_one(config)
         return _configuration(dev.identity)
 
     def get_interface_descriptor(
         self, dev: Described, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe the only interface."""
+        """Return the descriptor of the only interface."""
         _only_one(intf)
         _only_one(alt)
         return _interface(dev.identity)
@@ -127,7 +123,7 @@ class DescriptorBackend(usb.backend.IBackend):
     def get_endpoint_descriptor(
         self, dev: Described, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe an endpoint."""
+        """Return an endpoint's descriptor."""
         return _endpoint(dev.identity, ep)
 
 

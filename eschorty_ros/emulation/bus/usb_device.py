@@ -1,9 +1,9 @@
 """A USB device in memory: identity, endpoints, and the ways a real one fails.
 
-Transfers follow the bus, not Python: data travels in packets of ``wMaxPacketSize``, a short or
-empty packet ends a transfer, a time-out loses what had arrived, a packet larger than what is left
-of the buffer is an overflow, a halted endpoint refuses until the halt is cleared, and a device
-that was plugged in again has a new address, so handles from before stay dead.
+Transfers follow the rules of the bus: data travels in packets of ``wMaxPacketSize``, a short or
+empty packet ends a transfer, a time-out loses the packets that had arrived, a packet larger than
+the rest of the buffer is an overflow, a halted endpoint refuses until the halt is cleared, and a
+device that is plugged in again has a new address, so that its old handles stay invalid.
 """
 
 from __future__ import annotations
@@ -52,27 +52,27 @@ class UsbIdentity:
 
 
 class EmulatedUsbDevice:
-    """Base of the models: override ``control``, ``bulk_out``, and ``bulk_in`` where data is pulled.
+    """Base of the models, which override ``control``, ``bulk_out`` and ``bulk_in`` as needed.
 
     Parameters
     ----------
     identity : UsbIdentity
     wait : callable
-        How a read waits for data: ``wait(condition, seconds)``, False when nothing came. With
+        How a read waits for data: ``wait(condition, seconds)``, False on a time-out. With
         ``lambda *_: False`` every wait times out at once, for tests without sleeps.
 
     Attributes
     ----------
     gone : bool
-        Unplugged: every transfer fails with ENODEV, the bus no longer lists it.
+        Unplugged: every transfer fails with ENODEV, the bus does not list it.
     stalled : set of int
-        Endpoint addresses that refuse with EPIPE until their halt is cleared.
+        Halted endpoints: they refuse with EPIPE until the halt is cleared.
     mute : bool
-        The device answers nothing: every transfer times out.
+        Every transfer times out.
     denied : bool
         Opening fails with EACCES.
     kernel_driver : str or None
-        Name of the driver that holds the interface until it is detached.
+        Driver that holds the interface until it is detached.
     address : int
         Address on the bus; a new one after every ``replug``.
     """
@@ -99,7 +99,7 @@ class EmulatedUsbDevice:
 
     @property
     def gone(self) -> bool:
-        """Whether the device is unplugged."""
+        """Return whether the device is unplugged."""
         return self._gone
 
     @gone.setter
@@ -113,24 +113,24 @@ class EmulatedUsbDevice:
             pipe.wake()
 
     def replug(self) -> None:
-        """Come back at a new address, powered up afresh."""
+        """Plug the device in again: new address, state after power-up."""
         self.gone = True
         self.address = next(_addresses)
         self.power_up()
         self.gone = False
 
     def power_up(self) -> None:
-        """Take on the state after power-up; models extend it."""
+        """Set the state after power-up; models extend it."""
         self.stalled.clear()
         for pipe in self._pipes.values():
             pipe.clear()
 
     def free(self, owner: object) -> None:
-        """Drop the claims of ``owner``; the reads it left behind end at once."""
+        """Drop the claims of ``owner`` and end its reads."""
         with self.mutex:
             held = [interface for interface, holder in self.claims.items() if holder is owner]
             if held:
-                # Before somebody else may claim it and read.
+                # Before another handle can claim the interface and read.
                 for pipe in self._pipes.values():
                     pipe.cancel()
             for interface in held:
@@ -141,7 +141,7 @@ class EmulatedUsbDevice:
         self._pipes[endpoint].put(data, zero_length=zero_length)
 
     def pending(self, endpoint: int) -> bool:
-        """Whether the host has something to read on an IN endpoint."""
+        """Return whether an IN endpoint has data for the host."""
         return bool(self._pipes[endpoint])
 
     def control(
@@ -155,48 +155,48 @@ class EmulatedUsbDevice:
     ) -> bytes | int:
         """Answer a control request: bytes for IN (``data`` = bytes wanted), a count for OUT.
 
-        The base knows string descriptors; anything else is a stall.
+        The base answers string descriptors and stalls on anything else.
         """
         if (request_type, request, value >> 8) == (0x80, _GET_DESCRIPTOR, _STRING_DESCRIPTOR):
             return self._string(value & 0xFF)
         raise UsbFault(errno.EPIPE)
 
     def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
-        """Take a transfer from the host; returns the bytes accepted."""
+        """Receive a transfer from the host; returns the bytes accepted."""
         raise UsbFault(errno.EPIPE)
 
     def begin_read(self, endpoint: int) -> None:
-        """Begin a read in this thread, before its right to read is looked at.
+        """Begin a read in this thread, before its claim is checked.
 
-        From now on ``free`` ends it, also when it is to wait only later.
+        From now on ``free`` ends it, even before it waits.
         """
         self._pipes[endpoint].begin()
 
     def bulk_in(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
-        """Give the host a transfer of at most ``size`` bytes; the base takes what ``reply`` put."""
+        """Send the host a transfer of at most ``size`` bytes that ``reply`` queued."""
         return self._pipes[endpoint].take(
             size, timeout_ms / 1e3 if timeout_ms else None, lambda: self.check(endpoint)
         )
 
     def clear_halt(self, endpoint: int) -> None:
-        """Let a stalled endpoint work again."""
+        """Clear the halt of an endpoint."""
         self.stalled.discard(endpoint)
 
     def reset(self) -> None:
-        """Bus reset: stalls and unread data go, the address stays."""
+        """Reset the device: halts and unread data are cleared, the address stays."""
         self.stalled.clear()
         for pipe in self._pipes.values():
             pipe.clear()
 
     def check(self, endpoint: int) -> None:
-        """Raise what keeps ``endpoint`` from working now."""
+        """Raise the fault that keeps ``endpoint`` from working."""
         if self._gone:
             raise UsbFault(errno.ENODEV)
         if endpoint in self.stalled:
             raise UsbFault(errno.EPIPE)
 
     def before_transfer(self, endpoint: int, timeout_ms: int) -> None:
-        """Raise what the switches say of a transfer about to begin (endpoint 0 = control)."""
+        """Raise the fault that the switches cause in a new transfer (endpoint 0 = control)."""
         self.check(endpoint)
         if self.mute:
             with self._waiting:

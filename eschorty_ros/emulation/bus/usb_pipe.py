@@ -1,4 +1,4 @@
-"""Data on its way to the host through one endpoint of an emulated USB device."""
+"""Data queued for the host in one IN endpoint of an emulated USB device."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from collections.abc import Callable
 Wait = Callable[[threading.Condition, float | None], bool]
 
 
-class UsbFault(Exception):  # noqa: N818 -- the bus reports faults, the backend makes errors of them
-    """A transfer that failed, by the number the kernel would give."""
+class UsbFault(Exception):  # noqa: N818 -- the backend turns it into pyusb's error
+    """A failed transfer, with the kernel's error number."""
 
     def __init__(self, code: int):
         super().__init__(errno.errorcode[code])
@@ -19,7 +19,7 @@ class UsbFault(Exception):  # noqa: N818 -- the bus reports faults, the backend 
 
 
 class InPipe:
-    """Data on its way to the host through one IN endpoint."""
+    """Queue of one IN endpoint."""
 
     def __init__(self, max_packet: int, wait: Wait):
         self._max_packet = max_packet
@@ -27,14 +27,14 @@ class InPipe:
         self._queue: deque[memoryview] = deque()
         self._changed = threading.Condition()
         self._cancelled = 0
-        # Of every thread that reads: the cancellations before its read began.
+        # Per reading thread: the number of cancellations before its read began.
         self._begun = threading.local()
 
     def __bool__(self) -> bool:
         return bool(self._queue)
 
     def put(self, data: bytes | memoryview, *, zero_length: bool = False) -> None:
-        """Send a transfer; ``zero_length`` ends one of whole packets with an empty packet."""
+        """Queue a transfer; ``zero_length`` appends an empty packet, for one of full packets."""
         with self._changed:
             self._queue.append(memoryview(data))
             if zero_length and len(data):
@@ -42,17 +42,17 @@ class InPipe:
             self._changed.notify_all()
 
     def clear(self) -> None:
-        """Forget what the host has not read."""
+        """Discard unread data."""
         with self._changed:
             self._queue.clear()
 
     def wake(self) -> None:
-        """Let a waiting host look at the device again."""
+        """Make waiting reads check the device again."""
         with self._changed:
             self._changed.notify_all()
 
     def cancel(self) -> None:
-        """End the reads under way: whoever asked is no longer there to take the data."""
+        """End pending reads: the handle that reads was closed."""
         with self._changed:
             self._cancelled += 1
             self._changed.notify_all()
@@ -62,7 +62,7 @@ class InPipe:
         self._begun.cancelled = self._cancelled
 
     def take(self, size: int, timeout_s: float | None, check: Callable[[], None]) -> bytes:
-        """One transfer as the host controller gives it: at most ``size`` bytes.
+        """Return one transfer of at most ``size`` bytes, as a host controller does.
 
         ``check`` raises when the device can no longer deliver.
         """
@@ -84,15 +84,15 @@ class InPipe:
                     if len(data) % self._max_packet or not len(data) or not room:
                         return b"".join(parts)
                 if not self._wait(self._changed, timeout_s):
-                    # Whole packets that had arrived are gone with the cancelled transfer.
+                    # Packets that had arrived are lost with the cancelled transfer.
                     raise UsbFault(errno.ETIMEDOUT)
 
     def _split(self, data: memoryview, room: int) -> memoryview:
-        whole = room - room % self._max_packet
-        if whole < room or not room:
-            rest = data[whole + self._max_packet :]
+        fitting = room - room % self._max_packet
+        if fitting < room or not room:
+            rest = data[fitting + self._max_packet :]
             if len(rest):
                 self._queue.appendleft(rest)
             raise UsbFault(errno.EOVERFLOW)
-        self._queue.appendleft(data[whole:])
-        return data[:whole]
+        self._queue.appendleft(data[fitting:])
+        return data[:fitting]

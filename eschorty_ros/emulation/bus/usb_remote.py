@@ -25,7 +25,7 @@ from eschorty_ros.emulation.bus.usb_wire import (
 )
 
 _GRACE_S = 20.0
-"""A server that is stopped or overloaded counts as a device that is gone after this."""
+"""After this, a stopped or overloaded server counts as an unplugged device."""
 
 
 class _Link:
@@ -50,7 +50,7 @@ class _Link:
         timeout_ms: int = 1,
         into: memoryview | None = None,
     ) -> Any:
-        """Run a request; the answer as bytes, or its length when it goes ``into`` a buffer."""
+        """Return the answer to a request, or its length when it is received ``into`` a buffer."""
         with self._lock:
             try:
                 self._socket.settimeout(timeout_ms / 1e3 + _GRACE_S if timeout_ms else None)
@@ -59,8 +59,8 @@ class _Link:
                 view = memoryview(bytearray(size)) if into is None else into[:size]
                 receive_into(self._socket, view)
             except TimeoutError:
-                # A late answer would be taken for that of the next request, and what a late read
-                # takes from the device would be missing unnoticed.
+                # A late answer would pass for that of the next request, and the data of a late read
+                # would be missing unnoticed.
                 self._socket.close()
                 code = errno.ENODEV if op is Op.READ else errno.ETIMEDOUT
             except (Closed, OSError):
@@ -92,7 +92,7 @@ class _Seen:
 
 
 class _RemoteHandle:
-    """One opening: a link that keeps it, and a link per endpoint for transfers."""
+    """An opened device: one link that holds it open, and one per endpoint for transfers."""
 
     def __init__(self, path: str, address: int):
         self._path = path
@@ -123,7 +123,7 @@ class _RemoteHandle:
 
 
 def _first(link: _Link, op: Op, number: int) -> bytes:
-    """Run the request a link begins with; without it the link is of no use."""
+    """Run the first request of a link; closes the link when it fails."""
     try:
         answer: bytes = link.call(op, (number,))
     except usb.core.USBError:
@@ -133,12 +133,12 @@ def _first(link: _Link, op: Op, number: int) -> bytes:
 
 
 class RemoteBackend(DescriptorBackend):
-    """pyusb's backend interface over the socket of a ``UsbServer``; without one the bus is empty.
+    """pyusb's backend interface on the socket of a ``UsbServer``; the bus is empty without one.
 
     Parameters
     ----------
     path : str
-        Of the socket.
+        Path of the socket.
     """
 
     def __init__(self, path: str):
@@ -167,15 +167,15 @@ class RemoteBackend(DescriptorBackend):
             raise_usb_error(errno.ENODEV)
 
     def close_device(self, dev_handle: _RemoteHandle) -> None:
-        """Close; the server frees what was claimed."""
+        """Close; the server frees the claims."""
         dev_handle.close()
 
     def set_configuration(self, dev_handle: _RemoteHandle, config_value: int) -> None:
-        """Take the only configuration."""
+        """Accept the only configuration."""
         dev_handle.main.call(Op.CONFIGURATION)
 
     def get_configuration(self, dev_handle: _RemoteHandle) -> int:
-        """Tell the only configuration."""
+        """Return the only configuration."""
         dev_handle.main.call(Op.CONFIGURATION)
         return 1
 
@@ -190,7 +190,7 @@ class RemoteBackend(DescriptorBackend):
         dev_handle.main.call(Op.CLAIM, (intf,))
 
     def release_interface(self, dev_handle: _RemoteHandle, intf: int) -> None:
-        """Give the interface back."""
+        """Release the interface."""
         dev_handle.main.call(Op.RELEASE, (intf,))
 
     def bulk_write(
@@ -241,7 +241,7 @@ class RemoteBackend(DescriptorBackend):
         dev_handle.main.call(Op.RESET)
 
     def is_kernel_driver_active(self, dev_handle: _RemoteHandle, intf: int) -> bool:
-        """Tell whether a kernel driver holds the interface."""
+        """Return whether a kernel driver holds the interface."""
         return dev_handle.main.call(Op.DRIVER_ACTIVE, (intf,)) == b"\x01"
 
     def detach_kernel_driver(self, dev_handle: _RemoteHandle, intf: int) -> None:

@@ -1,9 +1,8 @@
 """An emulated bus for other processes: a server on a Unix socket.
 
-Every opening of a device is a link that carries no transfers. When it ends, as it does when the
-client's process dies in whatever way, the claim is free and the reads left behind end, as the
-kernel does it. Transfers have links of their own, one per endpoint, so that a waiting read holds
-nothing up.
+Every opened device has one link without transfers. When that link ends, also because the client's
+process died, the claim is freed and pending reads end, as in the kernel. Transfers have links of
+their own, one per endpoint, so that a waiting read delays no other request.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ class UsbServer:
     Parameters
     ----------
     path : path
-        Of the socket; one left behind by a server that died is replaced.
+        Path of the socket; a socket left by a dead server is replaced.
     models : callable
-        Gives the devices that are on the bus now.
+        Returns the devices on the bus.
 
     Raises
     ------
     DeviceError
-        The socket cannot be made.
+        When the socket cannot be made.
     """
 
     def __init__(
@@ -73,11 +72,11 @@ class UsbServer:
 
     @property
     def clients(self) -> int:
-        """Connections under way."""
+        """Return the number of open links."""
         return len(self._links)
 
     def close(self) -> None:
-        """End the service; clients find their devices gone."""
+        """Stop serving; clients then find their devices unplugged."""
         self._closed = True
         self._path.unlink(missing_ok=True)
         for link in (self._listener, *tuple(self._links)):
@@ -114,7 +113,7 @@ class UsbServer:
 
 
 class _Session:
-    """One link: it opened a handle, or it joined one to carry transfers."""
+    """One link: it opened a device, or joined an opened one to carry transfers."""
 
     def __init__(self, backend: EmulatedBackend, handles: dict[int, Handle], tokens: Iterator[int]):
         self._backend = backend
@@ -144,7 +143,7 @@ class _Session:
         return self._simple(handle, op, numbers[0], numbers[1])
 
     def end(self) -> None:
-        """Close what this link opened."""
+        """Close the device that this link opened."""
         if self._token and self._handle:
             self._handles.pop(self._token, None)
             self._backend.close_device(self._handle)

@@ -1,6 +1,6 @@
-"""What travels between an emulated bus and the processes that use it: small binary frames.
+"""Binary frames between the server of an emulated bus and its clients.
 
-A request is an operation, four numbers and data; the answer an error number (0 = done) and data.
+A request is an operation, four numbers and data; an answer is an error number (0 = done) and data.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ Request = tuple[Op, tuple[int, int, int, int], bytearray]
 
 
 class Closed(Exception):  # noqa: N818 -- an end, not an error
-    """The other side is no longer there."""
+    """The other side closed the link."""
 
 
 def receive_into(link: socket.socket, view: memoryview) -> None:
-    """Fill ``view``; raises ``Closed`` when the link ends before."""
+    """Fill ``view``; raises ``Closed`` when the link ends first."""
     while view.nbytes:
         count = link.recv_into(view)
         if not count:
@@ -77,6 +77,6 @@ def send_answer(link: socket.socket, code: int, data: bytes | memoryview = b"") 
 
 
 def receive_answer(link: socket.socket) -> tuple[int, int]:
-    """Wait for the head of an answer: error number and bytes that follow."""
+    """Wait for the header of an answer; returns the error number and the size of the data."""
     code, size = _ANSWER.unpack(_receive(link, _ANSWER.size))
     return code, size

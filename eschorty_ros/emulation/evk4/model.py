@@ -1,9 +1,9 @@
 """A Prophesee EVK4 on the emulated bus: control protocol, registers, data endpoint.
 
-It streams only after the documented sequences were written in order, and keeps what a camera
-would not forgive in ``watch.violations``. How a camera reacts to a wrong order, whether a packet
-of whole USB packets ends with an empty one, and what its bridge buffers after a stop are
-*unconfirmed on hardware*; the model takes the harder case each time.
+It streams only after the documented sequences were written in order, and records deviations in
+``watch.violations``. How a camera reacts to a wrong order, whether a packet of full USB packets
+ends with an empty one, and what its bridge buffers after a stop are *unconfirmed on hardware*; the
+model takes the case that is harder for the driver.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Evk4Model(EmulatedUsbDevice):
     Parameters
     ----------
     source : SensorSource
-        Gives the pixels' words while the sensor streams; read only when the host reads.
+        Returns the pixels' words while the sensor streams; read only when the host reads.
     board : BoardIdentity
     factory_dacs : mapping, optional
-        The unit's bias trim by name.
+        The camera's bias trim by name.
     clock_ns : callable, optional
-        With a clock the waits of the register sequences are judged.
+        With a clock the waits of the register sequences are checked, too.
     wait : callable
         As for ``EmulatedUsbDevice``.
 
@@ -63,11 +63,10 @@ class Evk4Model(EmulatedUsbDevice):
     board : TreuzellBoard
         Answers requests.
     buffer_bytes : int or None
-        Space of the device's own buffer. None: nothing is lost however late the host reads.
-        Otherwise what came about since the last read and does not fit is dropped with the
-        sensor's mark.
+        Size of the device's buffer. None: nothing is lost however late the host reads. Otherwise
+        words since the last read that do not fit are dropped, with the sensor's mark.
     configure : callable or None
-        Called with ``SensorSettings`` when registers that change what the pixels give were written.
+        Called with ``SensorSettings`` after a write that changes them.
     """
 
     def __init__(
@@ -115,18 +114,18 @@ class Evk4Model(EmulatedUsbDevice):
 
     @property
     def settings(self) -> SensorSettings:
-        """What the registers ask of the sensor now."""
+        """Return the settings in the registers."""
         return self._settings
 
     def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
-        """Take a control request and queue its answer."""
+        """Receive a control request and queue its answer."""
         if endpoint != CONTROL_OUT:
             raise UsbFault(errno.EPIPE)
         self.reply(CONTROL_IN, self.board.answer(data))
         return len(data)
 
     def bulk_in(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
-        """Give an answer or the next packet of events."""
+        """Send an answer or the next packet of events."""
         if endpoint == DATA_IN and self.watch.phase is Phase.STREAMING:
             self._pull(timeout_ms / 1e3)
         return super().bulk_in(endpoint, size, timeout_ms)
@@ -150,11 +149,11 @@ class Evk4Model(EmulatedUsbDevice):
             self._configure()
 
     def stale(self, data: bytes) -> None:
-        """Put bytes into the data endpoint that no start asked for."""
+        """Queue data of an earlier stream in the data endpoint."""
         self._send(data)
 
     def power_up(self) -> None:
-        """Come back with every register at its reset value."""
+        """Set every register to its reset value."""
         super().power_up()
         was = self.watch.phase
         self.watch.reset()
@@ -182,13 +181,13 @@ class Evk4Model(EmulatedUsbDevice):
                 self.configure(settings)
 
     def _pull(self, timeout_s: float) -> None:
-        """Move words from the source to the endpoint until a packet is there or time is up."""
+        """Move words from the source to the endpoint until a packet is complete or time is up."""
         run, until_s = self._run, time.monotonic() + timeout_s
         if self.buffer_bytes is not None:
             self._overflow(run)
         while not self.pending(DATA_IN):
             data = self._source.read(_PULL_BYTES, max(0.0, until_s - time.monotonic()))
-            if not self._take(data, run):
+            if not self._packetise(data, run):
                 return
 
     def _overflow(self, run: int) -> None:
@@ -197,18 +196,18 @@ class Evk4Model(EmulatedUsbDevice):
             kept = data[: space - space % 2]
             space -= len(kept)
             lost += (len(data) - len(kept)) // 2
-            if kept and not self._take(kept, run):
+            if kept and not self._packetise(kept, run):
                 return
         if lost:
-            self._take(dropped(lost), run)
+            self._packetise(dropped(lost), run)
 
-    def _take(self, data: bytes, run: int) -> bool:
-        """Packetise; False when there was nothing, or the stream it belongs to has ended."""
+    def _packetise(self, data: bytes, run: int) -> bool:
+        """Queue the packets of ``data``; False without data or after the end of its stream."""
         with self._stream_lock:
             if run != self._run:
                 return False
             if not data:
-                # The sensor sends a packet every period, however little is in it.
+                # The sensor sends a packet every period, however small.
                 self._send(self._packets.flush())
                 return False
             if not self._settings.trigger_in:

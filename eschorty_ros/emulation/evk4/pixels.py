@@ -1,4 +1,4 @@
-"""Pixels switched off in the sensor: their events are taken out of the word stream."""
+"""Pixels switched off in the sensor: their events are removed from the word stream."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _VECTOR_BITS = 12
 
 
 class PixelMask:
-    """Takes masked pixels out of EVT3 words; keeps row and vector base across calls.
+    """Removes masked pixels from EVT3 words; keeps row and vector base across calls.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class PixelMask:
         return bool(self._columns.any() or self._rows.any() or self._pixels)
 
     def apply(self, data: bytes) -> bytes:
-        """Give the stream without the events of masked pixels; every other word stays."""
+        """Return the words without the events of masked pixels."""
         words = np.frombuffer(data, np.dtype("<u2")).copy()
         kinds, payload = words >> 12, words & 0x7FF
         rows = self._filled(kinds == w3.ADDR_Y, payload, self._row)
@@ -68,7 +68,7 @@ class PixelMask:
     def _filled(
         self, given: NDArray[np.bool_], payload: NDArray[np.integer], before: int
     ) -> NDArray[np.int64]:
-        """Row in force at each word."""
+        """Return the row in force at each word."""
         last = np.maximum.accumulate(np.where(given, np.arange(len(given)), -1))
         rows = np.where(last >= 0, payload[last], before).astype(np.int64)
         if len(rows):
@@ -78,7 +78,7 @@ class PixelMask:
     def _vector_bases(
         self, kinds: NDArray[np.integer], payload: NDArray[np.integer]
     ) -> NDArray[np.int64]:
-        """Column of bit 0 at each word; a vector moves it on by its own width."""
+        """Return the column of bit 0 at each word; a vector advances it by its width."""
         steps = np.where(kinds == w3.VECT_12, 12, np.where(kinds == w3.VECT_8, 8, 0))
         moved = np.cumsum(steps) - steps
         given = kinds == w3.VECT_BASE_X

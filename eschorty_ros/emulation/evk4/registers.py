@@ -1,6 +1,6 @@
-"""The register file of an IMX636 behind an EVK4: reset values, and the few registers that act.
+"""The register file of an IMX636 in an EVK4: reset values, and the few registers that act.
 
-Everything else is memory: what was written is read back. Reset values are those the public
+All others are memory and read back the written value. Reset values are those that the public
 drivers rely on; the rest reads 0. *Unconfirmed on hardware.*
 """
 
@@ -56,12 +56,12 @@ class Registers:
     Parameters
     ----------
     factory_dacs : mapping
-        The unit's trim, DAC value by bias name; names left out take the common one.
+        The camera's trim, DAC value by bias name; the default is a typical one.
 
     Attributes
     ----------
     temperature_c : float
-        What the sensor measures of itself.
+        Temperature that the sensor reports.
     """
 
     def __init__(self, factory_dacs: Mapping[str, int] | None = None):
@@ -72,7 +72,7 @@ class Registers:
         self.reset()
 
     def reset(self) -> None:
-        """Take on the values after power-up or a sensor reset."""
+        """Set the values after power-up or a sensor reset."""
         self._values = dict(_RESET)
         for name, address in BIAS_ADDRESSES.items():
             self._values[address] = _BIAS_WORD | self.factory_dacs[name]
@@ -89,7 +89,7 @@ class Registers:
         if address == SENSOR_RESET and self[address] and not value:
             self.reset()
         elif address == WINDOW_CONTROL:
-            # The window is taken over at once: go, then done.
+            # The window takes effect at once: bit 0 requests it, bit 1 confirms.
             value = (value & ~1) | 2 if value & 1 else value
         elif address in (AFK_FLAGS, STC_FLAGS):
             value = self._flags(address, value)
@@ -98,7 +98,7 @@ class Registers:
         self._values[address] = value
 
     def _flags(self, address: int, value: int) -> int:
-        """Bit 2 is set by the sensor when ready and cleared by writing 1; bit 0 asks for it."""
+        """Return the new flags: bit 0 requests bit 2 (ready), a 1 written to bit 2 clears it."""
         return (value & ~4) | (4 if value & 1 else self[address] & 4 & ~value)
 
     def _temperature(self) -> int:

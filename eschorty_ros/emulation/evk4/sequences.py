@@ -1,8 +1,8 @@
-"""The register sequences an IMX636 behind an EVK4 expects, and a watch that recognises them.
+"""The register sequences that an IMX636 in an EVK4 expects, and a check of their order.
 
-Source: openeb 5.1.1 (imx636_evk3_issd.h), which neuromorphic-rs repeats value for value; kept
-apart from the driver's tables, so that a slip in either shows. That the camera insists on the
-order is assumed, *unconfirmed on hardware*.
+Source: openeb 5.1.1 (imx636_evk3_issd.h), confirmed by neuromorphic-rs; separate from the driver's
+tables, so that an error in either one shows. That the camera requires the order is
+*unconfirmed on hardware*.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Step:
     wait_ns: int = 0
 
     def matches(self, address: int, before: int, after: int) -> bool:
-        """Whether a write that took a register from ``before`` to ``after`` is this step."""
+        """Return whether a write that changed ``before`` to ``after`` is this step."""
         untouched = self.mask == _ALL or not (before ^ after) & ~self.mask
         return address == self.address and after & self.mask == self.value and untouched
 
@@ -76,7 +76,7 @@ SEQUENCES = {name: _parse(text) for name, text in _TEXTS.items()}
 
 
 class Phase(Enum):
-    """How far the sensor was brought."""
+    """State of the sensor."""
 
     OFF = "off"
     READY = "initialised"
@@ -84,19 +84,18 @@ class Phase(Enum):
 
 
 class SequenceWatch:
-    """Follows every register write and tells which sequences were completed in order.
+    """Follows every register write and recognises complete sequences.
 
     Parameters
     ----------
     clock_ns : callable, optional
-        With a clock the waits of the sequences are judged too.
+        With a clock the waits of the sequences are checked, too.
 
     Attributes
     ----------
     phase : Phase
     violations : list of str
-        What a camera would not forgive: broken sequences, sequences in the wrong phase, short
-        waits.
+        Broken sequences, sequences in the wrong phase, short waits.
     """
 
     def __init__(self, clock_ns: Callable[[], int] | None = None):
@@ -107,24 +106,24 @@ class SequenceWatch:
         self._wait: tuple[str, int] | None = None
 
     def reset(self) -> None:
-        """Forget half-done sequences and go off, as at power-up or a sensor reset."""
+        """Discard incomplete sequences and go off, as at power-up."""
         self.phase = Phase.OFF
         self._done = dict.fromkeys(SEQUENCES, 0)
         self._wait = None
 
     def sensor_reset(self) -> None:
-        """Go off because the sensor was reset, which only a sequence under way does."""
+        """Go off because the sensor was reset, as the initialisation does."""
         self._refuse("reset", Phase.STREAMING)
         self.phase = Phase.OFF
 
     def wrote(self, address: int, before: int, after: int) -> str | None:
-        """Take note of a write; the name of the sequence it completed."""
-        self._judge_wait()
+        """Record a write; returns the name of the sequence that it completed."""
+        self._check_wait()
         completed = None
         for name, steps in SEQUENCES.items():
             done = self._done[name]
             if not steps[done].matches(address, before, after):
-                # One step alone is no sequence: other sequences and settings share registers.
+                # One matching step is no sequence: settings and other sequences share registers.
                 if done > 1:
                     came = f"{address:X}={after:X} came"
                     self.violations.append(
@@ -146,7 +145,7 @@ class SequenceWatch:
         if wait_ns and self._clock_ns:
             self._wait = (f"{where}: wait {wait_ns / 1e3:g} us", self._clock_ns() + wait_ns)
 
-    def _judge_wait(self) -> None:
+    def _check_wait(self) -> None:
         if self._wait and self._clock_ns:
             text, until_ns = self._wait
             short_ns = until_ns - self._clock_ns()

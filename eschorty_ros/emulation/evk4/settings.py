@@ -1,4 +1,4 @@
-"""What the EVK4's registers ask of its sensor, in the units of the field."""
+"""The sensor's settings as the EVK4's registers hold them, in physical units."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ SETTING_ADDRESSES = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class SensorSettings:
-    """Sensor settings by their effect.
+    """Settings of the sensor.
 
     Attributes
     ----------
     biases : tuple of (name, int)
-        DAC offsets from the unit's trim.
+        DAC offsets from the camera's trim.
     columns_off, rows_off : frozenset of int
-        Masked lines.
+        Masked columns and rows.
     pixels_off : frozenset of (column, row)
         Masked pixels.
     trigger_in : bool
     packet_period_us : int
-        The sensor hands a packet over that often.
+        Period of the sensor's packets.
     event_rate : (int, int) or None
-        Events the event-rate control lets through per period, and the period (us); None when off.
+        Events that the event-rate control passes per period, and the period (us); None when off.
     flicker_band_hz : (float, float) or None
-        Band the anti-flicker filter removes, None when it is bypassed.
+        Band that the anti-flicker filter removes, None when off.
     noise_filter : (str, int) or None
-        ``stc`` or ``trail`` with its threshold in us, None when bypassed.
+        ``stc`` or ``trail`` with its threshold in us, None when off.
     """
 
     biases: tuple[tuple[str, int], ...]
@@ -63,7 +63,7 @@ class SensorSettings:
 
 
 def read_settings(registers: Registers) -> SensorSettings:
-    """Take the settings from the registers."""
+    """Return the settings in the registers."""
     return SensorSettings(
         biases=tuple(
             (name, (registers[address] & 0xFF) - registers.factory_dacs[name])
@@ -73,7 +73,7 @@ def read_settings(registers: Registers) -> SensorSettings:
         rows_off=frozenset(row for row in _lines(registers, _ROW_MASKS) if row < 720),
         pixels_off=_pixels(registers),
         trigger_in=bool(registers[_TRIGGER] & 1 << 10),
-        # 16 us steps; 0 would never end a packet.
+        # Steps of 16 us; a period of 0 would never end a packet.
         packet_period_us=max(16, registers[_PACKET_PERIOD] & 0xFFF0),
         event_rate=_event_rate(registers),
         flicker_band_hz=_flicker_band(registers),

@@ -1,4 +1,4 @@
-"""What comes out of the EVK4's data endpoint: the sensor's words in packets of the set latency."""
+"""The data stream of the EVK4: the sensor's words in packets of a set period."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Words = NDArray[np.uint16]
 
 
 class SensorSource(Protocol):
-    """The pixels in front of the camera model; thread-safe.
+    """The source of the pixels' words; thread-safe.
 
     ``start`` and ``stop`` come from the control thread while ``read`` may be waiting.
     """
 
     def start(self) -> None:
-        """Begin; sensor time starts at 0."""
+        """Start; sensor time is 0."""
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        """Whole EVT3 words that have come about, ``b""`` when none did in ``timeout_s``."""
+        """Return new EVT3 words, ``b""`` when none came in ``timeout_s``."""
 
     def stop(self) -> None:
-        """End."""
+        """Stop."""
 
 
 class Packetiser:
@@ -37,7 +37,7 @@ class Packetiser:
         self._frame = -1
 
     def push(self, data: bytes, period_us: int) -> list[bytes]:
-        """Take words, give the packets they complete."""
+        """Add words; returns the packets that they complete."""
         words = np.frombuffer(data, np.dtype("<u2"))
         cuts = self._cuts(words, period_us)
         packets, begin = [], 0
@@ -49,7 +49,7 @@ class Packetiser:
         return [packet for packet in packets if packet]
 
     def flush(self) -> bytes:
-        """Give what has no end yet."""
+        """Return the incomplete packet."""
         return self._finish(np.zeros(0, np.uint16))
 
     def _finish(self, last: Words) -> bytes:
@@ -66,7 +66,7 @@ class Packetiser:
         last_high = np.maximum.accumulate(np.where(is_high, np.arange(len(at)), -1))
         high = np.where(last_high >= 0, payload[last_high], self._high)
         self._high = int(high[-1])
-        # A TIME_HIGH alone tells too little: it is repeated within its 4096 us.
+        # A TIME_HIGH alone gives no time: it is repeated within its 4096 us.
         frames = ((high << 12) | payload)[~is_high] // period_us
         if not len(frames):
             return []
@@ -82,13 +82,13 @@ class Packetiser:
 
 
 def without_triggers(data: bytes) -> bytes:
-    """Take the trigger words out."""
+    """Return the words without trigger words."""
     words = np.frombuffer(data, np.dtype("<u2"))
     return words[words >> 12 != w3.EXT_TRIGGER].tobytes()
 
 
 def dropped(words: int) -> bytes:
-    """Mark the place where the sensor dropped that many words, as its readout does."""
+    """Return the sensor's mark for that many dropped words."""
     count = min(words, (1 << 28) - 1)
     mark = (
         w3.OTHERS << 12 | w3.DROPPED_EVENTS,

@@ -20,7 +20,7 @@ ANSWER_WORDS_MAX = 252
 
 
 class RegisterAccess(Protocol):
-    """What register requests act on."""
+    """The registers that requests access."""
 
     def read(self, address: int) -> int:
         """Read a register."""
@@ -31,7 +31,7 @@ class RegisterAccess(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class BoardIdentity:
-    """What the board says of itself."""
+    """Properties of the board."""
 
     serial: int = 0x00051234
     firmware: int = 0x030900
@@ -42,7 +42,7 @@ class BoardIdentity:
 
 
 def frame(property_: int, payload: bytes = b"") -> bytes:
-    """Build a frame."""
+    """Return a frame."""
     return struct.pack("<II", property_, len(payload)) + payload
 
 
@@ -55,7 +55,7 @@ def _strings(device: int, *texts: str) -> bytes:
 
 
 class TreuzellBoard:
-    """Answers requests on behalf of one board with one sensor, device 0.
+    """A board with one sensor, device 0, that answers requests.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class TreuzellBoard:
         }
 
     def answer(self, request: bytes) -> bytes:
-        """Answer one request."""
+        """Return the answer to a request."""
         if len(request) < 8:
             return frame(FAILED)
         property_, size = struct.unpack_from("<II", request)
