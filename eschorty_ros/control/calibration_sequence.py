@@ -1,13 +1,12 @@
-"""The order of a capture for a calibration, without ROS: whatever happens, laser off."""
+"""The steps of a capture for a calibration: on every way out the laser goes off."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
-from eschorty_ros.control.scan_sequence import End, Instrument, ScanCanceled, check_laser
+from eschorty_ros.control.scan_sequence import End, Instrument, Outcome, ScanCanceled, check_laser
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.live.calibration_capture import CaptureRequest
@@ -17,23 +16,15 @@ _DRAIN_S = 10.0
 _SETTLE_MM_S = 100.0
 
 
-@dataclass(slots=True)
-class CaptureOutcome:
-    """How a capture ended."""
-
-    end: End = End.ABORTED
-    message: str = ""
-
-
 class CaptureInstrument(Instrument, Protocol):
-    """What a capture needs beyond a scan's hands."""
+    """The same for a capture, which lasts for a time."""
 
     def hold(self, duration_s: float) -> None:
-        """Wait until so much sensor time has passed."""
+        """Wait until the reconstruction has passed so much sensor time."""
 
 
 def check_request(request: CaptureRequest) -> None:
-    """Raise ``ArgumentError`` with name, value and remedy when a capture cannot be done."""
+    """Raise ``ArgumentError`` with name, value and remedy unless the capture can be done."""
     if request.method not in METHODS:
         raise ArgumentError(f"method is {request.method!r}; choose one of {', '.join(METHODS)}")
     check_laser(request.frequency_hz, request.duty)
@@ -72,18 +63,18 @@ def run_capture(
     request: CaptureRequest,
     begin: Callable[[], None],
     finish: Callable[[], None],
-) -> CaptureOutcome:
-    """Do one capture; never raises an ``EschortyError``, and leaves laser off and stage at rest.
+) -> Outcome:
+    """Do one capture; raise no ``EschortyError``, leave the laser off and the stage at rest.
 
-    ``begin`` and ``finish`` have the reconstruction collect events and cease to; ``finish`` is
-    called whenever ``begin`` was.
+    ``begin`` and ``finish`` start and end the collection of events; ``finish`` runs whenever
+    ``begin`` returned.
     """
-    outcome = CaptureOutcome()
+    outcome = Outcome()
     collecting = False
     sweep = request.sweep
     try:
         instrument.report("preparing")
-        # Before anything is waited for or touched: it is refused while a scan is under way.
+        # First, because it is refused while a scan is under way.
         begin()
         collecting = True
         instrument.check_nodes()
@@ -109,9 +100,9 @@ def run_capture(
 
 
 def _finish(
-    instrument: CaptureInstrument, outcome: CaptureOutcome, finish: Callable[[], None] | None
+    instrument: CaptureInstrument, outcome: Outcome, finish: Callable[[], None] | None
 ) -> None:
-    """Leave every capture the same way: light off first."""
+    """Run the way out of every capture: laser off first."""
     instrument.shield()
     instrument.watch(False)
     steps: list[Callable[[], None]] = [instrument.laser_off]
@@ -123,8 +114,4 @@ def _finish(
     if finish is not None:
         steps.append(finish)
     for step in steps:
-        try:
-            step()
-        except EschortyError as error:
-            if outcome.end is not End.ABORTED:
-                outcome.end, outcome.message = End.ABORTED, str(error)
+        outcome.attempt(step)

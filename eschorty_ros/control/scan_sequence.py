@@ -1,4 +1,4 @@
-"""The order of a scan, without ROS: whatever happens, laser off, stage at rest, points kept."""
+"""The steps of a scan: on every way out the laser goes off, the stage rests, points are kept."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 
 
-class ScanFailure(EschortyError):  # noqa: N818 - named as the other failures are told
-    """A scan that cannot go on; the message begins with the culprit."""
+class ScanFailure(EschortyError):  # noqa: N818 - reported like the other failures
+    """A scan that cannot go on; the message begins with the component that failed."""
 
 
 class ScanCanceled(Exception):  # noqa: N818 - a request, not an error
-    """The client asked the scan to end."""
+    """The client canceled the scan."""
 
 
 class End(Enum):
@@ -31,7 +31,7 @@ class End(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ScanRequest:
-    """What is asked for; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+    """A scan's parameters; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
 
     scan_id: str
     start_mm: float
@@ -43,7 +43,7 @@ class ScanRequest:
 
 @dataclass(frozen=True, slots=True)
 class ScanLimits:
-    """What the stage can do, how it goes to the start, and how long the pipeline may stall."""
+    """The stage's limits, its speed to the start, and the longest wait for the last events."""
 
     travel_mm: tuple[float, float]
     speed_max_mm_s: float
@@ -54,7 +54,7 @@ class ScanLimits:
 
 @dataclass(slots=True)
 class ScanSummary:
-    """What an assembled scan holds."""
+    """The contents and losses of an assembled scan."""
 
     profiles: int = 0
     points: int = 0
@@ -66,40 +66,57 @@ class ScanSummary:
 
 
 @dataclass(slots=True)
-class ScanOutcome:
-    """How a scan ended and what it gave."""
+class Outcome:
+    """How a sequence ended, and why when it did not succeed."""
 
     end: End = End.ABORTED
     message: str = ""
+
+    def attempt(self, step: Callable[[], None]) -> None:
+        """Run a step of the way out; if it fails, so does the sequence. The first reason stays."""
+        try:
+            step()
+        except EschortyError as error:
+            if self.end is not End.ABORTED:
+                self.end, self.message = End.ABORTED, str(error)
+
+
+@dataclass(slots=True)
+class ScanOutcome(Outcome):
+    """The same with the summary of the assembled scan."""
+
     summary: ScanSummary = field(default_factory=ScanSummary)
 
 
 class Instrument(Protocol):
-    """What a sequence asks of laser, stage and reconstruction. Waiting calls ``pause``."""
+    """Laser, stage and reconstruction as a sequence uses them.
+
+    Every method that waits does so in ticks (see ``PacedWaiting``).
+    """
 
     def check_nodes(self) -> None:
-        """Raise ``ScanFailure`` naming the node that does not answer."""
+        """Raise ``ScanFailure`` that names the component that does not answer."""
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
-        """Set what is not 0; raises ``ScanFailure`` with the laser's reason."""
+        """Set what is not 0; raise ``ScanFailure`` with the laser's reason."""
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
         """Move and wait until the stage is there."""
 
     def stop_stage(self) -> None:
-        """End a move under way and wait for the stage to rest."""
+        """End a move under way and wait until the stage rests."""
 
     def laser_on(self) -> None:
-        """Heartbeat, arm, enable; returns when the output reads back on."""
+        """Start the heartbeat, arm, enable; return when the output reads back on."""
 
     def laser_off(self) -> None:
-        """Disable; returns when the output reads back off. The heartbeat ends in any case."""
+        """Disable; return when the output reads back off. The heartbeat ends in any case."""
 
     def watch(self, enabled: bool) -> None:
-        """Whether ``pause`` raises ``ScanFailure`` when light, events or odometry stop."""
+        """From here on every tick raises ``ScanFailure`` when light or events stop, or no more."""
 
     def shield(self) -> None:
-        """From here on ``pause`` no longer raises ``ScanCanceled``."""
+        """From here on no tick raises ``ScanCanceled``."""
 
     def drain(self, no_progress_s: float) -> None:
         """Wait until the reconstruction has passed the present time."""
@@ -109,17 +126,17 @@ class Instrument(Protocol):
 
 
 class ScanInstrument(Instrument, Protocol):
-    """What a scan needs beyond that."""
+    """The same for a scan, which the reconstruction collects."""
 
     def begin_scan(self, request: ScanRequest) -> None:
-        """Have the reconstruction collect points."""
+        """Start to collect points."""
 
     def end_scan(self, scan_id: str) -> ScanSummary:
-        """Have it publish what it collected."""
+        """Publish the points collected."""
 
 
 def check_request(request: ScanRequest, limits: ScanLimits) -> None:
-    """Raise ``ArgumentError`` with name, value and remedy when a scan cannot be done."""
+    """Raise ``ArgumentError`` with name, value and remedy unless the scan can be done."""
     low, high = limits.travel_mm
     for name in ("start_mm", "stop_mm"):
         value = getattr(request, name)
@@ -141,7 +158,7 @@ def check_request(request: ScanRequest, limits: ScanLimits) -> None:
 
 
 def check_laser(frequency_hz: float, duty: float) -> None:
-    """Raise ``ArgumentError`` when the laser cannot be set so; 0 keeps its setting."""
+    """Raise ``ArgumentError`` unless the laser can be set so; 0 keeps its setting."""
     if frequency_hz != 0.0 and not FREQUENCY_MIN_HZ <= frequency_hz <= FREQUENCY_MAX_HZ:
         raise ArgumentError(
             f"frequency is {frequency_hz:g} Hz; choose {FREQUENCY_MIN_HZ:g} to "
@@ -154,7 +171,10 @@ def check_laser(frequency_hz: float, duty: float) -> None:
 
 
 def sweep_ends_mm(request: ScanRequest, limits: ScanLimits) -> tuple[float, float]:
-    """Where the sweep begins and ends so that speed is constant in between, within the travel."""
+    """Return where the sweep begins and ends, within the travel.
+
+    Speed is constant from start to stop if the travel leaves room for the run-up.
+    """
     run_up = 1.1 * request.speed_mm_s**2 / (2.0 * limits.acceleration_mm_s2) + 0.2
     run_up = math.copysign(run_up, request.stop_mm - request.start_mm)
     low, high = limits.travel_mm
@@ -165,7 +185,7 @@ def sweep_ends_mm(request: ScanRequest, limits: ScanLimits) -> tuple[float, floa
 
 
 def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | None:
-    """Time of the first crossing of ``level_mm``, linear between samples (ns, mm).
+    """Return the time of the first crossing of ``level_mm``, linear between samples (ns, mm).
 
     ``None`` when the samples do not cross it.
     """
@@ -186,7 +206,7 @@ def sweep_progress(phase: str, position_mm: float, request: ScanRequest) -> floa
 
 
 def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
-    """Do one scan; never raises an ``EschortyError``, and leaves laser off and stage at rest."""
+    """Do one scan; raise no ``EschortyError``, leave the laser off and the stage at rest."""
     outcome = ScanOutcome()
     collecting = False
     begin_mm, end_mm = sweep_ends_mm(request, limits)
@@ -219,29 +239,20 @@ def _finish(
     outcome: ScanOutcome,
     collecting: bool,
 ) -> None:
-    """Leave every scan the same way: light off first."""
+    """Run the way out of every scan: laser off first."""
     instrument.shield()
     instrument.watch(False)
-    _attempt(outcome, instrument.laser_off)
+    outcome.attempt(instrument.laser_off)
     if outcome.end is not End.SUCCEEDED:
-        _attempt(outcome, instrument.stop_stage)
+        outcome.attempt(instrument.stop_stage)
     if not collecting:
         return
     instrument.report("finishing")
-    # After a failure whatever is still on the way is kept, but a dead camera is not waited for.
-    patience_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
-    _attempt(outcome, lambda: instrument.drain(patience_s))
+    # After a failure the last events are kept, but there is no long wait for a dead camera.
+    timeout_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
+    outcome.attempt(lambda: instrument.drain(timeout_s))
 
     def end_scan() -> None:
         outcome.summary = instrument.end_scan(request.scan_id)
 
-    _attempt(outcome, end_scan)
-
-
-def _attempt(outcome: ScanOutcome, step: Callable[[], None]) -> None:
-    """Run a step of the way out; its failure turns success into failure, the first reason stays."""
-    try:
-        step()
-    except EschortyError as error:
-        if outcome.end is not End.ABORTED:
-            outcome.end, outcome.message = End.ABORTED, str(error)
+    outcome.attempt(end_scan)

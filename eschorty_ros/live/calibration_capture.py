@@ -1,4 +1,4 @@
-"""What the reconstruction collects while it calibrates, and what can be said of it so far."""
+"""The events and profiles of a calibration, and the targets found in them so far."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ _REASONS_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """The stage moves the one target from ``start_mm`` to ``stop_mm`` and back."""
+    """A move of the one target by the stage, from ``start_mm`` to ``stop_mm`` and back.
+
+    Its range changes by ``range_per_stage`` times the stage's move.
+    """
 
     start_mm: float
     stop_mm: float
@@ -40,7 +43,7 @@ class Sweep:
 
 @dataclass(frozen=True, slots=True)
 class CaptureRequest:
-    """What is lit and for how long; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+    """A capture's parameters; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
 
     targets: tuple[KnownTarget, ...]
     method: str = "joint"
@@ -52,7 +55,7 @@ class CaptureRequest:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What a capture shows.
+    """The targets found in a capture.
 
     Attributes
     ----------
@@ -61,9 +64,9 @@ class Findings:
     posts : int
         Posts found, known or not.
     rejected : tuple of str
-        What fits nothing, with the reason.
+        Posts and targets without a match, with the reason.
     residual_px : ndarray of float64
-        Of the targets about a straight fit of k' and b'; empty below two targets.
+        Of the targets about a fit of k' and b'; empty below two targets.
     """
 
     targets: Targets | None = None
@@ -73,23 +76,23 @@ class Findings:
 
 
 class Capture(Protocol):
-    """Fed by the reconstruction's worker; looked at when the light is off, or in a copy."""
+    """A collection of events and profiles; one thread fills it, others search copies."""
 
     frame: AggregateFrame
     packets_lost: int
 
     def packet(self, packet: Packet) -> None:
-        """Take the next bytes of the EVT3 stream."""
+        """Add the next bytes of the EVT3 stream."""
 
     def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
-        """Take profiles whose stage positions are known."""
+        """Add profiles whose stage positions are known."""
 
     def find(self, frame: AggregateFrame) -> Findings:
-        """Look for the targets in a copy of the frame."""
+        """Search the targets in a copy of the frame."""
 
 
 class _Frame:
-    """The sum of all events; decodes on its own, as it may begin anywhere in the stream."""
+    """The sum of all events, with a decoder of its own that may start anywhere in the stream."""
 
     def __init__(self, nominal: Calibration) -> None:
         self._nominal = nominal
@@ -109,7 +112,7 @@ class _Frame:
 
 
 class PostsCapture(_Frame):
-    """Resting targets side by side.
+    """A capture of targets at rest, side by side.
 
     Parameters
     ----------
@@ -125,10 +128,10 @@ class PostsCapture(_Frame):
         self._line_width_px = line_width_px
 
     def profiles(self, timed: TimedProfiles, stage_mm: NDArray[np.float64]) -> None:
-        """See ``Capture``; profiles say nothing more about resting posts."""
+        """See ``Capture``; the frame is enough for posts at rest."""
 
     def find(self, frame: AggregateFrame) -> Findings:
-        """See ``Capture``; an ambiguous picture counts as no match yet."""
+        """See ``Capture``."""
         posts = find_posts(frame, self._line_width_px)
         match = match_posts(posts, self._known, self._nominal.model())
         return Findings(
@@ -137,7 +140,7 @@ class PostsCapture(_Frame):
 
 
 class SweepCapture(_Frame):
-    """One target that the stage moves along the range.
+    """A capture of one target that the stage moves along the range.
 
     Parameters
     ----------
@@ -180,8 +183,7 @@ def enough_targets(findings: Findings, wanted: int) -> Targets:
     Raises
     ------
     FitError
-        When fewer than three of them, or of what was asked for, were found; names the first
-        reasons.
+        For less than three, or than ``wanted`` if that is less; gives the first reasons.
     """
     targets = findings.targets
     found = len(targets) if targets is not None else 0
@@ -198,7 +200,7 @@ def enough_targets(findings: Findings, wanted: int) -> Targets:
 def make_capture(
     request: CaptureRequest, nominal: Calibration, line_width_px: float
 ) -> PostsCapture | SweepCapture:
-    """Make the capture that fits the request."""
+    """Make the capture of a request."""
     if request.sweep is not None:
         return SweepCapture(request, nominal)
     return PostsCapture(request, nominal, line_width_px)

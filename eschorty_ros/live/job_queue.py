@@ -1,4 +1,4 @@
-"""Jobs handed from the executor's threads to one worker thread, in order."""
+"""A queue of jobs from several threads to one worker thread."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _POLL_S = 0.1
 Job = Callable[[], None]
 
 
-class Mailbox:
-    """A queue in which bulk jobs are bounded and small ones always get through.
+class JobQueue:
+    """Jobs in the order of their arrival; bulk jobs are bounded, small ones are not.
 
     Parameters
     ----------
     bulk_max : int
-        Bulk jobs that may wait.
+        Longest queue of bulk jobs.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Mailbox:
         self._append(job, False)
 
     def post_bulk(self, job: Job) -> bool:
-        """Queue a bulk job; ``False`` and counted when the queue is full."""
+        """Queue a bulk job; return ``False`` and count it when the queue is full."""
         return self._append(job, True)
 
     def run(self, job: Job, timeout_s: float, alive: Callable[[], bool]) -> tuple[bool, str]:
@@ -52,7 +52,7 @@ class Mailbox:
         Returns
         -------
         bool, str
-            Whether it succeeded, and why not: an ``EschortyError``'s text, or that nobody did it.
+            Whether it succeeded, and otherwise the reason.
         """
         answered = threading.Event()
         refusal: list[str] = []
@@ -74,7 +74,7 @@ class Mailbox:
                 return False, f"the reconstruction did not answer within {timeout_s:g} s"
         return not refusal, "".join(refusal)
 
-    def take(self, timeout_s: float) -> Job | None:
+    def next(self, timeout_s: float) -> Job | None:
         """Return the oldest job, ``None`` when none comes within ``timeout_s``."""
         with self._arrived:
             if not self._jobs and not self._arrived.wait_for(lambda: bool(self._jobs), timeout_s):

@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
-from eschorty_ros.live.job_queue import Mailbox
+from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline
 from eschorty_ros.msg import LaserState, PositionTrigger
@@ -68,8 +68,8 @@ class ReconstructionNode(Node):
         if self._override is not None:
             self._pipeline.stream.set_laser(self._override, None)
         self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
-        self._mailbox = Mailbox(self.parameters["packets_max"])
-        self._reports = Reports(self, self._pipeline, self._mailbox)
+        self._jobs = JobQueue(self.parameters["packets_max"])
+        self._reports = Reports(self, self._pipeline, self._jobs)
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
         if self.parameters["auto_calibrate"]:
@@ -147,21 +147,21 @@ class ReconstructionNode(Node):
             )
             return
         packet = Packet(message.seq, ns_from_stamp(message.header.stamp), message.events)
-        self._mailbox.post_bulk(partial(self._take_packet, packet))
+        self._jobs.post_bulk(partial(self._take_packet, packet))
 
     def _on_clock(self, message: TimeReference) -> None:
         zero_ns = ns_from_stamp(message.header.stamp) - ns_from_stamp(message.time_ref)
-        self._mailbox.post(partial(self._pipeline.stream.announce_zero, zero_ns))
+        self._jobs.post(partial(self._pipeline.stream.announce_zero, zero_ns))
 
     def _on_laser(self, message: LaserState) -> None:
         read = None if self._override else self._read("laser/state", laser_settings, message)
         if read is not None:
-            self._mailbox.post(partial(self._pipeline.stream.set_laser, *read))
+            self._jobs.post(partial(self._pipeline.stream.set_laser, *read))
 
     def _on_trigger(self, message: PositionTrigger) -> None:
         read = self._read("stage/trigger", pulse_train, message)
         if read is not None:
-            self._mailbox.post(partial(self._pipeline.stream.set_pulses, *read))
+            self._jobs.post(partial(self._pipeline.stream.set_pulses, *read))
 
     def _read(self, topic: str, convert: Callable[[Any], tuple[Any, ...]], message: Any) -> Any:
         """Convert a message; ``None`` and a line in the log when it is bad."""
@@ -174,7 +174,7 @@ class ReconstructionNode(Node):
     def _on_stage(self, message: Odometry) -> None:
         t_ns = ns_from_stamp(message.header.stamp)
         position_mm = mm_from_m(message.pose.pose.position.y)
-        self._mailbox.post(partial(self._pipeline.placer.add_stage, t_ns, position_mm))
+        self._jobs.post(partial(self._pipeline.placer.add_stage, t_ns, position_mm))
         if self.parameters["publish_tf"]:
             x, y, z = self.calibration.stage_direction
             carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
@@ -182,7 +182,7 @@ class ReconstructionNode(Node):
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
         """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
-        return self._mailbox.run(job, timeout_s, self._lives)
+        return self._jobs.run(job, timeout_s, self._lives)
 
     def _lives(self) -> bool:
         """Whether the worker works; after a signal it does not, and an exit must not wait."""
@@ -203,7 +203,7 @@ class ReconstructionNode(Node):
     def _work(self) -> None:
         while not self._closing.is_set():
             try:
-                job = self._mailbox.take(0.02)
+                job = self._jobs.next(0.02)
                 if job is not None:
                     job()
                 self._step()
@@ -234,11 +234,11 @@ class ReconstructionNode(Node):
         names = Settings.__dataclass_fields__
         settings = Settings(**{name: values[name] for name in names if name in values})
         override = modulation_override(values)
-        self._mailbox.post(partial(self._pipeline.stream.set_settings, settings))
-        self._mailbox.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
+        self._jobs.post(partial(self._pipeline.stream.set_settings, settings))
+        self._jobs.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
         self._override = override
         if override is not None:
-            self._mailbox.post(partial(self._pipeline.stream.set_laser, override, None))
+            self._jobs.post(partial(self._pipeline.stream.set_laser, override, None))
 
 
 def main() -> int:

@@ -6,7 +6,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from eschorty_ros.live.job_queue import Mailbox
+from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_stream import clock_statistics
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.msg import ReconstructionState
@@ -23,11 +23,11 @@ class Reports:
         Unexpected exceptions of the worker, counted by the worker.
     """
 
-    def __init__(self, node: Node, pipeline: Pipeline, mailbox: Mailbox) -> None:
+    def __init__(self, node: Node, pipeline: Pipeline, jobs: JobQueue) -> None:
         self.faults = 0
         self._node = node
         self._pipeline = pipeline
-        self._mailbox = mailbox
+        self._jobs = jobs
         self._state = node.create_publisher(ReconstructionState, "reconstruction/state", 10)
         self._rate = diagnostics.Rate()
         self._diagnostics_rate = diagnostics.Rate()
@@ -61,10 +61,10 @@ class Reports:
             "packets": stream.packets,
             "packets_lost": stream.packets_lost,
             "packets_late": stream.packets_late,
-            "packets_refused_queue_full": self._mailbox.overflows,
+            "packets_refused_queue_full": self._jobs.overflows,
             "packets_held": stream.held,
             "stream_restarts": stream.restarts,
-            "queue": len(self._mailbox),
+            "queue": len(self._jobs),
             "events_per_second": self._diagnostics_rate.read(counters["events"]),
             **clock_statistics(stream),
             "profiles": self._pipeline.profiles,
