@@ -42,7 +42,7 @@ def calibrate_simulated(
     EschortyError
         Without ROS 2.
     """
-    one_calibration = nodes_module("one_calibration", make="test")
+    one_calibration = nodes_module("one_process.calibration", make="test")
     from matplotlib.image import imsave
 
     from eschorty_ros.cli.calibration_output import finish

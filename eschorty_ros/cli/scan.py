@@ -63,11 +63,11 @@ def command(
     from eschorty_ros.core.base.files import check_writable
 
     check_sweep(start, stop)
-    one_scan = nodes_module("one_scan", make="scan")
+    one_scan = nodes_module("one_process.scan", make="scan")
     _check(scene, calibration)
     tables = None
     if hardware is not None:
-        tables = nodes_module("hardware_file", make="scan").read_hardware(hardware)
+        tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     request = one_scan.OneScan(
         scene, calibration, start, stop, speed, frequency, seed, pixels, hardware=tables
     )
