@@ -40,7 +40,7 @@ def test_every_launch_argument_is_in_the_table_with_its_default():
         for node in tree.body
         if isinstance(node, ast.Assign) and node.targets[0].id == "ARGUMENTS"
     )
-    launching = ast.parse((ROOT / "eschorty_ros" / "nodes" / "launching.py").read_text())
+    launching = ast.parse((ROOT / "eschorty_ros" / "nodes" / "ros" / "launching.py").read_text())
     shared = {
         node.target.id: node.value for node in launching.body if isinstance(node, ast.AnnAssign)
     }

@@ -11,7 +11,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = ROOT / "launch"
-SHARED = ast.parse((ROOT / "eschorty_ros" / "nodes" / "launching.py").read_text()).body
+SHARED = ast.parse((ROOT / "eschorty_ros" / "nodes" / "ros" / "launching.py").read_text()).body
 ROWS = {node.target.id: node.value for node in SHARED if isinstance(node, ast.AnnAssign)}
 FUNCTIONS = {node.name: node for node in SHARED if isinstance(node, ast.FunctionDef)}
 NODES = {"camera", "laser", "stage", "reconstruction", "scanner", "replay"}
@@ -105,7 +105,7 @@ def test_launch_files_use_only_what_launch_ros_0_28_has(name):
 
 def test_every_node_a_launch_file_starts_is_a_module():
     for name in NODES:
-        assert (ROOT / "eschorty_ros" / "nodes" / f"{name}.py").is_file()
+        assert (ROOT / "eschorty_ros" / "nodes" / name / "node.py").is_file()
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -150,7 +150,7 @@ def test_rviz_shows_our_topics_with_our_quality_of_service():
 
 def test_rviz_names_frames_that_are_published():
     text = (ROOT / "config" / "scan.rviz").read_text()
-    published = (ROOT / "eschorty_ros" / "nodes" / "transforms.py").read_text()
+    published = (ROOT / "eschorty_ros" / "nodes" / "ros" / "transforms.py").read_text()
     named = set(re.findall(r"\beschorty_\w+", text))
     assert named <= FRAMES
     assert all(f'"{frame}"' in published for frame in named)

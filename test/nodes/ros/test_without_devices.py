@@ -20,11 +20,11 @@ NODES = "eschorty_ros.nodes.{}.node"
 # An empty bus for this host's real one, which may hold a camera or a generator.
 EMPTY = "eschorty_ros.emulation.bus.usb_remote:backend?/nonexistent/usb.sock"
 DEVICES = {
-    NODES + "camera": {"driver": "evk4", "backend": EMPTY},
-    NODES + "laser": {"driver": "awg", "backend": EMPTY},
-    NODES + "stage": {"driver": "apt", "serial": "no such controller"},
+    NODES.format("camera"): {"driver": "evk4", "backend": EMPTY},
+    NODES.format("laser"): {"driver": "awg", "backend": EMPTY},
+    NODES.format("stage"): {"driver": "apt", "serial": "no such controller"},
 }
-SCANNER = {NODES + "reconstruction": {}, NODES + "scanner": {"auto_scan": True}}
+SCANNER = {NODES.format("reconstruction"): {}, NODES.format("scanner"): {"auto_scan": True}}
 
 
 @pytest.fixture(scope="module")
