@@ -12,15 +12,13 @@ from std_srvs.srv import Trigger
 
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.evt3 import WordCounter
+from eschorty_ros.emulation.bench.folder import usb_spec
 from eschorty_ros.hardware.base.protocols import EventSource
 from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.camera.packet_publisher import PacketPublisher
-from eschorty_ros.nodes.camera.parameters import (
-    EVK4_TABLE,
-    missing_bias_file,
-)
+from eschorty_ros.nodes.camera.parameters import EVK4_TABLE, make_camera, missing_bias_file
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
@@ -82,7 +80,13 @@ class CameraNode(DeviceNode):
 
     def open_device(self) -> None:
         """Open the camera."""
-        self._source = drivers.make(drivers.CAMERAS, self.parameters, self.now_ns)
+        self._source = drivers.make(
+            "camera",
+            make_camera,
+            lambda bench: {"backend": usb_spec(bench)},
+            self.parameters,
+            self.now_ns,
+        )
         self._source.on_loss = self._on_loss
         if not self.waiting:
             self.get_logger().info("looking for the camera; its initialisation takes 3 s")

@@ -7,14 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.hardware.base.protocols import EventSource
+from eschorty_ros.hardware.base.usb import open_backend
 from eschorty_ros.hardware.camera.anti_flicker import FREQUENCY_HZ, AntiFlicker
 from eschorty_ros.hardware.camera.biases import BIASES, load_bias_file
 from eschorty_ros.hardware.camera.event_rate import RATE_MAX
 from eschorty_ros.hardware.camera.event_trail import THRESHOLD_US, TYPES
+from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
 from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACKET_PERIOD_US
 from eschorty_ros.hardware.camera.pixel_selection import windows_of
+from eschorty_ros.hardware.camera.reconnection import Reconnection
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
+from eschorty_ros.nodes.ros.drivers import ClockNs
 from eschorty_ros.nodes.ros.parameters import Param
 
 _IGNORED = "; the emulated camera ignores it"
@@ -139,3 +144,14 @@ def _pixels(text: str) -> tuple[tuple[int, int], ...]:
             raise ArgumentError(f"hot_pixels holds {pair!r}; write 'x,y x,y'")
         pixels.append((int(x), int(y)))
     return tuple(pixels)
+
+
+def make_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource:
+    """Return the camera's driver with the node's parameters."""
+    return Evk4(
+        open_backend(parameters["backend"]),
+        clock_ns,
+        parameters["serial"],
+        camera_settings(parameters),
+        Reconnection(parameters["reconnect_attempts"]),
+    )

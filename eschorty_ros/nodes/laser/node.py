@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,18 +18,22 @@ from eschorty_ros.control.laser_readback import LaserSnapshot
 from eschorty_ros.control.laser_supervisor import LaserKeeper
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, WAVEFORMS, Modulation
+from eschorty_ros.emulation.bench.folder import usb_spec
 from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
-from eschorty_ros.nodes.ros.parameters import Param
+from eschorty_ros.nodes.ros.parameters import Param, from_settings
 from eschorty_ros.nodes.ros.spin import run
 
 STATE_RATE_HZ = 20.0
 THREADS = 4
 WATCHED = ("camera", "stage")
 
+DRIVER_TABLE = from_settings(AwgSettings)
 TABLE = (
     *drivers.DRIVER,
     Param(
@@ -52,7 +56,7 @@ TABLE = (
     Param("camera_timeout", 1.0, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
     Param("stage_timeout", 1.0, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
     Param("readback_rate", 5.0, "how often the generator is read back", "Hz", 0.1, 20.0),
-    *drivers.LASER_TABLE,
+    *DRIVER_TABLE,
 )
 
 
@@ -104,7 +108,13 @@ class LaserNode(DeviceNode):
 
     def open_device(self) -> None:
         """Open the generator, dark, with the modulation of the parameters."""
-        laser = drivers.make(drivers.LASERS, self.parameters, self.now_ns)
+        laser = drivers.make(
+            "laser",
+            _make_laser,
+            lambda bench: {"backend": usb_spec(bench)},
+            self.parameters,
+            self.now_ns,
+        )
         self._keeper.open(laser, _modulation(dict(self.parameters)))
         self.get_logger().info(f"{laser.identity.model} {laser.identity.serial}: off")
 
@@ -262,6 +272,13 @@ class LaserNode(DeviceNode):
             return diagnostics.OK, self.state_label, values
         level = diagnostics.WARN if keeper.gate.interlock_open else diagnostics.OK
         return level, f"{output.name}: {snapshot.reason}", values
+
+
+def _make_laser(parameters: Mapping[str, Any], _: drivers.ClockNs) -> GuardedLaser:
+    settings = {param.name: parameters[param.name] for param in DRIVER_TABLE}
+    # Refused here, before a process is started for it.
+    AwgSettings(**settings)
+    return GuardedLaser("eschorty_ros.hardware.laser.awg:open_laser", settings)
 
 
 def _modulation(values: dict[str, Any]) -> Modulation:

@@ -16,6 +16,7 @@ from eschorty_ros.action import MoveStage
 from eschorty_ros.control.stage_states import new_states
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.clocks import PulseTrain
+from eschorty_ros.emulation.bench.folder import stage_port
 from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
@@ -24,6 +25,7 @@ from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param
 from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+from eschorty_ros.nodes.stage.parameters import DRIVER_TABLE, make_stage
 
 FEEDBACK_PERIOD_S = 0.05
 POLL_S = 0.01
@@ -32,7 +34,7 @@ ODOM_DEPTH = 2000
 
 TABLE = (
     *drivers.DRIVER,
-    *drivers.STAGE_TABLE,
+    *DRIVER_TABLE,
     Param("odom_rate", 100.0, "rate of stage/odom", "Hz", 1.0, 500.0),
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
     Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
@@ -80,7 +82,13 @@ class StageNode(DeviceNode):
     def open_device(self) -> None:
         """Open the stage."""
         with self._lock:
-            self._stage = drivers.make(drivers.STAGES, self.parameters, self.now_ns)
+            self._stage = drivers.make(
+                "stage",
+                make_stage,
+                lambda bench: {"port": stage_port(bench)},
+                self.parameters,
+                self.now_ns,
+            )
             identity, trigger = self._stage.identity, self._stage.trigger
         self._trigger.publish(self._trigger_message(trigger))
         self.get_logger().info(f"{identity.model} {identity.serial}")
