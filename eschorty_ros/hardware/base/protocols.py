@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     # Only names: the process that guards the laser starts without numpy.
     from eschorty_ros.core.clocks import PulseTrain
     from eschorty_ros.core.modulation import Modulation
-    from eschorty_ros.hardware.camera.settings import CameraSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +64,6 @@ class EventSource(Protocol):
         """Model, serial and firmware; complete after ``open``."""
 
     @property
-    def settings(self) -> CameraSettings:
-        """Settings as requested, the trigger input among them."""
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """One line for each oddity that ``open`` found."""
 
@@ -101,6 +96,9 @@ class EventSource(Protocol):
         Raises ``ArgumentError`` for an unknown bias or an offset outside its range,
         ``DeviceError`` when the camera is not open or keeps another value.
         """
+
+    def filters_out(self, frequency_hz: float) -> bool:
+        """Return whether a filter of the camera removes light modulated at ``frequency_hz``."""
 
     def read_biases(self) -> dict[str, int]:
         """Return the offsets in the camera; raises ``DeviceError`` when it is not open."""

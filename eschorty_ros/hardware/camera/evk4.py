@@ -91,11 +91,6 @@ class Evk4:
         return self._connection.identity
 
     @property
-    def settings(self) -> CameraSettings:
-        """Settings as requested."""
-        return self._connection.settings
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """One line for each oddity that ``open`` found."""
         session = self._connection.session
@@ -221,6 +216,11 @@ class Evk4:
         kept = self._connection.require(name).set_bias(name, offset)
         self._connection.settings = settings
         return kept
+
+    def filters_out(self, frequency_hz: float) -> bool:
+        """Return whether the anti-flicker filter removes light modulated at ``frequency_hz``."""
+        band = self._connection.settings.anti_flicker
+        return band is not None and band.erases(frequency_hz)
 
     def read_biases(self) -> dict[str, int]:
         """Return the offsets in the camera; raises ``DeviceError`` when it is not open."""

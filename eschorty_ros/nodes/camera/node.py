@@ -57,7 +57,7 @@ class CameraNode(DeviceNode):
         self._source: EventSource | None = None
         self._thread: threading.Thread | None = None
         self._ending = threading.Event()
-        self._laser_hz: float | None = None
+        self._laser_hz = 0.0
         self._rates = {name: diagnostics.Rate() for name in ("packets", "bytes", "on", "off")}
         self._biases: dict[str, int] = {}
         self._lost_reported = 0.0
@@ -240,8 +240,7 @@ class CameraNode(DeviceNode):
         loss = source.loss if source is not None else ""
         if loss:
             return diagnostics.ERROR, f"looking for the camera: {loss}", values
-        band = source.settings.anti_flicker if source is not None else None
-        if band is not None and self._laser_hz is not None and band.erases(self._laser_hz):
+        if source is not None and self._laser_hz and source.filters_out(self._laser_hz):
             line = (
                 f"the anti-flicker filter erases the laser's {self._laser_hz:g} Hz; switch it off"
             )
