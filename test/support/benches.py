@@ -16,9 +16,9 @@ from typing import Any
 
 from short_folder import short_folder
 
-from eschorty_ros.emulation.bench.cables import serving
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench.process import bench_process
+from eschorty_ros.emulation.bench.server import serving
 
 
 @contextlib.contextmanager

@@ -24,8 +24,8 @@ from eschorty_ros.emulation.bus.usb_device import (
     EmulatedUsbDevice,
     EndpointIdentity,
     UsbIdentity,
+    Wait,
 )
-from eschorty_ros.emulation.bus.usb_pipe import Wait
 
 VENDOR_ID, PRODUCT_ID = 0x6656, 0x0834
 ENDPOINT_OUT, ENDPOINT_IN = 0x01, 0x81

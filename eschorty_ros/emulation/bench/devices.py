@@ -9,11 +9,10 @@ from dataclasses import dataclass, field
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.emulation.apt.model import AptModel
 from eschorty_ros.emulation.awg.model import AwgModel
-from eschorty_ros.emulation.bench.imperfections import Imperfections
-from eschorty_ros.emulation.bench.physics import Physics
+from eschorty_ros.emulation.bench.physics import Imperfections, Physics
 from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice
-from eschorty_ros.emulation.evk4.control import sensor_control
 from eschorty_ros.emulation.evk4.model import Evk4Model
+from eschorty_ros.emulation.evk4.settings import sensor_control
 from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import named
 from eschorty_ros.simulation.world import BACKGROUND_HZ, World, warm_up

@@ -14,9 +14,9 @@ from eschorty_ros.emulation.bus.usb_descriptors import DescriptorBackend
 from eschorty_ros.emulation.bus.usb_device import (
     DIRECTION_IN,
     EmulatedUsbDevice,
+    UsbFault,
     UsbIdentity,
 )
-from eschorty_ros.emulation.bus.usb_pipe import UsbFault
 
 Buffer = array.array | bytearray | memoryview
 

@@ -18,15 +18,16 @@ from eschorty_ros.emulation.bus.usb_device import (
     SPEED_SUPER,
     EmulatedUsbDevice,
     EndpointIdentity,
+    UsbFault,
     UsbIdentity,
+    Wait,
 )
-from eschorty_ros.emulation.bus.usb_pipe import UsbFault, Wait
-from eschorty_ros.emulation.evk4.pixels import PixelMask
 from eschorty_ros.emulation.evk4.registers import SENSOR_RESET, Registers
 from eschorty_ros.emulation.evk4.sequences import Phase, SequenceWatch
 from eschorty_ros.emulation.evk4.settings import SETTING_ADDRESSES, SensorSettings, read_settings
 from eschorty_ros.emulation.evk4.stream import (
     Packetiser,
+    PixelMask,
     SensorSource,
     dropped,
     without_triggers,

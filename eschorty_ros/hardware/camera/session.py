@@ -14,9 +14,8 @@ import usb.backend
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.hardware.base.protocols import DeviceIdentity
 from eschorty_ros.hardware.camera import event_rate, imx636, monitors, treuzell
-from eschorty_ros.hardware.camera.async_reader import make_reader
 from eschorty_ros.hardware.camera.biases import BiasBank
-from eschorty_ros.hardware.camera.bulk_reader import BulkReader, ClockNs
+from eschorty_ros.hardware.camera.bulk_reader import BulkReader, ClockNs, make_reader
 from eschorty_ros.hardware.camera.camera_usb import (
     NAME,
     open_camera,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from camera_on_bench import CameraOnBench
 
-from eschorty_ros.emulation.evk4.control import sensor_control
 from eschorty_ros.emulation.evk4.model import Evk4Model
+from eschorty_ros.emulation.evk4.settings import sensor_control
 from eschorty_ros.hardware.camera.biases import BIASES
 from eschorty_ros.hardware.camera.settings import CameraSettings
 from eschorty_ros.simulation.pixels import Biases

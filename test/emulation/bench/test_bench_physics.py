@@ -12,8 +12,7 @@ from eschorty_ros.core.clocks import MotionPlan, plan_move
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.emulation.bench.imperfections import Imperfections
-from eschorty_ros.emulation.bench.physics import Physics
+from eschorty_ros.emulation.bench.physics import Imperfections, Physics
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import World
 

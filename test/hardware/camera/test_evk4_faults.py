@@ -14,7 +14,7 @@ import pytest
 from evk4_bench import PATIENCE_S, OnDemand, Rig, until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.emulation.bus.usb_pipe import UsbFault
+from eschorty_ros.emulation.bus.usb_device import UsbFault
 from eschorty_ros.emulation.evk4.model import CONTROL_IN, CONTROL_OUT, DATA_IN, Evk4Model
 from eschorty_ros.emulation.evk4.sequences import Phase
 from eschorty_ros.emulation.evk4.treuzell import BoardIdentity

@@ -10,9 +10,14 @@ from typing import Any
 import pytest
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, DeviceStallError
-from eschorty_ros.hardware.camera import async_reader
-from eschorty_ros.hardware.camera.async_reader import TRANSFERS, AsyncReader, make_reader
-from eschorty_ros.hardware.camera.bulk_reader import TRANSFER_BYTES, SyncReader
+from eschorty_ros.hardware.camera import bulk_reader
+from eschorty_ros.hardware.camera.bulk_reader import (
+    TRANSFER_BYTES,
+    TRANSFERS,
+    AsyncReader,
+    SyncReader,
+    make_reader,
+)
 
 libusb_package = pytest.importorskip("libusb_package", reason="libusb-package is not installed")
 pytest.importorskip("usb1", reason="libusb1 is not installed")
@@ -20,7 +25,7 @@ pytest.importorskip("usb1", reason="libusb1 is not installed")
 from usb1 import libusb1
 
 BACKEND = libusb_package.get_libusb1_backend()
-assert async_reader._queueing_library(BACKEND) is libusb1
+assert bulk_reader._queueing_library(BACKEND) is libusb1
 
 
 def address(transfer: Any) -> int:
