@@ -1,7 +1,7 @@
-"""Emulated benches for tests: in this process, or in one of their own.
+"""Emulated benches for tests, in this process or in another.
 
-``python benches.py FOLDER SETTINGS``, with ``BenchSettings`` as JSON, serves one that looks at
-each scene named on standard input.
+``python benches.py FOLDER SETTINGS``, with ``BenchSettings`` as JSON, serves a bench and sets each
+scene that it reads from standard input.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from eschorty_ros.emulation.bench.server import serving
 
 @contextlib.contextmanager
 def bench_here(**settings: Any) -> Iterator[tuple[Bench, Path]]:
-    """A bench of these ``BenchSettings`` in this process, and the folder it serves."""
+    """Yield a bench with these ``BenchSettings`` in this process, and its folder."""
     bench = Bench(BenchSettings(**settings))
     with short_folder() as folder, serving(bench, folder):
         yield bench, folder
@@ -31,15 +31,15 @@ def bench_here(**settings: Any) -> Iterator[tuple[Bench, Path]]:
 
 @contextlib.contextmanager
 def bench_elsewhere(**options: Any) -> Iterator[Path]:
-    """The folder of a bench with these options in a process of its own."""
+    """Yield the folder of a bench with these options in another process."""
     with short_folder() as folder:
         names = {name.replace("_", "-"): value for name, value in options.items()}
         with bench_process(folder, names):
             yield folder
 
 
-class TurnableBench:
-    """A bench in a process of its own that can be made to look elsewhere."""
+class RemoteBench:
+    """A bench in another process whose scene can be changed."""
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
         self.folder = folder
@@ -57,7 +57,7 @@ class TurnableBench:
             raise
 
     def look_at(self, scene: str) -> None:
-        """Put another scene in front of the camera, for the next start of its stream."""
+        """Set the scene from the next start of the stream on."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{scene}\n")
         self._process.stdin.flush()
@@ -74,10 +74,10 @@ class TurnableBench:
 
 
 @contextlib.contextmanager
-def turnable_bench(**settings: Any) -> Iterator[TurnableBench]:
-    """A bench of these ``BenchSettings`` in a process of its own."""
+def remote_bench(**settings: Any) -> Iterator[RemoteBench]:
+    """Yield a bench with these ``BenchSettings`` in another process."""
     with short_folder() as folder:
-        bench = TurnableBench(folder, settings)
+        bench = RemoteBench(folder, settings)
         try:
             yield bench
         finally:
@@ -85,7 +85,7 @@ def turnable_bench(**settings: Any) -> Iterator[TurnableBench]:
 
 
 def serve(folder: str, settings: str) -> None:
-    """Be the bench until standard input ends."""
+    """Serve the bench until standard input ends."""
     bench = Bench(BenchSettings(**json.loads(settings)))
     with serving(bench, Path(folder)):
         print("done", flush=True)

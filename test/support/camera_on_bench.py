@@ -1,4 +1,4 @@
-"""A whole emulated bench in this process, under a clock that tests set."""
+"""The emulated bench in this process, with a clock that tests set."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from waiting import DEADLINE_S
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
@@ -20,7 +21,6 @@ from eschorty_ros.hardware.camera.settings import CameraSettings
 
 MS = 1_000_000
 COLUMNS = 64
-PATIENCE_S = 60.0
 
 
 class StillBench:
@@ -29,7 +29,7 @@ class StillBench:
     Parameters
     ----------
     folder : path
-        Takes the calibration.
+        Folder for the calibration.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class StillBench:
         self.backend = EmulatedBackend(self.bench.usb_devices)
 
     def clock_ns(self) -> int:
-        """Give the bench's time."""
+        """Return the bench's time."""
         return self._now_ns
 
     def light(self, frequency_hz: float) -> None:
@@ -59,13 +59,13 @@ class StillBench:
         self.bench.physics.set_laser(self._now_ns, True, Modulation(frequency_hz))
 
     def statistic(self, name: str) -> int:
-        """One of the bench's counts."""
+        """Return one of the bench's counts."""
         return int(self.bench.physics.statistics()[name])
 
     def run(self, duration_ms: int, arrived: Callable[[], int]) -> None:
-        """Let time pass; returns when as many events have ``arrived`` as left the sensor."""
+        """Advance the time; returns when as many events have ``arrived`` as left the sensor."""
         self._now_ns += duration_ms * MS
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + DEADLINE_S
         while not (self._caught_up() and arrived() == self.statistic("events")):
             assert time.monotonic() < end_s, f"{arrived()} of {self.statistic('events')} came"
             time.sleep(1e-3)
@@ -75,7 +75,7 @@ class StillBench:
 
 
 class CameraOnBench(StillBench):
-    """The same with the EVK4 driver on it, and what it reads decoded.
+    """The same with the EVK4 driver and a decoder.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class CameraOnBench(StillBench):
         self.camera.close()
 
     def counts(self, duration_ms: int) -> NDArray[np.int64]:
-        """Let time pass; OFF and ON events that arrived in it."""
+        """Advance the time; returns the OFF and ON events that arrived meanwhile."""
         before = len(self._polarities)
         self.run(duration_ms, self._read)
         return np.bincount(self._polarities[before:], minlength=2)

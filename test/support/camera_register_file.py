@@ -1,4 +1,4 @@
-"""Registers in a dictionary: what the sensor's facilities are tested on."""
+"""Registers in a dictionary, for tests of the sensor's facilities."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 
 class RegisterFile:
-    """Holds what is written; some bits may be stuck, and every access is noted in order."""
+    """Stores written values; ``always_set`` bits read as 1, writes are recorded in order."""
 
     def __init__(self, values: Mapping[int, int] | None = None) -> None:
         self.values = dict(values or {})

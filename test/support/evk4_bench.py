@@ -1,14 +1,14 @@
-"""An EVK4 in memory with the driver on it, for tests: no sleeps, events on demand."""
+"""An emulated EVK4 with its driver, without sleeps and with events on demand."""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from waiting import DEADLINE_S
 
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
 from eschorty_ros.emulation.evk4.model import Evk4Model
@@ -18,11 +18,10 @@ from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.reconnection import Reconnection
 
 SERIAL = 0x00051234
-PATIENCE_S = 120.0
 
 
 def milliseconds(first: int, count: int) -> bytes:
-    """EVT3 of one event per millisecond of sensor time, at column 5 of row (ms modulo 720)."""
+    """Return EVT3 of one event per millisecond of sensor time: column 5, row ms modulo 720."""
     words = []
     for ms in range(first, first + count):
         t_us = 1000 * ms
@@ -31,74 +30,66 @@ def milliseconds(first: int, count: int) -> bytes:
 
 
 class OnDemand:
-    """A source that has what a test gives it; sensor time starts at 0 with every start."""
+    """A source of the events that a test gives; sensor time starts at 0 with every start."""
 
     def __init__(self) -> None:
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._waiting = b""
         self._ms = 0
         self.running = False
         self.starts = 0
 
     def start(self) -> None:
-        with self._news:
+        with self._changed:
             self.running = True
             self.starts += 1
             self._ms = 0
             self._waiting = b""
 
     def stop(self) -> None:
-        with self._news:
+        with self._changed:
             self.running = False
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def give(self, count: int) -> bytes:
-        """Let ``count`` milliseconds of events come about."""
-        with self._news:
+        """Add ``count`` milliseconds of events; returns their bytes."""
+        with self._changed:
             data = milliseconds(self._ms, count)
             self._ms += count
             self._waiting += data
-            self._news.notify_all()
+            self._changed.notify_all()
         return data
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        with self._news:
+        with self._changed:
             if not self._waiting:
-                self._news.wait(timeout_s)
+                self._changed.wait(timeout_s)
             data, self._waiting = self._waiting[:max_bytes], self._waiting[max_bytes:]
             return data
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    """Wait for a condition."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end_s, f"{what} did not come about"
-        time.sleep(0.002)
 
 
 _BUSES: dict[str, list[Evk4Model]] = {}
 
 
 def backend(name: str) -> EmulatedBackend:
-    """Backend ``evk4_bench:backend?name`` of the driver's parameter: the bus of that name."""
+    """Return the bus of that name, for the parameter ``evk4_bench:backend?name``."""
     return EmulatedBackend(lambda: _BUSES.get(name, []))
 
 
 def plug(name: str, *models: Evk4Model) -> None:
-    """Put these on the bus of that name."""
+    """Put cameras on the bus of that name."""
     _BUSES[name] = list(models)
 
 
-class _Tireless(Reconnection):
-    """Looks for its camera for ever."""
+class _Endless(Reconnection):
+    """Searches for the camera without end."""
 
     def wait_s(self, attempt: int) -> float:
         return self.longest_s
 
 
-class Rig:
-    """A model, a driver on it, what was read; ``attempts`` None never gives the camera up."""
+class CameraBench:
+    """A model with a driver; ``attempts`` None searches for a lost camera without end."""
 
     def __init__(self, *, attempts: int | None = 5, serial: int = SERIAL, **options: Any) -> None:
         self.source = OnDemand()
@@ -114,17 +105,17 @@ class Rig:
 
     def driver(self, *, attempts: int | None = 5, **options: Any) -> Evk4:
         options.setdefault("sleep", self._sleep)
-        reconnection = _Tireless(sys.maxsize) if attempts is None else Reconnection(attempts)
+        reconnection = _Endless(sys.maxsize) if attempts is None else Reconnection(attempts)
         camera = Evk4(self.backend, time.monotonic_ns, reconnection=reconnection, **options)
         camera.on_loss = self.losses.append
         return camera
 
     def _sleep(self, seconds: float) -> None:
         self.slept.append(seconds)
-        # A camera that comes back needs a moment of the test's own thread.
+        # Let the test's thread run.
         time.sleep(min(seconds, 1e-3))
 
-    def streaming(self) -> Rig:
+    def streaming(self) -> CameraBench:
         """Open and start."""
         self.camera.open()
         self.camera.start()
@@ -133,7 +124,7 @@ class Rig:
     def read(self, count: int) -> bytes:
         """Read at least ``count`` bytes; returns all bytes of these reads."""
         data = b""
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + DEADLINE_S
         while len(data) < count:
             assert time.monotonic() < end_s, f"{len(data)} of {count} bytes came"
             chunk = self.camera.read(0.1)
@@ -143,7 +134,7 @@ class Rig:
         return data
 
     def exchange(self, count: int = 20) -> None:
-        """Let events come about and read exactly them."""
+        """Give events and read exactly their bytes."""
         given = self.source.give(count)
         assert self.read(len(given)) == given
 
@@ -151,7 +142,7 @@ class Rig:
         """One of the driver's counters."""
         return int(self.camera.statistics()[name])
 
-    def __enter__(self) -> Rig:
+    def __enter__(self) -> CameraBench:
         return self
 
     def __exit__(self, *_: object) -> None:

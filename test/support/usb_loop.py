@@ -1,4 +1,4 @@
-"""A device that sends back what it gets: the smallest model on the emulated bus."""
+"""The smallest device on the emulated bus: it returns what it receives."""
 
 from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice, EndpointIdentity, UsbIdentity
 
@@ -18,12 +18,12 @@ IDENTITY = UsbIdentity(
 
 
 class Loop(EmulatedUsbDevice):
-    """Gives every transfer back; ends whole packets with an empty one if ``polite``."""
+    """Returns every transfer; ends one of full packets with an empty one if ``zero_length``."""
 
-    def __init__(self, identity=IDENTITY, *, polite=True, wait=lambda *_: False):
+    def __init__(self, identity=IDENTITY, *, zero_length=True, wait=lambda *_: False):
         super().__init__(identity, wait=wait)
-        self.polite = polite
+        self.zero_length = zero_length
 
     def bulk_out(self, endpoint, data, timeout_ms):
-        self.reply(IN, data, zero_length=self.polite and len(data) % PACKET == 0)
+        self.reply(IN, data, zero_length=self.zero_length and len(data) % PACKET == 0)
         return len(data)

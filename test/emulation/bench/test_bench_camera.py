@@ -18,21 +18,21 @@ from eschorty_ros.simulation.world import SensorControl
 OFF, ON = 0, 1
 
 
-def stepped(rig: CameraOnBench, name: str, offsets: tuple[int, ...], ms: int) -> list[np.ndarray]:
+def stepped(setup: CameraOnBench, name: str, offsets: tuple[int, ...], ms: int) -> list[np.ndarray]:
     """OFF and ON events at each of these offsets, set while the camera streams."""
     counts = []
     for offset in offsets:
-        assert rig.camera.set_bias(name, offset) == offset
-        assert rig.camera.read_biases()[name] == offset
-        rig.counts(10)
-        counts.append(rig.counts(ms))
+        assert setup.camera.set_bias(name, offset) == offset
+        assert setup.camera.read_biases()[name] == offset
+        setup.counts(10)
+        counts.append(setup.counts(ms))
     print(name, dict(zip(offsets, [count.tolist() for count in counts], strict=True)))
     return counts
 
 
 def test_a_camera_left_alone_is_simulated_as_the_factory_made_it(tmp_path: Path) -> None:
-    with CameraOnBench(tmp_path) as rig:
-        assert sensor_control(rig.bench.camera.settings) == SensorControl()
+    with CameraOnBench(tmp_path) as setup:
+        assert sensor_control(setup.bench.camera.settings) == SensorControl()
 
 
 @pytest.mark.parametrize(
@@ -42,38 +42,38 @@ def test_a_camera_left_alone_is_simulated_as_the_factory_made_it(tmp_path: Path)
 def test_raising_a_threshold_lowers_its_events_step_by_step(
     tmp_path: Path, name: str, polarity: int, offsets: tuple[int, ...]
 ) -> None:
-    with CameraOnBench(tmp_path) as rig:
-        rig.light(500.0)
-        rig.counts(20)
-        counts = [int(count[polarity]) for count in stepped(rig, name, offsets, 40)]
+    with CameraOnBench(tmp_path) as setup:
+        setup.light(500.0)
+        setup.counts(20)
+        counts = [int(count[polarity]) for count in stepped(setup, name, offsets, 40)]
         assert counts == sorted(counts, reverse=True)
         assert counts[-1] < 0.75 * counts[offsets.index(0)] < 0.75 * counts[0]
-        again = stepped(rig, name, (0,), 40)[0][polarity]
+        again = stepped(setup, name, (0,), 40)[0][polarity]
         assert again == pytest.approx(counts[offsets.index(0)], rel=0.03)
 
 
 def test_a_narrow_follower_takes_events_at_10_khz(tmp_path: Path) -> None:
-    with CameraOnBench(tmp_path) as rig:
-        rig.light(10_000.0)
-        rig.counts(10)
-        counts = [int(c.sum()) for c in stepped(rig, "bias_fo", (-30, -10, 10), 20)]
+    with CameraOnBench(tmp_path) as setup:
+        setup.light(10_000.0)
+        setup.counts(10)
+        counts = [int(c.sum()) for c in stepped(setup, "bias_fo", (-30, -10, 10), 20)]
         assert counts == sorted(counts)
         assert counts[0] < 0.5 * counts[-1]
 
 
 def test_the_high_pass_bias_changes_nothing(tmp_path: Path) -> None:
-    with CameraOnBench(tmp_path) as rig:
-        rig.light(70.0)
-        rig.counts(20)
-        counts = [int(c.sum()) for c in stepped(rig, "bias_hpf", (0, 120), 100)]
+    with CameraOnBench(tmp_path) as setup:
+        setup.light(70.0)
+        setup.counts(20)
+        counts = [int(c.sum()) for c in stepped(setup, "bias_hpf", (0, 120), 100)]
         assert counts[1] == pytest.approx(counts[0], rel=0.02)
 
 
 def test_a_shorter_dead_time_gives_more_events_at_2_khz(tmp_path: Path) -> None:
-    with CameraOnBench(tmp_path) as rig:
-        rig.light(2000.0)
-        rig.counts(20)
-        counts = [int(c.sum()) for c in stepped(rig, "bias_refr", (0, 60, 180), 20)]
+    with CameraOnBench(tmp_path) as setup:
+        setup.light(2000.0)
+        setup.counts(20)
+        counts = [int(c.sum()) for c in stepped(setup, "bias_refr", (0, 60, 180), 20)]
         assert counts == sorted(counts)
         assert counts[-1] > 1.5 * counts[0]
 
@@ -82,9 +82,9 @@ def test_biases_set_before_the_start_hold_from_its_first_event_on(tmp_path: Path
     settings = CameraSettings(biases={"bias_diff_on": 120})
     counts = []
     for given in (CameraSettings(), settings):
-        with CameraOnBench(tmp_path, given) as rig:
-            rig.light(500.0)
-            counts.append(int(rig.counts(40)[ON]))
+        with CameraOnBench(tmp_path, given) as setup:
+            setup.light(500.0)
+            counts.append(int(setup.counts(40)[ON]))
     print(counts)
     assert counts[1] < 0.8 * counts[0]
 
@@ -109,12 +109,12 @@ def test_offsets_beyond_the_normal_range_act_as_its_end() -> None:
 
 
 def test_the_rate_control_keeps_its_rate_and_tells_what_it_drops(tmp_path: Path) -> None:
-    with CameraOnBench(tmp_path, CameraSettings(erc_rate=300_000)) as rig:
-        rig.light(500.0)
-        rig.counts(100)
-        times_us = np.array(rig.times_us)
-        delivered, dropped = rig.statistic("events"), rig.statistic("rate_dropped")
-        counters = rig.decoder.counters
+    with CameraOnBench(tmp_path, CameraSettings(erc_rate=300_000)) as setup:
+        setup.light(500.0)
+        setup.counts(100)
+        times_us = np.array(setup.times_us)
+        delivered, dropped = setup.statistic("events"), setup.statistic("rate_dropped")
+        counters = setup.decoder.counters
         print(f"{delivered} delivered, {dropped} dropped, {counters}")
         assert np.bincount(times_us // 200).max() == 60
         assert dropped > 0.5 * delivered
@@ -129,10 +129,10 @@ def test_the_rate_control_keeps_its_rate_and_tells_what_it_drops(tmp_path: Path)
 def test_limited_and_free_cameras_make_the_same_events(tmp_path: Path) -> None:
     made = []
     for rate in (None, 300_000):
-        with CameraOnBench(tmp_path, CameraSettings(erc_rate=rate)) as rig:
-            rig.light(500.0)
-            rig.counts(50)
-            made.append(rig.statistic("events") + rig.statistic("rate_dropped"))
-            assert (rig.statistic("rate_dropped") > 0) == (rate is not None)
+        with CameraOnBench(tmp_path, CameraSettings(erc_rate=rate)) as setup:
+            setup.light(500.0)
+            setup.counts(50)
+            made.append(setup.statistic("events") + setup.statistic("rate_dropped"))
+            assert (setup.statistic("rate_dropped") > 0) == (rate is not None)
     print(made)
     assert made[0] == made[1]

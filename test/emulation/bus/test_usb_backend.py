@@ -50,7 +50,7 @@ def test_a_transfer_longer_than_the_buffer_goes_on_in_the_next_read(loop):
 
 
 def test_an_exact_multiple_without_an_empty_packet_blocks_a_larger_read_and_is_lost(loop):
-    loop.polite = False
+    loop.zero_length = False
     device = opened(loop)
     device.write(OUT, bytes(2 * PACKET))
     with pytest.raises(usb.core.USBTimeoutError) as caught:

@@ -255,24 +255,6 @@ def test_a_full_buffer_drops_and_says_how_much():
     ]  # fmt: skip
 
 
-def test_temperature_is_read_as_the_reference_says():
-    host = Host()
-    host.model.registers.temperature_c = 41.0
-    host.run("init")
-    host.write(0x4C, 0b11)
-    host.write(0x54, 0b10)
-    host.write(0x5C, 0b10)
-    host.write(0x5C, 0b11)
-    host.write(0x4C, 0b01)
-    host.write(0x4C, 0b11)
-    host.write(0x54, 1 << 12 | 0b10)
-    host.write(0x4C, 0b111)
-    values = [host.read(0x50) for _ in range(2)]
-    assert values[0] >> 11 & 1 == 0
-    assert values[1] >> 11 & 1 == 1
-    assert 0.190 * (values[1] & 0x3FF) - 56 == pytest.approx(41.0, abs=0.1)
-
-
 def test_masked_pixels_give_no_events_and_all_others_do():
     rng = np.random.default_rng(8)
     print("seed 8")
@@ -299,27 +281,6 @@ def test_masked_pixels_give_no_events_and_all_others_do():
     on = ((x < 8) | (x > 15)) & (y != 310) & ~((x == 100) & (y == 320))
     for field, expected in (("t", t), ("x", x), ("y", y), ("p", p)):
         assert np.array_equal(getattr(events, field), expected[on])
-
-
-def test_settings_are_told_by_their_effect():
-    seen = []
-    host = Host()
-    host.model.configure = seen.append
-    host.write(0x2004, 1 << 3)
-    host.write(0x4000, 1)
-    host.write(0x9100, 1 << 31 | 7 << 16 | 9)
-    for address, value in ((0x6000, 1), (0x6008, 200), (0x600C, 4000), (0x6050, 1)):
-        host.write(address, value)
-    host.write(0xC008, 15 << 8 | 156)
-    host.write(0xC000, 1)
-    host.write(0xD004, 10_000 << 1 | 1)
-    host.write(0xD000, 1)
-    now = host.model.settings
-    assert seen[-1] == now
-    assert (now.columns_off, now.rows_off, now.pixels_off) == ({35}, {0}, {(9, 7)})
-    assert now.event_rate == (4000, 200)
-    assert now.flicker_band_hz == pytest.approx((1e6 / 1920, 1e6 / 19968))
-    assert now.noise_filter == ("stc", 10_000)
 
 
 def test_replug_comes_back_reset():

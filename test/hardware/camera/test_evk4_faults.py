@@ -1,4 +1,4 @@
-"""Every fault of the camera's USB link: what the driver does, what the user reads."""
+"""Faults of the camera's USB link: what the driver does, what the user reads."""
 
 # ruff: noqa: E501 - a fault's line of the table in the docs is its docstring
 
@@ -11,7 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from evk4_bench import PATIENCE_S, OnDemand, Rig, until
+from evk4_bench import CameraBench, OnDemand
+from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.bus.usb_device import UsbFault
@@ -22,35 +23,35 @@ from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
 Answer = Callable[[bytes], bytes]
 
 
-def spoil(rig: Rig, *changes: Answer) -> None:
-    """Let the model's next answers go through ``changes``, one each."""
+def spoil(bench: CameraBench, *changes: Answer) -> None:
+    """Change the model's next answers by ``changes``, one each."""
     pending = list(changes)
-    whole = rig.model.board.answer
+    unchanged = bench.model.board.answer
 
     def answer(request: bytes) -> bytes:
-        reply = whole(request)
+        reply = unchanged(request)
         return pending.pop(0)(reply) if pending else reply
 
-    rig.model.board.answer = answer  # type: ignore[method-assign]
+    bench.model.board.answer = answer  # type: ignore[method-assign]
 
 
-def fail_data(rig: Rig, *codes: int) -> None:
-    """Let the next reads of the data endpoint fail with these error numbers."""
+def fail_data(bench: CameraBench, *codes: int) -> None:
+    """Make the next reads of the data endpoint fail with these error numbers."""
     pending = list(codes)
-    whole = rig.model.bulk_in
+    unchanged = bench.model.bulk_in
 
     def bulk_in(endpoint: int, size: int, timeout_ms: int) -> bytes:
-        if endpoint == DATA_IN and pending and rig.model.watch.phase is Phase.STREAMING:
+        if endpoint == DATA_IN and pending and bench.model.watch.phase is Phase.STREAMING:
             raise UsbFault(pending.pop(0))
-        return whole(endpoint, size, timeout_ms)
+        return unchanged(endpoint, size, timeout_ms)
 
-    rig.model.bulk_in = bulk_in  # type: ignore[method-assign]
+    bench.model.bulk_in = bulk_in  # type: ignore[method-assign]
 
 
-def read_on(rig: Rig) -> None:
+def read_on(bench: CameraBench) -> None:
     """Read until the driver gives up."""
     while True:
-        rig.camera.read(5.0)
+        bench.camera.read(5.0)
 
 
 def one_line(error: BaseException | str) -> str:
@@ -61,123 +62,123 @@ def one_line(error: BaseException | str) -> str:
 
 
 @pytest.mark.fault("USB unplugged")
-def test_unplug_in_a_scan() -> None:
-    """driver: unhealthy at once, waits, finds the same serial, sets up, restarts the stream; user reads: 'the device is gone; check cable and power, then reconnect'."""
-    with Rig(attempts=None) as rig:
-        rig.streaming()
-        rig.camera.set_bias("bias_diff_on", 15)
-        rig.exchange()
-        rig.model.gone = True
-        until(lambda: rig.losses, "the loss")
-        assert "the device is gone; check cable and power" in one_line(rig.losses[0])
-        assert not rig.camera.healthy
-        rig.model.replug()
-        until(lambda: rig.count("reconnects") == 1, "the reconnection")
-        assert rig.camera.loss == ""
-        rig.chunks.clear()
-        rig.exchange(9)
-        assert rig.chunks[0].restarted
-        assert dict(rig.model.settings.biases)["bias_diff_on"] == 15
-        assert (rig.count("losses"), rig.count("restarts")) == (1, 2)
+def test_unplugged_while_streaming() -> None:
+    """driver: unhealthy at once, waits, finds the same serial, initialises it, restarts the stream; user reads: 'the device is gone; check cable and power, then reconnect'."""
+    with CameraBench(attempts=None) as bench:
+        bench.streaming()
+        bench.camera.set_bias("bias_diff_on", 15)
+        bench.exchange()
+        bench.model.gone = True
+        wait_until(lambda: bench.losses, "the loss")
+        assert "the device is gone; check cable and power" in one_line(bench.losses[0])
+        assert not bench.camera.healthy
+        bench.model.replug()
+        wait_until(lambda: bench.count("reconnects") == 1, "the reconnection")
+        assert bench.camera.loss == ""
+        bench.chunks.clear()
+        bench.exchange(9)
+        assert bench.chunks[0].restarted
+        assert dict(bench.model.settings.biases)["bias_diff_on"] == 15
+        assert (bench.count("losses"), bench.count("restarts")) == (1, 2)
 
 
 @pytest.mark.fault("USB unplugged")
-def test_unplug_and_never_back() -> None:
+def test_unplugged_for_good() -> None:
     """driver: bounded attempts with growing waits, then an error; user reads: 'lost, and not back after 4 attempts (...); check cable and power, then configure it again'."""
-    with Rig(attempts=4) as rig:
-        rig.streaming()
-        rig.slept.clear()
-        rig.model.gone = True
+    with CameraBench(attempts=4) as bench:
+        bench.streaming()
+        bench.slept.clear()
+        bench.model.gone = True
         with pytest.raises(DeviceGoneError, match="00051234: lost, and not back after 4 attempts"):
-            read_on(rig)
-        assert rig.slept == [0.5, 1.0, 2.0, 4.0]
-        assert rig.count("reconnect_attempts") == 4
-        assert not rig.camera.healthy
+            read_on(bench)
+        assert bench.slept == [0.5, 1.0, 2.0, 4.0]
+        assert bench.count("reconnect_attempts") == 4
+        assert not bench.camera.healthy
 
 
 @pytest.mark.fault("USB unplugged")
 def test_another_camera_is_plugged_in_instead() -> None:
-    """driver: leaves the other serial alone and keeps looking; user reads: 'none with serial 00051234 can be opened, but there is 00000099; check cable, power and serial'."""
-    with Rig(attempts=2) as rig:
-        rig.streaming()
+    """driver: leaves the other serial alone and searches on; user reads: 'none with serial 00051234 can be opened, but there is 00000099; check cable, power and serial'."""
+    with CameraBench(attempts=2) as bench:
+        bench.streaming()
         stranger = Evk4Model(OnDemand(), board=BoardIdentity(serial=0x99), wait=lambda *_: False)
-        rig.bus[:] = [stranger]
-        rig.model.gone = True
+        bench.bus[:] = [stranger]
+        bench.model.gone = True
         with pytest.raises(DeviceGoneError, match=r"none with serial 00051234.*there is 00000099"):
-            read_on(rig)
+            read_on(bench)
         assert stranger.watch.phase is Phase.OFF
         assert not stranger.claims
 
 
 @pytest.mark.fault("USB unplugged")
 def test_power_dip_leaves_a_camera_that_does_not_stream() -> None:
-    """driver: asks a silent camera, finds it reset, initialises it again; user reads: 'it has stopped streaming by itself (reset or power dip); check its power'."""
-    with Rig() as rig:
-        rig.streaming()
-        rig.exchange()
-        rig.model.power_up()
-        until(lambda: rig.count("reconnects") == 1, "the reconnection")
-        assert "stopped streaming by itself" in one_line(rig.losses[0])
-        rig.chunks.clear()
-        rig.exchange()
-        assert rig.chunks[0].restarted
+    """driver: asks a camera without events, finds it reset, initialises it again; user reads: 'it has stopped streaming by itself (reset or power dip); check its power'."""
+    with CameraBench() as bench:
+        bench.streaming()
+        bench.exchange()
+        bench.model.power_up()
+        wait_until(lambda: bench.count("reconnects") == 1, "the reconnection")
+        assert "stopped streaming by itself" in one_line(bench.losses[0])
+        bench.chunks.clear()
+        bench.exchange()
+        assert bench.chunks[0].restarted
 
 
 @pytest.mark.fault("endpoint stalls")
 def test_stalled_data_endpoint() -> None:
     """driver: clears the halt once, reports a gap, goes on; user reads: failed_transfers and gaps in the diagnostics."""
-    with Rig() as rig:
-        rig.streaming()
-        rig.exchange()
-        rig.model.stalled.add(DATA_IN)
-        until(lambda: rig.count("failed_transfers") == 1, "the stall")
-        rig.chunks.clear()
-        rig.exchange()
-        assert rig.chunks[0].gap
-        assert (rig.count("gaps"), rig.count("losses")) == (1, 0)
+    with CameraBench() as bench:
+        bench.streaming()
+        bench.exchange()
+        bench.model.stalled.add(DATA_IN)
+        wait_until(lambda: bench.count("failed_transfers") == 1, "the stall")
+        bench.chunks.clear()
+        bench.exchange()
+        assert bench.chunks[0].gap
+        assert (bench.count("gaps"), bench.count("losses")) == (1, 0)
 
 
 @pytest.mark.fault("endpoint stalls")
 def test_data_endpoint_stalls_again() -> None:
     """driver: a second stall in a row is a loss, it reconnects; user reads: 'the device stalled the transfer'."""
-    with Rig() as rig:
-        rig.streaming()
-        fail_data(rig, errno.EPIPE, errno.EPIPE)
-        until(lambda: rig.count("reconnects") == 1, "the reconnection")
-        assert "stalled the transfer" in one_line(rig.losses[0])
-        rig.exchange()
-        assert rig.chunks[0].restarted
+    with CameraBench() as bench:
+        bench.streaming()
+        fail_data(bench, errno.EPIPE, errno.EPIPE)
+        wait_until(lambda: bench.count("reconnects") == 1, "the reconnection")
+        assert "stalled the transfer" in one_line(bench.losses[0])
+        bench.exchange()
+        assert bench.chunks[0].restarted
 
 
 @pytest.mark.parametrize("endpoint", [CONTROL_IN, CONTROL_OUT])
 @pytest.mark.fault("endpoint stalls")
 def test_stalled_control_endpoint(endpoint: int) -> None:
-    """driver: clears both control endpoints and asks once more; user reads: control_recoveries in the diagnostics."""
-    with Rig() as rig:
-        rig.streaming()
-        rig.model.stalled.add(endpoint)
-        assert rig.camera.set_bias("bias_fo", 7) == 7
-        assert rig.count("control_recoveries") == 1
-        rig.exchange()
-        assert rig.count("losses") == 0
+    """driver: clears both control endpoints and sends the request once more; user reads: control_recoveries in the diagnostics."""
+    with CameraBench() as bench:
+        bench.streaming()
+        bench.model.stalled.add(endpoint)
+        assert bench.camera.set_bias("bias_fo", 7) == 7
+        assert bench.count("control_recoveries") == 1
+        bench.exchange()
+        assert bench.count("losses") == 0
 
 
 @pytest.mark.fault("no answer, time-out")
-def test_camera_goes_mute() -> None:
-    """driver: asks after 0.1 s of silence, unhealthy when no answer came for 0.5 s, reconnects when it answers again; user reads: 'no answer in time; check that the device is on'."""
-    with Rig(attempts=None) as rig:
-        rig.streaming()
-        rig.exchange()
-        rig.model.mute = True
-        until(lambda: rig.losses, "the loss")
-        assert "no answer in time" in one_line(rig.losses[0])
-        assert not rig.camera.healthy
+def test_camera_stops_answering() -> None:
+    """driver: asks after 0.1 s without events, unhealthy after 0.5 s without an answer, reconnects when it answers again; user reads: 'no answer in time; check that the device is on'."""
+    with CameraBench(attempts=None) as bench:
+        bench.streaming()
+        bench.exchange()
+        bench.model.mute = True
+        wait_until(lambda: bench.losses, "the loss")
+        assert "no answer in time" in one_line(bench.losses[0])
+        assert not bench.camera.healthy
         with pytest.raises(DeviceError, match="bias_fo: the camera is not open"):
-            rig.camera.set_bias("bias_fo", 3)
-        rig.model.mute = False
-        until(lambda: rig.count("reconnects") == 1, "the reconnection")
-        rig.exchange()
-        until(lambda: rig.camera.healthy, "health")
+            bench.camera.set_bias("bias_fo", 3)
+        bench.model.mute = False
+        wait_until(lambda: bench.count("reconnects") == 1, "the reconnection")
+        bench.exchange()
+        wait_until(lambda: bench.camera.healthy, "health")
 
 
 SPOILT: dict[str, Answer] = {
@@ -194,81 +195,81 @@ SPOILT: dict[str, Answer] = {
 @pytest.mark.parametrize("name", SPOILT)
 @pytest.mark.fault("malformed transfer")
 def test_garbled_answer(name: str) -> None:
-    """driver: takes no answer it does not recognise, clears the link, asks once more; user reads: control_recoveries in the diagnostics."""
-    with Rig() as rig:
-        rig.streaming()
-        spoil(rig, SPOILT[name])
-        assert rig.camera.read_biases()["bias_diff_on"] == 0
-        assert rig.count("control_recoveries") == 1
-        rig.exchange()
+    """driver: discards the answer, clears the link, sends the request once more; user reads: control_recoveries in the diagnostics."""
+    with CameraBench() as bench:
+        bench.streaming()
+        spoil(bench, SPOILT[name])
+        assert bench.camera.read_biases()["bias_diff_on"] == 0
+        assert bench.count("control_recoveries") == 1
+        bench.exchange()
 
 
 @pytest.mark.parametrize("name", SPOILT)
 @pytest.mark.fault("malformed transfer")
 def test_garbled_answers_while_opening(name: str) -> None:
     """driver: the second wrong answer ends the attempt and releases the camera; user reads: one line that names the answer."""
-    with Rig() as rig:
-        spoil(rig, *[SPOILT[name]] * 2)
+    with CameraBench() as bench:
+        spoil(bench, *[SPOILT[name]] * 2)
         with pytest.raises(DeviceError) as caught:
-            rig.camera.open()
+            bench.camera.open()
         one_line(caught.value)
-        assert not rig.model.claims
-        rig.camera.open()
+        assert not bench.model.claims
+        bench.camera.open()
 
 
 @pytest.mark.fault("malformed transfer")
 def test_overflow_on_the_data_endpoint() -> None:
-    """driver: the transfer is lost: a gap is reported, the stream goes on; user reads: failed_transfers and gaps in the diagnostics."""
-    with Rig() as rig:
-        rig.streaming()
-        rig.exchange()
-        fail_data(rig, errno.EOVERFLOW)
-        until(lambda: rig.count("failed_transfers") == 1, "the overflow")
-        rig.chunks.clear()
-        rig.exchange()
-        assert rig.chunks[0].gap
-        assert rig.count("losses") == 0
+    """driver: reports the lost transfer as a gap and goes on; user reads: failed_transfers and gaps in the diagnostics."""
+    with CameraBench() as bench:
+        bench.streaming()
+        bench.exchange()
+        fail_data(bench, errno.EOVERFLOW)
+        wait_until(lambda: bench.count("failed_transfers") == 1, "the overflow")
+        bench.chunks.clear()
+        bench.exchange()
+        assert bench.chunks[0].gap
+        assert bench.count("losses") == 0
 
 
 @pytest.mark.fault("malformed transfer")
 def test_transfers_of_zero_length_and_of_whole_packets() -> None:
     """driver: an empty packet ends a transfer, not the stream; user reads: nothing."""
-    with Rig() as rig:
-        rig.streaming()
-        given = rig.source.give(128)
+    with CameraBench() as bench:
+        bench.streaming()
+        given = bench.source.give(128)
         assert len(given) == 1024
-        rig.model.reply(DATA_IN, b"")
-        assert rig.read(len(given)) == given
-        rig.exchange()
-        assert (rig.count("gaps"), rig.count("failed_transfers")) == (0, 0)
+        bench.model.reply(DATA_IN, b"")
+        assert bench.read(len(given)) == given
+        bench.exchange()
+        assert (bench.count("gaps"), bench.count("failed_transfers")) == (0, 0)
 
 
 @pytest.mark.fault("partial reply")
 def test_partial_answer() -> None:
-    """driver: an answer in two pieces is thrown away and asked for again; user reads: control_recoveries in the diagnostics."""
-    with Rig() as rig:
-        rig.camera.open()
+    """driver: discards an answer in two pieces and sends the request again; user reads: control_recoveries in the diagnostics."""
+    with CameraBench() as bench:
+        bench.camera.open()
 
         def halved(reply: bytes) -> bytes:
-            rig.model.reply(CONTROL_IN, reply[:12])
+            bench.model.reply(CONTROL_IN, reply[:12])
             return reply[12:]
 
-        spoil(rig, halved)
-        assert rig.camera.read_biases()["bias_diff_on"] == 0
-        assert rig.count("control_recoveries") == 1
+        spoil(bench, halved)
+        assert bench.camera.read_biases()["bias_diff_on"] == 0
+        assert bench.count("control_recoveries") == 1
 
 
 @pytest.mark.fault("stale reply")
 def test_stale_answer_after_a_time_out() -> None:
-    """driver: an answer that came too late is flushed, never taken for another register; user reads: control_recoveries in the diagnostics."""
-    with Rig() as rig:
-        rig.camera.open()
-        rig.camera.set_bias("bias_fo", 9)
-        late = rig.model.board.answer(
+    """driver: discards a late answer, which is recognised by its register; user reads: control_recoveries in the diagnostics."""
+    with CameraBench() as bench:
+        bench.camera.open()
+        bench.camera.set_bias("bias_fo", 9)
+        late = bench.model.board.answer(
             b"\x02\x01\x01\0" + b"\x0c\0\0\0" + bytes(4) + b"\x14\0\0\0\x01\0\0\0"
         )
-        rig.model.reply(CONTROL_IN, late)
-        biases = rig.camera.read_biases()
+        bench.model.reply(CONTROL_IN, late)
+        biases = bench.camera.read_biases()
         assert biases == {
             "bias_diff_on": 0,
             "bias_diff_off": 0,
@@ -276,67 +277,69 @@ def test_stale_answer_after_a_time_out() -> None:
             "bias_hpf": 0,
             "bias_refr": 0,
         }
-        assert rig.count("control_recoveries") == 1
+        assert bench.count("control_recoveries") == 1
 
 
 @pytest.mark.fault("no permission, busy")
 def test_access_denied() -> None:
     """driver: one line, nothing claimed, tried again when asked; user reads: 'permission denied; install the udev rules of docs/hardware.md and plug in again'."""
-    with Rig() as rig:
-        rig.model.denied = True
+    with CameraBench() as bench:
+        bench.model.denied = True
         with pytest.raises(
             DeviceError, match="permission denied; install the udev rules"
         ) as caught:
-            rig.camera.open()
+            bench.camera.open()
         one_line(caught.value)
-        rig.model.denied = False
-        rig.camera.open()
+        bench.model.denied = False
+        bench.camera.open()
 
 
 @pytest.mark.fault("no permission, busy")
-def test_a_kernel_driver_holds_it() -> None:
+def test_a_kernel_driver_holds_the_camera() -> None:
     """driver: detaches the kernel driver and gives it back on close; user reads: nothing."""
-    with Rig() as rig:
-        rig.model.kernel_driver = "uvcvideo"
-        rig.camera.open()
-        assert rig.model.kernel_driver is None
-        rig.camera.close()
-        assert rig.model.kernel_driver == "uvcvideo"
+    with CameraBench() as bench:
+        bench.model.kernel_driver = "uvcvideo"
+        bench.camera.open()
+        assert bench.model.kernel_driver is None
+        bench.camera.close()
+        assert bench.model.kernel_driver == "uvcvideo"
 
 
 @pytest.mark.fault("host stalls")
 def test_host_stalls() -> None:
-    """driver: receives on in its own thread: stamps are those of the receipt, nothing is lost; user reads: queue_bytes in the diagnostics."""
-    with Rig() as rig:
-        rig.streaming()
+    """driver: goes on receiving in its own thread, with the time of the receipt, and loses nothing; user reads: queue_bytes in the diagnostics."""
+    with CameraBench() as bench:
+        bench.streaming()
         given, received_ns = b"", []
         for round_ in range(1, 6):
-            given += rig.source.give(10)
-            until(lambda bytes_=80 * round_: rig.count("queue_bytes") == bytes_, "the receipt")
+            given += bench.source.give(10)
+            wait_until(
+                lambda bytes_=80 * round_: bench.count("queue_bytes") == bytes_, "the receipt"
+            )
             received_ns.append(time.monotonic_ns())
         time.sleep(0.3)
-        assert rig.count("queue_bytes") == len(given)
-        assert rig.read(len(given)) == given
+        assert bench.count("queue_bytes") == len(given)
+        assert bench.read(len(given)) == given
         last_ns, done = {}, 0
-        for chunk in rig.chunks:
+        for chunk in bench.chunks:
             done += len(chunk.data)
             last_ns[-(-done // 80) - 1] = chunk.arrival_ns
         assert all(last_ns[i] <= received_ns[i] for i in range(5))
-        assert rig.count("drops") == 0
+        assert bench.count("drops") == 0
 
 
 @pytest.mark.fault("two clients")
 def test_two_clients() -> None:
     """driver: the second program fails in one line, the first streams on; user reads: 'in use; close the other program, or unload the kernel driver that holds it'."""
-    with Rig() as rig:
-        rig.streaming()
-        second = rig.driver()
+    with CameraBench() as bench:
+        bench.streaming()
+        second = bench.driver()
         with pytest.raises(DeviceError, match="in use; close the other program") as caught:
             second.open()
         one_line(caught.value)
         second.close()
-        rig.exchange()
-        assert rig.count("losses") == 0
+        bench.exchange()
+        assert bench.count("losses") == 0
 
 
 def in_the_background(action: Callable[[], Any]) -> tuple[threading.Thread, list[BaseException]]:
@@ -356,38 +359,38 @@ def in_the_background(action: Callable[[], Any]) -> tuple[threading.Thread, list
 @pytest.mark.fault("shutdown at any time")
 def test_shutdown_in_the_initialisation() -> None:
     """driver: closing cuts the 2.5 s of the initialisation short and releases the camera; user reads: 'closed before it was ready'."""
-    with Rig() as rig:
-        camera = rig.driver(sleep=None)
+    with CameraBench() as bench:
+        camera = bench.driver(sleep=None)
         thread, errors = in_the_background(camera.open)
-        until(lambda: rig.model.claims, "the claim")
+        wait_until(lambda: bench.model.claims, "the claim")
         camera.close()
-        thread.join(PATIENCE_S)
+        thread.join(DEADLINE_S)
         assert not thread.is_alive()
         assert ["closed before it was ready" in one_line(error) for error in errors] == [True]
-        assert not rig.model.claims
+        assert not bench.model.claims
 
 
 @pytest.mark.fault("shutdown at any time")
 def test_shutdown_while_reconnecting() -> None:
     """driver: closing ends the search at once; user reads: nothing more."""
     before = set(threading.enumerate())
-    with Rig() as rig:
-        camera = rig.driver(attempts=None, sleep=None)
+    with CameraBench() as bench:
+        camera = bench.driver(attempts=None, sleep=None)
         camera.open()
         camera.start()
-        rig.model.gone = True
-        until(lambda: camera.loss, "the loss")
+        bench.model.gone = True
+        wait_until(lambda: camera.loss, "the loss")
         camera.close()
         camera.close()
-        until(lambda: set(threading.enumerate()) <= before, "the end of its threads")
+        wait_until(lambda: set(threading.enumerate()) <= before, "the end of its threads")
 
 
 @pytest.mark.fault("shutdown at any time")
-def test_shutdown_in_a_scan_of_a_mute_camera() -> None:
-    """driver: closes within 2 s though nothing answers any more; user reads: nothing more."""
-    with Rig(attempts=0) as rig:
-        rig.streaming()
-        rig.exchange()
+def test_shutdown_while_the_camera_does_not_answer() -> None:
+    """driver: closes within 2 s without any answer; user reads: nothing more."""
+    with CameraBench(attempts=0) as bench:
+        bench.streaming()
+        bench.exchange()
         waits: list[float] = []
 
         def wait(condition: threading.Condition, seconds: float | None) -> bool:
@@ -396,9 +399,9 @@ def test_shutdown_in_a_scan_of_a_mute_camera() -> None:
                 waits.append(seconds)
             return condition.wait(seconds)
 
-        rig.model._wait = wait
-        rig.model.mute = True
-        rig.camera.close()
+        bench.model._wait = wait
+        bench.model.mute = True
+        bench.camera.close()
         print(f"waited {sum(waits):.2f} s for answers")
         assert sum(waits) < 1.0
-        assert not rig.model.claims
+        assert not bench.model.claims

@@ -6,10 +6,7 @@ import pytest
 from camera_register_file import RegisterFile
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.hardware.camera import imx636
 from eschorty_ros.hardware.camera.registers import (
-    Wait,
-    Write,
     await_bits,
     parse_sequence,
     run_sequence,
@@ -35,19 +32,6 @@ def test_mask_replaces_only_its_bits() -> None:
 def test_misspelt_sequence_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="no register access"):
         parse_sequence(text)
-
-
-def test_tables_have_the_documented_length() -> None:
-    """EVENT_CAMERA 4.4: init 67 writes and 2.50 s, start and stop 3 + 2, destroy 20 writes."""
-    writes = [step for step in imx636.INIT if isinstance(step, Write)]
-    waits_s = sum(step.us for step in imx636.INIT if isinstance(step, Wait)) * 1e-6
-    assert len(writes) == 67
-    assert waits_s == pytest.approx(2.503, abs=0.001)
-    for sequence in (imx636.START, imx636.STOP):
-        masked = [s for s in sequence if isinstance(s, Write) and s.mask != 0xFFFF_FFFF]
-        plain = [s for s in sequence if isinstance(s, Write) and s.mask == 0xFFFF_FFFF]
-        assert (len(plain), len(masked)) == (3, 2)
-    assert sum(isinstance(step, Write) for step in imx636.DESTROY) == 20
 
 
 def test_waiting_for_a_bit_that_never_comes_names_it() -> None:

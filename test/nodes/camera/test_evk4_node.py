@@ -220,31 +220,6 @@ def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
     assert "erases the laser's 70 Hz; switch it off" in status.message
 
 
-def test_a_bias_set_while_it_streams_thins_out_the_emulated_events(
-    start: Start, tmp_path: Path
-) -> None:
-    still = StillBench(tmp_path)
-    run = start(model=still.bench.camera).active()
-    words = run.node.words
-    still.light(500.0)
-
-    def on_events() -> int:
-        still.run(10, lambda: words.on + words.off)
-        before = words.on
-        still.run(50, lambda: words.on + words.off)
-        return words.on - before
-
-    counts = []
-    for offset in (-50, 0, 70, 140):
-        accepted, reason = run.observer.set_parameter("camera", "bias_diff_on", offset)
-        assert accepted, reason
-        counts.append(on_events())
-    print(counts)
-    assert counts == sorted(counts, reverse=True)
-    assert counts[-1] < 0.8 * counts[1]
-    assert run.node.parameters["bias_diff_on"] == 140
-
-
 def test_what_the_rate_control_drops_is_told(start: Start, tmp_path: Path) -> None:
     still = StillBench(tmp_path)
     run = start(model=still.bench.camera, erc_mode="enabled", erc_rate=300_000).active()

@@ -61,11 +61,3 @@ def test_ctrl_c_in_the_initialisation_and_while_streaming(socket: Path) -> None:
             end_well(running["camera"])
         assert model.watch.phase is Phase.OFF
         wait_until(lambda: not model.claims, "the claim's end")
-
-
-def test_process_without_a_camera_waits_and_ends_well() -> None:
-    domain = free_domain()
-    with processes({CAMERA: {"driver": "evk4"}}, domain) as running:
-        camera = running["camera"]
-        wait_until(lambda: "waiting: EVK4 camera: no such device" in camera.output, "the line")
-        end_well(camera)

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import calibration_scenarios as scenarios
-from benches import turnable_bench
+from benches import remote_bench
 from ros_process import NodeProcess, processes
 
 from eschorty_ros.nodes.ros.domain import free_domain
@@ -41,7 +41,7 @@ def instrument(tmp_path_factory):
     domain = free_domain()
     settings = scenarios.bench_settings(log, scenarios.KNOWN_SCENE)
     with (
-        turnable_bench(**settings) as emulated,
+        remote_bench(**settings) as emulated,
         processes(scenarios.node_parameters(emulated.folder, folder), domain) as running,
         scenarios.bench(domain, log, folder) as bench,
     ):
