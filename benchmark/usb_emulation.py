@@ -17,11 +17,9 @@ import numpy as np
 import usb.core
 import usb.util
 
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.bus import EmulatedBackend, UsbServer
 from eschorty_ros.emulation.bus.usb_remote import backend
-from eschorty_ros.emulation.bus.usb_server import UsbServer
-from eschorty_ros.emulation.evk4.model import DATA_IN, Evk4Model
-from eschorty_ros.emulation.evk4.sequences import SEQUENCES
+from eschorty_ros.emulation.evk4 import DATA_IN, SEQUENCES, Evk4Model
 
 PERIODS_US = (1008, 4000)
 EVENTS_PER_US = 20

@@ -7,7 +7,7 @@ from typing import Any
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg.model import AwgModel
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.hardware.laser.awg import AwgLaser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 

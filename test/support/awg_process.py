@@ -16,7 +16,7 @@ from typing import Any
 from short_folder import short_folder
 
 from eschorty_ros.emulation.awg.model import AwgModel, truth
-from eschorty_ros.emulation.bus.usb_server import UsbServer
+from eschorty_ros.emulation.bus import UsbServer
 
 
 class AwgProcess:

@@ -15,9 +15,8 @@ from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
-from eschorty_ros.hardware.camera.evk4 import Evk4
-from eschorty_ros.hardware.camera.settings import CameraSettings
+from eschorty_ros.emulation.bus import EmulatedBackend
+from eschorty_ros.hardware.camera import CameraSettings, Evk4
 
 MS = 1_000_000
 COLUMNS = 64

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 from waiting import DEADLINE_S
 
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
-from eschorty_ros.emulation.evk4.model import Evk4Model
-from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
+from eschorty_ros.emulation.bus import EmulatedBackend
+from eschorty_ros.emulation.evk4 import BoardIdentity, Evk4Model
 from eschorty_ros.hardware.base.protocols import EventChunk
-from eschorty_ros.hardware.camera.evk4 import Evk4
-from eschorty_ros.hardware.camera.reconnection import Reconnection
+from eschorty_ros.hardware.camera import Evk4, Reconnection
 
 SERIAL = 0x00051234
 

@@ -1,6 +1,6 @@
 """The smallest device on the emulated bus: it returns what it receives."""
 
-from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice, EndpointIdentity, UsbIdentity
+from eschorty_ros.emulation.bus import EmulatedUsbDevice, EndpointIdentity, UsbIdentity
 
 OUT, IN = 0x02, 0x82
 PACKET = 64

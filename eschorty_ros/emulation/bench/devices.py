@@ -10,12 +10,12 @@ from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.emulation.apt.model import AptModel
 from eschorty_ros.emulation.awg.model import AwgModel
 from eschorty_ros.emulation.bench.physics import Imperfections, Physics
-from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice
-from eschorty_ros.emulation.evk4.model import Evk4Model
-from eschorty_ros.emulation.evk4.settings import sensor_control
-from eschorty_ros.simulation.pixels import preset
+from eschorty_ros.emulation.bus import EmulatedUsbDevice
+from eschorty_ros.emulation.evk4 import Evk4Model, SensorSettings
+from eschorty_ros.simulation.pixels import LIMITS, Biases, preset
+from eschorty_ros.simulation.readout import EventRate
 from eschorty_ros.simulation.scenes import named
-from eschorty_ros.simulation.world import BACKGROUND_HZ, World, warm_up
+from eschorty_ros.simulation.world import BACKGROUND_HZ, SensorControl, World, warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,3 +98,13 @@ class Bench:
     def usb_devices(self) -> list[EmulatedUsbDevice]:
         """Return the devices on the USB bus."""
         return [self.camera, self.laser]
+
+
+def sensor_control(settings: SensorSettings) -> SensorControl:
+    """Biases and event rate of ``settings``; a bias beyond its normal range acts as at its end."""
+    offsets = dict(settings.biases)
+    biases = {
+        name: min(max(offsets[f"bias_{name}"], low), high) for name, (low, high) in LIMITS.items()
+    }
+    rate = settings.event_rate
+    return SensorControl(Biases(**biases), EventRate(*rate) if rate else None)

@@ -24,8 +24,7 @@ from eschorty_ros.emulation.bench.folder import (
     usb_spec,
 )
 from eschorty_ros.emulation.bench.physics import TRIGGERS, Imperfections
-from eschorty_ros.emulation.bus.pty_port import PtyPort
-from eschorty_ros.emulation.bus.usb_server import UsbServer
+from eschorty_ros.emulation.bus import PtyPort, UsbServer
 from eschorty_ros.simulation.pixels import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
 

@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from eschorty_ros.emulation.bus.usb_device import (
+from eschorty_ros.emulation.bus import (
     SPEED_SUPER,
     EmulatedUsbDevice,
     EndpointIdentity,

@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from eschorty_ros.emulation.evk4.registers import BIAS_ADDRESSES, SENSOR_RESET, Registers
-from eschorty_ros.simulation.pixels import LIMITS, Biases
-from eschorty_ros.simulation.readout import EventRate
-from eschorty_ros.simulation.world import SensorControl
 
 _CONTROL, _MASKS_ON = 0x0004, 1 << 1
 _COLUMN_MASKS = range(0x2000, 0x20A0, 4)
@@ -82,16 +79,6 @@ def read_settings(registers: Registers) -> SensorSettings:
         flicker_band_hz=_flicker_band(registers),
         noise_filter=_noise_filter(registers),
     )
-
-
-def sensor_control(settings: SensorSettings) -> SensorControl:
-    """Biases and event rate of ``settings``; a bias beyond its normal range acts as at its end."""
-    offsets = dict(settings.biases)
-    biases = {
-        name: min(max(offsets[f"bias_{name}"], low), high) for name, (low, high) in LIMITS.items()
-    }
-    rate = settings.event_rate
-    return SensorControl(Biases(**biases), EventRate(*rate) if rate else None)
 
 
 def _lines(registers: Registers, addresses: range) -> frozenset[int]:

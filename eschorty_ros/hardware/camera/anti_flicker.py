@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.camera.registers import Registers, await_bits, update
 
-FREQUENCY_HZ = (50, 520)
+ANTI_FLICKER_HZ = (50, 520)
 
 _PIPELINE, _INITIALISATION, _INVALIDATION = 0xC000, 0xC0C4, 0xC0C0
 _PARAMETERS, _PERIOD = 0xC004, 0xC008
@@ -46,7 +46,7 @@ class AntiFlicker:
     duty_percent: float = 50.0
 
     def __post_init__(self) -> None:
-        low, high = FREQUENCY_HZ
+        low, high = ANTI_FLICKER_HZ
         if not low <= self.low_hz <= self.high_hz <= high:
             raise ArgumentError(
                 f"anti-flicker band is {self.low_hz} to {self.high_hz} Hz; "

@@ -11,8 +11,8 @@ from eschorty_ros.hardware.camera.registers import Registers, Write, run_sequenc
 
 PERIOD_US = 200
 COUNT_MAX = 640_000
-RATE_MAX = COUNT_MAX * 1_000_000 // PERIOD_US
-RATE_DEFAULT = 20_000_000
+ERC_RATE_MAX = COUNT_MAX * 1_000_000 // PERIOD_US
+ERC_RATE_DEFAULT = 20_000_000
 
 _CONTROL, _TARGET, _SWITCH, _COUNT = 0x6000, 0x602C, 0x6050, 0x600C
 _COUNT_MASK = 0x3F_FFFF
@@ -21,7 +21,7 @@ _BEFORE_TABLES = (
     Write(_CONTROL, 0, 0x3),
     Write(0x6004, 1, 0x1),
     Write(0x6008, PERIOD_US, 0x3FF),
-    Write(_COUNT, RATE_DEFAULT * PERIOD_US // 1_000_000, _COUNT_MASK),
+    Write(_COUNT, ERC_RATE_DEFAULT * PERIOD_US // 1_000_000, _COUNT_MASK),
     Write(0x6028, 0x3, 0x7),
     Write(_TARGET, 1, 0x1),
 )
@@ -55,7 +55,7 @@ def set_event_rate(registers: Registers, enabled: bool, rate: int) -> int:
     count = rate * PERIOD_US // 1_000_000
     if not 1 <= count <= COUNT_MAX:
         raise ArgumentError(
-            f"erc_rate is {rate} events/s; choose {1_000_000 // PERIOD_US} to {RATE_MAX}"
+            f"erc_rate is {rate} events/s; choose {1_000_000 // PERIOD_US} to {ERC_RATE_MAX}"
         )
     update(registers, _SWITCH, 1, int(enabled))
     update(registers, _COUNT, _COUNT_MASK, count)

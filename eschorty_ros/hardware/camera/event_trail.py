@@ -9,8 +9,8 @@ from __future__ import annotations
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.camera.registers import Registers, await_bits, update
 
-TYPES = ("trail", "stc_cut_trail", "stc_keep_trail")
-THRESHOLD_US = (1_000, 100_000)
+TRAIL_TYPES = ("trail", "stc_cut_trail", "stc_keep_trail")
+TRAIL_THRESHOLD_US = (1_000, 100_000)
 
 _PIPELINE, _INITIALISATION, _STC, _TRAIL = 0xD000, 0xD0C4, 0xD004, 0xD008
 _TIMESTAMPING, _INVALIDATION = 0xD00C, 0xD0C0
@@ -48,7 +48,7 @@ TIMING = _timing()
 
 
 def set_event_trail(registers: Registers, kind: str, threshold_us: int) -> int:
-    """Switch a filter of :data:`TYPES` on; returns the threshold in force (us).
+    """Switch a filter of :data:`TRAIL_TYPES` on; returns the threshold in force (us).
 
     Raises
     ------
@@ -57,9 +57,11 @@ def set_event_trail(registers: Registers, kind: str, threshold_us: int) -> int:
     DeviceError
         When the filter's memory does not become ready.
     """
-    if kind not in TYPES:
-        raise ArgumentError(f"trail_filter_type is {kind!r}; choose one of {', '.join(TYPES)}")
-    low, high = THRESHOLD_US
+    if kind not in TRAIL_TYPES:
+        raise ArgumentError(
+            f"trail_filter_type is {kind!r}; choose one of {', '.join(TRAIL_TYPES)}"
+        )
+    low, high = TRAIL_THRESHOLD_US
     if not low <= threshold_us <= high:
         raise ArgumentError(f"trail_filter_threshold is {threshold_us} us; choose {low} to {high}")
     # Half rounds up, as in openeb.

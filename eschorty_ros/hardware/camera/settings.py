@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
 from eschorty_ros.hardware.camera.biases import BiasBank, check_offset
-from eschorty_ros.hardware.camera.event_rate import RATE_DEFAULT, set_event_rate
+from eschorty_ros.hardware.camera.event_rate import ERC_RATE_DEFAULT, set_event_rate
 from eschorty_ros.hardware.camera.event_trail import clear_event_trail, set_event_trail
 from eschorty_ros.hardware.camera.monitors import (
     PACKET_PERIOD_DEFAULT_US,
@@ -83,7 +83,7 @@ def apply_settings(
     if settings.packet_period_us != LEAVE:
         applied["packet_period_us"] = set_packet_period(registers, settings.packet_period_us)
     enabled = settings.erc_rate is not None
-    rate = set_event_rate(registers, enabled, settings.erc_rate or RATE_DEFAULT)
+    rate = set_event_rate(registers, enabled, settings.erc_rate or ERC_RATE_DEFAULT)
     applied["erc_rate_hz"] = rate if enabled else 0
     set_anti_flicker(registers, settings.anti_flicker)
     if settings.trail_filter:

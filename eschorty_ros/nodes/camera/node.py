@@ -14,7 +14,7 @@ from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.evt3 import WordCounter
 from eschorty_ros.emulation.bench.folder import usb_spec
 from eschorty_ros.hardware.base.protocols import EventSource
-from eschorty_ros.hardware.camera.biases import BIASES, save_bias_file
+from eschorty_ros.hardware.camera import BIASES, save_bias_file
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.camera.packet_publisher import PacketPublisher

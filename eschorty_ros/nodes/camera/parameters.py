@@ -9,16 +9,24 @@ from typing import Any
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.base.protocols import EventSource
 from eschorty_ros.hardware.base.usb import open_backend
-from eschorty_ros.hardware.camera.anti_flicker import FREQUENCY_HZ, AntiFlicker
-from eschorty_ros.hardware.camera.biases import BIASES, load_bias_file
-from eschorty_ros.hardware.camera.event_rate import RATE_MAX
-from eschorty_ros.hardware.camera.event_trail import THRESHOLD_US, TYPES
-from eschorty_ros.hardware.camera.evk4 import Evk4
-from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
-from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACKET_PERIOD_US
-from eschorty_ros.hardware.camera.pixel_selection import windows_of
-from eschorty_ros.hardware.camera.reconnection import Reconnection
-from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
+from eschorty_ros.hardware.camera import (
+    ANTI_FLICKER_HZ,
+    BIASES,
+    ERC_RATE_MAX,
+    HEIGHT,
+    LEAVE,
+    PACKET_PERIOD_DEFAULT_US,
+    PACKET_PERIOD_US,
+    TRAIL_THRESHOLD_US,
+    TRAIL_TYPES,
+    WIDTH,
+    AntiFlicker,
+    CameraSettings,
+    Evk4,
+    Reconnection,
+    load_bias_file,
+    windows_of,
+)
 from eschorty_ros.nodes.ros.drivers import ClockNs
 from eschorty_ros.nodes.ros.parameters import Param
 
@@ -65,12 +73,14 @@ EVK4_TABLE = (
         "event-rate control, off unless enabled: dropped events are counted and bias the centroid",
         choices=("na", "disabled", "enabled"),
     ),
-    Param("erc_rate", 100_000_000, "rate beyond which it drops", "events/s", 5_000, RATE_MAX),
+    Param("erc_rate", 100_000_000, "rate beyond which it drops", "events/s", 5_000, ERC_RATE_MAX),
     Param("roi", _FULL_FRAME, "x, y, width, height per window; columns and rows multiply", "px"),
     Param("hot_pixels", "", "pixels to mask, at most 64: 'x,y x,y'"),
     Param("trail_filter", False, "filter of trailing events" + _IGNORED),
-    Param("trail_filter_type", "trail", "kind of that filter", choices=TYPES),
-    Param("trail_filter_threshold", 10_000, "its time, in steps of 1 ms", "us", *THRESHOLD_US),
+    Param("trail_filter_type", "trail", "kind of that filter", choices=TRAIL_TYPES),
+    Param(
+        "trail_filter_threshold", 10_000, "its time, in steps of 1 ms", "us", *TRAIL_THRESHOLD_US
+    ),
     Param(
         "trigger_in_mode",
         "disabled",
@@ -78,8 +88,8 @@ EVK4_TABLE = (
         choices=("disabled", "external"),
     ),
     Param("anti_flicker", False, "filter of flicker: erases a laser in its band" + _IGNORED),
-    Param("anti_flicker_low", 50, "lower edge of its band", "Hz", *FREQUENCY_HZ),
-    Param("anti_flicker_high", 520, "upper edge of its band", "Hz", *FREQUENCY_HZ),
+    Param("anti_flicker_low", 50, "lower edge of its band", "Hz", *ANTI_FLICKER_HZ),
+    Param("anti_flicker_high", 520, "upper edge of its band", "Hz", *ANTI_FLICKER_HZ),
     Param("anti_flicker_band_pass", False, "keep what flickers in the band instead"),
 )
 

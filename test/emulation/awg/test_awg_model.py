@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
-from eschorty_ros.emulation.bus.usb_device import UsbFault
+from eschorty_ros.emulation.bus import UsbFault
 
 Say = Callable[[str], str]
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from camera_on_bench import CameraOnBench
 
-from eschorty_ros.emulation.evk4.model import Evk4Model
-from eschorty_ros.emulation.evk4.settings import sensor_control
-from eschorty_ros.hardware.camera.biases import BIASES
-from eschorty_ros.hardware.camera.settings import CameraSettings
+from eschorty_ros.emulation.bench.devices import sensor_control
+from eschorty_ros.emulation.evk4 import Evk4Model
+from eschorty_ros.hardware.camera import BIASES, CameraSettings
 from eschorty_ros.simulation.pixels import Biases
 from eschorty_ros.simulation.world import SensorControl
 

@@ -9,7 +9,7 @@ from waiting import wait_until
 
 from eschorty_ros.emulation.bench.folder import STAGE_PORT, usb_spec
 from eschorty_ros.hardware.base.usb import open_backend
-from eschorty_ros.hardware.camera.evk4 import Evk4
+from eschorty_ros.hardware.camera import Evk4
 
 
 def test_unplugged_devices_leave_the_bus_and_the_port_and_come_back() -> None:

@@ -9,7 +9,7 @@ import serial
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.emulation.bus.pty_port import PtyPort
+from eschorty_ros.emulation.bus import PtyPort
 
 EVERY_BYTE = bytes(range(256))
 

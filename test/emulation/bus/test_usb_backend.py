@@ -10,7 +10,7 @@ import usb.util
 from usb_loop import IN, OUT, PACKET, Loop
 from waiting import DEADLINE_S
 
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.bus import EmulatedBackend
 
 
 @pytest.fixture

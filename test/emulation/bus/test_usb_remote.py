@@ -16,8 +16,7 @@ from usb_loop import IN, OUT, PACKET, Loop
 from waiting import DEADLINE_S
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.emulation.bus import usb_remote
-from eschorty_ros.emulation.bus.usb_server import UsbServer
+from eschorty_ros.emulation.bus import UsbServer, usb_remote
 from eschorty_ros.hardware.base.usb import open_backend
 
 

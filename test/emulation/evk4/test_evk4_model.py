@@ -8,10 +8,16 @@ import pytest
 import usb.core
 
 from eschorty_ros.core.evt3 import decoder as evt3
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
-from eschorty_ros.emulation.evk4.model import CONTROL_IN, CONTROL_OUT, DATA_IN, Evk4Model
-from eschorty_ros.emulation.evk4.sequences import SEQUENCES, Phase
-from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
+from eschorty_ros.emulation.bus import EmulatedBackend
+from eschorty_ros.emulation.evk4 import (
+    CONTROL_IN,
+    CONTROL_OUT,
+    DATA_IN,
+    SEQUENCES,
+    BoardIdentity,
+    Evk4Model,
+    Phase,
+)
 
 READ, WRITE = 0x10102, 0x40010102
 

@@ -15,7 +15,7 @@ from eschorty_ros.core.base.errors import (
     DeviceStallError,
     DeviceTimeoutError,
 )
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.hardware.base import usb as usb_access
 
 

@@ -10,13 +10,9 @@ from evk4_bench import SERIAL, CameraBench, OnDemand
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, DeviceGoneError
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
-from eschorty_ros.emulation.evk4.model import Evk4Model
-from eschorty_ros.emulation.evk4.sequences import Phase
-from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
-from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker
-from eschorty_ros.hardware.camera.evk4 import Evk4
-from eschorty_ros.hardware.camera.settings import CameraSettings
+from eschorty_ros.emulation.bus import EmulatedBackend
+from eschorty_ros.emulation.evk4 import BoardIdentity, Evk4Model, Phase
+from eschorty_ros.hardware.camera import AntiFlicker, CameraSettings, Evk4
 
 
 def test_open_start_stop_close_follow_the_sensor_s_sequences_and_waits() -> None:

@@ -15,10 +15,15 @@ from evk4_bench import CameraBench, OnDemand
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
-from eschorty_ros.emulation.bus.usb_device import UsbFault
-from eschorty_ros.emulation.evk4.model import CONTROL_IN, CONTROL_OUT, DATA_IN, Evk4Model
-from eschorty_ros.emulation.evk4.sequences import Phase
-from eschorty_ros.emulation.evk4.treuzell import BoardIdentity
+from eschorty_ros.emulation.bus import UsbFault
+from eschorty_ros.emulation.evk4 import (
+    CONTROL_IN,
+    CONTROL_OUT,
+    DATA_IN,
+    BoardIdentity,
+    Evk4Model,
+    Phase,
+)
 
 Answer = Callable[[bytes], bytes]
 

@@ -16,7 +16,7 @@ from eschorty_ros.core.base.errors import (
     DeviceTimeoutError,
 )
 from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, PACKET, AwgModel
-from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend
+from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.hardware.laser.usbtmc import REPLY_LIMIT, UsbTmc, is_usbtmc
 
 

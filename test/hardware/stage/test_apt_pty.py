@@ -15,7 +15,7 @@ from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.apt.model import AptModel
-from eschorty_ros.emulation.bus.pty_port import PtyPort
+from eschorty_ros.emulation.bus import PtyPort
 from eschorty_ros.hardware.stage import apt_port
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 from eschorty_ros.hardware.stage.apt_stage import AptStage, open_stage

@@ -24,7 +24,7 @@ from spinning import spinning
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from eschorty_ros.emulation.evk4.model import Evk4Model
+from eschorty_ros.emulation.evk4 import Evk4Model
 from eschorty_ros.hardware.camera import evk4
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.ros import qos

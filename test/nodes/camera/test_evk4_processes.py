@@ -15,9 +15,8 @@ from evk4_bench import OnDemand
 from ros_process import NodeProcess, Observer, processes, wait_until
 from short_folder import short_folder
 
-from eschorty_ros.emulation.bus.usb_server import UsbServer
-from eschorty_ros.emulation.evk4.model import Evk4Model
-from eschorty_ros.emulation.evk4.sequences import Phase
+from eschorty_ros.emulation.bus import UsbServer
+from eschorty_ros.emulation.evk4 import Evk4Model, Phase
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
 

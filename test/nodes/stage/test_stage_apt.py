@@ -22,7 +22,7 @@ from rclpy.action import ActionClient
 from ros_process import NodeProcess, Observer, wait_until
 
 from eschorty_ros.emulation.apt.model import AptModel
-from eschorty_ros.emulation.bus.pty_port import PtyPort
+from eschorty_ros.emulation.bus import PtyPort
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.domain import free_domain
