@@ -13,7 +13,7 @@ from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.base.errors import DeviceError
 
 if TYPE_CHECKING:
-    from eschorty_ros.nodes.one_process.scan import OneScan, Outcome
+    from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
     from eschorty_ros.report.accuracy import Accuracy
 
 
@@ -68,18 +68,14 @@ def command(
     tables = None
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
-    request = one_scan.OneScan(
+    job = one_scan.ScanJob(
         scene, calibration, start, stop, speed, frequency, seed, pixels, hardware=tables
     )
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")
-    with (
-        ended_by_signals(),
-        progress_bar("scanning") as report,
-        one_scan.instrument(request) as made,
-    ):
-        outcome = made.scan(request, report)
-    finish(request, outcome, out)
+    with ended_by_signals(), progress_bar("scanning") as feedback:
+        result = one_scan.scan_once(job, feedback)
+    finish(job, result, out)
 
 
 def _check(scene: str, calibration: str) -> None:
@@ -91,57 +87,55 @@ def _check(scene: str, calibration: str) -> None:
     load_calibration(calibration)
 
 
-def finish(request: OneScan, outcome: Outcome, out: Path) -> None:
+def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     """Write cloud and picture, print the table; a scan that failed or is empty raises."""
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.core.storage import write_cloud
     from eschorty_ros.report import accuracy, figures
     from eschorty_ros.simulation.scenes import names as scenes
 
-    if outcome.success or len(outcome.points):
-        write_cloud(out / "scan.pcd", outcome.points)
-    if not outcome.success or not len(outcome.points):
-        kept = f" ({len(outcome.points):,} points kept in {out / 'scan.pcd'})"
-        raise DeviceError(outcome.message + (kept if len(outcome.points) else ""))
-    calibration = load_calibration(request.calibration)
-    if request.hardware is not None:
-        title = f"{request.frequency_hz:g} Hz, {request.speed_mm_s:g} mm/s, {request.calibration}"
+    if result.success or len(result.points):
+        write_cloud(out / "scan.pcd", result.points)
+    if not result.success or not len(result.points):
+        kept = f" ({len(result.points):,} points kept in {out / 'scan.pcd'})"
+        raise DeviceError(result.message + (kept if len(result.points) else ""))
+    calibration = load_calibration(job.calibration)
+    if job.hardware is not None:
+        title = f"{job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, {job.calibration}"
         direction = calibration.stage_direction
-        figure = figures.scan_figure(outcome.points, None, title, direction)
+        figure = figures.scan_figure(result.points, None, title, direction)
         figures.save(figure, out / "scan.png")
-        pairs(f"{out / 'scan.pcd'}, {out / 'scan.png'}", _counted(outcome))
+        pairs(f"{out / 'scan.pcd'}, {out / 'scan.png'}", _counted(result))
         return
-    truth = scenes.named(request.scene)
+    truth = scenes.named(job.scene)
     model, direction = calibration.model(), calibration.stage_direction
-    error_mm = accuracy.range_error_mm(outcome.points, truth, model, direction)
-    sweep = accuracy.Sweep(
-        request.start_mm, request.stop_mm, request.speed_mm_s, request.frequency_hz
-    )
-    measured = accuracy.measure(outcome.points, truth, model, sweep, direction, error_mm)
+    error_mm = accuracy.range_error_mm(result.points, truth, model, direction)
+    sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz)
+    measured = accuracy.measure(result.points, truth, model, sweep, direction, error_mm)
     title = (
-        f"{request.scene}: {request.frequency_hz:g} Hz, {request.speed_mm_s:g} mm/s, "
-        f"{request.calibration}; median |error| {measured.error_median_mm:.2f} mm"
+        f"{job.scene}: {job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, "
+        f"{job.calibration}; median |error| {measured.error_median_mm:.2f} mm"
     )
-    figures.save(figures.scan_figure(outcome.points, error_mm, title, direction), out / "scan.png")
-    _print(outcome, measured, sweep.seconds, out)
+    figures.save(figures.scan_figure(result.points, error_mm, title, direction), out / "scan.png")
+    _print(result, measured, sweep.seconds, out)
 
 
-def _counted(outcome: Outcome) -> dict[str, str]:
-    note = {"note": outcome.message} if outcome.message else {}
+def _counted(result: ScanResult) -> dict[str, str]:
+    note = {"note": result.message} if result.message else {}
     return {
-        "profiles": f"{outcome.profiles:,}",
-        "points": f"{len(outcome.points):,}",
-        "events": f"{outcome.events:,} ({outcome.events_dropped:,} dropped, "
-        f"{outcome.packets_lost:,} packets lost)",
+        "profiles": f"{result.profiles:,}",
+        "points": f"{len(result.points):,}",
+        "events": f"{result.events:,} ({result.events_dropped:,} dropped, "
+        f"{result.packets_lost:,} packets lost)",
         **note,
     }
 
 
-def _print(outcome: Outcome, measured: Accuracy, seconds: float, out: Path) -> None:
+def _print(result: ScanResult, measured: Accuracy, seconds: float, out: Path) -> None:
     pairs(
         f"{out / 'scan.pcd'}, {out / 'scan.png'}",
         {
-            **_counted(outcome),
+            **_counted(result),
             "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
             "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole periods",
             "median |range error|": f"{measured.error_median_mm:.3f} mm",

@@ -22,8 +22,8 @@ import functools, sys
 from eschorty_ros.nodes.one_process import calibration as nodes
 made = nodes.bench_options
 log, seconds = sys.argv.pop(1), float(sys.argv.pop(1))
-nodes.bench_options = lambda job: made(job) | {"laser-log": log}
-nodes.OneCalibration = functools.partial(nodes.OneCalibration, capture_s=seconds)
+nodes.bench_options = lambda *values: made(*values) | {"laser-log": log}
+nodes.CalibrationJob = functools.partial(nodes.CalibrationJob, capture_s=seconds)
 from eschorty_ros.cli import main
 main(prog_name="eschorty")
 """

@@ -26,7 +26,7 @@ import sys
 from eschorty_ros.nodes.one_process import scan as one_scan
 made = one_scan.bench_options
 log = sys.argv.pop(1)
-one_scan.bench_options = lambda job: made(job) | {"laser-log": log}
+one_scan.bench_options = lambda *values: made(*values) | {"laser-log": log}
 from eschorty_ros.cli import main
 main(prog_name="eschorty")
 """
@@ -139,22 +139,22 @@ main(prog_name="eschorty")
 
 def test_a_scan_without_points_is_no_success(tmp_path):
     from eschorty_ros.cli.scan import finish
-    from eschorty_ros.nodes.one_process.scan import OneScan, Outcome
+    from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
 
-    request = OneScan("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper")
+    request = ScanJob("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper")
     points = np.empty(0, POINT_DTYPE)
     with pytest.raises(DeviceError, match="no points: no events came"):
-        finish(request, Outcome(True, "no points: no events came", points, 0, 0, 0, 0), tmp_path)
+        finish(request, ScanResult(True, "no points: no events came", points, 0, 0, 0, 0), tmp_path)
     assert len(read_cloud(tmp_path / "scan.pcd")) == 0
 
 
 def test_what_a_scan_lost_is_printed(tmp_path, capsys):
     from eschorty_ros.cli.scan import finish
-    from eschorty_ros.nodes.one_process.scan import OneScan, Outcome
+    from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
 
-    request = OneScan("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper", hardware={})
+    request = ScanJob("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper", hardware={})
     points = np.zeros(4, POINT_DTYPE)
     points["x"] = points["t"] = points["y"] = points["column"] = [1, 2, 3, 4]
     lost = "7 points had no stage position"
-    finish(request, Outcome(True, lost, points, 4, 100, 0, 0), tmp_path)
+    finish(request, ScanResult(True, lost, points, 4, 100, 0, 0), tmp_path)
     assert lost in capsys.readouterr().out

@@ -13,37 +13,28 @@ from rclpy.action import ActionClient
 from eschorty_ros.action import Calibrate
 from eschorty_ros.core.calibration import KnownTarget, Targets, read_targets
 from eschorty_ros.core.optics import Calibration, load_calibration
-from eschorty_ros.nodes.one_process.action_job import (
+from eschorty_ros.nodes.one_process.composition import (
     Feedback,
     bench_options,
     bench_parameters,
-    result,
+    composition,
 )
-from eschorty_ros.nodes.one_process.composition import Tables, composition
 from eschorty_ros.nodes.reconstruction.active_calibration import targets_path
 from eschorty_ros.nodes.reconstruction.calibration_messages import target_message
 
 
 @dataclass(frozen=True, slots=True)
-class OneCalibration:
-    """What to calibrate with.
+class CalibrationJob:
+    """A calibration on emulated devices.
 
     Attributes
     ----------
     targets : tuple of KnownTarget
-        What the scene holds, as far as the calibration is told.
-    scene : str
-    calibration : str
-        The build as designed.
-    as_built : str
-        The build the simulated world has.
-    method : {"joint", "paper"}
-    capture_s, frequency_hz : float
-    seed : int
-    pixels : str
-        Preset of the pixels.
+        The known targets of the scene.
     folder : str
         Where the calibration is written.
+    calibration, as_built : str
+        The build as designed, and that of the simulated world.
     """
 
     targets: tuple[KnownTarget, ...]
@@ -59,20 +50,20 @@ class OneCalibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CalibrationOutcome:
-    """The action's ended.
+class CalibrationResult:
+    """The action's result.
 
     Attributes
     ----------
     success : bool
     message : str
-        Why not, empty when it succeeded.
+        Why it failed, ``""`` on success.
     calibration : Calibration or None
         As read back from ``file``.
     file : str
     verdicts, rejected : tuple of str
     targets : Targets or None
-        What was found and fitted to.
+        The targets found, to which it was fitted.
     frame : ndarray of uint8, shape (rows, columns)
         All events of the capture.
     """
@@ -87,34 +78,20 @@ class CalibrationOutcome:
     frame: NDArray[np.uint8]
 
 
-def calibration_parameters(job: OneCalibration) -> Tables:
-    """Parameters of every node for a calibration on emulated devices."""
-    tables = bench_parameters()
-    tables["reconstruction"] |= {
-        "calibration": job.calibration,
-        "calibration_folder": job.folder,
-    }
-    return tables
-
-
-def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcome:
+def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult:
     """Run all nodes on emulated devices, calibrate once through the action, end them.
-
-    Parameters
-    ----------
-    job : OneCalibration
-    feedback : callable
-        Called with the share done and a line of text.
 
     Raises
     ------
     DeviceError
-        When the nodes do not answer, refuse the goal or take far too long.
+        When a node fails, or the action refuses the goal or takes far too long.
     """
-    with composition(calibration_parameters(job), bench_options(job)) as running:
+    tables = bench_parameters()
+    tables["reconstruction"] |= {"calibration": job.calibration, "calibration_folder": job.folder}
+    bench = bench_options(job.scene, job.as_built, job.seed, job.pixels)
+    with composition(tables, bench) as running:
         feedback(0.0, "starting")
         action: ActionClient[Any, Any, Any] = ActionClient(running.client, Calibrate, "calibrate")
-        running.wait_until_active(action)
         goal = Calibrate.Goal(
             targets=[target_message(target) for target in job.targets],
             method=job.method,
@@ -129,8 +106,8 @@ def calibrate_once(job: OneCalibration, feedback: Feedback) -> CalibrationOutcom
                 f"{state.phase} {state.matched} of {state.posts} posts known",
             )
 
-        ended = result(action, goal, on_feedback, 5.0 * job.capture_s)
-    return CalibrationOutcome(
+        ended = running.result(action, goal, on_feedback, 5.0 * job.capture_s)
+    return CalibrationResult(
         success=bool(ended.success),
         message=str(ended.message),
         calibration=load_calibration(ended.file) if ended.success else None,

@@ -1,4 +1,4 @@
-"""All nodes in one process, spinning beside a client's own node; the bench in another one."""
+"""All nodes in one process beside a client's own node, the emulated bench in another process."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 
 import rclpy
 import yaml
+from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -41,15 +42,39 @@ START_S = 300.0
 """A slow machine's first start compiles for minutes."""
 _POLL_S = 0.02
 
+SLACK_S = 300.0
+"""Added to the time that a goal needs: on a slow machine an emulated camera falls behind."""
+
 Tables = dict[str, dict[str, Any]]
+"""Parameters by node."""
+
+Feedback = Callable[[float, str], None]
+"""Receives the share done and a line of text."""
 
 
-def lossless_events() -> Tables:
-    """Parameters that let no event get lost; an emulated camera can wait."""
+def bench_parameters() -> Tables:
+    """Return parameters of the nodes at a bench whose stage triggers the camera.
+
+    No event is lost, because an emulated camera can wait.
+    """
     topic = f"{NAMESPACE}/camera/events"
-    return {
+    tables: Tables = {
         node: {"qos_overrides": {topic: {end: {"reliability": "reliable"}}}}
         for node, end in (("camera", "publisher"), ("reconstruction", "subscription"))
+    }
+    tables["camera"]["trigger_in_mode"] = "external"
+    tables["reconstruction"]["trigger_source"] = "stage"
+    return tables
+
+
+def bench_options(scene: str, calibration: str, seed: int, pixels: str) -> dict[str, object]:
+    """Return options of a bench whose stage triggers the camera."""
+    return {
+        "scene": scene,
+        "calibration": calibration,
+        "seed": seed,
+        "pixels": pixels,
+        "trigger": "stage",
     }
 
 
@@ -61,7 +86,7 @@ class Composition:
         self._nodes = nodes
 
     def wait_until_active(self, action: Any) -> None:
-        """Wait until every node is active and ``action``'s server is there.
+        """Wait until every node is active and the server of ``action`` has been discovered.
 
         Raises
         ------
@@ -73,6 +98,35 @@ class Composition:
             START_S,
             lambda: "; ".join(("the nodes are not active", *self._waiting())),
         )
+
+    def result(
+        self,
+        action: ActionClient[Any, Any, Any],
+        goal: Any,
+        on_feedback: Callable[[Any], None],
+        expected_s: float,
+    ) -> Any:
+        """Send a goal once all nodes are active; return its result. An interruption cancels it.
+
+        Raises
+        ------
+        DeviceError
+            When a node fails, or the server refuses the goal or takes far longer than
+            ``expected_s``.
+        """
+        self.wait_until_active(action)
+        sent = action.send_goal_async(goal, feedback_callback=on_feedback)
+        wait(sent.done, START_S, "the action does not answer")
+        handle = sent.result()
+        if handle is None or not handle.accepted:
+            raise DeviceError("the goal was refused; see the message above")
+        finished = handle.get_result_async()
+        try:
+            wait(finished.done, expected_s + SLACK_S, "the action does not end")
+        except BaseException:
+            handle.cancel_goal_async()
+            raise
+        return finished.result().result
 
     def _waiting(self) -> list[str]:
         return [
@@ -94,11 +148,10 @@ class Composition:
 
 @contextlib.contextmanager
 def composition(values: Tables, bench: Mapping[str, object] | None = None) -> Iterator[Composition]:
-    """All nodes with these parameters; on leaving, whatever happened, the laser is off.
+    """Run all nodes with these parameters inside the context; the laser is off on every exit.
 
-    With ``bench``, options of ``eschorty-bench``, the devices are emulated by a process of its
-    own that lives as long. Unless ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own,
-    so that they meet no other instrument.
+    With ``bench``, options of ``eschorty-bench``, another process emulates the devices. Unless
+    ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own, apart from other instruments.
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with contextlib.ExitStack() as ending:
@@ -158,21 +211,21 @@ def _parameter_file(values: Tables) -> str:
 
 
 def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
-    # Shutting an executor down while it spins raises in this thread, so it is asked to end.
+    # Shutting an executor down while it spins raises in this thread.
     try:
         while not ending.is_set():
             turn(executor)
     except ExternalShutdownException:
         pass
     except Exception:
-        # A callback that publishes while the context ends fails; that is no news.
+        # A callback that publishes while the context ends fails.
         if not ending.is_set():
             raise
 
 
 def wait(condition: Callable[[], Any], limit_s: float, fault: str | Callable[[], str]) -> None:
-    """Wait for ``condition``; raises ``DeviceError`` with ``fault`` after ``limit_s``."""
-    # Polled from the main thread, so that Ctrl-C arrives at once.
+    """Wait for ``condition``; raise ``DeviceError`` with ``fault`` after ``limit_s``."""
+    # Polling in the main thread lets Ctrl-C interrupt it.
     end_s = time.monotonic() + limit_s
     while not condition():
         if time.monotonic() > end_s:
