@@ -24,7 +24,7 @@ from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.laser.node import LaserNode
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 from eschorty_ros.nodes.ros.domain import free_domain
-from eschorty_ros.nodes.ros.spin import make_safe, turn, undisturbed
+from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored, turn
 from eschorty_ros.nodes.scanner.node import ScannerNode
 from eschorty_ros.nodes.stage.node import StageNode
 
@@ -192,7 +192,7 @@ def _running(parameter_file: Path) -> Iterator[Composition]:
         thread.start()
         yield made
     finally:
-        with undisturbed():
+        with signals_ignored():
             make_safe(nodes)
             ending.set()
             # An ended context also ends callbacks that wait, such as homing.

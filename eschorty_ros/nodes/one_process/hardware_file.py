@@ -1,4 +1,4 @@
-"""A ROS parameter file for real devices: what `eschorty scan --hardware` reads."""
+"""The ROS parameter file of `eschorty scan --hardware`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ TABLES = {
 
 
 def read_hardware(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
-    """Read parameters by node; camera, laser and stage get their real drivers unless told.
+    """Return parameters by node; the drivers of camera, laser and stage are real by default.
 
-    The file is what launch files and ``--params-file`` take, with whole node names:
+    The file has the format of launch files and ``--params-file``, with full node names:
     ``/eschorty/laser: {ros__parameters: {high_v: 3.3}}``.
 
     Raises

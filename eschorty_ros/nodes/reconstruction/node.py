@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -154,22 +155,21 @@ class ReconstructionNode(Node):
         self._jobs.post(partial(self._pipeline.stream.announce_zero, zero_ns))
 
     def _on_laser(self, message: LaserState) -> None:
-        read = None if self._override else self._read("laser/state", laser_settings, message)
-        if read is not None:
-            self._jobs.post(partial(self._pipeline.stream.set_laser, *read))
+        if self._override is None:
+            with self._bad_values_logged("laser/state"):
+                settings = laser_settings(message)
+                self._jobs.post(partial(self._pipeline.stream.set_laser, *settings))
 
     def _on_trigger(self, message: PositionTrigger) -> None:
-        read = self._read("stage/trigger", pulse_train, message)
-        if read is not None:
-            self._jobs.post(partial(self._pipeline.stream.set_pulses, *read))
+        with self._bad_values_logged("stage/trigger"):
+            self._jobs.post(partial(self._pipeline.stream.set_pulses, pulse_train(message)))
 
-    def _read(self, topic: str, convert: Callable[[Any], tuple[Any, ...]], message: Any) -> Any:
-        """Convert a message; ``None`` and a line in the log when it is bad."""
+    @contextlib.contextmanager
+    def _bad_values_logged(self, topic: str) -> Iterator[None]:
         try:
-            return convert(message)
+            yield
         except ArgumentError as error:
             self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=5.0)
-            return None
 
     def _on_stage(self, message: Odometry) -> None:
         t_ns = ns_from_stamp(message.header.stamp)

@@ -1,4 +1,4 @@
-"""Point clouds and images as ROS messages, built without touching single elements in Python."""
+"""Point clouds and images as messages, built from arrays without loops over elements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 
 def live_dtype(scan_dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Layout of a live cloud whose assembled scan has ``scan_dtype``: ``t`` is uint32 instead."""
+    """Return the layout of a live cloud: that of the assembled scan with ``t`` as uint32."""
     names = scan_dtype.names or ()
     return np.dtype([(name, "<u4" if name == "t" else scan_dtype[name].str) for name in names])
 
@@ -39,14 +39,14 @@ _POINT_FIELD_TYPES = {
 
 
 def _bytes_field(values: NDArray[Any]) -> array[int]:
-    """Copy an array's bytes into the one type a message field takes at full speed."""
+    """Copy an array's bytes into the type that a message field accepts without a loop."""
     data = array("B")
     data.frombytes(np.ascontiguousarray(values).data.cast("B"))
     return data
 
 
 def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
-    """Unorganised ``PointCloud2`` of a structured array, one field of the message per field."""
+    """Return the unorganised ``PointCloud2`` of a structured array, field by field."""
     message = PointCloud2()
     message.header.stamp = stamp_from_ns(stamp_ns)
     message.header.frame_id = frame_id
@@ -74,7 +74,7 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
 
 
 def points_from_message(message: PointCloud2) -> NDArray[Any]:
-    """View an unorganised cloud as a structured array, fields as the message has them."""
+    """Return an unorganised cloud as a structured array with the message's fields."""
     codes = {datatype: "<" + code for code, datatype in _POINT_FIELD_TYPES.items()}
     dtype = np.dtype(
         {
@@ -88,7 +88,7 @@ def points_from_message(message: PointCloud2) -> NDArray[Any]:
 
 
 def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
-    """Points of an assembled scan as those of a live one, ``t`` counted from ``stamp_ns``.
+    """Return an assembled scan's points in the layout of a live cloud, ``t`` from ``stamp_ns``.
 
     All of ``t_ns`` lies within ``LIVE_SPAN_NS`` after ``stamp_ns``.
     """
@@ -101,7 +101,7 @@ def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: in
 
 
 def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
-    """Message ``mono8`` of a (rows, columns) uint8 image."""
+    """Return the ``mono8`` message of a (rows, columns) uint8 image."""
     message = Image()
     message.header.stamp = stamp_from_ns(stamp_ns)
     message.header.frame_id = frame_id

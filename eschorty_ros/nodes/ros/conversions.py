@@ -1,6 +1,8 @@
-"""Between ROS messages in SI units and the package's own nanoseconds and millimetres."""
+"""Conversions between messages in SI units and the package's nanoseconds and millimetres."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from builtin_interfaces.msg import Time
 
@@ -11,68 +13,63 @@ _NS_PER_S = 1_000_000_000
 
 
 def stamp_from_ns(t_ns: int) -> Time:
-    """Message stamp of an int64 time in nanoseconds; exact."""
+    """Return the message stamp of an int64 time in nanoseconds; exact."""
     seconds, nanoseconds = divmod(int(t_ns), _NS_PER_S)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
 def ns_from_stamp(stamp: Time) -> int:
-    """Int64 nanoseconds of a message stamp; exact."""
+    """Return the int64 nanoseconds of a message stamp; exact."""
     return int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
 
 
 def mm_from_m(metres: float) -> float:
-    """Millimetres of a length in metres."""
+    """Return a length in metres in millimetres."""
     return metres * 1e3
 
 
 def m_from_mm(millimetres: float) -> float:
-    """Metres of a length in millimetres."""
+    """Return a length in millimetres in metres."""
     return millimetres * 1e-3
 
 
-def modulation_from_laser_state(state: object) -> tuple[Modulation, int | None]:
-    """Modulation a ``LaserState`` reports, and the ROS time of one rising edge.
+def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
+    """Return the modulation of a ``LaserState`` and its times.
 
     Returns
     -------
     modulation : Modulation
-        Without ``on_edge_us``: that needs the camera's clock.
+        Without ``on_edge_us``, which needs the camera's clock.
     epoch_ns : int or None
-        ``None`` when the message's ``phase_epoch`` is zero, which means unknown.
+        ROS time of one rising edge, ``None`` when ``phase_epoch`` is zero, which means unknown.
+    on_since_ns : int or None
+        Since when the laser is on, ``None`` when it is off.
 
     Raises
     ------
     ArgumentError
-        When the message holds a frequency, duty or waveform out of range.
+        When frequency, duty or waveform is out of range.
     """
     modulation = Modulation(
-        frequency_hz=float(state.frequency),  # type: ignore[attr-defined]
-        duty=float(state.duty),  # type: ignore[attr-defined]
-        waveform=str(state.waveform),  # type: ignore[attr-defined]
+        frequency_hz=float(state.frequency),
+        duty=float(state.duty),
+        waveform=str(state.waveform),
     )
-    epoch_ns = ns_from_stamp(state.phase_epoch)  # type: ignore[attr-defined]
-    return modulation, epoch_ns or None
+    epoch_ns = ns_from_stamp(state.phase_epoch) or None
+    on = state.output == state.OUTPUT_ON
+    return modulation, epoch_ns, ns_from_stamp(state.output_since) if on else None
 
 
-def laser_settings(state: object) -> tuple[Modulation, int | None, int | None]:
-    """Add to ``modulation_from_laser_state`` since when the laser is on, ``None`` when off."""
-    modulation, epoch_ns = modulation_from_laser_state(state)
-    lit = state.output == state.OUTPUT_ON  # type: ignore[attr-defined]
-    since_ns = ns_from_stamp(state.output_since) if lit else None  # type: ignore[attr-defined]
-    return modulation, epoch_ns, since_ns
-
-
-def pulse_train(trigger: object) -> tuple[PulseTrain | None]:
-    """Where a ``PositionTrigger`` says that the stage gives pulses, ``None`` when nowhere.
+def pulse_train(trigger: Any) -> PulseTrain | None:
+    """Return the stage's pulses that a ``PositionTrigger`` describes, ``None`` without pulses.
 
     Raises
     ------
     ArgumentError
-        When the message holds a position that is not finite or a negative interval.
+        When a position is not finite or the interval is negative.
     """
-    interval_mm = mm_from_m(float(trigger.interval))  # type: ignore[attr-defined]
-    count = int(trigger.count)  # type: ignore[attr-defined]
+    interval_mm = mm_from_m(float(trigger.interval))
+    count = int(trigger.count)
     if interval_mm == 0.0 or count == 0:
-        return (None,)
-    return (PulseTrain(mm_from_m(float(trigger.first)), interval_mm, count),)  # type: ignore[attr-defined]
+        return None
+    return PulseTrain(mm_from_m(float(trigger.first)), interval_mm, count)

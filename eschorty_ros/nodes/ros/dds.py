@@ -1,4 +1,4 @@
-"""How the nodes' messages travel."""
+"""The Fast DDS profile of the nodes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from eschorty_ros.core.base.files import config_folders
 
 PROFILE = "fastdds.xml"
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-# Their Fast DDS 2 spells profiles differently.
+# Fast DDS 2 of these has another format of profiles.
 _OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 
 
 def use_profile() -> None:
     """Make Fast DDS read ``config/fastdds.xml`` unless the user has chosen a profile.
 
-    With its defaults a message that got lost on a loaded host comes again only after up to 3 s,
-    even on a reliable topic. Must run before the first ``rclpy.init`` of the process.
+    With its defaults a message lost on a loaded host is repeated after up to 3 s, even on a
+    reliable topic. Call it before the first ``rclpy.init`` of the process.
     """
     chosen = any(name in os.environ for name in VARIABLES)
     if chosen or os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS:

@@ -1,4 +1,4 @@
-"""Health of a node on ``/diagnostics`` once a second."""
+"""The health of a node on ``/diagnostics``, once a second."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Report = tuple[bytes, str, Mapping[str, Any]]
 
 
 class Rate:
-    """Amount per second between two readings, on the steady clock."""
+    """Increase per second of a total between two readings, on the steady clock."""
 
     def __init__(self) -> None:
         self._total = 0.0
         self._read_at_s = time.monotonic()
 
     def read(self, total: float) -> float:
-        """Rate since the last reading, given the running ``total``."""
+        """Return the rate since the last reading from the present ``total``."""
         now_s = time.monotonic()
         elapsed_s = now_s - self._read_at_s
         rate = (total - self._total) / elapsed_s if elapsed_s > 0.0 else 0.0
@@ -36,14 +36,14 @@ class Rate:
 
 
 class Diagnostics:
-    """Publishes what ``report`` returns, in every lifecycle state.
+    """Publishes the result of ``report`` in every lifecycle state.
 
     Parameters
     ----------
     node : rclpy.node.Node
     report : callable
         Returns level (``OK``, ``WARN``, ``ERROR``), one line, and named values with their units
-        in the names. A node that says in ``waiting`` what it waits for is at ``WARN`` with that.
+        in the names. A node whose ``waiting`` is not empty is at ``WARN`` with that line.
     callback_group : rclpy.callback_groups.CallbackGroup, optional
         Group of the timer; the node's default group when omitted.
     """

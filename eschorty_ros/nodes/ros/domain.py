@@ -9,34 +9,34 @@ import socket
 from eschorty_ros.core.base.errors import DeviceError
 
 _DOMAINS = range(1, 102)
-# What is left of an instrument need not be its first participant.
+# The participant of an instrument that still runs need not be its first.
 _PARTICIPANTS = 10
 _reserved: set[int] = set()
 
 
 def free_domain() -> int:
-    """Find a ROS domain (1 to 101) on which nobody on this host is, and reserve it.
+    """Return a ROS domain (1 to 101) without a participant on this host, and reserve it.
 
-    It stays this process's until the process ends: who asks next, here or in another process, gets
-    another one as long as there are any.
+    The reservation ends with this process. The next call, here or in another process, returns
+    another domain as long as there is one.
 
     Raises
     ------
     DeviceError
-        When every one is taken.
+        When every domain is taken.
     """
     domains = list(_DOMAINS)
     random.SystemRandom().shuffle(domains)
-    # Its own ones again only when there is nothing else.
+    # The domains that this process has reserved come last.
     domains.sort(key=_reserved.__contains__)
     for domain in domains:
-        if _silent(domain) and _reserve(domain):
+        if _unused(domain) and _reserve(domain):
             return domain
     raise DeviceError("every ROS domain from 1 to 101 is taken on this host; set ROS_DOMAIN_ID")
 
 
-def _silent(domain: int) -> bool:
-    """Whether no participant holds its discovery port (RTPS 9.6.1.1)."""
+def _unused(domain: int) -> bool:
+    """Return whether no participant holds a discovery port of the domain (RTPS 9.6.1.1)."""
     with contextlib.ExitStack() as probes:
         for participant in range(_PARTICIPANTS):
             probe = probes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -48,7 +48,7 @@ def _silent(domain: int) -> bool:
 
 
 def _reserve(domain: int) -> bool:
-    """Hold a name that only one process of this host can hold, until this process ends."""
+    """Bind a name that only one process of this host can bind, until this process ends."""
     if domain in _reserved:
         return True
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:

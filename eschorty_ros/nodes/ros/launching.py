@@ -1,4 +1,4 @@
-"""What the launch files share. Needs the packages launch and launch_ros."""
+"""The common part of the launch files. Needs the packages launch and launch_ros."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ PARAMETERS: Argument = (
 
 
 def declare(arguments: tuple[Argument, ...]) -> list[DeclareLaunchArgument]:
-    """Launch arguments from a table."""
+    """Return launch arguments from a table."""
     return [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
         for name, default, text, choices in arguments
@@ -65,39 +65,39 @@ def declare(arguments: tuple[Argument, ...]) -> list[DeclareLaunchArgument]:
 
 
 def number(name: str) -> Any:
-    """Value of an argument as a float, also when it is written without a decimal point."""
+    """Return an argument's value as a float, also without a decimal point."""
     return ParameterValue(LaunchConfiguration(name), value_type=float)
 
 
 def text(name: str) -> Any:
-    """Value of an argument as a string, also when it looks like a number."""
+    """Return an argument's value as a string, also if it could be a number."""
     return ParameterValue(LaunchConfiguration(name), value_type=str)
 
 
 def truth(name: str) -> Any:
-    """Value of an argument that is true or false."""
+    """Return the value of an argument that is true or false."""
     return ParameterValue(LaunchConfiguration(name), value_type=bool)
 
 
 def driver(real: str) -> Any:
-    """Choose the emulated bench, or the real device's driver."""
+    """Return the driver at the emulated bench, or that of the real device."""
     return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
 
 
 def reliable(end: str) -> dict[str, Any]:
-    """Lossless events at one end; an emulated camera can wait, so nothing has to be lost."""
+    """Return parameters for lossless events at one end, as an emulated camera can wait."""
     if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
     return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
 
 
 def trigger_input() -> Any:
-    """Switch the camera's trigger input on when the argument ``trigger`` says it is wired."""
+    """Return the mode of the camera's trigger input, enabled if the argument ``trigger`` is set."""
     unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
     return IfElseSubstitution(unwired, "disabled", "external")
 
 
 def instrument(**reconstruction: Any) -> dict[str, dict[str, Any]]:
-    """Parameters of devices and reconstruction by node, from arguments that bear their names."""
+    """Return parameters of devices and reconstruction by node, from arguments of their names."""
     return {
         "camera": {
             "driver": driver("evk4"),
@@ -116,7 +116,7 @@ def instrument(**reconstruction: Any) -> dict[str, dict[str, Any]]:
 
 
 def bench(**options: str) -> Any:
-    """Emulated devices in a process of their own when the argument ``fake`` is true.
+    """Return the process of the emulated devices, started when the argument ``fake`` is true.
 
     ``options`` maps options of ``eschorty-bench`` to the launch arguments that give them.
     """
@@ -132,7 +132,7 @@ def bench(**options: str) -> Any:
 
 
 def node(executable: str, parameters: dict[str, Any]) -> Any:
-    """One of the package's nodes, named as its executable; the file has the last word."""
+    """Return a node named as its executable; the parameter file overrides ``parameters``."""
     return Node(
         package="eschorty_ros",
         executable=executable,
@@ -145,7 +145,7 @@ def node(executable: str, parameters: dict[str, Any]) -> Any:
 
 
 def rviz() -> Any:
-    """RViz with the package's view, when the argument ``rviz`` is true."""
+    """Return RViz with the package's view, started when the argument ``rviz`` is true."""
     return Node(
         package="rviz2",
         executable="rviz2",

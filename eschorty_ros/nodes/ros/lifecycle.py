@@ -1,4 +1,4 @@
-"""What camera, laser and stage share: transitions that never fail in silence, and a safe state."""
+"""The lifecycle of camera, laser and stage: every failure is logged and leads to a safe state."""
 
 from __future__ import annotations
 
@@ -28,10 +28,9 @@ class DeviceNode(LifecycleNode):
     ``fault`` at any time, stops and closes the device and leads through error processing to
     unconfigured. Every failure is logged: one line for an ``EschortyError``.
 
-    With ``auto_start``, a device that cannot be opened is waited for: the node stays unconfigured,
-    logs the reason when it changes, says it in ``waiting`` and tries again every 2 s. Once it was
-    active nothing starts by itself: after a failure in operation somebody has to look and to
-    configure and activate again.
+    With ``auto_start``, a node whose device cannot be opened stays unconfigured, logs the reason
+    when it changes, holds it in ``waiting`` and retries every 2 s. After a failure in operation
+    nothing restarts by itself: the user has to configure and activate again.
 
     Parameters
     ----------
@@ -47,7 +46,7 @@ class DeviceNode(LifecycleNode):
     failure : str
         What failed last, empty after a successful configure.
     waiting : str
-        What keeps the node from starting and when it tries again, empty when nothing does.
+        Why the node cannot start yet and when it retries, ``""`` when it does not wait.
     """
 
     def __init__(
@@ -62,7 +61,7 @@ class DeviceNode(LifecycleNode):
         self.failure = ""
         self.waiting = ""
         self._auto_starting = False
-        self._told = ""
+        self._logged = ""
         self._faulted = threading.Event()
         self._fault_guard = self.create_guard_condition(self._leave_after_fault)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -73,15 +72,15 @@ class DeviceNode(LifecycleNode):
         )
 
     def open_device(self) -> None:
-        """Open the device, apply the settings, make the publishers."""
+        """Open the device and apply the settings."""
         raise NotImplementedError
 
     def start_device(self) -> None:
-        """Begin what the node does while active."""
+        """Start the work of the active state."""
         raise NotImplementedError
 
     def stop_device(self) -> None:
-        """End it."""
+        """Stop the work of the active state."""
         raise NotImplementedError
 
     def close_device(self) -> None:
@@ -99,14 +98,14 @@ class DeviceNode(LifecycleNode):
         return self.state_label == "active"
 
     def safe_state(self) -> None:
-        """Stop and close the device whatever the node's state; uses no ROS."""
+        """Stop and close the device in any state of the node; uses no ROS."""
         try:
             self.stop_device()
         finally:
             self.close_device()
 
     def fault(self, reason: str) -> None:
-        """Report that the device failed, from any thread: safe at once, unconfigured soon."""
+        """Log a failure of the device and lead the node to unconfigured; from any thread."""
         known, self.failure = self.failure, reason
         if reason != known:
             self.get_logger().error(reason)
@@ -115,7 +114,7 @@ class DeviceNode(LifecycleNode):
             self._fault_guard.trigger()
 
     def now_ns(self) -> int:
-        """Read the node's ROS time, int64 nanoseconds."""
+        """Return the node's ROS time, int64 nanoseconds."""
         return int(self.get_clock().now().nanoseconds)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -124,7 +123,7 @@ class DeviceNode(LifecycleNode):
         if not self._auto_starting:
             self.waiting = ""
         self._faulted.clear()
-        opening = self._open_if_there if self._auto_starting else self.open_device
+        opening = self._open_or_wait if self._auto_starting else self.open_device
         if not self._attempt("configure", opening) or self.waiting:
             self._attempt("close", self.safe_state)
             return TransitionCallbackReturn.FAILURE
@@ -189,15 +188,15 @@ class DeviceNode(LifecycleNode):
         if configured == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
 
-    def _open_if_there(self) -> None:
-        """Open the device; one that cannot be opened is to be waited for."""
+    def _open_or_wait(self) -> None:
+        """Open the device; set ``waiting`` when that fails."""
         try:
             self.open_device()
         except DeviceError as error:
             self.waiting = f"waiting: {error}; trying again every {RETRY_S:g} s"
-            if self.waiting != self._told:
+            if self.waiting != self._logged:
                 self.get_logger().warning(self.waiting)
-            self._told = self.waiting
+            self._logged = self.waiting
         else:
             self.waiting = ""
 

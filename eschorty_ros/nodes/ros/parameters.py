@@ -1,4 +1,4 @@
-"""Table-driven ROS parameters: description, unit, range declared once; refusals with a reason."""
+"""ROS parameters from tables with description, unit and range; every refusal has a reason."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Param:
     ----------
     name : str
     default : bool, int, float, str or tuple of int
-        Its type is the parameter's type; an integer given for a float is taken as one.
+        Its type is the parameter's type; an integer is accepted for a float.
     description : str
     unit : str
-        As in the contract of the ROS surface: SI.
+        SI.
     minimum, maximum : float, optional
         Inclusive bounds of a number; both or neither.
     choices : tuple of str
@@ -55,7 +55,7 @@ class Param:
     dynamic: bool = False
 
     def descriptor(self) -> ParameterDescriptor:
-        """Make the ROS descriptor: description with unit, range, constraint, read-only flag."""
+        """Return the ROS descriptor: description with unit, range, constraint, read-only flag."""
         descriptor = ParameterDescriptor(
             name=self.name,
             description=f"{self.description} [{self.unit}]" if self.unit else self.description,
@@ -76,7 +76,7 @@ class Param:
         return descriptor
 
     def check(self, value: Any) -> None:
-        """Raise ``ArgumentError`` when ``value`` is not one of the choices."""
+        """Raise ``ArgumentError`` unless ``value`` is one of the choices."""
         if self.choices and value not in self.choices:
             raise ArgumentError(
                 f"parameter {self.name} is {value!r}; choose one of {', '.join(self.choices)}"
@@ -84,7 +84,7 @@ class Param:
 
 
 def from_settings(settings_class: type[Any], *, dynamic: bool = False) -> tuple[Param, ...]:
-    """Parameters of a settings dataclass whose fields carry ``description, unit, range, choices``.
+    """Return parameters of a dataclass whose fields carry ``description, unit, range, choices``.
 
     Fields whose default is not a bool, number or string are left out.
     """
@@ -117,8 +117,8 @@ class Parameters(Mapping[str, Any]):
     table : iterable of Param
     on_change : callable, optional
         Called with all values as they would be after a change, before it is accepted. It applies
-        the change; an ``EschortyError`` it raises refuses the change, and its text is the reason
-        the caller sees. Applying there, not after acceptance, lets a device refuse too.
+        the change, so that a device can refuse it: an ``EschortyError`` refuses the change and
+        its text is the reason that the caller receives.
 
     Raises
     ------
@@ -154,7 +154,7 @@ class Parameters(Mapping[str, Any]):
         return len(self._table)
 
     def settings(self, settings_class: type[Any]) -> Any:
-        """Build the dataclass ``from_settings`` made parameters of."""
+        """Return the dataclass that ``from_settings`` made parameters of, with their values."""
         names = {field.name for field in dataclasses.fields(settings_class)}
         return settings_class(**{name: value for name, value in self.items() if name in names})
 
@@ -190,8 +190,8 @@ def _declare(node: Node, param: Param) -> None:
         try:
             node.declare_parameter(param.name, param.default, param.descriptor())
         except InvalidParameterTypeException:
-            whole = _given_integer(node, param)
-            node.declare_parameter(param.name, whole, param.descriptor(), ignore_override=True)
+            value = _given_integer(node, param)
+            node.declare_parameter(param.name, value, param.descriptor(), ignore_override=True)
     except (
         InvalidParameterTypeException,
         InvalidParameterValueException,
@@ -201,7 +201,7 @@ def _declare(node: Node, param: Param) -> None:
 
 
 def _given_integer(node: Node, param: Param) -> float:
-    """Take the whole number given at start where a float was declared."""
+    """Return the integer given at start for a float parameter, as a float."""
     probe = ParameterDescriptor(dynamic_typing=True)
     given = node.declare_parameter(param.name, param.default, probe).value
     node.undeclare_parameter(param.name)

@@ -1,6 +1,6 @@
-"""Quality of service, one function per kind of topic; every call returns a fresh profile.
+"""Quality of service, one function per kind of topic.
 
-Fresh, because overriding by parameter changes the profile it is given.
+Every call returns a new profile, because overriding by parameter changes the profile.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def events() -> QoSProfile:
 
 
 def latched(depth: int = 1) -> QoSProfile:
-    """State a late joiner must still get: reliable, transient local.
+    """State that a late joiner still receives: reliable, transient local.
 
-    ``depth`` is 1 for what is simply replaced; ``STATE_HISTORY`` where no change may be lost on
-    the way, such as the laser's state.
+    ``depth`` is 1 where only the newest message counts, ``STATE_HISTORY`` where no change may be
+    lost, such as the laser's state.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
@@ -38,7 +38,7 @@ def latched(depth: int = 1) -> QoSProfile:
 
 
 def stream(depth: int = STREAM_DEPTH) -> QoSProfile:
-    """Messages that must all arrive while one listens: reliable, volatile."""
+    """Messages that must all reach the present subscribers: reliable, volatile."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
@@ -48,7 +48,7 @@ def stream(depth: int = STREAM_DEPTH) -> QoSProfile:
 
 
 def heartbeat() -> QoSProfile:
-    """Signs of life: only the newest counts, and none is worth repeating."""
+    """Heartbeats: only the newest counts, and none is repeated."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=1,

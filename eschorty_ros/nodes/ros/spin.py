@@ -1,4 +1,4 @@
-"""Running nodes: one way from ``init`` to a clean exit, with the hardware safe on every path."""
+"""Running nodes from ``init`` to a clean exit; on every path the hardware is made safe."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from rclpy.node import Node
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.nodes.ros.dds import use_profile
 
-_BREATH_S = 3e-4
+_PAUSE_S = 3e-4
 
 
 def make_safe(nodes: Sequence[Node]) -> None:
-    """Call ``safe_state()`` of every node that has one; a failure does not keep the next from it.
+    """Call ``safe_state()`` of every node that has one, also after the failure of another.
 
-    It reaches the drivers directly: after a signal the ROS context is already invalid.
+    It uses the drivers directly, because after a signal the ROS context is invalid.
     """
     for node in nodes:
         safe_state = getattr(node, "safe_state", None)
@@ -44,7 +44,7 @@ def make_safe(nodes: Sequence[Node]) -> None:
 
 @contextlib.contextmanager
 def unless_shut_down(node: Node) -> Iterator[None]:
-    """Swallow the errors of a context that a signal has ended meanwhile: nobody is left to tell."""
+    """Suppress the errors of a context that a signal has ended."""
     try:
         yield
     except (_rclpy.RCLError, _rclpy.InvalidHandle):
@@ -52,12 +52,12 @@ def unless_shut_down(node: Node) -> Iterator[None]:
             raise
 
 
-def _interrupt_at_first() -> Callable[[], None]:
-    """Let Ctrl-C interrupt what comes before a call of what is returned; later it ends the context.
+def _interrupt_during_start() -> Callable[[], None]:
+    """Let Ctrl-C raise ``KeyboardInterrupt`` until the returned function is called.
 
-    An exception in the middle of a callback would leave half-made objects to their finalizers.
+    Later it ends the context: an exception in a callback would leave half-made objects.
     """
-    # No lock, as an event has: the signal may come while the main thread holds it.
+    # An event has a lock, which the main thread may hold when the signal comes.
     starting = True
 
     def interrupt(*_: object) -> None:
@@ -74,14 +74,14 @@ def _interrupt_at_first() -> Callable[[], None]:
 
 
 def _ignore_signals() -> dict[signal.Signals, Any]:
-    """Ignore what ends a process; returns the handlers so far."""
+    """Ignore the signals that end a process; return their handlers."""
     endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     return {number: signal.signal(number, signal.SIG_IGN) for number in endings}
 
 
 @contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Within it a second Ctrl-C or SIGTERM cannot interrupt the way to the safe state."""
+def signals_ignored() -> Iterator[None]:
+    """Ignore the signals that end a process inside the context, so that it reaches a safe state."""
     kept = _ignore_signals()
     try:
         yield
@@ -91,27 +91,26 @@ def undisturbed() -> Iterator[None]:
 
 
 def turn(executor: Executor) -> None:
-    """One turn of a spin loop."""
+    """Run one turn of a spin loop."""
     executor.spin_once(timeout_sec=0.1)
     # While a callback runs, rclpy 9 polls for the next of its group without a pause and would
-    # keep the interpreter from the simulation and the reconstruction.
-    time.sleep(_BREATH_S)
+    # take the interpreter from the other threads.
+    time.sleep(_PAUSE_S)
 
 
 def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None) -> int:
-    """Build the nodes, spin them until a signal, make the hardware safe; returns the exit code.
+    """Build the nodes, spin them until a signal, make the hardware safe; return the exit code.
 
-    The process is meant to end then: signals stay ignored.
+    Signals stay ignored afterwards, because the process is to end.
 
     Parameters
     ----------
     factories : callables
-        Each makes one node once the context exists.
+        Each makes one node in the context.
     threads : int
-        1 spins in this thread; more gives that many to a ``MultiThreadedExecutor``, needed where
-        a callback waits (actions).
+        Threads of the executor; more than one where a callback waits (actions).
     args : sequence of str, optional
-        Command line; the process's own when omitted.
+        Command line; that of the process when omitted.
 
     Returns
     -------
@@ -124,8 +123,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     code = 0
     use_profile()
     try:
-        started = _interrupt_at_first()
-        # Its own handler of SIGINT and SIGTERM ends the context and so the loop below.
+        started = _interrupt_during_start()
+        # rclpy's handler of SIGINT and SIGTERM ends the context and so the loop below.
         rclpy.init(args=list(args) if args is not None else None)
         started()
         signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
@@ -142,12 +141,12 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         print(f"error: {error}", file=sys.stderr, flush=True)
         code = 1
     except Exception:
-        # A callback that publishes while a signal ends the context fails; that is no news.
+        # A callback that publishes while a signal ends the context fails.
         if rclpy.ok():
             traceback.print_exc()
             code = 1
     finally:
-        # For good, as the process ends. Shutting rclpy down gives back the handlers before it.
+        # Twice, because the shutdown of rclpy restores the handlers.
         _ignore_signals()
         make_safe(nodes)
         _tear_down(nodes, executor)

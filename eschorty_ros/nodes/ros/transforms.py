@@ -18,7 +18,7 @@ OPTICAL = "eschorty_optical"
 def carriage(
     t_ns: int, position_mm: float, direction: tuple[float, float, float]
 ) -> TransformStamped:
-    """Place the carriage in the base at ROS time ``t_ns``: along the unit vector ``direction``."""
+    """Return the carriage in the base at ROS time ``t_ns``; ``direction`` is a unit vector."""
     transform = _between(BASE, STAGE, t_ns)
     offset_m = transform.transform.translation
     offset_m.x, offset_m.y, offset_m.z = stage_offset_m(position_mm, direction).tolist()
@@ -26,10 +26,10 @@ def carriage(
 
 
 def mounts(t_ns: int) -> list[TransformStamped]:
-    """Make the static ones: carriage to link (same axes), link to optical (z forward).
+    """Return the static transforms: carriage to link (same axes), link to optical (z forward).
 
-    The optical frame shares the link's origin: it is a change of axes, x right along increasing
-    columns, y down, z along the range axis.
+    The optical frame has the link's origin and other axes: x right along increasing columns, y
+    down, z along the range axis.
     """
     optical = _between(LINK, OPTICAL, t_ns)
     optical.transform.rotation.x = optical.transform.rotation.z = math.sqrt(0.5)

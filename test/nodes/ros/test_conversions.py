@@ -22,7 +22,7 @@ from eschorty_ros.nodes.ros.cloud_messages import (
     points_from_message,
 )
 from eschorty_ros.nodes.ros.conversions import (
-    modulation_from_laser_state,
+    laser_settings,
     ns_from_stamp,
     stamp_from_ns,
 )
@@ -84,12 +84,12 @@ def test_image_is_row_major():
 
 def test_laser_state_without_epoch_leaves_the_phase_unknown():
     state = LaserState(frequency=70.0, duty=0.5, waveform="square")
-    assert modulation_from_laser_state(state)[1] is None
+    assert laser_settings(state)[1] is None
     state.phase_epoch = stamp_from_ns(10**18 + 1)
-    modulation, epoch_ns = modulation_from_laser_state(state)
+    modulation, epoch_ns, _ = laser_settings(state)
     assert (modulation.frequency_hz, epoch_ns) == (70.0, 10**18 + 1)
     with pytest.raises(ArgumentError, match="frequency_hz is 0"):
-        modulation_from_laser_state(LaserState(duty=0.5, waveform="square"))
+        laser_settings(LaserState(duty=0.5, waveform="square"))
 
 
 def test_optical_frame_is_a_rotation_with_z_along_the_range_axis():
