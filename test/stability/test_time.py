@@ -15,7 +15,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import ClockLine, SensorClock, StageTrack, fit_edges
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Encoder, Events, Triggers, sort_readout
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase import EdgeSchedule
+from eschorty_ros.core.modulation.edges import EdgeSchedule
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, place

@@ -18,7 +18,7 @@ from eschorty_ros.core.line._centroid import (
 from eschorty_ros.core.line._row import HALF_PER_SIGMA
 from eschorty_ros.core.line._smoothing import Smoothing, _reject_isolated, _smooth
 from eschorty_ros.core.line._window import BLOCK, FRACTION, ROW_BITS, TIME_LIMIT_US
-from eschorty_ros.core.modulation._phase_gate import G_LENGTH, _outside
+from eschorty_ros.core.modulation.phase_gate import _outside
 
 CLOSED, EMPTY, FILLED = 0, 1, 2
 STATE = np.dtype(
@@ -99,7 +99,7 @@ def _append(events, first, limit_us, columns, rows, gate, state, counters):
     over = 0
     outside = 0
     gated = 0
-    gating = gate[G_LENGTH] > 0.0
+    gating = gate.length_us > 0.0
     while i < end and t[i] < limit_us:
         c = np.uintp(x[i])
         r = np.uint32(y[i])

@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import exact, whole
+_CAPACITY = 4096
+_DTYPES = (np.int64, np.uint16, np.uint16, np.uint8)
+
+EventArrays = tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]
+"""Times in us, columns, rows and polarities."""
 
 
 class HeldEvents:
@@ -13,17 +17,12 @@ class HeldEvents:
 
     Attributes
     ----------
-    t, x, y, p : ndarray of int64, uint16, uint16, uint8
-        The queued events: views valid until the next change.
     refused : int
         Leading events in which no phase was found.
     """
 
     def __init__(self) -> None:
-        self._t = np.empty(4096, dtype=np.int64)
-        self._x = np.empty(4096, dtype=np.uint16)
-        self._y = np.empty(4096, dtype=np.uint16)
-        self._p = np.empty(4096, dtype=np.uint8)
+        self._buffers = tuple(np.empty(_CAPACITY, dtype) for dtype in _DTYPES)
         self._first = 0
         self._end = 0
         self.refused = 0
@@ -32,45 +31,22 @@ class HeldEvents:
         return self._end - self._first
 
     @property
-    def t(self) -> NDArray[np.int64]:
-        """Times, us."""
-        return self._t[self._first : self._end]
+    def arrays(self) -> EventArrays:
+        """The queued events: views valid until the next change."""
+        t, x, y, p = (values[self._first : self._end] for values in self._buffers)
+        return t, x, y, p
 
-    @property
-    def x(self) -> NDArray[np.uint16]:
-        """Columns."""
-        return self._x[self._first : self._end]
-
-    @property
-    def y(self) -> NDArray[np.uint16]:
-        """Rows."""
-        return self._y[self._first : self._end]
-
-    @property
-    def p(self) -> NDArray[np.uint8]:
-        """Polarities."""
-        return self._p[self._first : self._end]
-
-    def append(
-        self,
-        t: NDArray[np.int64],
-        x: NDArray[np.uint16],
-        y: NDArray[np.uint16],
-        p: NDArray[np.uint8],
-    ) -> None:
+    def append(self, events: EventArrays) -> None:
         """Copy events to the end."""
-        count = exact("t", t, np.int64).size
-        x, y = exact("x", x, np.uint16, count), exact("y", y, np.uint16, count)
-        p = exact("p", p, np.uint8, count)
-        if self._end + count > len(self._t):
+        count = events[0].size
+        if self._end + count > self._buffers[0].size:
             self._make_room(count)
-        new = slice(self._end, self._end + count)
-        self._t[new], self._x[new], self._y[new], self._p[new] = t, x, y, p
+        for buffer, values in zip(self._buffers, events, strict=True):
+            buffer[self._end : self._end + count] = values
         self._end += count
 
     def drop(self, count: int) -> None:
-        """Forget the first ``count`` events."""
-        whole("count", count, 0, len(self))
+        """Remove the first ``count`` events."""
         self._first += count
         self.refused = max(self.refused - count, 0)
         if self._first == self._end:
@@ -78,10 +54,9 @@ class HeldEvents:
 
     def _make_room(self, count: int) -> None:
         held = len(self)
-        size = max(len(self._t), 2 * (held + count))
-        for name in ("_t", "_x", "_y", "_p"):
-            old = getattr(self, name)
-            new = np.empty(size, dtype=old.dtype)
-            new[:held] = old[self._first : self._end]
-            setattr(self, name, new)
+        size = max(self._buffers[0].size, 2 * (held + count))
+        grown = tuple(np.empty(size, dtype) for dtype in _DTYPES)
+        for new, old in zip(grown, self.arrays, strict=True):
+            new[:held] = old
+        self._buffers = grown
         self._first, self._end = 0, held

@@ -1,13 +1,14 @@
-"""The modulation's phase, from the events it makes."""
+"""The modulation's phase from the events that it causes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, whole, whole_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, whole_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation.modulation import Modulation
 
@@ -19,7 +20,7 @@ _RAYLEIGH_MIN = 30.0
 
 @dataclass(frozen=True, slots=True)
 class PhaseEstimate:
-    """Rising edge seen in a window of events.
+    """A rising edge found in a window of events.
 
     Attributes
     ----------
@@ -33,7 +34,7 @@ class PhaseEstimate:
         Strength squared times the number of events; exponential with mean 1 for unmodulated
         events.
     found : bool
-        Whether the Rayleigh test calls the window modulated.
+        Whether the window is modulated by the Rayleigh test.
     """
 
     edge_us: int
@@ -45,11 +46,11 @@ class PhaseEstimate:
 def estimate_phase(
     t_us: NDArray[np.int64], polarity: NDArray[np.uint8], modulation: Modulation
 ) -> PhaseEstimate:
-    """Rising edge from a window of events, by circular statistics at the known frequency.
+    """Return a rising edge from a window of events, by circular statistics at the known frequency.
 
-    ON events follow the rising edge and OFF events the falling one, so OFF events are turned back
-    by the duty cycle and both vote for one direction. The burst's beginning, where the counts
-    rise above the background, is taken as the edge.
+    ON events follow the rising edge and OFF events the falling one, so the phase of OFF events is
+    reduced by the duty cycle and both have one mean direction. The edge is where the burst begins:
+    where the counts rise above the background.
 
     Parameters
     ----------
@@ -64,7 +65,10 @@ def estimate_phase(
     -------
     PhaseEstimate
 
-    Raises ``ArgumentError`` when there are no events, or they are not in time order.
+    Raises
+    ------
+    ArgumentError
+        When there are no events, or they are not in time order.
     """
     t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     fall = np.flatnonzero(np.diff(t_us) < 0)
@@ -90,7 +94,7 @@ def estimate_phase(
 
 
 def _burst_begin(phase: NDArray[np.float64]) -> float:
-    """Phase (0 to 1) at which the largest burst rises above the background."""
+    """Return the phase, 0 to 1, at which the largest burst rises above the background."""
     bins = np.minimum((phase * _HISTOGRAM_BINS).astype(np.int64), _HISTOGRAM_BINS - 1)
     counts = np.bincount(bins, minlength=_HISTOGRAM_BINS).astype(np.float64)
     smooth = counts + np.roll(counts, 1) + np.roll(counts, -1)
@@ -105,16 +109,21 @@ def _burst_begin(phase: NDArray[np.float64]) -> float:
     return (begin % _HISTOGRAM_BINS) / _HISTOGRAM_BINS
 
 
-def decide_window(
+class Window(NamedTuple):
+    """Leading events of a stream that one estimate is made from."""
+
+    size: int
+    end_us: int
+
+
+def estimation_window(
     t_us: NDArray[np.int64], watermark_us: int, modulation: Modulation
-) -> tuple[int, int] | None:
-    """Leading events of one estimation window and its end (us), ``None`` while it is still open.
+) -> Window | None:
+    """Return the first estimation window of ``t_us``, ``None`` while it is still open.
 
     A window is the fewest times ``WINDOW_PERIODS`` periods from the first event on that hold
-    ``WINDOW_EVENTS`` events; only events decide it, not when they arrived.
+    ``WINDOW_EVENTS`` events. It depends on the events alone, not on when they arrived.
     """
-    t_us = exact("t_us", t_us, np.int64)
-    whole("watermark_us", watermark_us, -TIME_LIMIT, TIME_LIMIT)
     if t_us.size < WINDOW_EVENTS:
         return None
     span_us = WINDOW_PERIODS * modulation.period_us
@@ -123,4 +132,4 @@ def decide_window(
     end_us = first + round(pieces * span_us)
     if watermark_us <= end_us:
         return None
-    return int(np.searchsorted(t_us, end_us)), end_us
+    return Window(int(np.searchsorted(t_us, end_us)), end_us)

@@ -1,16 +1,17 @@
-"""Phase gate: an event stays only when it comes soon after the laser edge that can cause it.
+"""Phase gate: an event is kept only soon after the laser edge that can cause it.
 
-ON events follow rising edges and OFF events falling ones; background does not care. Of background
-of both polarities a share of (LEAD_US + gate) / period is left, 8 % at 70 Hz with 1 ms.
+ON events follow rising edges and OFF events falling ones; background is spread evenly. Of
+background of both polarities a share of (LEAD_US + gate) / period is left, 8 % at 70 Hz with 1 ms.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
-from eschorty_ros.core.base.arrays import whole
-from eschorty_ros.core.modulation import _phase_gate as kernels
+import numpy as np
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.numbers import whole
 from eschorty_ros.core.modulation.modulation import Modulation
 
 LEAD_US = 200
@@ -19,8 +20,29 @@ LEAD_US = 200
 GATE_MAX_US = 100_000
 
 
-def gate_parameters(modulation: Modulation, gate_us: int) -> NDArray[np.float64]:
-    """Return what the compiled test needs to know.
+class PhaseGate(NamedTuple):
+    """Windows behind the laser's edges in which events are kept.
+
+    Attributes
+    ----------
+    period_us, frequency_mhz : float
+        Length of the period and its reciprocal.
+    on_lead_us, off_lead_us : float
+        Added to the time since the rising edge, they give the time since the window of ON and of
+        OFF events opened.
+    length_us : float
+        Length of a window; 0 is no gate.
+    """
+
+    period_us: float = 1.0
+    frequency_mhz: float = 1.0
+    on_lead_us: float = 0.0
+    off_lead_us: float = 0.0
+    length_us: float = 0.0
+
+
+def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
+    """Return the windows behind the edges of ``modulation``.
 
     Parameters
     ----------
@@ -31,9 +53,8 @@ def gate_parameters(modulation: Modulation, gate_us: int) -> NDArray[np.float64]
 
     Returns
     -------
-    ndarray of float64, shape (5,)
-        The last entry is 0 where nothing is to be removed: no gate, no edges, or windows that
-        cover the whole period.
+    PhaseGate
+        No gate where the windows cover the whole period.
 
     Raises
     ------
@@ -41,13 +62,17 @@ def gate_parameters(modulation: Modulation, gate_us: int) -> NDArray[np.float64]
         When ``gate_us`` lies outside its range.
     """
     whole("gate_us", gate_us, 0, GATE_MAX_US)
-    gate = np.zeros(kernels.G_SIZE)
-    period_us = modulation.period_us
-    length_us = LEAD_US + gate_us
-    if gate_us and modulation.waveform != "sine" and length_us < period_us:
-        gate[kernels.G_PERIOD] = period_us
-        gate[kernels.G_INVERSE] = 1.0 / period_us
-        gate[kernels.G_ON] = LEAD_US
-        gate[kernels.G_OFF] = LEAD_US - modulation.duty * period_us
-        gate[kernels.G_LENGTH] = length_us
-    return gate
+    period_us, length_us = modulation.period_us, float(LEAD_US + gate_us)
+    if gate_us == 0 or modulation.waveform == "sine" or length_us >= period_us:
+        return PhaseGate()
+    on_lead_us = float(LEAD_US)
+    off_lead_us = on_lead_us - modulation.duty * period_us
+    return PhaseGate(period_us, 1.0 / period_us, on_lead_us, off_lead_us, length_us)
+
+
+@kernel
+def _outside(dt_us, polarity, gate):
+    """Return whether ``dt_us`` after a rising edge lies outside the window of its polarity."""
+    late_us = dt_us + (gate.on_lead_us if polarity else gate.off_lead_us)
+    late_us -= gate.period_us * np.floor(late_us * gate.frequency_mhz)
+    return late_us >= gate.length_us

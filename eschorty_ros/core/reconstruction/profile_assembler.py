@@ -20,7 +20,7 @@ from eschorty_ros.core.line._row import likelihood_size
 from eschorty_ros.core.line._smoothing import Smoothing
 from eschorty_ros.core.line._window import BLOCK, ROW_BITS, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase_gate import gate_parameters
+from eschorty_ros.core.modulation.phase_gate import phase_gate
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -57,7 +57,7 @@ class ProfileAssembler:
 
     def restart(self, modulation: Modulation) -> None:
         """Forget the open period, the seeds and the line's width; gate by ``modulation``."""
-        self._gate = gate_parameters(modulation, self._gate_us)
+        self._gate = phase_gate(modulation, self._gate_us)
         self._state["open"] = binning.CLOSED
         self._state["half"] = self._assembly.estimator.half_max
         self._assembly.columns.counts[:] = 0

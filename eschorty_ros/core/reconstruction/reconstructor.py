@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -13,19 +14,17 @@ from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.line._window import TIME_LIMIT_US
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.held_events import HeldEvents
-from eschorty_ros.core.modulation.phase import EDGES_MAX
 from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
-from eschorty_ros.core.modulation.phase_lock import FLUSH_US, PhaseLock
 from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.reconstruction.periods import PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 
-PIECE_BYTES = 1 << 17
-# Pieces with edges that nobody has taken; who reconstructs a file does not need them.
+_PIECE_BYTES = 1 << 17
 _STAGE_EDGES_MAX = 1024
+"""Pieces with edges that are kept; without a call of ``take_stage_edges`` they would pile up."""
 
 
 class Reconstructor:
@@ -40,115 +39,65 @@ class Reconstructor:
         meanwhile, not lost).
     settings : Settings
 
+    Attributes
+    ----------
+    settings : Settings
+    model : RangeModel
+    modulation : Modulation
+        The one that data are cut by now.
+    first_t_us, newest_t_us : int or None
+        Sensor times of the first and the newest event.
+
     Raises
     ------
     ArgumentError
-        When the profile is longer than the 4.19 s an event's time within it can count.
+        When the profile is longer than the 4.19 s that the time within it can count.
+
+    Examples
+    --------
+    A line in row 350, 12 events in each of 8 columns, four periods of 1 kHz:
+
+    >>> import numpy as np
+    >>> from eschorty_ros.core.evt3 import Encoder
+    >>> from eschorty_ros.core.modulation import Modulation
+    >>> from eschorty_ros.core.optics import load_calibration
+    >>> t, column, event = np.meshgrid(
+    ...     np.arange(4) * 1000 + 100, np.arange(8), np.arange(12), indexing="ij"
+    ... )
+    >>> row = 350 + event % 3 - 1
+    >>> data = Encoder().encode(t.ravel(), column.ravel(), row.ravel(), np.ones(t.size, int))
+    >>> calibration = load_calibration("config_3")
+    >>> reconstructor = Reconstructor(calibration, Modulation(1000.0, on_edge_us=0))
+    >>> profiles = Profiles.concatenate([reconstructor.push(data), reconstructor.flush()])
+    >>> profiles.profile_count, len(profiles)
+    (4, 32)
+    >>> print(f"row {profiles.row[0]:.1f} is at {profiles.range_mm[0]:.1f} mm")
+    row 350.0 is at 1131.0 mm
     """
 
     def __init__(
         self, calibration: Calibration, modulation: Modulation, settings: Settings | None = None
     ) -> None:
         self.settings = settings = settings or Settings()
-        self.model = calibration.model()
-        self._decoder = Decoder(self.model.columns, self.model.rows)
-        self._filter = (
-            ActivityFilter(self.model.columns, self.model.rows)
-            if settings.noise_filter == "activity"
-            else None
-        )
-        self._assembler = ProfileAssembler(settings, self.model)
-        self._compensator: StepCompensator | None = None
-        self._ready: list[Profiles] = []
-        self._held = HeldEvents()
-        self._counts: dict[str, int] = dict.fromkeys(
-            (
-                "events", "events_filtered", "events_outside_phase", "points",
-                "points_beyond_pole", "columns_compensated",
-            ),
-            0,
-        )  # fmt: skip
-        self._schedule_counts: dict[str, int] = {}
-        self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
-        self._settled_us = -TIME_LIMIT
+        self.model = model = calibration.model()
         self.first_t_us: int | None = None
         self.newest_t_us: int | None = None
+        self._decoder = Decoder(model.columns, model.rows)
+        self._filter: ActivityFilter | None = None
+        if settings.noise_filter == "activity":
+            self._filter = ActivityFilter(model.columns, model.rows)
+        self._assembler = ProfileAssembler(settings, model)
+        self._compensator: StepCompensator | None = None
+        self._counts = Counter(
+            events=0, events_filtered=0, points=0, points_beyond_pole=0, columns_compensated=0
+        )
+        self._watermark_us = -TIME_LIMIT
+        self._before_restart: list[Profiles] = []
+        self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         self._begin(modulation)
 
-    def _begin(self, modulation: Modulation) -> None:
-        """Start over with the phase; counters and the decoder go on."""
-        longest_us = modulation.period_us * (self.settings.periods_per_profile + 1)
-        if longest_us >= TIME_LIMIT_US:
-            raise ArgumentError(
-                f"periods_per_profile is {self.settings.periods_per_profile}; "
-                f"{modulation.frequency_hz:g} Hz allows "
-                f"{int(TIME_LIMIT_US / modulation.period_us) - 1}"
-            )
-        self._modulation = modulation
-        self._lock = PhaseLock(modulation, self.settings.periods_per_profile)
-        self._assembler.restart(modulation)
-        if self.settings.reflectance_compensation == "on" and self.settings.stage_speed_mm_s:
-            self._compensator = StepCompensator(self.settings, self.model, modulation)
-
-    @property
-    def modulation(self) -> Modulation:
-        """The modulation data are cut by now."""
-        return self._modulation
-
-    @property
-    def time_us(self) -> int | None:
-        """Sensor time up to which the stream has been read, events or not; ``None`` at first."""
-        return self._decoder.time_us
-
-    @property
-    def settled_us(self) -> int | None:
-        """Sensor time before which nothing comes any more; ``None`` at first."""
-        return self._decoder.settled_us
-
-    @property
-    def phase_missing(self) -> bool:
-        """Whether a flush found no phase and cut from the first event's time on."""
-        return self._lock.missing
-
-    @property
-    def phase(self) -> PhaseEstimate | None:
-        """The first estimate of the phase, ``None`` where it is known or not found yet."""
-        return self._lock.estimate
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """Counts since construction, by name.
-
-        ``events`` (decoded) = ``events_filtered`` + ``events_gated`` + ``events_binned`` +
-        ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_phase`` +
-        ``events_held`` (not assigned yet).
-        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
-        ``decoder_*`` come from the decoder.
-        """
-        counts = dict(self._counts)
-        bins = self._assembler.counters
-        counts["events_outside_phase"] += bins.pop("events_before_first_edge") + self._lock.refused
-        counts.update(bins)
-        if self._compensator is not None:
-            counts["columns_compensated"] += self._compensator.columns_compensated
-        counts["events_held"] = len(self._held)
-        counts["events_dropped"] = (
-            counts["events_over_column_limit"]
-            + counts["events_outside_sensor"]
-            + counts["events_outside_phase"]
-        )
-        for name, value in self._lock.counters.items():
-            counts[name] = value + self._schedule_counts.get(name, 0)
-        counts["periods_empty"] += self._lock.schedule.periods_jumped + self._schedule_counts.get(
-            "periods_jumped", 0
-        )
-        decoder = self._decoder.counters
-        counts["sensor_drop_words"] = decoder.sensor_drop_words
-        counts.update({f"decoder_{k}": int(v) for k, v in asdict(decoder).items()})
-        return counts
-
     def push(self, data: bytes | bytearray | memoryview) -> Profiles:
-        """Take the next bytes of the stream and return the profiles they complete.
+        """Return the profiles that the next bytes of the stream complete.
 
         With ``reflectance_compensation`` the newest wait for those behind them.
 
@@ -158,38 +107,57 @@ class Reconstructor:
             EVT3, cut anywhere.
         """
         view = octets("data", data)
-        for begin in range(0, len(view), PIECE_BYTES):
-            events = self._decoder.decode(view[begin : begin + PIECE_BYTES])
-            now_us = self._decoder.settled_us
-            if now_us is not None:
-                # Periods before it are closed: a TIME_HIGH that steps back must not reopen them.
-                if len(events) and events.t[0] < self._settled_us:
-                    np.maximum(events.t, self._settled_us, out=events.t)
-                self._settled_us = max(self._settled_us, now_us)
-                self._absorb(events, self._settled_us)
-        return self._finished()
+        for begin in range(0, len(view), _PIECE_BYTES):
+            events = self._decoded(view[begin : begin + _PIECE_BYTES])
+            if events is not None:
+                self._periods.add(self._filtered(events), self._watermark_us)
+        rows = self._with_reflectance(self._assembler.take())
+        rows = self._compensated(rows)
+        return self._with_ranges(rows)
 
     def flush(self) -> Profiles:
-        """Close the open period; call at the end of the stream.
+        """Close the open period and return all profiles left; call at the end of the stream.
 
         Without any phase until here the periods are cut from the first event's time on and
         ``phase_missing`` is set.
         """
-        self._drain()
-        return self._finished(last=True)
-
-    def _finished(self, last: bool = False) -> Profiles:
-        """Return the points of the periods closed by now; with ``last`` of all."""
+        self._periods.finish(self.newest_t_us)
         rows = self._with_reflectance(self._assembler.take())
-        if self._compensator is not None:
-            rows = self._compensator.push(rows)
-            if last:
-                rows = LineRows.concatenate([rows, self._compensator.flush()])
-        profiles = Profiles.from_rows(rows, self.model)
-        self._counts["points"] += len(profiles)
-        self._counts["points_beyond_pole"] += len(rows) - len(profiles)
-        ready, self._ready = self._ready, []
-        return Profiles.concatenate([*ready, profiles]) if ready else profiles
+        rows = self._compensated(rows, last=True)
+        return self._with_ranges(rows)
+
+    def _decoded(self, piece: memoryview) -> Events | None:
+        """Return the events of ``piece``, or ``None`` before the stream's first time."""
+        events = self._decoder.decode(piece)
+        settled_us = self._decoder.settled_us
+        if settled_us is None:
+            return None
+        if len(events):
+            # Periods before it are closed: a TIME_HIGH that steps back must not reopen them.
+            if events.t[0] < self._watermark_us:
+                np.maximum(events.t, self._watermark_us, out=events.t)
+            if self.first_t_us is None:
+                self.first_t_us = int(events.t[0])
+            self.newest_t_us = int(events.t[-1])
+            self._counts["events"] += len(events)
+        self._watermark_us = max(self._watermark_us, settled_us)
+        if len(events.triggers):
+            self._add_triggers(events.triggers)
+        return events
+
+    def _add_triggers(self, triggers: Triggers) -> None:
+        source = self.settings.trigger_source
+        if source == "laser":
+            self._periods.lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
+        elif source == "stage" and len(self._stage_edges) < _STAGE_EDGES_MAX:
+            self._stage_edges.append((triggers.t.copy(), triggers.edge.copy()))
+
+    def _filtered(self, events: Events) -> Events:
+        if self._filter is None:
+            return events
+        kept = self._filter.filter(events)
+        self._counts["events_filtered"] += len(events) - len(kept)
+        return kept
 
     def _with_reflectance(self, rows: LineRows) -> LineRows:
         if self.settings.reflectance == "off" or len(rows) == 0:
@@ -203,121 +171,109 @@ class Reconstructor:
         )
         return replace(rows, reflectance=reflectance, reflectance_sigma=sigma)
 
-    def note_gap(self) -> None:
-        """Bytes were lost before the next ``push``: the periods' grid and the epoch stay."""
-        self._decoder.note_gap()
+    def _compensated(self, rows: LineRows, last: bool = False) -> LineRows:
+        if self._compensator is None:
+            return rows
+        rows = self._compensator.push(rows)
+        return LineRows.concatenate([rows, self._compensator.flush()]) if last else rows
+
+    def _with_ranges(self, rows: LineRows) -> Profiles:
+        """Return ``rows`` with their ranges, behind what a restart left."""
+        profiles = Profiles.from_rows(rows, self.model)
+        self._counts["points"] += len(profiles)
+        self._counts["points_beyond_pole"] += len(rows) - len(profiles)
+        before, self._before_restart = self._before_restart, []
+        return Profiles.concatenate([*before, profiles]) if before else profiles
 
     def set_modulation(self, modulation: Modulation) -> None:
         """Use ``modulation`` for data pushed afterwards; the open period is closed first."""
-        if modulation != self._modulation:
+        if modulation != self.modulation:
             self._restart(modulation)
 
+    def restart_phase(self) -> None:
+        """Estimate the phase again from the next data on: the laser has been switched on.
+
+        Nothing happens where the phase is known, or not found yet.
+        """
+        if self.modulation.on_edge_us is None and self._periods.lock.schedule.anchored:
+            self._restart(self.modulation)
+
     def _restart(self, modulation: Modulation) -> None:
-        self._ready = [self.flush()]
-        if self._compensator is not None:
-            self._counts["columns_compensated"] += self._compensator.columns_compensated
-        self._counts["events_outside_phase"] += self._lock.refused
-        counts = self._lock.counters
-        counts["periods_jumped"] = self._lock.schedule.periods_jumped
+        self._before_restart = [self.flush()]
+        periods, compensator = self._periods, self._compensator
         self._begin(modulation)
-        for name, value in counts.items():
-            self._schedule_counts[name] = self._schedule_counts.get(name, 0) + value
+        self._counts.update(periods.counters)
+        if compensator is not None:
+            self._counts["columns_compensated"] += compensator.columns_compensated
+
+    def _begin(self, modulation: Modulation) -> None:
+        """Start with another modulation; counters and the decoder go on."""
+        every = self.settings.periods_per_profile
+        if modulation.period_us * (every + 1) >= TIME_LIMIT_US:
+            raise ArgumentError(
+                f"periods_per_profile is {every}; {modulation.frequency_hz:g} Hz allows "
+                f"{int(TIME_LIMIT_US / modulation.period_us) - 1}"
+            )
+        self.modulation = modulation
+        self._periods = PeriodCutter(modulation, every, self._assembler)
+        if self.settings.reflectance_compensation == "on" and self.settings.stage_speed_mm_s:
+            self._compensator = StepCompensator(self.settings, self.model, modulation)
+
+    def note_gap(self) -> None:
+        """Note that bytes were lost before the next ``push``: grid and sensor time go on."""
+        self._decoder.note_gap()
 
     def take_stage_edges(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Trigger edges since the last call, if they are the stage's: times (us), 1 for rising."""
+        """Return the stage's trigger edges since the last call: times (us), 1 for rising.
+
+        There are none unless ``trigger_source`` is ``stage``.
+        """
         edges, self._stage_edges = self._stage_edges, []
         if not edges:
             return np.empty(0, np.int64), np.empty(0, np.uint8)
         return np.concatenate([t for t, _ in edges]), np.concatenate([kind for _, kind in edges])
 
-    def _take_triggers(self, triggers: Triggers) -> None:
-        source = self.settings.trigger_source
-        if source == "laser":
-            self._lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
-        elif source == "stage" and len(self._stage_edges) < _STAGE_EDGES_MAX:
-            self._stage_edges.append((triggers.t.copy(), triggers.edge.copy()))
+    @property
+    def time_us(self) -> int | None:
+        """Sensor time up to which the stream has been read, events or not; ``None`` at first."""
+        return self._decoder.time_us
 
-    def restart_phase(self) -> None:
-        """Estimate the phase anew from the next data on: the laser has been switched on.
+    @property
+    def settled_us(self) -> int | None:
+        """Sensor time before which no event is still to come; ``None`` at first."""
+        return self._decoder.settled_us
 
-        Nothing happens where the phase is known, or still looked for.
+    @property
+    def phase_missing(self) -> bool:
+        """Whether a flush found no phase and cut from the first event's time on."""
+        return self._periods.lock.missing
+
+    @property
+    def phase(self) -> PhaseEstimate | None:
+        """The first estimate of the phase, ``None`` where it is known or not found yet."""
+        return self._periods.lock.estimate
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts since construction, by name.
+
+        ``events`` (decoded) = ``events_filtered`` + ``events_gated`` + ``events_binned`` +
+        ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_phase`` +
+        ``events_held`` (not assigned yet).
+        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
+        ``decoder_*`` come from the decoder.
         """
-        if self._modulation.on_edge_us is None and self._lock.schedule.anchored:
-            self._restart(self._modulation)
-
-    def _absorb(self, events: Events, now_us: int) -> None:
-        self._counts["events"] += len(events)
-        triggers = events.triggers
-        if len(triggers):
-            self._take_triggers(triggers)
-        if len(events):
-            if self.first_t_us is None:
-                self.first_t_us = int(events.t[0])
-            self.newest_t_us = int(events.t[-1])
-        if self._filter is not None:
-            decoded = len(events)
-            events = self._filter.filter(events)
-            self._counts["events_filtered"] += decoded - len(events)
-        if not self._lock.schedule.anchored:
-            self._held.append(events.t, events.x, events.y, events.p)
-            if not self._lock.find(self._held, now_us):
-                return
-            self._assign(None, now_us)
-        else:
-            self._assign(events, now_us)
-
-    def _assign(self, events: Events | None, watermark_us: int) -> None:
-        """Put everything certain before ``watermark_us`` into periods; hold the rest back."""
-        held, schedule = self._held, self._lock.schedule
-        first, count = 0, 0 if events is None else len(events)
-        more = True
-        while more:
-            if len(held):
-                self._lock.skip_to(int(held.t[0]))
-            elif events is not None and first < count:
-                self._lock.skip_to(int(events.t[first]))
-            edges, indices = schedule.advance(self._lock.limit(watermark_us))
-            more = len(edges) == EDGES_MAX
-            safe_us = schedule.safe_us
-            edge = 0
-            stop = int(np.searchsorted(held.t, safe_us))
-            waiting = stop < len(held)
-            last = 0
-            if events is not None and not waiting:
-                last = max(int(np.searchsorted(events.t, safe_us)), first)
-            if stop:
-                edge = self._merge(held, slice(0, stop), edges, indices, edge, last <= first)
-                held.drop(stop)
-            if events is not None and last > first:
-                new = slice(first, last)
-                edge = self._merge(events, new, edges, indices, edge, True)
-                first = last
-            if edge < len(edges):
-                self._merge(held, slice(0, 0), edges, indices, edge, True)
-            more = more or self._lock.settle(watermark_us)
-        if events is not None and first < count:
-            held.append(events.t[first:], events.x[first:], events.y[first:], events.p[first:])
-
-    def _merge(
-        self,
-        source: Events | HeldEvents,
-        part: slice,
-        edges: NDArray[np.int64],
-        indices: NDArray[np.int64],
-        edge: int,
-        drain: bool,
-    ) -> int:
-        t, x, y, p = source.t[part], source.x[part], source.y[part], source.p[part]
-        self._lock.observe(t, p)
-        return self._assembler.merge(t, x, y, p, edges, indices, edge, drain)
-
-    def _drain(self) -> None:
-        if self._lock.schedule.anchored or self._lock.find(self._held, FLUSH_US, last=True):
-            self._finish()
-
-    def _finish(self) -> None:
-        """Assign what is held back and close the open period."""
-        newest = self.newest_t_us
-        if newest is not None:
-            self._assign(None, self._lock.schedule.watermark_after(newest))
-        self._assembler.close()
+        counts = Counter(self._counts)
+        counts.update(self._periods.counters)
+        counts.update(self._assembler.counters)
+        counts["events_outside_phase"] += counts.pop("events_before_first_edge")
+        if self._compensator is not None:
+            counts["columns_compensated"] += self._compensator.columns_compensated
+        counts["events_dropped"] = sum(
+            counts[f"events_{reason}"]
+            for reason in ("over_column_limit", "outside_sensor", "outside_phase")
+        )
+        decoder = self._decoder.counters
+        counts["sensor_drop_words"] = decoder.sensor_drop_words
+        counts.update({f"decoder_{k}": int(v) for k, v in asdict(decoder).items()})
+        return dict(counts)

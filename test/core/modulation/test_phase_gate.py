@@ -11,7 +11,7 @@ from line_events import encoded
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, gate_parameters
+from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, phase_gate
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.simulation.scenes import Plane
@@ -105,9 +105,9 @@ def test_gate_off_or_as_long_as_the_period_removes_nothing():
 
 
 def test_a_sine_has_no_edges_to_gate_by():
-    assert not gate_parameters(Modulation(70.0, waveform="sine"), 1000).any()
+    assert phase_gate(Modulation(70.0, waveform="sine"), 1000).length_us == 0.0
     with pytest.raises(ArgumentError, match="gate_us is -1; choose a whole number from 0 to"):
-        gate_parameters(Modulation(70.0), -1)
+        phase_gate(Modulation(70.0), -1)
 
 
 def test_points_do_not_depend_on_how_the_bytes_are_split():

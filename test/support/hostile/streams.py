@@ -8,7 +8,7 @@ from typing import Any
 from eschorty_ros.core.evt3 import activity_filter as noise
 from eschorty_ros.core.evt3 import decoder as evt3
 from eschorty_ros.core.evt3 import word_count as evt3_count
-from eschorty_ros.core.modulation import held_events, modulation
+from eschorty_ros.core.modulation import modulation
 from eschorty_ros.core.reconstruction import reconstructor, settings
 from eschorty_ros.core.storage import raw_file
 from hostile.kinds import (
@@ -97,13 +97,6 @@ CALLS: dict[str, Call] = {
         method(evt3_count.WordCounter, "add"), {"data": b"\x00\x80"}, {"data": octets()}
     ),
     "evt3.event_arrays": Call(evt3.event_arrays, {"size": 3}, {"size": whole(-1, 1 << 40)}),
-    "held_events.HeldEvents": Call(held_events.HeldEvents, {}),
-    "held_events.HeldEvents.append": Call(
-        method(held_events.HeldEvents, "append"), EVENTS, EVENT_KINDS
-    ),
-    "held_events.HeldEvents.drop": Call(
-        method(held_events.HeldEvents, "drop"), {"count": 0}, {"count": whole(-1, 1)}
-    ),
     "noise.ActivityFilter": Call(
         noise.ActivityFilter,
         {"width": 64, "height": 64, "window_us": 5},

@@ -17,17 +17,13 @@ from eschorty_ros.core.clocks import (
     pulses,
 )
 from eschorty_ros.core.modulation import (
-    held_events,
     modulation,
-    phase,
     phase_estimate,
     phase_gate,
-    phase_lock,
 )
 from hostile.kinds import (
     Call,
     Kind,
-    exactly,
     integers,
     number,
     reals,
@@ -50,18 +46,6 @@ def a_track() -> clock.StageTrack:
     track = clock.StageTrack()
     track.append([0, 10], [0.0, 1.0])
     return track
-
-
-def a_schedule() -> phase.EdgeSchedule:
-    schedule = phase.EdgeSchedule(LASER)
-    schedule.anchor(0, 0)
-    return schedule
-
-
-def a_lock() -> phase_lock.PhaseLock:
-    lock = phase_lock.PhaseLock(LASER)
-    lock.schedule.anchor(0, 0)
-    return lock
 
 
 PULSES = pulses.PulseTrain(0.0, 2.0, 3)
@@ -276,70 +260,13 @@ CALLS: dict[str, Call] = {
         {"plan": motion.plan_move(0, 0.0, 5.0, 1.0, 1.0), "at_ns": 10, "deceleration_mm_s2": 1.0},
         {"at_ns": whole(), "deceleration_mm_s2": number(0.0)},
     ),
-    "phase.EdgeSchedule": Call(
-        phase.EdgeSchedule, {"modulation": LASER, "every": 2}, {"every": whole(0)}
-    ),
-    "phase.EdgeSchedule.add_triggers": Call(
-        method(a_schedule, "add_triggers"),
-        {"t_us": TIMES},
-        {"t_us": exactly("i8", N, alone=True)},
-    ),
-    "phase.EdgeSchedule.anchor": Call(
-        method(a_schedule, "anchor"),
-        {"edge_us": 5, "start_us": 10},
-        {"edge_us": whole(T_MAX + 1), "start_us": whole(T_MAX + 1)},
-    ),
-    "phase.EdgeSchedule.jump": Call(
-        method(a_schedule, "jump"), {"t_us": 5}, {"t_us": whole(T_MAX + 1)}
-    ),
-    "phase.EdgeSchedule.watermark_after": Call(
-        method(a_schedule, "watermark_after"), {"newest_us": 5}, {"newest_us": whole(T_MAX + 1)}
-    ),
-    "phase.EdgeSchedule.advance": Call(
-        method(a_schedule, "advance"),
-        {"watermark_us": 50_000},
-        {"watermark_us": whole(T_MAX + 1)},
-    ),
-    "phase.EdgeSchedule.middle_after": Call(
-        method(a_schedule, "middle_after"), {"multiple": 8}, {"multiple": whole(0, T_MAX)}
-    ),
-    "phase.EdgeSchedule.shift": Call(
-        method(a_schedule, "shift"), {"by_us": 8}, {"by_us": whole(7200, -7200)}
-    ),
-    "phase_lock.PhaseLock": Call(
-        phase_lock.PhaseLock, {"modulation": LASER, "every": 2}, {"every": whole(0)}
-    ),
-    "phase_lock.PhaseLock.find": Call(
-        method(a_lock, "find"),
-        {"held": held_events.HeldEvents(), "now_us": 5, "last": False},
-        {"now_us": whole(T_MAX + 1)},
-    ),
-    "phase_lock.PhaseLock.skip_to": Call(
-        method(a_lock, "skip_to"), {"t_us": 5}, {"t_us": whole(T_MAX + 1)}
-    ),
-    "phase_lock.PhaseLock.limit": Call(
-        method(a_lock, "limit"), {"watermark_us": 5}, {"watermark_us": whole(T_MAX + 1)}
-    ),
-    "phase_lock.PhaseLock.observe": Call(
-        method(a_lock, "observe"),
-        {"t_us": TIMES, "polarity": SIGNS},
-        {"t_us": exactly("i8", N, alone=True), "polarity": exactly("u1", N)},
-    ),
-    "phase_lock.PhaseLock.settle": Call(
-        method(a_lock, "settle"), {"watermark_us": 5}, {"watermark_us": whole(T_MAX + 1)}
-    ),
     "phase_estimate.estimate_phase": Call(
         phase_estimate.estimate_phase,
         {"t_us": TIMES, "polarity": SIGNS, "modulation": LASER},
         {"t_us": integers(2**63, size=N), "polarity": POLARITY},
     ),
-    "phase_estimate.decide_window": Call(
-        phase_estimate.decide_window,
-        {"t_us": np.arange(5000), "watermark_us": 10**6, "modulation": LASER},
-        {"t_us": exactly("i8", 5000, alone=True), "watermark_us": whole()},
-    ),
-    "phase_gate.gate_parameters": Call(
-        phase_gate.gate_parameters,
+    "phase_gate.phase_gate": Call(
+        phase_gate.phase_gate,
         {"modulation": LASER, "gate_us": 1000},
         {"gate_us": whole(-1, 100_001)},
     ),

@@ -9,8 +9,8 @@ import pytest
 from line_events import line_events
 
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase import EdgeSchedule
-from eschorty_ros.core.modulation.phase_estimate import decide_window, estimate_phase
+from eschorty_ros.core.modulation.edges import EdgeSchedule
+from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 
 SEED = 31
 
@@ -134,7 +134,7 @@ def test_window_does_not_depend_on_when_it_is_asked_for():
     t = np.sort(rng.integers(0, 10_000_000, 20_000))
     modulation = Modulation(70.0)
     answers = {
-        decide_window(t[: int(np.searchsorted(t, w))], w, modulation)
+        estimation_window(t[: int(np.searchsorted(t, w))], w, modulation)
         for w in range(0, 10_000_000, 100_000)
     }
     answers.discard(None)

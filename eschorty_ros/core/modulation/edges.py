@@ -1,0 +1,270 @@
+"""Where modulation periods begin: exact edge times, re-anchored by triggers."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.modulation.modulation import Modulation
+
+EDGES_MAX = 1 << 14
+"""Most edges per call; bounds the work between two looks at the events."""
+
+_JUMP_PERIODS = 4096  # longer gaps are skipped in one step
+_TOLERANCE_SHARE = 4  # a trigger belongs to an edge within this part of the period
+_MISSED_MAX = 3  # after as many edges without a trigger any trigger sets a new phase
+
+
+class _State(NamedTuple):
+    """The last edge: ``step`` periods after the anchor, ``elapsed_us`` and a remainder."""
+
+    anchor_us: int = 0
+    step: int = 0
+    elapsed_us: int = 0
+    remainder: int = 0
+    index: int = 0
+    last_us: int = 0
+    triggered: bool = False
+    missed: int = 0
+
+
+class _Counts(NamedTuple):
+    triggers_used: int = 0
+    triggers_spurious: int = 0
+    edges_bridged: int = 0
+    phase_locks: int = 0
+
+
+class _Period(NamedTuple):
+    """Length of the period, ``quotient + remainder / denominator`` us, and the edges to keep."""
+
+    quotient_us: int
+    remainder: int
+    denominator: int
+    every: int
+
+
+class EdgeSchedule:
+    """Rising edges of one modulation, in order, each decided exactly once.
+
+    Edge ``k`` after an anchor lies at ``anchor + round(k / f)`` with the quotient exact (Python
+    integers to jump, an integer remainder to step), so no error grows with time or index.
+
+    Parameters
+    ----------
+    modulation : Modulation
+    every : int
+        Return only each ``every``-th edge.
+
+    Attributes
+    ----------
+    anchored : bool
+        Whether the phase is fixed.
+    safe_us : int
+        Time before which events can be assigned to periods.
+    periods_jumped : int
+        Profiles without events that :meth:`jump` has skipped.
+
+    Notes
+    -----
+    A rising trigger within a quarter of a period of the predicted edge replaces it and becomes the
+    new anchor. Where a trigger is missing the prediction stands, but only after that quarter has
+    passed. Triggers elsewhere are counted as spurious, unless three edges in a row went missing:
+    then the next trigger sets a new phase. Events are never assigned to a period before its limits
+    are certain, so the result does not depend on when data arrive.
+    """
+
+    def __init__(self, modulation: Modulation, every: int = 1) -> None:
+        self._period = 1_000_000 / Fraction(modulation.frequency_hz)
+        numerator, denominator = self._period.as_integer_ratio()
+        self._parts = _Period(*divmod(numerator, denominator), denominator, every)
+        self._state = _State()
+        self._counts = _Counts()
+        self._edges_us, self._indices = np.empty((2, EDGES_MAX), np.int64)
+        self._triggers_us = np.empty(0, dtype=np.int64)
+        self.anchored = False
+        self.safe_us = 0
+        self.periods_jumped = 0
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts by name."""
+        return self._counts._asdict()
+
+    @property
+    def first_trigger_us(self) -> int | None:
+        """Earliest trigger not used yet."""
+        return int(self._triggers_us[0]) if self._triggers_us.size else None
+
+    @property
+    def triggered(self) -> bool:
+        """Whether triggers set the edges."""
+        return self._state.triggered
+
+    @property
+    def last_us(self) -> int:
+        """Time of the last edge returned or skipped."""
+        return self._state.last_us
+
+    def middle_after(self, multiple: int) -> int:
+        """Return the middle of the period that begins with the next multiple of ``multiple``."""
+        ahead = multiple - self._state.index % multiple
+        step = self._state.step + ahead
+        return self._edge_us(step) + self._parts.quotient_us // 2
+
+    def shift(self, by_us: int) -> None:
+        """Move all edges not returned yet by less than half a period."""
+        self._state = self._state._replace(anchor_us=self._state.anchor_us + by_us)
+
+    def add_triggers(self, t_us: NDArray[np.int64]) -> None:
+        """Append rising edges of the trigger input, in time order."""
+        self._triggers_us = np.concatenate([self._triggers_us, t_us])
+
+    def anchor(self, edge_us: int, start_us: int) -> None:
+        """Fix the phase by an edge at ``edge_us`` and begin with the last edge until ``start_us``.
+
+        With ``every`` > 1 it is the last one whose index is a multiple of it.
+        """
+        every = self._parts.every
+        self._state = _State(anchor_us=edge_us)
+        self._seek((self._step_at(start_us) // every) * every - 1)
+        self.anchored = True
+
+    def jump(self, t_us: int) -> None:
+        """Skip profiles that end before ``t_us``, the time of the next event, if there are many."""
+        target_us = t_us if self.first_trigger_us is None else min(t_us, self.first_trigger_us)
+        if target_us - self.last_us <= _JUMP_PERIODS * self._period:
+            return
+        every, state, counts = self._parts.every, self._state, self._counts
+        # The edge of the profile that holds the target is still to come.
+        skipped = self._step_at(target_us) - 1 - every - state.step
+        skipped -= skipped % every
+        if skipped <= 0:
+            return
+        self.periods_jumped += skipped // every
+        if state.triggered:
+            self._state = state._replace(missed=state.missed + skipped)
+            self._counts = counts._replace(edges_bridged=counts.edges_bridged + skipped)
+        self._seek(state.step + skipped)
+
+    def watermark_after(self, newest_us: int) -> int:
+        """Return the watermark that makes everything up to ``newest_us`` certain, nothing later."""
+        if not self.triggered:
+            return newest_us + 1
+        return newest_us + 1 + max((self._parts.quotient_us + 1) // _TOLERANCE_SHARE, 1)
+
+    def advance(self, watermark_us: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the edges certain now and their indices: views valid until the next call.
+
+        Sets ``safe_us``. When ``EDGES_MAX`` edges are returned there may be more: assign the
+        events, then call again.
+        """
+        # Plain tuples cross into compiled code faster than named ones.
+        n, used, self.safe_us, state, counts = _schedule(
+            tuple(self._state),
+            tuple(self._counts),
+            self._parts,
+            self._triggers_us,
+            watermark_us,
+            self._edges_us,
+            self._indices,
+        )
+        self._state, self._counts = _State._make(state), _Counts._make(counts)
+        self._triggers_us = self._triggers_us[used:]
+        return self._edges_us[:n], self._indices[:n]
+
+    def _edge_us(self, step: int) -> int:
+        return self._state.anchor_us + round(step * self._period)
+
+    def _step_at(self, t_us: int) -> int:
+        """Count edges from the anchor to the last one at or before ``t_us``."""
+        elapsed = t_us - self._state.anchor_us
+        step = int(elapsed / self._period) + 1
+        while round(step * self._period) > elapsed:
+            step -= 1
+        return step
+
+    def _seek(self, step: int) -> None:
+        """Make ``step`` the last edge returned."""
+        numerator, denominator = self._period.as_integer_ratio()
+        elapsed_us, remainder = divmod(step * numerator, denominator)
+        self._state = self._state._replace(
+            step=step,
+            elapsed_us=elapsed_us,
+            remainder=remainder,
+            index=self._state.index + step - self._state.step,
+            last_us=self._edge_us(step),
+        )
+
+
+@kernel
+def _rounded(quotient, remainder, denominator):
+    """Return ``quotient + remainder / denominator`` to the nearest integer, half to even."""
+    twice = 2 * remainder
+    if twice > denominator or (twice == denominator and quotient & 1):
+        return quotient + 1
+    return quotient
+
+
+@kernel
+def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indices):
+    """Write the edges that are certain once everything before the watermark is known.
+
+    Returns the number of edges, the number of triggers used, the time before which events can be
+    assigned, the new state and the new counts.
+    """
+    anchor_us, step, at_us, remainder, index, last_us, triggered, missed = state
+    used, spurious, bridged, locks = counts
+    tolerance_us = max((period.quotient_us + 1) // _TOLERANCE_SHARE, 1)
+    n = 0
+    taken = 0
+    safe_us = watermark_us
+    while True:
+        next_us = at_us + period.quotient_us
+        next_remainder = remainder + period.remainder
+        if next_remainder >= period.denominator:
+            next_remainder -= period.denominator
+            next_us += 1
+        predicted_us = anchor_us + _rounded(next_us, next_remainder, period.denominator)
+        if n == edges_us.size:
+            safe_us = min(watermark_us, last_us)
+            break
+        locked = triggered and missed < _MISSED_MAX
+        deadline_us = predicted_us + tolerance_us if triggered else predicted_us
+        if taken < triggers_us.size and triggers_us[taken] <= deadline_us:
+            edge_us = triggers_us[taken]
+            taken += 1
+            if locked and edge_us < predicted_us - tolerance_us:
+                spurious += 1
+                continue
+            if not locked:
+                locks += 1
+            used += 1
+            triggered = True
+            anchor_us = edge_us
+            missed = step = at_us = remainder = 0
+            if not locked and edge_us - last_us < tolerance_us:
+                # The edge just predicted was this one: later edges count from the trigger.
+                continue
+        elif deadline_us < watermark_us:
+            edge_us = predicted_us
+            step += 1
+            at_us, remainder = next_us, next_remainder
+            if triggered:
+                missed += 1
+                bridged += 1
+        else:
+            safe_us = min(watermark_us, predicted_us)
+            break
+        index += 1
+        last_us = edge_us
+        if index % period.every == 0:
+            edges_us[n] = edge_us
+            indices[n] = index
+            n += 1
+    state = anchor_us, step, at_us, remainder, index, last_us, triggered, missed
+    return n, taken, safe_us, state, (used, spurious, bridged, locks)

@@ -1,0 +1,110 @@
+"""Cutting the stream of events into modulation periods."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.evt3 import Events
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.edges import EDGES_MAX
+from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
+from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
+from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
+
+
+class PeriodCutter:
+    """Assigns events to the periods of one modulation; holds back those not certain yet.
+
+    Parameters
+    ----------
+    modulation : Modulation
+    every : int
+        Periods per profile.
+    assembler : ProfileAssembler
+        Takes the events and the periods' beginnings.
+
+    Attributes
+    ----------
+    lock : PhaseLock
+    """
+
+    def __init__(self, modulation: Modulation, every: int, assembler: ProfileAssembler) -> None:
+        self.lock = PhaseLock(modulation, every)
+        self._held = HeldEvents()
+        self._assembler = assembler
+        assembler.restart(modulation)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts by name."""
+        return {
+            "events_held": len(self._held),
+            "events_outside_phase": self.lock.refused,
+            "periods_empty": self.lock.schedule.periods_jumped,
+            **self.lock.counters,
+        }
+
+    def add(self, events: Events, watermark_us: int) -> None:
+        """Assign ``events``; none before ``watermark_us`` is still to come."""
+        arrays = events.t, events.x, events.y, events.p
+        if self.lock.schedule.anchored:
+            self._assign(arrays, watermark_us)
+            return
+        self._held.append(arrays)
+        if self.lock.find(self._held, watermark_us):
+            self._assign_held(watermark_us)
+
+    def finish(self, newest_us: int | None) -> None:
+        """Assign the events held back, up to ``newest_us``, and close the open period."""
+        lock = self.lock
+        if not lock.schedule.anchored and not lock.find(self._held, END_OF_STREAM_US, last=True):
+            return
+        if newest_us is not None:
+            self._assign_held(lock.schedule.watermark_after(newest_us))
+        self._assembler.close()
+
+    def _assign_held(self, watermark_us: int) -> None:
+        t, x, y, p = self._held.arrays
+        self._assign((t[:0], x[:0], y[:0], p[:0]), watermark_us)
+
+    def _assign(self, new: EventArrays, watermark_us: int) -> None:
+        """Assign the events certain before the watermark, held ones first; hold back the rest."""
+        held, lock = self._held, self.lock
+        first = 0
+        more = True
+        while more:
+            pending_us = held.arrays[0] if len(held) else new[0][first:]
+            if pending_us.size:
+                lock.skip_to(int(pending_us[0]))
+            edges_us, indices = lock.schedule.advance(lock.limit(watermark_us))
+            safe_us = lock.schedule.safe_us
+            ready = int(np.searchsorted(held.arrays[0], safe_us))
+            edge = 0
+            if ready:
+                part = slice(0, ready)
+                edge = self._merge(held.arrays, part, edges_us, indices, edge, drain=False)
+                held.drop(ready)
+            end = first
+            if len(held) == 0:
+                end = max(int(np.searchsorted(new[0], safe_us)), first)
+            if end > first or edge < len(edges_us):
+                part = slice(first, end)
+                self._merge(new, part, edges_us, indices, edge, drain=True)
+                first = end
+            more = len(edges_us) == EDGES_MAX or lock.close_block(watermark_us)
+        t, x, y, p = new
+        held.append((t[first:], x[first:], y[first:], p[first:]))
+
+    def _merge(
+        self,
+        events: EventArrays,
+        part: slice,
+        edges_us: NDArray[np.int64],
+        indices: NDArray[np.int64],
+        edge: int,
+        drain: bool,
+    ) -> int:
+        t, x, y, p = (values[part] for values in events)
+        self.lock.observe(t, p)
+        return self._assembler.merge(t, x, y, p, edges_us, indices, edge, drain)
