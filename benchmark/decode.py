@@ -29,7 +29,7 @@ from streams import line_row_events, sparse_events  # noqa: E402
 
 from eschorty_ros.core.evt3 import ActivityFilter  # noqa: E402
 from eschorty_ros.core.evt3 import decoder as evt3  # noqa: E402
-from eschorty_ros.core.storage import RawReader, RawWriter  # noqa: E402
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter  # noqa: E402
 
 PIECE_BYTES = 128 * 1024
 SEED = 20_240_601

@@ -64,7 +64,9 @@ def test_versions_agree() -> None:
     assert f'version="{manifest}"' in (ROOT / "setup.py").read_text()
 
 
-@pytest.mark.parametrize("module", ["cli", "core.calibration", "simulation.scene", "report"])
+@pytest.mark.parametrize(
+    "module", ["cli", "core.calibration", "simulation.scenes", "report", "live", "control"]
+)
 def test_imports_without_ros(module: str) -> None:
     code = (
         "import sys; sys.modules['rclpy'] = None; "

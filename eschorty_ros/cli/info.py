@@ -80,7 +80,7 @@ def _raw(path: Path) -> None:
     import numpy as np
 
     from eschorty_ros.core.evt3 import Decoder
-    from eschorty_ros.core.storage import RawReader
+    from eschorty_ros.core.storage.raw_file import RawReader
 
     reader = RawReader(path)
     header = reader.header

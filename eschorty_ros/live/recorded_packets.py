@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from eschorty_ros.core.evt3 import Decoder
-from eschorty_ros.core.storage import RawReader
+from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES
 
 _PIECE_BYTES = 16_384

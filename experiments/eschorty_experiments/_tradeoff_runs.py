@@ -16,7 +16,8 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import NOISE_FILTERS, Profiles, Reconstructor, Settings
 from eschorty_ros.core.reconstruction import paper_method as reference
-from eschorty_ros.core.storage import RawReader, Recording
+from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.simulation.scenes import Scene, named
 from eschorty_ros.simulation.world import simulate_recording
 

@@ -18,7 +18,8 @@ from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
-from eschorty_ros.core.storage import RawReader, Recording
+from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage.raw_file import RawReader
 
 _CHUNK_BYTES = 1 << 20
 

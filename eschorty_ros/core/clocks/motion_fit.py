@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, number, positive, times, whole
 from eschorty_ros.core.base.errors import ArgumentError
@@ -560,6 +559,9 @@ def _fitted_shape(
             speed * math.exp(log_speed),
             acceleration * math.exp(log_acceleration),
         )
+
+    # scipy takes longer to import than a stage to be read.
+    from scipy.optimize import least_squares
 
     def residuals(parameters: Array) -> Array:
         start_s, log_speed, log_acceleration = parameters

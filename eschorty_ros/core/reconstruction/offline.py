@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.settings import Settings
-from eschorty_ros.core.storage import RawReader, Recording
+from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage.raw_file import RawReader
 
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8

@@ -1,4 +1,4 @@
-"""Prophesee RAW files, recordings and clouds."""
+"""Recordings and clouds; Prophesee RAW files in ``raw_file``, which brings the decoder with it."""
 
 from eschorty_ros.core.storage.cloud import (
     POINT_DTYPE,
@@ -8,7 +8,6 @@ from eschorty_ros.core.storage.cloud import (
     read_cloud,
     write_cloud,
 )
-from eschorty_ros.core.storage.raw_file import RawReader, RawWriter
 from eschorty_ros.core.storage.recording import (
     CALIBRATION_FILE,
     EVENTS_FILE,
@@ -34,8 +33,6 @@ __all__ = [
     "TRUTH_DTYPE",
     "TRUTH_FILE",
     "Points",
-    "RawReader",
-    "RawWriter",
     "Recording",
     "join_points",
     "load_recording",

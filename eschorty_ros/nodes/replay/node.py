@@ -24,7 +24,8 @@ from sensor_msgs.msg import TimeReference
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
 from eschorty_ros.core.clocks import NS_PER_US
-from eschorty_ros.core.storage import RawReader, Recording, load_recording
+from eschorty_ros.core.storage import Recording, load_recording
+from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.live.recorded_packets import timed_packets
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos

@@ -20,13 +20,13 @@ from eschorty_ros.core.storage import (
     LASER_FILE,
     STAGE_FILE,
     TRUTH_FILE,
-    RawWriter,
     Recording,
     load_recording,
     write_laser_yaml,
     write_stage_csv,
     write_truth_csv,
 )
+from eschorty_ros.core.storage.raw_file import RawWriter
 from eschorty_ros.simulation.pixels import PixelParameters
 from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World

@@ -223,7 +223,7 @@ def test_names_are_found_where_colcon_pip_and_git_put_them(
 
 def test_reading_a_calibration_needs_no_ros_and_no_compiler() -> None:
     code = (
-        "import sys, eschorty_ros.core.storage.recording as r;"
+        "import sys, eschorty_ros.core.storage, eschorty_ros.core.optics as r;"
         "r.load_calibration('nominal');"
         "heavy = {'rclpy', 'numba', 'open3d', 'matplotlib', 'scipy'};"
         "print(sorted(heavy & set(sys.modules)))"

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 from streams import words_of
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
-from eschorty_ros.core.storage import RawReader, RawWriter
+from eschorty_ros.core.storage.raw_file import RawReader, RawWriter
 
 WORDS = words_of("8000 6064 002A 2805")
 NEW = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
