@@ -1,4 +1,4 @@
-"""The calibration in use: told to everybody, exchanged only for one of the same instrument."""
+"""The calibration in use: published, and exchanged only for one of the same instrument."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ Use = Callable[[Calibration], None]
 
 
 class ActiveCalibration:
-    """Holds the active calibration, publishes it latched, offers to load and save it.
+    """Holds the active calibration, publishes it latched, loads and saves it by service.
 
     Parameters
     ----------
     node : rclpy.node.Node
     calibration : Calibration
-        The one at start: sensor and build that every later one must share.
+        The first one; every later one must have the same sensor and build.
     file : str
-        Where it came from.
+        Its file.
     folder : str
-        Where calibrations are written; empty: ``eschorty`` in ROS's home.
+        Where calibrations are written; ``""``: ``eschorty`` in ROS's home.
     use : callable
-        Puts a calibration to use, or raises an ``EschortyError`` and leaves all as it was.
+        Changes the calibration in use, or raises an ``EschortyError`` and changes nothing.
     """
 
     def __init__(
@@ -47,17 +47,17 @@ class ActiveCalibration:
         self._publisher = node.create_publisher(
             ActiveCalibrationMessage, "reconstruction/calibration", qos.latched()
         )
-        # One at a time: loading while a calibration is written must not mix the two.
+        # One at a time, so that loading and writing do not mix.
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
             (LoadCalibration, "load_calibration", self._on_load),
             (SaveCalibration, "save_calibration", self._on_save),
         ):
             node.create_service(kind, f"reconstruction/{name}", callback, callback_group=group)
-        self._tell(file)
+        self._publish(file)
 
     def store(self, calibration: Calibration, targets: Targets) -> str:
-        """Write the targets and ``calibration``, then put it to use; the calibration's path.
+        """Write the targets and ``calibration``, then use it; return the calibration's path.
 
         Raises
         ------
@@ -75,10 +75,10 @@ class ActiveCalibration:
     def _exchange(self, calibration: Calibration, file: str) -> None:
         self._use(calibration)
         self.calibration = calibration
-        self._tell(file)
+        self._publish(file)
         self._node.get_logger().info(f"calibration {calibration.id or calibration.name}: {file}")
 
-    def _tell(self, file: str) -> None:
+    def _publish(self, file: str) -> None:
         now_ns = self._node.get_clock().now().nanoseconds
         self._publisher.publish(active_message(self.calibration, file, now_ns))
 
@@ -116,7 +116,7 @@ class ActiveCalibration:
 
 
 def targets_path(calibration_path: Path) -> Path:
-    """Where the targets of a calibration fitted on the instrument lie."""
+    """Return the path of the targets of a calibration fitted on the instrument."""
     return calibration_path.with_name(f"{calibration_path.stem}-targets.csv")
 
 

@@ -1,4 +1,4 @@
-"""One calibration without being asked: what the launch file runs."""
+"""One calibration at the start of the node, for the launch file."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from eschorty_ros.nodes.reconstruction.calibration_messages import target_messag
 
 
 class AutoCalibration:
-    """Sends one goal to the ``calibrate`` action as soon as it is there.
+    """Sends one goal to the ``calibrate`` action as soon as its server is discovered.
 
     Parameters
     ----------
     node : rclpy.node.Node
     distances : str
-        File of what is known of the targets: a name in ``config/`` or a path.
+        File of the known targets: a name in ``config/`` or a path.
     method : str
     capture_s : float
 
     Raises
     ------
     FormatError, CalibrationError
-        When the file cannot be read, or there is none of that name.
+        When the file cannot be read or is not found.
     """
 
     def __init__(self, node: Node, distances: str, method: str, capture_s: float) -> None:

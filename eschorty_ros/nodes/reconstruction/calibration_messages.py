@@ -17,12 +17,12 @@ from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_
 
 
 def request_from_goal(goal: Any) -> CaptureRequest:
-    """Turn a ``Calibrate`` goal into a request.
+    """Return the request of a ``Calibrate`` goal.
 
     Raises
     ------
     ArgumentError
-        For a target whose range or size is no positive number.
+        For a target whose range or size is not positive.
     """
     sweep = None
     if goal.sweep_speed != 0.0:
@@ -54,7 +54,7 @@ def _known_target(target: Any) -> KnownTarget:
 
 
 def target_message(target: KnownTarget) -> CalibrationTarget:
-    """Turn a known target into a message."""
+    """Return the message of a known target."""
     return CalibrationTarget(
         range=m_from_mm(target.range_mm),
         range_sigma=m_from_mm(target.sigma_range_mm),
@@ -66,7 +66,7 @@ def target_message(target: KnownTarget) -> CalibrationTarget:
 
 
 def active_message(calibration: Calibration, file: str, stamp_ns: int) -> ActiveCalibration:
-    """Tell which calibration is in use since ``stamp_ns``."""
+    """Return the message of the calibration in use since ``stamp_ns``."""
     message = ActiveCalibration(
         name=calibration.name,
         id=calibration.id or "",

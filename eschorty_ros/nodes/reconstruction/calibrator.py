@@ -1,4 +1,4 @@
-"""The ``calibrate`` action: light the targets, find them, fit, use the fit."""
+"""The ``calibrate`` action: capture the targets, find them, fit a calibration, use it."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from eschorty_ros.nodes.ros.spin import unless_shut_down
 from eschorty_ros.nodes.ros.transforms import OPTICAL
 
 _FEEDBACK_S = 0.2
-_LOOK_S = 0.5
-_LOOK_TIMEOUT_S = 2.0
-_LOOK_JOIN_S = 5.0
-_HAND_TIMEOUT_S = 30.0
+_SEARCH_S = 0.5
+_COPY_TIMEOUT_S = 2.0
+_SEARCH_JOIN_S = 5.0
+_WORKER_TIMEOUT_S = 30.0
 
 InWorker = Callable[[Callable[[], None], float], tuple[bool, str]]
 
 
 class Calibrator:
-    """One calibration at a time.
+    """Runs one calibration at a time.
 
     A goal that cannot be done is accepted and aborted at once, because only a result can carry
     the reason to the client.
@@ -53,12 +53,12 @@ class Calibrator:
         The reconstruction node.
     active : ActiveCalibration
     in_worker : callable
-        Runs a job in the reconstruction's worker: whether it succeeded, and why not.
-    tap : callable
-        Hands the worker a capture to feed, or ``None``; called in the worker. Raises an
-        ``EschortyError`` when it cannot be done now.
+        Runs a job in the reconstruction's worker; returns whether it succeeded, and why not.
+    set_capture : callable
+        Sets the capture to feed, or ``None``; called in the worker. Raises an ``EschortyError``
+        when that is refused.
     line_width_px : callable
-        Reads the width of the line from the node's settings.
+        Returns the width of the line in the node's settings.
     timeouts_s : tuple of float
         Those of ``InstrumentClient``.
     """
@@ -68,7 +68,7 @@ class Calibrator:
         node: Node,
         active: ActiveCalibration,
         in_worker: InWorker,
-        tap: Callable[[Capture | None], None],
+        set_capture: Callable[[Capture | None], None],
         line_width_px: Callable[[], float],
         timeouts_s: tuple[float, float, float],
     ) -> None:
@@ -76,7 +76,7 @@ class Calibrator:
         self._active = active
         self._nominal = active.calibration
         self._in_worker = in_worker
-        self._tap = tap
+        self._set_capture = set_capture
         self._line_width_px = line_width_px
         self._timeouts_s = timeouts_s
         self._client: InstrumentClient | None = None
@@ -93,13 +93,8 @@ class Calibrator:
             callback_group=ReentrantCallbackGroup(),
         )
 
-    @property
-    def busy(self) -> bool:
-        """Whether a calibration is under way."""
-        return not self._idle.is_set()
-
     def safe_state(self) -> None:
-        """End a capture under way: its way out switches the laser off, its heartbeat stops."""
+        """End a capture under way: on its way out the laser goes off and its heartbeat stops."""
         self._ending = True
         if self._client is not None:
             self._client.end()
@@ -127,7 +122,7 @@ class Calibrator:
         client = self._made_client()
         client.prepare(lambda: bool(goal.is_cancel_requested), feedback.send)
         outcome = run_capture(
-            client, request, lambda: self._hand(capture), lambda: self._hand(None)
+            client, request, lambda: self._feed(capture), lambda: self._feed(None)
         )
         result = Calibrate.Result(message=outcome.message)
         if not self._node.context.ok():
@@ -177,13 +172,13 @@ class Calibrator:
         goal.abort()
         return Calibrate.Result(success=False, message=reason)
 
-    def _hand(self, capture: Capture | None) -> None:
-        done, reason = self._in_worker(lambda: self._tap(capture), _HAND_TIMEOUT_S)
+    def _feed(self, capture: Capture | None) -> None:
+        done, reason = self._in_worker(lambda: self._set_capture(capture), _WORKER_TIMEOUT_S)
         if not done:
             raise DeviceError(f"reconstruction: {reason}")
 
     def _made_client(self) -> InstrumentClient:
-        # Made for the first goal: until then its subscriptions would cost for nothing.
+        # Made for the first goal, because its subscriptions cost time.
         if self._client is None:
             self._client = InstrumentClient(self._node, *self._timeouts_s)
             if self._ending:
@@ -192,7 +187,7 @@ class Calibrator:
 
 
 class _Feedback:
-    """What a capture shows while it lasts, looked for in copies of its frame."""
+    """The targets found in copies of a capture's frame while the capture lasts."""
 
     def __init__(
         self, goal: Any, request: CaptureRequest, capture: Capture, in_worker: InWorker
@@ -201,48 +196,48 @@ class _Feedback:
         self._request = request
         self._capture = capture
         self._in_worker = in_worker
-        self._begun_s = self._sent_s = self._looked_s = time.monotonic()
+        self._begun_s = self._sent_s = self._searched_s = time.monotonic()
         self._message = Calibrate.Feedback()
-        # Beside the sequence, whose thread keeps the laser's heartbeat.
-        self._looking = threading.Thread(target=self._look, daemon=True)
+        # In another thread than the sequence, which keeps up the laser's heartbeat.
+        self._search = threading.Thread(target=self._find, daemon=True)
 
     def send(self, phase: str) -> None:
-        """Publish the state when it is due, after a new look when that is due."""
+        """Publish the state when it is due; start a new search when that is due."""
         now_s = time.monotonic()
         if phase == self._message.phase and now_s - self._sent_s < _FEEDBACK_S:
             return
         message = self._message
         if phase == "capturing" != message.phase:
-            self._begun_s = self._looked_s = now_s
+            self._begun_s = self._searched_s = now_s
         self._sent_s = now_s
         message.phase = phase
         if phase == "capturing":
             share = (now_s - self._begun_s) / self._expected_s()
             message.progress = min(max(share, 0.0), 1.0)
-            if now_s - self._looked_s >= _LOOK_S and not self._looking.is_alive():
-                self._looked_s = now_s
-                self._looking = threading.Thread(target=self._look, daemon=True)
-                self._looking.start()
+            if now_s - self._searched_s >= _SEARCH_S and not self._search.is_alive():
+                self._searched_s = now_s
+                self._search = threading.Thread(target=self._find, daemon=True)
+                self._search.start()
         elif phase in ("finishing", "fitting"):
             message.progress = 1.0
         self._goal.publish_feedback(message)
 
-    def _look(self) -> None:
+    def _find(self) -> None:
         copies: list[AggregateFrame] = []
-        self._in_worker(lambda: copies.append(copy.deepcopy(self._capture.frame)), _LOOK_TIMEOUT_S)
+        self._in_worker(lambda: copies.append(copy.deepcopy(self._capture.frame)), _COPY_TIMEOUT_S)
         if not copies:
             return
         try:
             findings = self._capture.find(copies[0])
         except EschortyError:
-            # A picture that is not complete yet may be ambiguous.
+            # An incomplete frame may be ambiguous.
             findings = Findings()
         self._note(findings, copies[0].events)
 
     def show(self, findings: Findings, events: int) -> None:
-        """Publish what the whole capture shows."""
-        if self._looking.is_alive():
-            self._looking.join(_LOOK_JOIN_S)
+        """Publish the targets found in the complete capture."""
+        if self._search.is_alive():
+            self._search.join(_SEARCH_JOIN_S)
         self._note(findings, events)
         self._goal.publish_feedback(self._message)
 

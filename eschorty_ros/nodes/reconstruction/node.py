@@ -43,13 +43,13 @@ _STAGE_DEPTH = 2000
 
 
 class ReconstructionNode(Node):
-    """Callbacks queue; one worker thread computes and publishes.
+    """Callbacks queue jobs; one worker thread computes and publishes.
 
-    Parameters are those of ``core.reconstruction.Settings`` and of ``TABLE``.
+    Its parameters are those of ``core.reconstruction.Settings`` and of ``TABLE``.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        # Before anything can fail: a half-built node is destroyed, too.
+        # First, because a node whose constructor fails is destroyed, too.
         self._closing = threading.Event()
         self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
         super().__init__("reconstruction", **kwargs)
@@ -114,7 +114,7 @@ class ReconstructionNode(Node):
             self._pipeline,
             (packets, odometry),
             self._in_worker,
-            self._lives,
+            self._alive,
             self.parameters["stage_timeout"],
             self._outputs.scan,
         )
@@ -128,7 +128,7 @@ class ReconstructionNode(Node):
         self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
 
     def safe_state(self) -> None:
-        """End a calibration under way: its way out switches the laser off."""
+        """End a calibration under way: on its way out the laser goes off."""
         self._calibrator.safe_state()
 
     def destroy_node(self) -> None:
@@ -148,7 +148,7 @@ class ReconstructionNode(Node):
             )
             return
         packet = Packet(message.seq, ns_from_stamp(message.header.stamp), message.events)
-        self._jobs.post_bulk(partial(self._take_packet, packet))
+        self._jobs.post_bulk(partial(self._add_packet, packet))
 
     def _on_clock(self, message: TimeReference) -> None:
         zero_ns = ns_from_stamp(message.header.stamp) - ns_from_stamp(message.time_ref)
@@ -181,11 +181,11 @@ class ReconstructionNode(Node):
             self._tf.publish(TFMessage(transforms=[carriage]))
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
-        """Run ``job`` after everything queued before it; whether it succeeded, and why not."""
-        return self._jobs.run(job, timeout_s, self._lives)
+        """Run ``job`` after the queued ones; return whether it succeeded, and why not."""
+        return self._jobs.run(job, timeout_s, self._alive)
 
-    def _lives(self) -> bool:
-        """Whether the worker works; after a signal it does not, and an exit must not wait."""
+    def _alive(self) -> bool:
+        """Return whether the worker runs: not after a signal, when the exit must not wait."""
         return not self._closing.is_set() and self.context.ok()
 
     def _use_calibration(self, calibration: Calibration) -> None:
@@ -208,13 +208,13 @@ class ReconstructionNode(Node):
                     job()
                 self._step()
             except Exception:
-                # The context is invalid after a signal; a failure then is no news.
-                if not self._lives():
+                # After a signal the context is invalid.
+                if not self._alive():
                     return
                 self._reports.faults += 1
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
 
-    def _take_packet(self, packet: Packet) -> None:
+    def _add_packet(self, packet: Packet) -> None:
         self._outputs.packet(packet.data)
         stream = self._pipeline.stream
         if stream.epoch is None:

@@ -1,4 +1,4 @@
-"""What the reconstruction publishes while data flow: profile, points, event frame."""
+"""The clouds and the event image that the reconstruction publishes."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _FRAME_INTERVAL_S = 0.1
 
 
 class Outputs:
-    """Publishers of the reconstruction node; nothing is built that nobody subscribes to.
+    """Publishers of the reconstruction node; messages without a subscriber are not built.
 
-    Every method but the constructor is called by the worker thread only.
+    Only the worker thread calls the methods, except the constructor.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Outputs:
         self._model = calibration.model()
 
     def packet(self, data: Any) -> None:
-        """Let the picture see a packet, while somebody looks at it."""
+        """Add a packet to the event image if it has a subscriber."""
         if self._image.get_subscription_count() == 0:
             self._frame = None
             return
@@ -69,14 +69,14 @@ class Outputs:
         self._frame.push(data)
 
     def event_frame(self, stamp_ns: int) -> None:
-        """Publish the picture when it is due."""
+        """Publish the event image when it is due."""
         now_s = time.monotonic()
         if self._frame is not None and now_s - self._frame_at_s >= _FRAME_INTERVAL_S:
             self._frame_at_s = now_s
             self._image.publish(image_message(self._frame.render(), stamp_ns, OPTICAL))
 
     def profiles(self, fresh: list[TimedProfiles]) -> None:
-        """Publish each profile, or as many as the greatest rate allows."""
+        """Publish each profile, or as many as the maximum rate allows."""
         if self._profile.get_subscription_count() == 0:
             return
         for timed in fresh:

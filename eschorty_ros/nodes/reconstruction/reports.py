@@ -1,4 +1,4 @@
-"""What the reconstruction tells about itself: state, diagnostics, the answer to ``end_scan``."""
+"""The reconstruction's state and diagnostics."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from rclpy.node import Node
 
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_stream import clock_statistics
-from eschorty_ros.live.pipeline import Pipeline, ScanReport
+from eschorty_ros.live.pipeline import Pipeline
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.nodes.ros import diagnostics
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 
 class Reports:
-    """Reads a pipeline that another thread drives; numbers of one report may be a moment apart.
+    """Reads a pipeline that another thread runs: the numbers of one report need not be of one time.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Reports:
         self._state.publish(state)
 
     def diagnose(self) -> diagnostics.Report:
-        """Level, line and values for ``/diagnostics``."""
+        """Return level, line and values for ``/diagnostics``."""
         stream, placer = self._pipeline.stream, self._pipeline.placer
         counters = stream.counters
         values: dict[str, Any] = {
@@ -85,14 +85,3 @@ class Reports:
         if stream.packets_lost or placer.points_without_stage:
             return diagnostics.WARN, "packets or points were lost", values
         return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
-
-
-def fill_end_scan(response: Any, report: ScanReport) -> None:
-    """Put a scan's figures, and what was lost, into an ``EndScan`` response."""
-    response.profiles = report.scan.profiles
-    response.points = len(report.scan.points)
-    response.events = report.events
-    response.packets_lost = report.packets_lost
-    response.events_dropped = report.events_dropped
-    response.sigma_median = report.scan.sigma_median_m
-    response.message = report.message

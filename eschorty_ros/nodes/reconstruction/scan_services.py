@@ -14,7 +14,6 @@ from rclpy.subscription import Subscription
 
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
-from eschorty_ros.nodes.reconstruction.reports import fill_end_scan
 from eschorty_ros.nodes.ros.conversions import mm_from_m
 from eschorty_ros.srv import BeginScan, EndScan
 
@@ -23,23 +22,23 @@ _ASSEMBLE_S = 30.0
 
 
 class ScanServices:
-    """Has the worker begin and end scans; waits for it in a callback group of its own.
+    """Services that begin and end scans in the worker thread and wait for it.
 
     Parameters
     ----------
     node : rclpy.node.Node
     pipeline : Pipeline
-        Touched by the worker alone.
+        Used by the worker alone.
     sources : sequence of Subscription
-        What a scan cannot do without a publisher of.
+        Subscriptions that a scan needs publishers of.
     in_worker : callable
-        Runs a job in the worker; whether it succeeded, and why not.
-    lives : callable
-        Whether the worker works.
+        Runs a job in the worker; returns whether it succeeded, and why not.
+    alive : callable
+        Returns whether the worker runs.
     stage_timeout_s : float
-        For how long points may wait for the stage after the end.
+        Longest wait of points for the stage after the end.
     publish : callable
-        Takes a finished scan and the ROS time, ns.
+        Publishes a finished scan, given the ROS time (ns) for one without points.
     """
 
     def __init__(
@@ -48,15 +47,15 @@ class ScanServices:
         pipeline: Pipeline,
         sources: Sequence[Subscription],
         in_worker: Callable[[Callable[[], None]], tuple[bool, str]],
-        lives: Callable[[], bool],
+        alive: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
     ) -> None:
         self._node, self._pipeline, self._sources = node, pipeline, sources
-        self._in_worker, self._lives = in_worker, lives
-        self._patience_s = stage_timeout_s + _ASSEMBLE_S
+        self._in_worker, self._alive = in_worker, alive
+        self._timeout_s = stage_timeout_s + _ASSEMBLE_S
         self._publish = publish
-        self._ending: tuple[Callable[[ScanReport], None], ...] = ()
+        self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
@@ -66,26 +65,25 @@ class ScanServices:
             node.create_service(kind, name, callback, callback_group=group)
 
     def finish(self) -> None:
-        """Publish the scan that was ended once all its points have their place; in the worker."""
-        # Background makes profiles after the light is off, too; nobody waits for those.
-        if self._ending and not self._pipeline.placer.holds(self._ended_s):
-            callbacks, self._ending = self._ending, ()
+        """Publish an ended scan once all its points have their place; called in the worker."""
+        # Profiles that arrive later come from the background, without light.
+        if self._ended is not None and not self._pipeline.placer.holds(self._ended_s):
+            ended, self._ended = self._ended, None
             report = self._pipeline.end_scan()
             self._publish(report.scan, self._node.get_clock().now().nanoseconds)
-            for callback in callbacks:
-                callback(report)
+            ended(report)
 
     def _on_begin(self, request: Any, response: Any) -> Any:
-        # A publisher may know this node's subscriptions before they know the publisher; whoever
-        # begins a scan must be able to rely on every message sent from then on.
+        # A publisher may discover this node's subscriptions before they discover the publisher.
+        # After the answer every message sent must arrive.
         missing = self._unconnected()
         deadline_s = time.monotonic() + _CONNECT_S
-        while missing and time.monotonic() < deadline_s and self._lives():
+        while missing and time.monotonic() < deadline_s and self._alive():
             time.sleep(0.02)
             missing = self._unconnected()
         if missing:
             response.success = False
-            response.message = f"nobody publishes {' and '.join(missing)}; start camera and stage"
+            response.message = f"no publisher of {' and '.join(missing)}; start camera and stage"
             return response
         begin = partial(
             self._pipeline.begin_scan,
@@ -110,7 +108,7 @@ class ScanServices:
         def begin_end() -> None:
             self._ended_s = time.monotonic()
             self._pipeline.close_period(request.scan_id, self._ended_s)
-            self._ending = (done,)
+            self._ended = done
 
         response.success, response.message = self._in_worker(begin_end)
         if not response.success:
@@ -119,13 +117,20 @@ class ScanServices:
             response.success = False
             response.message = "the scan was not assembled in time; see the node's log"
             return response
-        fill_end_scan(response, reports[0])
+        report = reports[0]
+        response.profiles = report.scan.profiles
+        response.points = len(report.scan.points)
+        response.events = report.events
+        response.packets_lost = report.packets_lost
+        response.events_dropped = report.events_dropped
+        response.sigma_median = report.scan.sigma_median_m
+        response.message = report.message
         return response
 
     def _awaited(self, event: threading.Event) -> bool:
-        """Wait for the worker's event; after a signal nobody works any more."""
-        end_s = time.monotonic() + self._patience_s
+        """Wait for the worker's event; after a signal it may not come."""
+        end_s = time.monotonic() + self._timeout_s
         while not event.wait(0.1):
-            if time.monotonic() > end_s or not self._lives():
+            if time.monotonic() > end_s or not self._alive():
                 return event.is_set()
         return True

@@ -1,4 +1,4 @@
-"""Node ``replay``: a recording into the topics the camera, laser and stage would publish."""
+"""Node ``replay``: publishes a recording on the topics of camera, laser and stage."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ _RESEND_S = 2.0
 
 
 class ReplayNode(Node):
-    """Plays once, has the reconstruction assemble it on ``scan/points``, and ends the process.
+    """Publishes a recording once as one scan of the reconstruction, and ends the process.
 
-    Times are the recording's, laid onto ROS time from now on without stretching, whatever the
-    rate. Playing stays a bounded way ahead of the reconstruction, so that nothing is lost to a
-    reliable subscription.
+    The stamps are the recording's times, shifted to begin at the present ROS time; the rate does
+    not change them. The node stays at most a bounded number of messages ahead of the
+    reconstruction, so that a reliable subscription loses nothing.
     """
 
     def __init__(self, **kwargs: Any) -> None:
-        # Before anything can fail: a half-built node is destroyed, too.
+        # First, because a node whose constructor fails is destroyed, too.
         self._closing = threading.Event()
         self._player = threading.Thread(target=self._run, name="replay", daemon=True)
         super().__init__("replay", **kwargs)
@@ -87,7 +87,7 @@ class ReplayNode(Node):
         self._player.start()
 
     def destroy_node(self) -> None:
-        """End the player, then the node."""
+        """Stop the player, then the node."""
         self._closing.set()
         if self._player.is_alive():
             self._player.join(timeout=5.0)
@@ -156,7 +156,7 @@ class ReplayNode(Node):
                 and self._begin.service_is_ready()
                 and self._end.service_is_ready()
             ),
-            "no reconstruction listens",
+            "no reconstruction subscribes",
         )
         for end in self.get_subscriptions_info_by_topic(self._events.topic_name):
             if end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
@@ -184,7 +184,7 @@ class ReplayNode(Node):
         self._laser.publish(state)
 
     def _publish_stream(self) -> int:
-        """Publish all packets and the stage rows up to each; the last sensor time (us)."""
+        """Publish all packets and the stage rows up to each; return the last sensor time (us)."""
         rate = self.parameters["rate"]
         rows_us = self._recording.stage_samples["t_us"]
         pending: list[int] = []
@@ -238,7 +238,7 @@ class ReplayNode(Node):
 
     def _await_processed(self, t_us: int) -> None:
         self._advanced_s = time.monotonic()
-        self._wait(lambda: self._until_ns >= self._ns(t_us), "the reconstruction stands still")
+        self._wait(lambda: self._until_ns >= self._ns(t_us), "the reconstruction makes no progress")
 
     def _ns(self, t_us: int) -> int:
         return self._zero_ns + t_us * NS_PER_US
@@ -252,7 +252,7 @@ class ReplayNode(Node):
                 raise DeviceError(f"{fault} for {timeout_s:g} s; check that it runs")
 
     def _call(self, client: Any, request: Any, *, again: bool = False) -> Any:
-        """Answer of a service, asked ``again`` and again where that does no harm.
+        """Return a service's answer; with ``again`` the request is repeated.
 
         A server that has just discovered this node may not know yet where to send its answer.
         """

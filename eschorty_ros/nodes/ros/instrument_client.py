@@ -104,11 +104,11 @@ class InstrumentClient(PacedWaiting):
             self.wait(there, self._node_timeout_s, failure)
 
     def missing(self) -> str:
-        """Name what is not there yet, one thing of each node; empty when a sequence can begin."""
+        """Return what is missing, one item of each node; ``""`` when a sequence can begin."""
         absent = [failure for there, failure in self._needed(0) if not there()]
         named = {text.split(":")[0]: text for text in reversed(absent) if isinstance(text, str)}
         if absent and not named:
-            # Whatever is missing keeps events from being reconstructed, so it comes first.
+            # Only the events are missing, for a reason that the monitor finds.
             return self.monitor.why_no_progress()
         return "; ".join(reversed(named.values()))
 
@@ -288,7 +288,7 @@ class ScanClient(InstrumentClient):
         """See ``ScanInstrument``; a scan that is still open is ended and published first."""
         state = self.monitor.reconstruction
         if state is not None and state.scan_id:
-            self._node.get_logger().warning(f"ending {state.scan_id}, which nobody ended")
+            self._node.get_logger().warning(f"ending {state.scan_id}, which was left open")
             self.end_scan(state.scan_id)
         begin = BeginScan.Request(
             scan_id=request.scan_id,

@@ -57,12 +57,12 @@ TABLE = (
 )  # fmt: skip
 
 _FEEDBACK_S = 0.1
-# So long the other nodes may take to come up before anybody is told.
+# Time for the other nodes to start before a missing one is logged.
 _STARTING_S = 5.0
 
 
 class ScannerNode(Node):
-    """One scan at a time.
+    """Runs one scan at a time.
 
     A goal that cannot be done is accepted and aborted at once, because only a result can carry
     the reason to the client.
@@ -111,7 +111,7 @@ class ScannerNode(Node):
             )
 
     def safe_state(self) -> None:
-        """End a scan under way: its way out switches the laser off, and its heartbeat stops."""
+        """End a scan under way: on its way out the laser goes off and its heartbeat stops."""
         self._client.end()
         self._idle.wait(2.0)
 

@@ -156,12 +156,12 @@ def test_diagnostics_name_the_counters(live):
 
 def test_scan_services_refuse_with_a_reason(live):
     observer = live[0]
-    # The replay has ended, so nobody feeds the node.
+    # The replay, which publishes the events, has ended.
     begin = observer.call(
         BeginScan, "reconstruction/begin_scan", BeginScan.Request(scan_id="x", stop=1.0)
     )
     assert not begin.success
-    assert "nobody publishes" in begin.message
+    assert "no publisher of" in begin.message
     end = observer.call(EndScan, "reconstruction/end_scan", EndScan.Request(scan_id="x"))
     assert not end.success
     assert "'x' is not being collected" in end.message
