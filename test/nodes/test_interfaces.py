@@ -1,4 +1,4 @@
-"""docs/interfaces.md has every topic, service, action and parameter as the nodes have them."""
+"""docs/interfaces.md describes every topic, service, action and parameter of the nodes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def page() -> str:
     return tables.PAGE.read_text(encoding="utf-8")
 
 
-def test_the_page_has_the_topics_as_they_are(nodes, page):
+def test_the_page_has_the_topics(nodes, page):
     assert tables.topic_table(nodes) in page, "run: make reference"
 
 
@@ -38,19 +38,19 @@ def test_the_page_has_every_parameter_with_default_and_range(page):
     assert tables.parameter_tables() in page, "run: make reference"
 
 
-def test_every_name_is_explained_and_no_other(nodes):
+def test_the_described_names_are_those_of_the_nodes(nodes):
     assert set(tables.topics(nodes)) == set(tables.TOPICS)
     assert set(tables.services(nodes)) == set(tables.SERVICES)
 
 
 def test_the_parameter_tables_are_what_the_nodes_declare(nodes):
     for node in nodes:
-        told = {param.name for param in tables.PARAMETERS[node.get_name()]}
+        described = {param.name for param in tables.PARAMETERS[node.get_name()]}
         declared = {name for name in node._parameters if not name.startswith("qos_overrides.")}
-        assert declared - {"use_sim_time", "start_type_description_service"} == told
+        assert declared - {"use_sim_time", "start_type_description_service"} == described
 
 
 def test_the_readme_names_every_topic_of_the_instrument(nodes):
     text = README.read_text(encoding="utf-8")
-    told_elsewhere = {"camera/clock"}
-    assert [name for name in set(tables.topics(nodes)) - told_elsewhere if name not in text] == []
+    elsewhere = {"camera/clock"}
+    assert [name for name in set(tables.topics(nodes)) - elsewhere if name not in text] == []

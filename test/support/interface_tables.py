@@ -20,41 +20,30 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from eschorty_ros.core.reconstruction import Settings
-from eschorty_ros.nodes.camera import node as camera
-from eschorty_ros.nodes.laser import node as laser
-from eschorty_ros.nodes.reconstruction import node as reconstruction
-from eschorty_ros.nodes.reconstruction import parameters as reconstruction_parameters
+from eschorty_ros.nodes.one_process.composition import NODES
+from eschorty_ros.nodes.one_process.hardware_file import TABLES
 from eschorty_ros.nodes.replay import node as replay
 from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.lifecycle import AUTO_START
-from eschorty_ros.nodes.ros.parameters import Param, from_settings
-from eschorty_ros.nodes.scanner import node as scanner
-from eschorty_ros.nodes.stage import node as stage
+from eschorty_ros.nodes.ros.parameters import Param
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
 NAMESPACE = "/eschorty"
 
 PARAMETERS = {
-    "camera": (AUTO_START, *camera.TABLE),
-    "laser": (AUTO_START, *laser.TABLE),
-    "stage": (AUTO_START, *stage.TABLE),
-    "reconstruction": (
-        *reconstruction_parameters.TABLE,
-        *from_settings(Settings, dynamic=True),
-    ),
-    "scanner": scanner.TABLE,
+    **{name: (AUTO_START, *table) if name in REAL else table for name, table in TABLES.items()},
     "replay": replay.TABLE,
 }
 TOPICS = {
-    "camera/events": "raw EVT3; stamp: arrival of the first byte; `seq` without holes",
-    "camera/clock": "ROS time (`header.stamp`) of a sensor time (`time_ref`); nobody has to tell",
+    "camera/events": "raw EVT3; stamp: arrival of the first byte; `seq` without gaps",
+    "camera/clock": "ROS time (`header.stamp`) of a sensor time (`time_ref`); optional",
     "camera/heartbeat": "10 Hz while events can come",
-    "laser/state": "requested and read-back output, modulation, and why",
+    "laser/state": "requested and read-back output, modulation, and the reason",
     "laser/heartbeat": "10 Hz while the sender wants light; the reconstruction when it calibrates",
-    "laser/interlock": "true: open, dark",
+    "laser/interlock": "true: open, laser off",
     "stage/odom": "position along the stage in `pose.pose.position.y`, speed in `twist`",
-    "stage/trigger": "where the stage gives pulses to the camera",
+    "stage/trigger": "positions of the stage's pulses to the camera",
     "stage/heartbeat": "10 Hz while the stage is active",
     "profile": "one period in `eschorty_link`; `profile_rate_max` at most",
     "points": "batches in `eschorty_base`, 20 Hz at most",
@@ -63,7 +52,7 @@ TOPICS = {
     "reconstruction/state": "progress and losses, 10 Hz",
     "reconstruction/calibration": "the calibration in use",
     "/diagnostics": "health of each node, 1 Hz",
-    "/tf": "carriage in the base, as `stage/odom` tells",
+    "/tf": "carriage in the base, from `stage/odom`",
     "/tf_static": "carriage to link to optical frame",
 }
 SERVICES = {
@@ -72,7 +61,7 @@ SERVICES = {
     "laser/arm": "allows `laser/enable` for `arm_timeout`",
     "laser/enable": "light on or off; refused with the reason",
     "reconstruction/begin_scan": "collect points for `scan/points`",
-    "reconstruction/end_scan": "publish them, and say what was lost",
+    "reconstruction/end_scan": "publish them, and report what was lost",
     "reconstruction/load_calibration": "use another calibration of the same instrument",
     "reconstruction/save_calibration": "write the one in use",
     "scan": "to start, laser on, sweep, laser off",
@@ -105,8 +94,7 @@ def every_node() -> Iterator[list[Node]]:
     rclpy.init(args=["--ros-args", *options, *given], domain_id=free_domain())
     nodes: list[Node] = []
     try:
-        nodes += [camera.CameraNode(), laser.LaserNode(), stage.StageNode()]
-        nodes += [reconstruction.ReconstructionNode(), scanner.ScannerNode()]
+        nodes += [make() for make in NODES.values()]
         # The replay's ends do not depend on what it plays.
         with (
             mock.patch.object(replay, "load_recording"),
@@ -147,7 +135,7 @@ def services(nodes: list[Node]) -> dict[str, tuple[str, str]]:
 
 
 def topic_table(nodes: list[Node]) -> str:
-    """Topics in the order of ``TOPICS``; one that is not told of there comes without words."""
+    """Topics in the order of ``TOPICS``; one that is missing there has no description."""
     lines = ["| topic | type | from | to | QoS | what |", "| --- | --- | --- | --- | --- | --- |"]
     found = topics(nodes)
     for name in sorted(found, key=lambda name: _rank(TOPICS, name)):
@@ -210,8 +198,8 @@ def _number(value: float) -> str:
     return f"{value:.10g}"
 
 
-def _rank(told: dict[str, str], name: str) -> tuple[int, str]:
-    return (list(told).index(name) if name in told else len(told), name)
+def _rank(described: dict[str, str], name: str) -> tuple[int, str]:
+    return (list(described).index(name) if name in described else len(described), name)
 
 
 def _names(nodes: Iterable[str]) -> str:

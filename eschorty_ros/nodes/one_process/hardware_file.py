@@ -24,7 +24,7 @@ TABLES = {
     "camera": camera.TABLE,
     "laser": laser.TABLE,
     "stage": stage.TABLE,
-    "reconstruction": (*reconstruction_parameters.TABLE, *from_settings(Settings)),
+    "reconstruction": (*reconstruction_parameters.TABLE, *from_settings(Settings, dynamic=True)),
     "scanner": scanner.TABLE,
 }
 

@@ -17,11 +17,11 @@ TABLE = (
     Param("duty", 0.5, "duty where frequency is given", "", 0.001, 0.999, dynamic=True),
     Param("waveform", "square", "waveform where frequency is given",
           choices=WAVEFORMS, dynamic=True),
-    Param("clock_timeout", 2.0, "wait for camera/clock, where somebody publishes it, before the "
-          "packets' stamps serve", "s", 0.0, 60.0),
+    Param("clock_timeout", 2.0, "longest wait for camera/clock if it has a publisher; then the "
+          "packets' stamps are used", "s", 0.0, 60.0),
     Param("packet_period", 1008e-6, "time over which the camera collects events before it sends "
           "them; metavision_driver's default is 0.004", "s", 0.0, 0.1),
-    Param("stage_gap", 0.5, "longest distance of two stage samples that is bridged; 0 bridges any",
+    Param("stage_gap", 0.5, "longest time between two stage samples that is bridged; 0 bridges any",
           "s", 0.0, 1e6, dynamic=True),
     # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.
     Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
@@ -43,7 +43,7 @@ TABLE = (
 
 
 def modulation_override(values: Mapping[str, Any]) -> Modulation | None:
-    """Modulation the parameters give instead of the laser node's, ``None`` when they do not."""
+    """Return the modulation in the parameters, ``None`` when the laser node's is to be used."""
     if not values["frequency"]:
         return None
     return Modulation(values["frequency"], values["duty"], values["waveform"])

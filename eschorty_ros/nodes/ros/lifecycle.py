@@ -14,7 +14,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 
-AUTO_START = Param("auto_start", True, "configure and activate without being asked")
+AUTO_START = Param("auto_start", True, "configure and activate at start")
 RETRY_S = 2.0
 
 
