@@ -1,4 +1,4 @@
-"""Where the stage was at a sensor time, and what ROS time that was."""
+"""The stage's position at a sensor time, and the ROS time of a sensor time."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ POSITION_LIMIT_MM = 1e9
 
 
 def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np.int64]:
-    """Positions rounded to the nanometre, int64.
+    """Return positions rounded to the nanometre, int64.
 
-    Positions that went through text with six decimals and through ROS metres give the same
-    integers, so a recording and the live nodes place points identically. ``name`` is what an
-    error calls them.
+    Positions read from text with six decimals and from ROS metres give the same integers, so a
+    recording and the live nodes place points identically. ``name`` stands in errors.
 
     Raises
     ------
@@ -72,7 +71,7 @@ class StageTrack:
         self._end = 0
 
     def __len__(self) -> int:
-        """Count the samples held."""
+        """Return the count of samples held."""
         return self._end - self._begin
 
     @property
@@ -114,7 +113,7 @@ class StageTrack:
         self._extend(at_us[later], positions[later])
 
     def position_mm(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Stage position at sensor times.
+        """Return the stage position at sensor times.
 
         Parameters
         ----------
@@ -174,7 +173,7 @@ class SensorClock:
 
     The estimate may step at an observation, never between two of them: times converted between
     two observations are strictly monotone. When arrival or sensor time goes back (clock set,
-    camera restarted) everything starts anew and ``restarts`` counts it.
+    camera restarted) the window is dropped.
 
     Parameters
     ----------
@@ -186,9 +185,9 @@ class SensorClock:
     Attributes
     ----------
     restarts : int
-        Times the window was thrown away.
+        Times the window was dropped.
     residual_ns : int or None
-        How much later than the clock says the last observed packet arrived.
+        How much later than by this clock the last observed packet arrived.
     """
 
     def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
@@ -212,22 +211,22 @@ class SensorClock:
 
     @property
     def line(self) -> ClockLine | None:
-        """The relation as known now, ``None`` while nothing is known."""
+        """The relation as known now, ``None`` before."""
         return self._fixed or self._adopted or self._envelope.line
 
     @property
     def arrival_line(self) -> ClockLine | None:
-        """The relation as the packets' arrivals alone show it."""
+        """The relation by the packets' arrivals alone."""
         return self._fixed or self._envelope.line
 
     @property
     def zero_ns(self) -> int | None:
-        """ROS time of sensor time 0, ns; ``None`` while nothing is known."""
+        """ROS time of sensor time 0, ns; ``None`` while the relation is unknown."""
         return None if self.line is None else self.line.to_ns(0)
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster ROS time passes than sensor time; 0 while nothing is known."""
+        """How much faster ROS time passes than sensor time; 0 while the relation is unknown."""
         return 0.0 if self.line is None else self.line.drift_ppb * 1e-3
 
     @property
@@ -236,13 +235,13 @@ class SensorClock:
         return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
 
     def goes_on(self, t_us: int, arrival_ns: int) -> bool:
-        """Whether neither time lies before the last observed."""
+        """Return whether neither time lies before the last observed."""
         t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])
 
     def observe(self, t_us: int, arrival_ns: int) -> None:
-        """Take note that the event of sensor time ``t_us`` arrived at ROS time ``arrival_ns``."""
+        """Add one arrival: the event of sensor time ``t_us`` came at ROS time ``arrival_ns``."""
         t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         if self._fixed is None:
@@ -255,10 +254,7 @@ class SensorClock:
         self.residual_ns = arrival_ns - self.to_ns(t_us)
 
     def adopt(self, line: ClockLine | None) -> None:
-        """Use ``line``, known from edges, until another comes; ``None`` goes back to arrivals.
-
-        An announced zero stays.
-        """
+        """Use ``line``, known from edges, unless a zero was announced; ``None`` for arrivals."""
         self._adopted = line
 
     @overload
@@ -266,7 +262,7 @@ class SensorClock:
     @overload
     def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
     def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
-        """ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
+        """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         return self._known().to_ns(t_us)
 
     @overload
@@ -274,7 +270,7 @@ class SensorClock:
     @overload
     def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
     def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
-        """Sensor time (us, nearest, halves up) of ROS time ``t_ns``; undoes :meth:`to_ns`."""
+        """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
         return self._known().to_us(t_ns)
 
     def _known(self) -> ClockLine:

@@ -15,8 +15,8 @@ NS_PER_US = 1_000
 DRIFT_MAX_PPB = 200_000
 T_US_LIMIT = TIME_LIMIT // NS_PER_US
 _PPB_TIMES_US = 1_000_000
-# The correction is at most 2e-4 of the time: each turn leaves as little of the error.
-_TURNS = 8
+# Each iteration leaves 2e-4 of the error, the largest drift.
+_ITERATIONS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class ClockLine:
     Parameters
     ----------
     origin_us, origin_ns : int
-        Sensor time (us) and ROS time (ns) of one moment.
+        Sensor time (us) and ROS time (ns) at one instant.
     drift_ppb : int
         How much more ROS time passes than sensor time, parts in 10^9; within 200 000.
 
@@ -53,10 +53,10 @@ class ClockLine:
     @overload
     def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
     def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
-        """ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
+        """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         if isinstance(t_us, np.ndarray):
             since = _within("t_us", t_us, T_US_LIMIT) - self.origin_us
-            # Half the range, as the correction comes on top of it.
+            # Half the range where the drift adds to it.
             return self._elapsed_ns(_within("t_us", since, self._reach_us)) + self.origin_ns
         since_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT) - self.origin_us
         return int(self._elapsed_ns(since_us)) + self.origin_ns
@@ -66,13 +66,13 @@ class ClockLine:
     @overload
     def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
     def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
-        """Sensor time (us, nearest, halves up) of ROS time ``t_ns``; undoes :meth:`to_ns`."""
+        """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
         if isinstance(t_ns, np.ndarray):
             return self._since_us(_within("t_ns", t_ns, TIME_LIMIT) - self.origin_ns)
         return int(self._since_us(whole("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT) - self.origin_ns))
 
     def shifted(self, by_ns: int) -> ClockLine:
-        """Return the same drift, ``by_ns`` later."""
+        """Return the line that lies ``by_ns`` later."""
         by_ns = whole("by_ns", by_ns, -2 * TIME_LIMIT, 2 * TIME_LIMIT)
         return ClockLine(self.origin_us, self.origin_ns + by_ns, self.drift_ppb)
 
@@ -86,20 +86,20 @@ class ClockLine:
         if not self.drift_ppb:
             return since_us * NS_PER_US
         # In two steps, as the product of both would leave 64 bits.
-        turns, rest = since_us // _PPB_TIMES_US, since_us % _PPB_TIMES_US
-        late = turns * self.drift_ppb + rest * self.drift_ppb // _PPB_TIMES_US
+        millions, rest = since_us // _PPB_TIMES_US, since_us % _PPB_TIMES_US
+        late = millions * self.drift_ppb + rest * self.drift_ppb // _PPB_TIMES_US
         return since_us * NS_PER_US + late
 
     def _since_us(self, since_ns: Any) -> Any:
         found = (since_ns + NS_PER_US // 2) // NS_PER_US
-        for _ in range(_TURNS if self.drift_ppb else 0):
+        for _ in range(_ITERATIONS if self.drift_ppb else 0):
             left = since_ns - self._elapsed_ns(found)
             found = found + (left + NS_PER_US // 2) // NS_PER_US
         return found + self.origin_us
 
 
 def _within(name: str, values: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
-    """Refuse times that would leave 64 bits when they are converted."""
+    """Return ``values`` as int64; refuse those that leave 64 bits when converted."""
     checked = times(name, values)
     wrong = (checked > limit) | (checked < -limit)
     if wrong.any():

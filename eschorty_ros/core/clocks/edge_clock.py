@@ -1,4 +1,4 @@
-"""The sensor's clock from a stage's trigger edges, while they come in."""
+"""The sensor's clock from a stage's trigger edges, as they come in."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _REFIT_US = 50_000
 
 
 class EdgeClock:
-    """Collects the edges of the last minute and fits them whenever new ones have a position.
+    """The edges of the last minute, fitted whenever the odometry covers new ones.
 
     Attributes
     ----------
     fit : EdgeFit or None
         The last fit that held.
     pulses : PulseTrain or None
-        Where the stage gives its pulses; without it no edge means anything.
+        The pulses the stage gives; without them no fit is made.
     edges_dropped : int
-        Edges beyond what is kept: the input sees something faster than a stage.
+        Edges beyond those kept: the input sees a source faster than a stage.
     """
 
     def __init__(self, pulses: PulseTrain | None = None) -> None:
@@ -39,7 +39,7 @@ class EdgeClock:
         self._fitted_us: int | None = None
 
     def __len__(self) -> int:
-        """Count the edges kept, both kinds."""
+        """Return the count of edges kept, of both kinds."""
         return self._t_us.size
 
     @property
@@ -67,14 +67,14 @@ class EdgeClock:
         self._polarity = np.concatenate([self._polarity, polarity])[begin:]
 
     def update(self, track: StageTrack, arrivals: ClockLine, *, now: bool = False) -> bool:
-        """Fit again when there is something new; whether ``fit`` has changed.
+        """Fit again when there are new edges; return whether ``fit`` has changed.
 
         Parameters
         ----------
         track : StageTrack
             Odometry over ROS time, us.
         arrivals : ClockLine
-            The clock as the packets' arrivals show it.
+            The clock by the packets' arrivals.
         now : bool
             Fit every new edge, not only after 50 ms of them.
         """

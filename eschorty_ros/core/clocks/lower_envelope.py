@@ -1,8 +1,8 @@
-"""A clock seen through one-sided delays: the line below all arrivals.
+"""A clock from arrivals with one-sided delays: the line below all of them.
 
-A packet can be late, for any reason and by any time, but never early. The relation of the clocks
-is therefore the line that lies below all points (sensor time, arrival) and touches those that came
-without delay: an edge of their lower convex hull (Moon, Skelly, Towsley: Estimation and removal of
+A packet may be late by any time, but never early. The relation of the clocks is therefore the line
+that lies below all points (sensor time, arrival) and touches those without delay: an edge of their
+lower convex hull (Moon, Skelly, Towsley: Estimation and removal of
 clock skew from network delay measurements, INFOCOM 1999).
 """
 
@@ -17,19 +17,19 @@ from eschorty_ros.core.base.arrays import TIME_LIMIT, whole
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, T_US_LIMIT, ClockLine
 
 _BINS = 600
-# Points further above the line say that the host was busy, nothing about the clocks.
+# Points further above the line are late because of the host and fix nothing.
 _PROMPT_NS = 5e6
-# A slope must explain as much as this span of it would; keeps short windows from inventing drift.
-_SPAN_DOUBTED_US = 1e6
+# A drift costs as much as it amounts to over this span, so that short windows have none.
+_DRIFT_COST_SPAN_US = 1e6
 
 
 class LowerEnvelope:
-    """Offset and drift from packets whose arrival is late by an unknown, never negative, time.
+    """Offset and drift from packets whose arrival is late by an unknown time of 0 or more.
 
-    Of each stretch of sensor time only the earliest arrival is kept. Among the hull's edges with a
-    drift within 200 ppm the one is taken that most points come near to: points further above than
-    5 ms all count the same, so a host that lags for seconds neither shifts nor tilts the line as
-    long as the window holds some packets that were in time.
+    Of each bin of sensor time only the earliest arrival is kept. Of the hull's edges with a drift
+    within 200 ppm the one nearest to most points is chosen: points more than 5 ms above all count
+    the same, so a host that lags for seconds neither shifts nor tilts the line as long as the
+    window holds some packets that were in time.
 
     Parameters
     ----------
@@ -47,13 +47,13 @@ class LowerEnvelope:
     def __init__(self, window_ns: int) -> None:
         self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
         self._bin_us = max(window_ns // (NS_PER_US * _BINS), 1)
-        # Each: number of its stretch, sensor time, arrival.
+        # Each: number of its bin, sensor time, arrival.
         self._points: deque[tuple[int, int, int]] = deque()
         self.line: ClockLine | None = None
         self.touched_us = 0
 
     def __len__(self) -> int:
-        """Count the points held."""
+        """Return the count of points held."""
         return len(self._points)
 
     def observe(self, t_us: int, arrival_ns: int) -> ClockLine:
@@ -61,18 +61,18 @@ class LowerEnvelope:
         t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         points = self._points
-        stretch = t_us // self._bin_us
-        if self.line is not None and points and points[-1][0] == stretch:
+        bin_ = t_us // self._bin_us
+        if self.line is not None and points and points[-1][0] == bin_:
             late_ns = arrival_ns - self.line.to_ns(t_us)
             if late_ns < points[-1][2] - self.line.to_ns(points[-1][1]):
-                points[-1] = (stretch, t_us, arrival_ns)
+                points[-1] = (bin_, t_us, arrival_ns)
             if late_ns <= 0:
                 self.line = self.line.shifted(late_ns)
                 self.touched_us = t_us
             if points[0][2] >= arrival_ns - self._window_ns:
                 return self.line
         else:
-            points.append((stretch, t_us, arrival_ns))
+            points.append((bin_, t_us, arrival_ns))
         while points[0][2] < arrival_ns - self._window_ns:
             points.popleft()
         self.line = self._fit()
@@ -91,7 +91,7 @@ class LowerEnvelope:
 
 
 def _drift_ppb(since_us: NDArray[np.float64], late_ns: NDArray[np.float64]) -> int:
-    """Drift of the hull's edge nearest to most points, within its bounds."""
+    """Return the drift of the hull's edge nearest to most points, within its bounds."""
     corners = _lower_hull(since_us, late_ns)
     slopes = np.diff(late_ns[corners]) / np.diff(since_us[corners])
     # ns per us is 10^-3.
@@ -99,13 +99,13 @@ def _drift_ppb(since_us: NDArray[np.float64], late_ns: NDArray[np.float64]) -> i
     ppb = ppb[np.abs(ppb) <= DRIFT_MAX_PPB]
     above = late_ns - ppb[:, None] * 1e-6 * since_us
     above -= above.min(axis=1, keepdims=True)
-    # Shared out like the rest: late points must not outvote the prompt ones.
-    doubt_ns = np.abs(ppb) * 1e-6 * _SPAN_DOUBTED_US * (above < _PROMPT_NS).mean(axis=1)
-    return int(ppb[np.argmin(np.minimum(above, _PROMPT_NS).mean(axis=1) + doubt_ns)])
+    # Weighed by the share of prompt points, as their distances are.
+    drift_cost_ns = np.abs(ppb) * 1e-6 * _DRIFT_COST_SPAN_US * (above < _PROMPT_NS).mean(axis=1)
+    return int(ppb[np.argmin(np.minimum(above, _PROMPT_NS).mean(axis=1) + drift_cost_ns)])
 
 
 def _lower_hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> list[int]:
-    """Find the corners of the lower convex hull; ``x`` must not fall."""
+    """Return the corners of the lower convex hull; ``x`` must not fall."""
     xs, ys = x.tolist(), y.tolist()
     hull: list[int] = []
     for k in range(len(xs)):

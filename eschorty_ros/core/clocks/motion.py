@@ -1,8 +1,4 @@
-"""Planned straight-line motion as pieces of constant acceleration.
-
-Two processes that hold the same plan compute the same position at the same time: the plan is
-exchanged instead of sampled positions.
-"""
+"""Planned straight-line motion as pieces of constant acceleration."""
 
 from __future__ import annotations
 
@@ -24,7 +20,7 @@ class MotionPlan:
     Parameters
     ----------
     start_ns : int
-        Time the plan begins, int64 nanoseconds of whatever clock the owner uses.
+        Time the plan begins, ns of any clock.
     position_mm, velocity_mm_s : float
         State at ``start_ns``.
     durations_s, accelerations_mm_s2 : tuple of float
@@ -64,7 +60,7 @@ class MotionPlan:
         return float(self.state(self.end_ns)[0])
 
     def state(self, t_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Position (mm) and velocity (mm/s) at integer times ``t_ns``, same shape as ``t_ns``.
+        """Return position (mm) and velocity (mm/s) at integer times ``t_ns``, in its shape.
 
         Before ``start_ns`` the state at ``start_ns``; from ``end_ns`` on exactly one position and
         velocity 0.
@@ -87,7 +83,7 @@ class MotionPlan:
         return position, velocity
 
     def passing_s(self, position_mm: ArrayLike) -> NDArray[np.float64]:
-        """Time after ``start_ns`` (s) at which each position is first reached.
+        """Return the time after ``start_ns`` (s) at which each position is first reached.
 
         Parameters
         ----------
@@ -96,7 +92,7 @@ class MotionPlan:
         Returns
         -------
         float64, shape (n,)
-            NaN where the motion does not come by.
+            NaN where it is never reached.
         """
         wanted = vector("position_mm", position_mm)
         passing = np.where(wanted == self.position_mm, 0.0, np.nan)
@@ -116,10 +112,10 @@ class MotionPlan:
 def _first_root(
     distance: NDArray[np.float64], velocity: float, acceleration: float, duration_s: float
 ) -> NDArray[np.float64]:
-    """Smallest time from 0 to ``duration_s`` after which ``distance`` is covered, else NaN."""
+    """Return the time from 0 to ``duration_s`` after which ``distance`` is covered, else NaN."""
     slack_s = 1e-9 * duration_s
     discriminant = velocity * velocity + 2.0 * acceleration * distance
-    # At the turning point rounding may leave less than nothing.
+    # At the turning point rounding may leave a negative number.
     rounding = 1e-12 * (velocity * velocity + np.abs(2.0 * acceleration * distance))
     root = np.sqrt(np.where(np.abs(discriminant) <= rounding, 0.0, discriminant))
     q = -0.5 * (velocity + math.copysign(1.0, velocity) * root)
@@ -136,7 +132,7 @@ def plan_move(
     speed_mm_s: float,
     acceleration_mm_s2: float,
 ) -> MotionPlan:
-    """Trapezoid from rest at ``position_mm`` to rest at ``target_mm``.
+    """Return the trapezoid from rest at ``position_mm`` to rest at ``target_mm``.
 
     Raises
     ------
@@ -151,7 +147,7 @@ def plan_move(
     sign = math.copysign(1.0, target_mm - position_mm)
     peak = min(speed_mm_s, math.sqrt(distance * acceleration_mm_s2))
     ramp_s = peak / acceleration_mm_s2
-    # Where the ramps meet, rounding may leave a cruise of less than nothing.
+    # Where the ramps meet, rounding may leave a negative cruise.
     cruise_s = max(distance / peak - ramp_s, 0.0) if peak > 0.0 else 0.0
     return MotionPlan(
         start_ns,
@@ -163,7 +159,7 @@ def plan_move(
 
 
 def plan_stop(plan: MotionPlan, at_ns: int, deceleration_mm_s2: float) -> MotionPlan:
-    """Profiled stop of ``plan`` begun at ``at_ns``.
+    """Return the profiled stop of ``plan`` from ``at_ns`` on.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Offset and drift of the sensor's clock from pulses a stage gives at known positions.
 
-Pulse ``n`` begins as the carriage passes ``first + n interval``. The odometry says when that was in
-ROS time, the camera's trigger input when it was in sensor time. Which pulse an edge is follows from
-the approximate clock and, where that is not good to a pulse, from the ramps: there the pulses are
+Pulse ``n`` begins as the carriage passes ``first + n interval``. The odometry gives the ROS time of
+that, the camera's trigger input the sensor time. Which pulse an edge belongs to follows from the
+approximate clock and, where that is not good to a pulse, from the ramps: there the pulses are
 further apart in time, and only the right shift lays all edges onto the pulses.
 """
 
@@ -19,37 +19,36 @@ from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockL
 from eschorty_ros.core.clocks.pulses import PulseTrain
 
 EDGES_MIN = 8
-# KBD101 looks at its position every 102 us: an edge comes later than the position by a time evenly
-# spread from 0 to that, so by half of it on average.
+# A KBD101 samples its position every 102 us, so an edge is late by half of that on average.
 SAMPLING_US = 102
 _SPEED_MIN_MM_S = 5.0
-# On ramps the odometry's straight lines cut the corners, and edges tell less anyway.
+# On ramps the odometry's straight lines cut the corners.
 _STEADY_US = 20_000
 _STEADY_SHARE = 0.1
 _SHARE_MIN = 0.6
 _SHARE_GOOD = 0.97
-# Where the edges are looked for, as the time by which packets' arrivals show them late: first near,
-# then as late as a slow host may be.
+# Lateness of the packets' arrivals over which the edges are searched: first of a usual host, then
+# of a slow one.
 _NEAR_MS = (-10.0, 30.0)
 _FAR_MS = (-10.0, 5_000.0)
 _STEP_MS = 1.0
 _EDGES_SEARCHED = 100
 _SEARCHED_AT_ONCE = 1 << 18
 _CANDIDATES = 12
-# Where no ramp tells pulses apart the packets' arrivals decide: a millisecond of lateness costs
-# this share of the interval. Far away they have no say.
-_DOUBT_PER_MS = 2e-4
-_DOUBT_FAR_PER_MS = 1e-7
-# Edges this near to a pulse (share of the interval) are its own, if not good enough for the fit.
-_OWN = 0.1
+# Cost of a millisecond of lateness, as a share of the interval: it decides where no ramp
+# distinguishes the pulses.
+_NEAR_COST_PER_MS = 2e-4
+_FAR_COST_PER_MS = 1e-7
+# Edges this near to a pulse (share of the interval) belong to it, even if the fit leaves them out.
+_BELONGS = 0.1
 _DRIFT_SIGMA = 20e-6
 _NOISE_MM = 0.01
-_TURNS = 6
+_ITERATIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeFit:
-    """What the edges say.
+    """Relation of the clocks by the edges.
 
     Attributes
     ----------
@@ -75,7 +74,7 @@ class EdgeFit:
 def fit_edges(
     t_us: NDArray[np.int64], track: StageTrack, pulses: PulseTrain, arrivals: ClockLine
 ) -> EdgeFit | None:
-    """Clock that lays the edges onto the pulses.
+    """Return the clock that lays the edges onto the pulses.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ def fit_edges(
         Odometry over ROS time, us.
     pulses : PulseTrain
     arrivals : ClockLine
-        The clock as the packets' arrivals show it; late rather than early.
+        The clock by the packets' arrivals; late rather than early.
 
     Returns
     -------
@@ -97,10 +96,10 @@ def fit_edges(
     if t_us.size < EDGES_MIN or pulses.count == 0:
         return None
     match = _Match(t_us, track, pulses, arrivals)
-    near = match.best(_NEAR_MS, _DOUBT_PER_MS)
+    near = match.best(_NEAR_MS, _NEAR_COST_PER_MS)
     if near is not None and near.used >= _SHARE_GOOD * (near.used + near.spurious):
         return near
-    far = match.best(_FAR_MS, _DOUBT_FAR_PER_MS)
+    far = match.best(_FAR_MS, _FAR_COST_PER_MS)
     return near if far is None or (near is not None and near.used >= far.used) else far
 
 
@@ -116,19 +115,19 @@ class _Match:
         self._track = track
         self._pulses = pulses
         self._arrivals = arrivals
-        # A position as it was when the controller looked, on average.
+        # When the controller sampled the position, on average.
         self._all_us = arrivals.to_ns(t_us) // NS_PER_US - SAMPLING_US // 2
         self._t_us = t_us
         stride = -(-t_us.size // _EDGES_SEARCHED)
         self._some_us = self._all_us[::stride] if stride > 1 else self._all_us
 
-    def best(self, span_ms: tuple[float, float], doubt_per_ms: float) -> EdgeFit | None:
-        """Fit about the best shift within a span."""
-        late_ms = self._search(span_ms, doubt_per_ms)
+    def best(self, span_ms: tuple[float, float], cost_per_ms: float) -> EdgeFit | None:
+        """Return the fit about the best shift within a span."""
+        late_ms = self._search(span_ms, cost_per_ms)
         return None if late_ms is None else self._fit(late_ms)
 
-    def _search(self, span_ms: tuple[float, float], doubt_per_ms: float) -> float | None:
-        """Shift with which most edges lie on pulses, ``None`` when no edge has a position."""
+    def _search(self, span_ms: tuple[float, float], cost_per_ms: float) -> float | None:
+        """Return the shift that lays most edges on pulses; ``None`` if no edge has a position."""
         late_ms = np.arange(span_ms[0], span_ms[1], self._step_ms())
         rows = max(_SEARCHED_AT_ONCE // self._some_us.size, 1)
         cost = np.concatenate(
@@ -143,8 +142,8 @@ class _Match:
             return None
         best = valleys[np.argsort(cost[valleys], kind="stable")[:_CANDIDATES]]
         fine_ms = [self._refined(float(late_ms[k])) for k in best]
-        worth = self._off(np.array(fine_ms)).mean(axis=1) + doubt_per_ms * np.abs(fine_ms)
-        return fine_ms[int(np.argmin(worth))]
+        fine_cost = self._off(np.array(fine_ms)).mean(axis=1) + cost_per_ms * np.abs(fine_ms)
+        return fine_ms[int(np.argmin(fine_cost))]
 
     def _refined(self, late_ms: float) -> float:
         for _ in range(3):
@@ -157,7 +156,7 @@ class _Match:
         return late_ms
 
     def _off(self, late_ms: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance from the pulses (share of the interval, at most 0.25) by shift and edge."""
+        """Return distances from pulses (share of the interval, up to 0.25) by shift and edge."""
         at = self._some_us[None, :] - np.rint(late_ms * 1e3).astype(np.int64)[:, None]
         off = np.abs(self._pulses.offset_mm(self._track.position_mm(at))) / self._pulses.interval_mm
         return np.where(off < 0.25, off, 0.25)
@@ -168,14 +167,14 @@ class _Match:
         return min(_STEP_MS, 0.15e3 * self._pulses.interval_mm / fastest)
 
     def _state(self, at_us: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance from the pulses (mm) and speed (mm/s) at ROS times."""
+        """Return the distance from the pulses (mm) and the speed (mm/s) at ROS times."""
         position = self._track.position_mm(at_us)
         ahead = self._track.position_mm(at_us + 1000)
         behind = self._track.position_mm(at_us - 1000)
         return self._pulses.offset_mm(position), (ahead - behind) / 2e-3
 
     def _steady(self, at_us: NDArray[np.int64], speed: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell where the speed hardly changes."""
+        """Return where the speed hardly changes."""
         position = self._track.position_mm(at_us)
         ahead = self._track.position_mm(at_us + _STEADY_US) - position
         behind = position - self._track.position_mm(at_us - _STEADY_US)
@@ -183,12 +182,12 @@ class _Match:
         return change < np.maximum(_STEADY_SHARE * np.abs(speed), _SPEED_MIN_MM_S)
 
     def _fit(self, late_ms: float) -> EdgeFit | None:
-        """Refine offset and drift by least squares over the edges that fit."""
+        """Return offset and drift by least squares over the edges that fit."""
         late_ns, slope = late_ms * 1e6, 0.0
         middle_us = int(self._t_us[self._t_us.size // 2])
         since_s: NDArray[np.float64] = (self._t_us - middle_us) / 1e6
         limit_mm, noise_mm = 0.25 * self._pulses.interval_mm, _NOISE_MM
-        for _ in range(_TURNS):
+        for _ in range(_ITERATIONS):
             late_us = np.rint((late_ns + slope * since_s * 1e9) * 1e-3).astype(np.int64)
             offset_mm, speed = self._state(self._all_us - late_us)
             near = (np.abs(offset_mm) < limit_mm) & (np.abs(speed) > _SPEED_MIN_MM_S)
@@ -207,7 +206,7 @@ class _Match:
         drift_ppb = self._arrivals.drift_ppb - round(slope * 1e9)
         known = ~np.isnan(offset_mm)
         residual_mm = float(np.sqrt(np.mean(offset_mm[near] ** 2)))
-        near |= (np.abs(offset_mm) < _OWN * self._pulses.interval_mm) & (
+        near |= (np.abs(offset_mm) < _BELONGS * self._pulses.interval_mm) & (
             np.abs(speed) > _SPEED_MIN_MM_S
         )
         if abs(drift_ppb) > DRIFT_MAX_PPB or near.sum() < _SHARE_MIN * known.sum():
@@ -227,7 +226,7 @@ class _Match:
     def _counted(
         self, at_us: NDArray[np.int64], offset_mm: NDArray[np.float64], near: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], int]:
-        """Edges used, one for each pulse passed, and pulses passed without one."""
+        """Return the edges used, one per pulse passed, and the count of pulses without one."""
         index = np.flatnonzero(near)
         position = self._track.position_mm(at_us[index])
         pulse = self._pulses.nearest(position).astype(np.int64)
@@ -257,7 +256,7 @@ def _correction(
     slope: float,
     noise_mm: float,
 ) -> tuple[float, float]:
-    """Further lateness (ns) and slope; a slope within some 20 ppm needs no proof."""
+    """Return the further lateness (ns) and slope, with a prior of 20 ppm for the slope."""
     rows = np.column_stack((speed_mm_s, speed_mm_s * since_s)) / noise_mm
     scale = np.array([1e-3, _DRIFT_SIGMA])
     normal = (rows * scale).T @ (rows * scale)

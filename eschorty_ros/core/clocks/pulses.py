@@ -1,4 +1,4 @@
-"""Pulses of a stage at equal distances, and the edges they make at a trigger input."""
+"""Pulses of a stage at equal distances, and their edges at a trigger input."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ class PulseTrain:
 
 
 def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Edges with which the pulses begin, out of rising and falling ones.
+    """Return the edges with which the pulses begin, out of rising and falling ones.
 
     A pulse has one width and the pauses vary with the speed: where the time from rising to falling
-    edges is the steadier one, or the shorter one if both are as steady, pulses begin rising. With
-    edges of one kind only, they are taken.
+    edges is the steadier one, or the shorter one if both are as steady, pulses begin rising. Edges
+    of one kind only are returned as they are.
 
     Parameters
     ----------
