@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from eschorty_ros.core.clocks import MotionPlan, plan_move, plan_stop
-from eschorty_ros.hardware.stage.apt_messages import Scale
+from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks.pulses import PulseTrain
 
 SAMPLING_NS = 102_400
 EMERGENCY_MM_S2 = 14_883.0
@@ -19,60 +19,24 @@ _HISTORY_NS = 60_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class PulsePattern:
-    """Position pulses as programmed, in mm of the encoder.
+    """Position pulses as programmed, for each direction, in mm of the encoder."""
 
-    Parameters
-    ----------
-    forward, reverse : tuple of float, float, int
-        First position, interval, count of each direction.
-    width_ns : int
-    """
-
-    forward: tuple[float, float, int] | None
-    reverse: tuple[float, float, int] | None
+    forward: PulseTrain | None
+    reverse: PulseTrain | None
     width_ns: int
 
 
-def pulse_pattern(
-    pulses: dict[str, int], forward: bool, reverse: bool, scale: Scale
-) -> PulsePattern:
-    """Pattern of a trigger message's fields, for the directions that are switched on."""
-    steps: list[tuple[float, float, int] | None] = []
-    for sense, on in (("forward", forward), ("reverse", reverse)):
-        first, interval, count = (
-            pulses[f"{field}_{sense}"] for field in ("start", "interval", "count")
-        )
-        wanted = on and interval > 0
-        steps.append((scale.mm(first), scale.mm(interval), count) if wanted else None)
-    return PulsePattern(steps[0], steps[1], pulses["width_us"] * 1000)
-
-
-def stage_data(
-    travel_mm: float, speed_mm_s: float, acceleration_mm_s2: float, scale: Scale
-) -> dict[str, int | bytes]:
-    """Fields of the stage data of a DDS220."""
-    return {
-        "channel": 1,
-        "part": b"DDS220",
-        "serial": 45_000_001,
-        "counts_per_unit": round(scale.counts_per_mm),
-        "maximum": scale.position(travel_mm),
-        "acceleration": scale.acceleration(acceleration_mm_s2),
-        "deceleration": scale.acceleration(EMERGENCY_MM_S2),
-        "velocity": scale.velocity(speed_mm_s),
-    }
-
-
 class Axis:
-    """Where the carriage truly is; ``travel_mm`` are the hard ends.
+    """The true motion of the carriage.
 
     Parameters
     ----------
     at_ns : int
     position_mm : float
     travel_mm : tuple of float
+        Hard ends.
     on_plan : callable
-        Told every new motion.
+        Called with every new motion.
     sampled_pulses : bool
         Whether pulses begin at the controller's next cycle of 102.4 us only.
     """
@@ -101,19 +65,19 @@ class Axis:
         return self._plans[-1]
 
     def position_mm(self, at_ns: int) -> float:
-        """Tell the true position."""
+        """Return the true position."""
         return float(self._plan_at(at_ns).state(at_ns)[0])
 
     def velocity_mm_s(self, at_ns: int) -> float:
-        """Tell the true velocity."""
+        """Return the true velocity."""
         return float(self._plan_at(at_ns).state(at_ns)[1])
 
     def encoder_mm(self, at_ns: int) -> float:
-        """Read the encoder."""
+        """Return the encoder's position."""
         return self.position_mm(at_ns) - self.encoder_offset_mm
 
     def bits(self, at_ns: int, ordered: bool, enabled: bool) -> int:
-        """Status bits of limits and motion; ``ordered`` while an order is being carried out."""
+        """Return status bits of limits and motion; ``ordered`` while an order is carried out."""
         velocity = self.velocity_mm_s(at_ns)
         here, (low, high) = self.position_mm(at_ns), self.travel_mm
         blocked = self.obstacle_mm is not None and abs(here - self.obstacle_mm) < 1e-6
@@ -131,11 +95,11 @@ class Axis:
         )
 
     def moving(self, at_ns: int) -> bool:
-        """Whether the motion is not over."""
+        """Return whether the motion is not over."""
         return at_ns < self.plan.end_ns
 
     def move(self, at_ns: int, target_mm: float, speed: float, acceleration: float) -> None:
-        """Trapezoid from where it rests; a hard end or an obstacle on the way stops it short."""
+        """Begin a trapezoid from rest; a hard end or an obstacle on the way stops it short."""
         low, high = self.travel_mm
         here = self.position_mm(at_ns)
         target = min(max(target_mm, low), high)
@@ -153,12 +117,12 @@ class Axis:
             self._follow(plan_stop(self.plan, at_ns, deceleration))
 
     def freeze(self, at_ns: int) -> None:
-        """Stand still at once, as a blocked carriage does."""
+        """Halt at once, as a blocked carriage does."""
         self.stalled = True
         self._follow(MotionPlan(at_ns, self.position_mm(at_ns)))
 
     def pulses(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
-        """Edges of the trigger output from ``from_ns`` to before ``until_ns``: time, rising."""
+        """Return the trigger edges from ``from_ns`` to before ``until_ns``: time, rising."""
         pattern = self.pattern
         if pattern is None:
             return []
@@ -174,13 +138,11 @@ class Axis:
 
     def _rises(self, plan: MotionPlan, pattern: PulsePattern) -> list[int]:
         travelled = plan.end_mm - plan.position_mm
-        steps = pattern.forward if travelled > 0.0 else pattern.reverse
-        if travelled == 0.0 or steps is None:
+        train = pattern.forward if travelled > 0.0 else pattern.reverse
+        if travelled == 0.0 or train is None:
             return []
-        first, interval, count = steps
-        interval = math.copysign(interval, travelled)
-        places = self.encoder_offset_mm + first + interval * np.arange(count)
-        passing_s = plan.passing_s(places)
+        positions = train.first_mm + train.interval_mm * np.arange(train.count)
+        passing_s = plan.passing_s(self.encoder_offset_mm + positions)
         rises = plan.start_ns + np.rint(passing_s[passing_s > 0.0] * 1e9).astype(np.int64)
         if self._sampled:
             rises = -(-rises // SAMPLING_NS) * SAMPLING_NS
@@ -200,7 +162,7 @@ class Axis:
 
 
 def _cut(plan: MotionPlan, after_s: float) -> MotionPlan:
-    """``plan`` that ends all at once."""
+    """Return ``plan`` with an abrupt end."""
     durations = []
     for duration_s in plan.durations_s:
         durations.append(min(duration_s, max(after_s, 0.0)))

@@ -1,4 +1,4 @@
-"""APT frames from the controller's side: commands taken apart, answers put together."""
+"""APT frames on the controller's side: commands parsed, answers packed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from eschorty_ros.hardware.stage import apt_messages as apt
 
-_HOST_LAYOUTS = {layout.id: layout for layout in apt.TO_CONTROLLER.values()}
+_COMMANDS = {layout.id: layout for layout in apt.TO_CONTROLLER.values()}
 _ANSWERS = {
     layout.name: layout
     for layouts in apt.FROM_CONTROLLER.values()
@@ -15,29 +15,29 @@ _ANSWERS = {
 }
 
 
-class HostFrames:
-    """Commands out of the bytes a host sends; what is none is skipped byte by byte."""
+class CommandParser:
+    """Commands out of the bytes a host sends; bytes of none are skipped one by one."""
 
     def __init__(self) -> None:
-        self._heard = bytearray()
+        self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[str, int, dict[str, int]]]:
-        """Name, address and fields of each command that is whole with ``data``."""
-        heard = self._heard
-        heard += data
-        while len(heard) >= apt.HEADER_BYTES:
-            id, length = struct.unpack_from("<HH", heard)
-            layout = _HOST_LAYOUTS.get(id)
-            long = bool(heard[4] & apt.LONG)
-            known = layout is not None and long == bool(layout.payload) and heard[5] == apt.HOST
+        """Yield name, address and fields of each command that ``data`` completes."""
+        buffer = self._buffer
+        buffer += data
+        while len(buffer) >= apt.HEADER_BYTES:
+            id, length = struct.unpack_from("<HH", buffer)
+            layout = _COMMANDS.get(id)
+            long = bool(buffer[4] & apt.LONG)
+            known = layout is not None and long == bool(layout.payload) and buffer[5] == apt.HOST
             if layout is None or not known or (long and length != layout.payload_bytes):
-                del heard[0]
+                del buffer[0]
                 continue
             size = apt.HEADER_BYTES + layout.payload_bytes
-            if len(heard) < size:
+            if len(buffer) < size:
                 return
-            body = bytes(heard[:size])
-            del heard[:size]
+            body = bytes(buffer[:size])
+            del buffer[:size]
             fields = (
                 struct.unpack_from("<" + layout.payload, body, apt.HEADER_BYTES)
                 if layout.payload
@@ -46,8 +46,8 @@ class HostFrames:
             yield layout.name, body[4] & ~apt.LONG, dict(zip(layout.fields, fields, strict=False))
 
 
-def answer(name: str, source: int, **values: int | bytes) -> bytes:
-    """Frame of the message ``name`` to the host; fields that are not given are 0."""
+def pack_answer(name: str, source: int, **values: int | bytes) -> bytes:
+    """Return the frame of the message ``name`` to the host; fields not given are 0."""
     layout = _ANSWERS[name]
     fields = [values.get(field, 0) for field in layout.fields]
     if layout.payload:

@@ -1,13 +1,14 @@
-"""What a stage controller was told, and loses with its power."""
+"""Settings of a stage controller, lost with its power."""
 
 from __future__ import annotations
 
-from eschorty_ros.emulation.apt.axis import PulsePattern, pulse_pattern
+from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.emulation.apt.axis import PulsePattern
 from eschorty_ros.hardware.stage.apt_messages import Scale
 
 _KINDS = ("velocity", "home", "ports", "pulses", "rack_trigger")
-ASKING = frozenset(f"request_{kind}" for kind in _KINDS)
-SETTING = frozenset(f"set_{kind}" for kind in (*_KINDS, "rack_trigger_state"))
+REQUESTS = frozenset(f"request_{kind}" for kind in _KINDS)
+SETTINGS = frozenset(f"set_{kind}" for kind in (*_KINDS, "rack_trigger_state"))
 _FORWARD, _REVERSE, _BOTH = 0x0D, 0x0E, 0x0F
 
 Values = dict[str, int]
@@ -25,13 +26,13 @@ class Memory:
 
     def __init__(self, scale: Scale, rack: bool) -> None:
         self._scale, self._rack = scale, rack
-        self._kept: dict[str, Values] = {}
-        self.forget()
+        self._values: dict[str, Values] = {}
+        self.reset()
 
-    def forget(self) -> None:
-        """Go back to what is set at power-up."""
+    def reset(self) -> None:
+        """Return to the settings at power-up."""
         scale = self._scale
-        self._kept = {
+        self._values = {
             "velocity": {
                 "channel": 1,
                 "minimum": 0,
@@ -47,41 +48,51 @@ class Memory:
             },
         }
 
-    def keep(self, kind: str, values: Values) -> None:
-        """Take what the message ``set_<kind>`` holds."""
-        self._kept[kind] = values
+    def set(self, kind: str, values: Values) -> None:
+        """Store the fields of the message ``set_<kind>``."""
+        self._values[kind] = values
 
-    def kept(self, kind: str) -> Values | None:
-        """Fields of the message that tells of ``kind``; ``None`` when it was never set."""
-        return self._kept.get(kind)
+    def get(self, kind: str) -> Values | None:
+        """Return the fields last set; ``None`` when there are none."""
+        return self._values.get(kind)
 
     @property
     def speed_mm_s(self) -> float:
-        """Of moves."""
-        return self._kept["velocity"]["velocity"] / self._scale.velocity_unit
+        """Speed of moves."""
+        return self._values["velocity"]["velocity"] / self._scale.velocity_unit
 
     @property
     def acceleration_mm_s2(self) -> float:
-        """Of moves, of homing, and of profiled stops."""
-        return self._kept["velocity"]["acceleration"] / self._scale.acceleration_unit
+        """Acceleration of moves, of homing, and of profiled stops."""
+        return self._values["velocity"]["acceleration"] / self._scale.acceleration_unit
 
     @property
     def homing_mm_s(self) -> float:
         """Speed of homing."""
-        return self._kept["home"]["velocity"] / self._scale.velocity_unit
+        return self._values["home"]["velocity"] / self._scale.velocity_unit
 
     @property
     def pattern(self) -> PulsePattern | None:
         """Pulses as ports and trigger are set."""
-        ports = self._kept.get("ports", {})
+        ports = self._values.get("ports", {})
         modes = {ports.get("mode_1"), ports.get("mode_2")}
-        pulses = self._kept.get("pulses")
+        pulses = self._values.get("pulses")
         if self._rack:
-            pulses = self._kept.get("rack_trigger")
-            wired = self._kept.get("rack_port", {}).get("mode") == 1
-            armed = self._kept.get("rack_trigger_state", {}).get("state") == 1
+            pulses = self._values.get("rack_trigger")
+            wired = self._values.get("rack_port", {}).get("mode") == 1
+            armed = self._values.get("rack_trigger_state", {}).get("state") == 1
             modes = {pulses["out_mode"]} if pulses and wired and armed else set()
         if pulses is None:
             return None
-        forward, reverse = bool(modes & {_FORWARD, _BOTH}), bool(modes & {_REVERSE, _BOTH})
-        return pulse_pattern(pulses, forward, reverse, self._scale)
+        forward = self._train(pulses, "forward") if modes & {_FORWARD, _BOTH} else None
+        reverse = self._train(pulses, "reverse") if modes & {_REVERSE, _BOTH} else None
+        return PulsePattern(forward, reverse, pulses["width_us"] * 1000)
+
+    def _train(self, pulses: Values, sense: str) -> PulseTrain | None:
+        start, interval, count = (
+            pulses[f"{field}_{sense}"] for field in ("start", "interval", "count")
+        )
+        if interval <= 0 or count <= 0:
+            return None
+        first = start if sense == "forward" else start - (count - 1) * interval
+        return PulseTrain(self._scale.mm(first), self._scale.mm(interval), count)

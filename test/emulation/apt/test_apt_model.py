@@ -77,7 +77,7 @@ def test_homing_and_a_move_follow_the_trapezoid() -> None:
     )
     assert moved.msg == "mot_move_completed"
     assert moved.position == 50 * 20_000
-    plan = host.model.plan()
+    plan = host.model.axis.plan
     assert 0 < plan.start_ns - ordered_ns < 6_000_000
     assert (plan.end_ns - plan.start_ns) * 1e-9 == pytest.approx(0.6, abs=1e-4)
 

@@ -247,7 +247,7 @@ def test_ignored_move() -> None:
 def test_error_message(text: str) -> None:
     """driver: stops; user reads: the controller's code and words, or to look at its display."""
     bench = moving()
-    bench.model.complain(17, text)
+    bench.model.send_error(17, text)
     read = bench.failure()
     assert (f"error 17: {text}" if text else "look at its display") in read
     assert at_rest(bench)

@@ -133,14 +133,14 @@ def test_blocked_callback(port: str, model: AptModel) -> None:
     """driver: keeps alive while whoever listens to it hangs; user reads: nothing."""
     stage = opened(port)
     heard: list[float] = []
-    obey = model._obey
+    handle = model._handle
 
     def listening(name: str, address: int, values: dict[str, int], at_ns: int) -> None:
         if name == "keep_alive":
             heard.append(time.monotonic())
-        obey(name, address, values, at_ns)
+        handle(name, address, values, at_ns)
 
-    model._obey = listening  # type: ignore[method-assign]
+    model._handle = listening  # type: ignore[method-assign]
     release = threading.Event()
 
     def hang() -> None:
