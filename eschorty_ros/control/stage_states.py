@@ -1,26 +1,26 @@
-"""What a stage's odometry has still to tell."""
+"""The states of a stage that its odometry has not published yet."""
 
 from __future__ import annotations
 
 from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 
-# Odometry of so many periods is made up for.
+# A stall of up to so many periods is filled.
 FILL_MAX = 200
 # A newest time further back than this comes of a clock that was set.
 _CLOCK_BACK_NS = 100_000_000
 
 
-def new_states(stage: LinearStage, told_ns: int, period_ns: int) -> list[StageState]:
-    """States since the last one told, in time order; a pause leaves no gap.
+def states_since(stage: LinearStage, last_ns: int, period_ns: int) -> list[StageState]:
+    """Return the states since ``last_ns`` in time order; a stall leaves no gap.
 
     Parameters
     ----------
     stage : LinearStage
-    told_ns : int
-        Time of the last state told. When the clock has been set back, what is told goes on from
-        the newest.
+    last_ns : int
+        Time of the last published state. Where the clock was set back, only the newest state is
+        returned.
     period_ns : int
-        Distance of the states that a pause left out.
+        Distance of the states that fill a stall.
 
     Raises
     ------
@@ -28,11 +28,10 @@ def new_states(stage: LinearStage, told_ns: int, period_ns: int) -> list[StageSt
         When the stage has failed.
     """
     newest = stage.state()
-    if told_ns - _CLOCK_BACK_NS <= newest.t_ns <= told_ns:
+    if last_ns - _CLOCK_BACK_NS <= newest.t_ns <= last_ns:
         return []
-    missed = range(told_ns + period_ns, newest.t_ns - period_ns // 2, period_ns)
-    # After a longer silence the past is over.
+    missed = range(last_ns + period_ns, newest.t_ns - period_ns // 2, period_ns)
     fill = missed if len(missed) <= FILL_MAX else ()
-    # Where the axis had no reference yet, nothing is told afterwards.
-    told = [(t_ns, stage.state(t_ns)) for t_ns in fill]
-    return [*(state for t_ns, state in told if state.t_ns == t_ns), newest]
+    filled = [(t_ns, stage.state(t_ns)) for t_ns in fill]
+    # Where the axis had no reference yet, a state has another time than the requested one.
+    return [*(state for t_ns, state in filled if state.t_ns == t_ns), newest]

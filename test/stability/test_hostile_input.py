@@ -24,7 +24,7 @@ HANDED_OUT = {
     "aggregate_frame.Pixels", "calibration_fit.CalibrationFit", "centroid.Centroids",
     "optical_build.Design", "optical_build.DesignTable", "evt3.Counters", "evt3.Events",
     "evt3.Triggers", "noise.FilterCounters", "offline.Result", "phase_estimate.PhaseEstimate",
-    "position_edges.EdgeFit", "post_finder.Post", "post_matching.PostMatch", "profiles.LineRows",
+    "edge_fit.EdgeFit", "post_finder.Post", "post_matching.PostMatch", "profiles.LineRows",
     "profiles.Profiles", "raw_file.Header", "recording.Recording", "yaml_file.Schema",
 }  # fmt: skip
 """Plain records that the package makes; nobody else has to."""

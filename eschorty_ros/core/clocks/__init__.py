@@ -1,21 +1,20 @@
 """Sensor time, host time and stage position, each as a function of the others."""
 
-from eschorty_ros.core.clocks.clock import (
+from eschorty_ros.core.clocks.clock_line import NS_PER_US, ClockLine
+from eschorty_ros.core.clocks.edge_clock import EdgeClock
+from eschorty_ros.core.clocks.edge_fit import fit_edges
+from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
+from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
+from eschorty_ros.core.clocks.sensor_clock import SensorClock
+from eschorty_ros.core.clocks.stage_track import (
     NM_PER_MM,
-    NS_PER_US,
     POSITION_LIMIT_MM,
-    SensorClock,
     StageTrack,
     quantise_nm,
 )
-from eschorty_ros.core.clocks.clock_line import ClockLine
-from eschorty_ros.core.clocks.edge_clock import EdgeClock
-from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
-from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
-from eschorty_ros.core.clocks.motion_fit import MotionFit
-from eschorty_ros.core.clocks.position_edges import fit_edges
-from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
 
+# ``motion_fit`` is imported by its own name: it loads scipy.optimize, which takes long.
 __all__ = [
     "NM_PER_MM",
     "NS_PER_US",
@@ -23,7 +22,6 @@ __all__ = [
     "ClockLine",
     "EdgeClock",
     "LowerEnvelope",
-    "MotionFit",
     "MotionPlan",
     "PulseTrain",
     "SensorClock",

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, whole_vector
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock import StageTrack
 from eschorty_ros.core.clocks.clock_line import NS_PER_US, ClockLine
-from eschorty_ros.core.clocks.position_edges import EdgeFit, fit_edges
+from eschorty_ros.core.clocks.edge_fit import EdgeFit, fit_edges
 from eschorty_ros.core.clocks.pulses import PulseTrain, leading_edges
+from eschorty_ros.core.clocks.stage_track import StageTrack
 
 _WINDOW_US = 60_000_000
 _EDGES_MAX = 8192

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, number, positive, times, vector, whole
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock import POSITION_LIMIT_MM
+from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
 
 
 @dataclass(frozen=True, slots=True)

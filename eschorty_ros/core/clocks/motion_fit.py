@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, number, positive, times, whole
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock import POSITION_LIMIT_MM
 from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
+from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
 
 _LEGS_MAX = 64
 _READINGS_MAX = 10_000

@@ -1,4 +1,4 @@
-"""Stage node: moves as an action, odometry, and where it gives pulses."""
+"""Stage node: moves as an action, odometry, and the stage's pulses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
 from eschorty_ros.action import MoveStage
-from eschorty_ros.control.stage_states import new_states
+from eschorty_ros.control.stage_states import states_since
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.emulation.bench.folder import stage_port
@@ -27,10 +27,10 @@ from eschorty_ros.nodes.ros.parameters import Param
 from eschorty_ros.nodes.ros.spin import run, unless_shut_down
 from eschorty_ros.nodes.stage.parameters import DRIVER_TABLE, make_stage
 
-FEEDBACK_PERIOD_S = 0.05
-POLL_S = 0.01
-# More than DDS's heartbeat of 3 s holds: what got lost can still be repeated.
-ODOM_DEPTH = 2000
+_FEEDBACK_PERIOD_S = 0.05
+_POLL_S = 0.01
+# More than a DDS heartbeat of 3 s holds, so that lost messages can be repeated.
+_ODOM_DEPTH = 2000
 
 TABLE = (
     *drivers.DRIVER,
@@ -59,8 +59,8 @@ class StageNode(DeviceNode):
         self._stage: LinearStage | None = None
         super().__init__("stage", TABLE, **kwargs)
         self.moves = 0
-        self._told_ns = 0
-        self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(ODOM_DEPTH))
+        self._published_ns = 0
+        self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(_ODOM_DEPTH))
         self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
         self._move = ActionServer(
             self,
@@ -106,7 +106,7 @@ class StageNode(DeviceNode):
                 raise DeviceError(f"the stage is not homed after {limit_s:g} s; check it")
             if not self.context.ok():
                 raise DeviceError("homing interrupted by shutdown")
-            time.sleep(POLL_S)
+            time.sleep(_POLL_S)
 
     def stop_device(self) -> None:
         """Profiled stop."""
@@ -122,14 +122,14 @@ class StageNode(DeviceNode):
             stage.close()
 
     def destroy_node(self) -> None:
-        """Destroy the action server first: the node does not know it."""
+        """Destroy the action server first, which the node does not list."""
         # rclpy 9.1 drops the future of an answered result request twice and raises.
         with contextlib.suppress(ValueError):
             self._move.destroy()
         super().destroy_node()
 
     def _healthy(self) -> bool:
-        """Whether light is of use: the stage can be moved."""
+        """Return whether the stage can be moved: without it the laser stays off."""
         stage = self._stage
         return stage is not None and stage.healthy and self.active and not self.failure
 
@@ -143,13 +143,13 @@ class StageNode(DeviceNode):
         if not self._busy.acquire(blocking=False):
             return self._aborted(goal, "stage refused: another move is under way; cancel it first")
         try:
-            return self._carry_out(goal)
+            return self._move_to_goal(goal)
         except EschortyError as error:
             return self._aborted(goal, str(error))
         finally:
             self._busy.release()
 
-    def _carry_out(self, goal: Any) -> MoveStage.Result:
+    def _move_to_goal(self, goal: Any) -> MoveStage.Result:
         target_mm, speed_mm_s = mm_from_m(goal.request.position), mm_from_m(goal.request.speed)
         self._begin(target_mm, speed_mm_s)
         state = self._follow(goal)
@@ -184,7 +184,7 @@ class StageNode(DeviceNode):
         self.moves += 1
 
     def _follow(self, goal: Any) -> StageState:
-        """Wait until the stage rests; the state it rests in."""
+        """Wait until the stage rests; return its state."""
         feedback_s = 0.0
         stopping = False
         while True:
@@ -198,7 +198,7 @@ class StageNode(DeviceNode):
             if not self.context.ok():
                 stage.stop()
                 raise DeviceError("move interrupted by shutdown")
-            if time.monotonic() - feedback_s >= FEEDBACK_PERIOD_S:
+            if time.monotonic() - feedback_s >= _FEEDBACK_PERIOD_S:
                 feedback_s = time.monotonic()
                 feedback = MoveStage.Feedback(
                     position=m_from_mm(state.position_mm),
@@ -206,7 +206,7 @@ class StageNode(DeviceNode):
                 )
                 with unless_shut_down(self):
                     goal.publish_feedback(feedback)
-            time.sleep(POLL_S)
+            time.sleep(_POLL_S)
 
     def _aborted(self, goal: Any, reason: str) -> MoveStage.Result:
         if not self.context.ok():
@@ -229,12 +229,13 @@ class StageNode(DeviceNode):
         if stage is None:
             return
         try:
-            states = new_states(stage, self._told_ns, round(1e9 / self.parameters["odom_rate"]))
+            period_ns = round(1e9 / self.parameters["odom_rate"])
+            states = states_since(stage, self._published_ns, period_ns)
         except EschortyError as error:
             self.fault(f"stage lost: {error}")
             return
         for state in states:
-            self._told_ns = state.t_ns
+            self._published_ns = state.t_ns
             self._odom.publish(self._odometry(state))
 
     def _trigger_message(self, pulses: PulseTrain | None) -> PositionTrigger:

@@ -25,12 +25,12 @@ from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.domain import free_domain
 
-# To the far end it takes longer than anything that is waited for here.
+# To the far end it takes longer than any wait of these tests.
 SLOW_M_S = 0.01
 
 
 class Stage:
-    """A stage node and a client of it; ``held`` ends both."""
+    """A stage node and a client of it, which ``held`` ends."""
 
     def __init__(
         self, held: contextlib.ExitStack, observer: Observer, emulated: Bench, folder: Path
@@ -81,11 +81,11 @@ def test_activate_homes(stage: Stage) -> None:
     wait_until(lambda: stage.odometry[-1].pose.pose.position.y == 0.0, "the home position")
 
 
-def test_trigger_is_told_to_late_joiners(stage: Stage) -> None:
-    told = stage.observer.collect(PositionTrigger, "stage/trigger", qos.latched())
-    wait_until(lambda: told, "the position trigger")
-    assert told[0].interval == pytest.approx(0.002)
-    assert told[0].count > 100
+def test_late_subscribers_receive_the_trigger(stage: Stage) -> None:
+    received = stage.observer.collect(PositionTrigger, "stage/trigger", qos.latched())
+    wait_until(lambda: received, "the position trigger")
+    assert received[0].interval == pytest.approx(0.002)
+    assert received[0].count > 100
 
 
 def test_move_arrives(stage: Stage) -> None:
@@ -113,8 +113,7 @@ def test_odometry_lies_on_the_true_motion(stage: Stage) -> None:
     print(
         f"odometry off by {np.median(off_mm):.4f}, up to {off_mm.max():.4f} mm, {len(off_mm)} times"
     )
-    # Where a loaded machine lets the emulated controller answer late, single ones lie farther off;
-    # what the driver makes of given delays is tested in virtual time.
+    # On a loaded machine single ones lie farther off; delays are tested in virtual time.
     assert np.median(off_mm) < 0.1
     assert {message.pose.covariance[7] > 0.0 for message in seen} == {True}
 
@@ -123,7 +122,7 @@ def test_odometry_lies_on_the_true_motion(stage: Stage) -> None:
     ("position", "speed", "reason"),
     [(0.5, 0.1, "outside the travel"), (-0.01, 0.1, "outside the travel"), (0.1, 1.0, "speed")],
 )
-def test_impossible_goal_tells_why(
+def test_an_impossible_goal_is_aborted_with_a_reason(
     stage: Stage, position: float, speed: float, reason: str
 ) -> None:
     outcome = stage.move(position, speed)

@@ -7,14 +7,15 @@ from functools import partial
 import numpy as np
 
 from eschorty_ros.core.clocks import (
-    clock,
     clock_line,
     edge_clock,
+    edge_fit,
     lower_envelope,
     motion,
     motion_fit,
-    position_edges,
     pulses,
+    sensor_clock,
+    stage_track,
 )
 from eschorty_ros.core.modulation import (
     modulation,
@@ -42,8 +43,8 @@ from hostile.subjects import (
 )
 
 
-def a_track() -> clock.StageTrack:
-    track = clock.StageTrack()
+def a_track() -> stage_track.StageTrack:
+    track = stage_track.StageTrack()
     track.append([0, 10], [0.0, 1.0])
     return track
 
@@ -59,50 +60,50 @@ def a_fit() -> motion_fit.MotionFit:
 
 
 CALLS: dict[str, Call] = {
-    "clock.quantise_nm": Call(
-        partial(clock.quantise_nm, name="position_mm"),
+    "stage_track.quantise_nm": Call(
+        partial(stage_track.quantise_nm, name="position_mm"),
         {"position_mm": [1.0, 2.0]},
         {"position_mm": vector(2e9, -2e9, size=2, any_shape=True), "name": Kind([])},
     ),
-    "clock.StageTrack": Call(
-        clock.StageTrack, {"max_gap_us": 5}, {"max_gap_us": whole(0, optional=True)}
+    "stage_track.StageTrack": Call(
+        stage_track.StageTrack, {"max_gap_us": 5}, {"max_gap_us": whole(0, optional=True)}
     ),
-    "clock.StageTrack.append": Call(
-        method(clock.StageTrack, "append"),
+    "stage_track.StageTrack.append": Call(
+        method(stage_track.StageTrack, "append"),
         {"t_us": TIMES, "position_mm": np.zeros(N)},
         {"t_us": integers(2**63, size=N), "position_mm": vector(2e9, size=N)},
     ),
-    "clock.StageTrack.position_mm": Call(
+    "stage_track.StageTrack.position_mm": Call(
         method(a_track, "position_mm"),
         {"t_us": [3, 4]},
         {"t_us": integers(2**63, size=2, any_shape=True)},
     ),
-    "clock.StageTrack.forget_before": Call(
+    "stage_track.StageTrack.forget_before": Call(
         method(a_track, "forget_before"), {"t_us": 3}, {"t_us": whole()}
     ),
-    "clock.SensorClock": Call(
-        clock.SensorClock,
+    "sensor_clock.SensorClock": Call(
+        sensor_clock.SensorClock,
         {"zero_ns": 5, "window_ns": 10},
         {"zero_ns": whole(optional=True), "window_ns": whole(0)},
     ),
-    "clock.SensorClock.observe": Call(
-        method(clock.SensorClock, "observe"),
+    "sensor_clock.SensorClock.observe": Call(
+        method(sensor_clock.SensorClock, "observe"),
         {"t_us": 5, "arrival_ns": 10},
         {"t_us": whole(), "arrival_ns": whole()},
     ),
-    "clock.SensorClock.goes_on": Call(
-        method(clock.SensorClock, "goes_on"),
+    "sensor_clock.SensorClock.goes_on": Call(
+        method(sensor_clock.SensorClock, "goes_on"),
         {"t_us": 5, "arrival_ns": 10},
         {"t_us": whole(), "arrival_ns": whole()},
     ),
-    "clock.SensorClock.to_ns": Call(
-        method(partial(clock.SensorClock, 7), "to_ns"), {"t_us": 3}, {"t_us": whole()}
+    "sensor_clock.SensorClock.to_ns": Call(
+        method(partial(sensor_clock.SensorClock, 7), "to_ns"), {"t_us": 3}, {"t_us": whole()}
     ),
-    "clock.SensorClock.to_us": Call(
-        method(partial(clock.SensorClock, 7), "to_us"), {"t_ns": 3}, {"t_ns": whole()}
+    "sensor_clock.SensorClock.to_us": Call(
+        method(partial(sensor_clock.SensorClock, 7), "to_us"), {"t_ns": 3}, {"t_ns": whole()}
     ),
-    "clock.SensorClock.adopt": Call(
-        method(clock.SensorClock, "adopt"), {"line": clock_line.ClockLine(0, 0)}
+    "sensor_clock.SensorClock.adopt": Call(
+        method(sensor_clock.SensorClock, "adopt"), {"line": clock_line.ClockLine(0, 0)}
     ),
     "clock_line.ClockLine": Call(
         clock_line.ClockLine,
@@ -140,8 +141,8 @@ CALLS: dict[str, Call] = {
         method(edge_clock.EdgeClock, "update"),
         {"track": a_track(), "arrivals": clock_line.ClockLine(0, 0), "now": True},
     ),
-    "position_edges.fit_edges": Call(
-        position_edges.fit_edges,
+    "edge_fit.fit_edges": Call(
+        edge_fit.fit_edges,
         {
             "t_us": np.arange(8),
             "track": a_track(),

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, whole_vector
-from eschorty_ros.core.clocks.clock import StageTrack
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
 from eschorty_ros.core.clocks.pulses import PulseTrain
+from eschorty_ros.core.clocks.stage_track import StageTrack
 
 EDGES_MIN = 8
 # A KBD101 samples its position every 102 us, so an edge is late by half of that on average.

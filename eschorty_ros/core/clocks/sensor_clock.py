@@ -1,0 +1,136 @@
+"""The ROS time of a sensor time."""
+
+from __future__ import annotations
+
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import TIME_LIMIT, whole
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.clocks.clock_line import T_US_LIMIT, ClockLine
+from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
+
+
+class SensorClock:
+    """Conversion between sensor microseconds and ROS nanoseconds.
+
+    With ``zero_ns`` given (announced by the camera) the relation is fixed and exact. Without it
+    offset and drift are the lower envelope of the packets' arrivals over a sliding window, see
+    `LowerEnvelope`, until a better relation is known from
+    trigger edges (:meth:`adopt`).
+
+    The estimate may step at an observation, never between two of them: times converted between
+    two observations are strictly monotone. When arrival or sensor time goes back (clock set,
+    camera restarted) the window is dropped.
+
+    Parameters
+    ----------
+    zero_ns : int, optional
+        ROS time (ns) at which the sensor's clock read zero.
+    window_ns : int
+        Length of the sliding window, ns of arrival time.
+
+    Attributes
+    ----------
+    restarts : int
+        Times the window was dropped.
+    residual_ns : int or None
+        How much later than by this clock the last observed packet arrived.
+    """
+
+    def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
+        self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
+        self._fixed = None if zero_ns is None else ClockLine(0, _zero(zero_ns))
+        self._adopted: ClockLine | None = None
+        self._envelope = LowerEnvelope(window_ns)
+        self._last: tuple[int, int] | None = None
+        self.restarts = 0
+        self.residual_ns: int | None = None
+
+    @property
+    def exact(self) -> bool:
+        """Whether the zero was announced."""
+        return self._fixed is not None
+
+    @property
+    def from_edges(self) -> bool:
+        """Whether the relation comes from trigger edges."""
+        return self._adopted is not None
+
+    @property
+    def line(self) -> ClockLine | None:
+        """The relation as known now, ``None`` before."""
+        return self._fixed or self._adopted or self._envelope.line
+
+    @property
+    def arrival_line(self) -> ClockLine | None:
+        """The relation by the packets' arrivals alone."""
+        return self._fixed or self._envelope.line
+
+    @property
+    def zero_ns(self) -> int | None:
+        """ROS time of sensor time 0, ns; ``None`` while the relation is unknown."""
+        return None if self.line is None else self.line.to_ns(0)
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster ROS time passes than sensor time; 0 while the relation is unknown."""
+        return 0.0 if self.line is None else self.line.drift_ppb * 1e-3
+
+    @property
+    def offset_age_us(self) -> int:
+        """Sensor time since the newest packet that arrived without delay."""
+        return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
+
+    def goes_on(self, t_us: int, arrival_ns: int) -> bool:
+        """Return whether neither time lies before the last observed."""
+        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])
+
+    def observe(self, t_us: int, arrival_ns: int) -> None:
+        """Add one arrival: the event of sensor time ``t_us`` came at ROS time ``arrival_ns``."""
+        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        if self._fixed is None:
+            if not self.goes_on(t_us, arrival_ns):
+                self._envelope = LowerEnvelope(self._window_ns)
+                self._adopted = None
+                self.restarts += 1
+            self._envelope.observe(t_us, arrival_ns)
+        self._last = (t_us, arrival_ns)
+        self.residual_ns = arrival_ns - self.to_ns(t_us)
+
+    def adopt(self, line: ClockLine | None) -> None:
+        """Use ``line``, known from edges, unless a zero was announced; ``None`` for arrivals."""
+        self._adopted = line
+
+    @overload
+    def to_ns(self, t_us: int) -> int: ...
+    @overload
+    def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
+    def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+        """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
+        return self._known().to_ns(t_us)
+
+    @overload
+    def to_us(self, t_ns: int) -> int: ...
+    @overload
+    def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
+    def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+        """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
+        return self._known().to_us(t_ns)
+
+    def _known(self) -> ClockLine:
+        line = self.line
+        if line is None:
+            raise ArgumentError(
+                "the ROS time of sensor time 0 is unknown; announce it or observe a packet first"
+            )
+        return line
+
+
+def _zero(zero_ns: int) -> int:
+    return whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT)
