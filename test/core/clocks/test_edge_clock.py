@@ -1,4 +1,4 @@
-"""Edges that come in one by one, with the odometry behind them."""
+"""Edges that come in one by one, before the odometry that covers them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_edges_count_once_the_odometry_covers_them():
     assert bench.error_um(clock.fit) < 10.0
 
 
-def test_nothing_without_a_grid():
+def test_no_fit_without_pulses():
     bench = StagePulses()
     clock = EdgeClock()
     clock.add(bench.edges, np.ones(bench.edges.size, np.uint8))
@@ -43,7 +43,7 @@ def test_nothing_without_a_grid():
     assert not clock.update(bench.track, bench.arrivals(1.0), now=True)
 
 
-def test_what_is_kept_is_bounded():
+def test_the_edges_kept_are_bounded():
     clock = EdgeClock(PULSES)
     for begin in range(0, 100_000, 1000):
         clock.add(np.arange(begin, begin + 1000), np.ones(1000, np.uint8))

@@ -27,7 +27,7 @@ def test_several_sweeps_give_the_drift():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_missing_spurious_and_noisy(seed):
+def test_missing_and_spurious_edges_and_noisy_odometry(seed):
     bench = StagePulses(missing=0.03, spurious=8, odometry_mm=0.02, seed=seed)
     fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(2.0))
     print(f"seed {seed}: {bench.error_um(fit):.1f} um, {fit}, {bench.missing} missing")
@@ -37,7 +37,7 @@ def test_missing_spurious_and_noisy(seed):
 
 
 @pytest.mark.parametrize("late_ms", [40.0, 800.0, 4000.0])
-def test_a_host_that_was_slow_from_the_start_is_found_out_by_the_ramps(late_ms):
+def test_the_ramps_correct_a_host_that_was_slow_from_the_start(late_ms):
     bench = StagePulses()
     fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(late_ms))
     assert bench.error_um(fit) < 10.0
@@ -66,7 +66,7 @@ def test_a_slow_sweep_after_a_fast_way_to_its_start():
     assert slow.error_um(fit) * 50.0 / 300.0 < 5.0
 
 
-def test_direction_back():
+def test_a_sweep_back():
     bench = StagePulses((210.0, 10.0))
     fit = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(3.0))
     assert bench.error_um(fit) < 10.0
@@ -78,7 +78,7 @@ def test_edges_of_a_laser_are_refused():
     assert fit_edges(laser, bench.track, PULSES, bench.arrivals(3.0)) is None
 
 
-def test_too_few_edges_or_none_in_the_odometry_give_nothing():
+def test_too_few_edges_or_none_within_the_odometry_give_no_fit():
     bench = StagePulses()
     assert fit_edges(bench.edges[:7], bench.track, PULSES, bench.arrivals(1.0)) is None
     assert fit_edges(bench.edges + 10**9, bench.track, PULSES, bench.arrivals(1.0)) is None

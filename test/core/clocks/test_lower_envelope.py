@@ -1,4 +1,4 @@
-"""Offset and drift from arrivals that are late by whatever the host likes, but never early."""
+"""Offset and drift from arrivals that are late by any time, but never early."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_seconds_of_lag_neither_shift_nor_tilt_the_line(drift_ppm):
     assert np.abs(off).max() < 400_000
 
 
-def test_a_host_that_is_slow_from_the_first_packet_on_is_forgiven_once_it_is_not():
+def test_a_host_that_is_slow_at_first_leaves_no_error_once_it_is_prompt():
     envelope = LowerEnvelope(60_000_000_000)
     stream = packets(
         12.0, 50e-6, lambda t_s, rng: jitter(t_s, rng) + 3e9 * np.exp(-((t_s / 2.0) ** 2))
@@ -86,7 +86,7 @@ def test_ever_growing_lag_is_not_taken_for_drift():
 
 
 def test_the_window_slides():
-    """The oscillator changes its drift; the window forgets how it was."""
+    """The oscillator changes its drift in the middle."""
     envelope = LowerEnvelope(10_000_000_000)
     t, true, arrival = packets(40.0, 0.0, jitter)
     bent = np.clip(t - 20_000_000, 0, None) // 10
@@ -101,7 +101,7 @@ def test_the_result_does_not_depend_on_the_uptime(start_us):
     lines = []
     for begin in (0, start_us):
         envelope = LowerEnvelope(60_000_000_000)
-        # A multiple of the stretches' length, so that the same packets share one.
+        # A multiple of the bins' length, so that the same packets share one.
         begin -= begin % 100_000
         t, _, arrival = packets(10.0, 50e-6, jitter, start_us=begin)
         for now, arrived in zip(t.tolist(), arrival.tolist(), strict=True):

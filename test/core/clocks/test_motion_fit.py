@@ -100,7 +100,7 @@ def test_other_acceleration_and_speed_are_found() -> None:
     assert fit.residual_mm < 0.02
 
 
-def test_wrong_readings_do_no_harm() -> None:
+def test_wrong_readings_are_outliers_and_leave_no_error() -> None:
     true = plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0)
     fit = MotionFit()
     fit.expect_move(true)
@@ -115,7 +115,7 @@ def test_wrong_readings_do_no_harm() -> None:
     assert worst_um(fit, true) < 20.0
 
 
-def test_a_motion_that_is_not_the_ordered_one_is_not_believed() -> None:
+def test_a_motion_that_is_not_the_ordered_one_is_discarded() -> None:
     blocked = plan_stop(
         plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0), ORDERED_NS + 300_000_000, 20_000.0
     )
@@ -155,7 +155,7 @@ def test_unknown_motion_is_interpolated_and_late_readings_counted() -> None:
     assert fit.until_ns == 2000
 
 
-def test_refusals() -> None:
+def test_wrong_arguments_are_refused() -> None:
     fit = MotionFit()
     with pytest.raises(ArgumentError, match="position is unknown"):
         fit.state(0)

@@ -4,37 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import ClockLine, SensorClock
 
-EPOCH_US = 1_760_000_000_000_000
-EPOCH_NS = EPOCH_US * 1000
+EPOCH_NS = 1_760_000_000_000_000_000
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
-@given(st.integers(0, 2**60), st.integers(0, 2**52))
-def test_conversion_is_exact_both_ways(zero_ns: int, t_us: int) -> None:
-    clock = SensorClock(zero_ns)
-    assert clock.to_ns(t_us) == zero_ns + 1000 * t_us
-    assert clock.to_us(clock.to_ns(t_us)) == t_us
-    array = clock.to_ns(np.array([t_us], np.int64))
-    assert array.dtype == np.int64
-    assert int(array[0]) == clock.to_ns(t_us)
-    assert int(clock.to_us(array)[0]) == t_us
-
-
-def test_nanoseconds_between_microseconds_go_to_the_nearest() -> None:
-    clock = SensorClock(EPOCH_NS + 7)
-    offsets = np.array([-501, -500, -1, 0, 499, 500, 1499, 1500])
-    expected = [-1, 0, 0, 0, 0, 1, 1, 2]
-    assert clock.to_us(EPOCH_NS + 7 + offsets).tolist() == expected
-    assert [clock.to_us(EPOCH_NS + 7 + int(offset)) for offset in offsets] == expected
-
-
-def test_announced_zero_stays_and_the_residual_tells_the_delay() -> None:
+def test_announced_zero_stays_and_the_residual_is_the_delay() -> None:
     clock = SensorClock(EPOCH_NS)
     assert clock.residual_ns is None
     clock.observe(1000, EPOCH_NS + 1_000_000 + 250_000)
@@ -43,44 +20,30 @@ def test_announced_zero_stays_and_the_residual_tells_the_delay() -> None:
     assert (clock.zero_ns, clock.residual_ns) == (EPOCH_NS, -10)
 
 
-def test_unknown_zero_is_said() -> None:
+def test_an_unknown_zero_is_an_error() -> None:
     clock = SensorClock()
     assert clock.zero_ns is None
     with pytest.raises(ArgumentError, match="unknown"):
         clock.to_ns(5)
 
 
-def observe_all(clock: SensorClock, drift: float, seed: int, seconds: int) -> list[int]:
-    """Packets every 4 ms, late by an exponential delay; error of the zero after each, ns."""
-    rng = np.random.default_rng(seed)
-    t_us = np.arange(1, seconds * 250) * 4000
-    emitted = EPOCH_NS + (t_us * (1.0 + drift) * 1000).astype(np.int64)
-    arrival = np.maximum.accumulate(emitted + rng.exponential(2e6, t_us.size).astype(np.int64))
+@pytest.mark.parametrize("drift", [50e-6, -50e-6])
+def test_the_window_follows_a_drifting_oscillator_under_late_packets(drift: float) -> None:
+    """50 ppm over 60 s is 3 ms."""
+    rng = np.random.default_rng(6)
+    clock = SensorClock(window_ns=10_000_000_000)
+    t_us = np.arange(1, 60 * 250) * 4000
+    sent = EPOCH_NS + (t_us * (1.0 + drift) * 1000).astype(np.int64)
+    arrival = np.maximum.accumulate(sent + rng.exponential(2e6, t_us.size).astype(np.int64))
     errors = []
-    for t, arrived, true in zip(t_us.tolist(), arrival.tolist(), emitted.tolist(), strict=True):
+    for t, arrived, true in zip(t_us.tolist(), arrival.tolist(), sent.tolist(), strict=True):
         clock.observe(t, arrived)
-        assert clock.residual_ns is not None
         assert clock.residual_ns >= 0
         errors.append(clock.to_ns(t) - true)
-    return errors
-
-
-def test_lower_envelope_finds_the_zero_under_late_packets() -> None:
-    clock = SensorClock()
-    errors = observe_all(clock, 0.0, 5, 20)
-    assert min(errors) >= 0
-    assert max(errors[250:]) < 50_000
+    assert np.abs(errors[2500:]).max() < 60_000
+    assert abs(clock.drift_ppm - drift * 1e6) < 6.0
+    assert 0 <= clock.offset_age_us < 10_000_000
     assert clock.restarts == 0
-
-
-def test_sliding_window_follows_a_drifting_oscillator() -> None:
-    """50 ppm over 60 s is 3 ms, and the line follows it."""
-    for drift in (50e-6, -50e-6):
-        clock = SensorClock(window_ns=10_000_000_000)
-        errors = observe_all(clock, drift, 6, 60)
-        assert max(abs(error) for error in errors[2500:]) < 60_000
-        assert abs(clock.drift_ppm - drift * 1e6) < 6.0
-        assert 0 <= clock.offset_age_us < 10_000_000
 
 
 def test_window_equals_the_plain_minimum() -> None:
@@ -94,7 +57,7 @@ def test_window_equals_the_plain_minimum() -> None:
         assert clock.zero_ns == int((arrival[: index + 1] - t_us[: index + 1] * 1000)[recent].min())
 
 
-def test_time_going_back_starts_the_window_anew() -> None:
+def test_time_going_back_restarts_the_window() -> None:
     clock = SensorClock()
     clock.observe(1_000_000, EPOCH_NS)
     clock.observe(100, EPOCH_NS + 1000)
@@ -105,7 +68,7 @@ def test_time_going_back_starts_the_window_anew() -> None:
     assert clock.to_ns(200) == EPOCH_NS - 10**9
 
 
-def test_a_line_known_from_edges_is_used_until_the_clock_starts_anew() -> None:
+def test_a_line_known_from_edges_is_used_until_the_clock_restarts() -> None:
     clock = SensorClock()
     clock.observe(1_000_000, EPOCH_NS)
     better = ClockLine(1_000_000, EPOCH_NS - 2_000_000, 50_000)

@@ -1,4 +1,4 @@
-"""Stage positions at sensor times and the sensor's clock against ROS time."""
+"""Stage positions at sensor times."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import StageTrack, quantise_nm
 
 EPOCH_US = 1_760_000_000_000_000
-EPOCH_NS = EPOCH_US * 1000
 
 
 def track(*samples: tuple[int, float], max_gap_us: int | None = None) -> StageTrack:
@@ -92,7 +91,7 @@ def test_positions_stay_between_their_samples() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e10])
-def test_positions_that_are_none_are_refused(bad: float) -> None:
+def test_positions_that_are_not_finite_or_too_far_are_refused(bad: float) -> None:
     with pytest.raises(ArgumentError, match="position_mm is"):
         StageTrack().append(0, bad)
 

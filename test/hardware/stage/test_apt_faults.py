@@ -1,4 +1,4 @@
-"""Every fault a stage on a serial line can have: what the driver does, what the user reads."""
+"""Faults of a stage on a serial line: what the driver does, what the user reads."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STOP, ENABLE, STATUS_REQUEST, KEEP_ALIVE = 0x0465, 0x0210, 0x0490, 0x0492
 
 
 def moving(speed_mm_s: float = 100.0, **model: object) -> AptBench:
-    """A bench half a second into a move to 200 mm."""
+    """Return a bench half a second into a move to 200 mm."""
     bench = AptBench(**model)
     bench.stage.move_to(200.0, speed_mm_s)
     bench.advance(0.5)
@@ -29,8 +29,8 @@ def at_rest(bench: AptBench) -> bool:
 
 
 @pytest.mark.fault("garbage between frames")
-def test_garbage_in_a_move() -> None:
-    """driver: skips it and goes on; user reads: skipped_bytes in the diagnostics."""
+def test_garbage_in_a_move_is_skipped() -> None:
+    """driver: skips it and continues; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
     bench = AptBench()
     bench.stage.move_to(200.0, 100.0)
@@ -42,8 +42,8 @@ def test_garbage_in_a_move() -> None:
 
 
 @pytest.mark.fault("bytes lost")
-def test_lost_bytes_in_a_move() -> None:
-    """driver: asks again for what got lost; user reads: broken_frames and skipped_bytes."""
+def test_a_move_arrives_in_spite_of_lost_bytes() -> None:
+    """driver: requests again what was lost; user reads: broken_frames and skipped_bytes."""
     bench = AptBench(seed=3)
     bench.model.disturbance.loss_share = 0.05
     bench.move(200.0, 50.0)
@@ -54,8 +54,8 @@ def test_lost_bytes_in_a_move() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("bit flips")
-def test_flipped_bits(rests: bool) -> None:
-    """driver: believes no single odd message, asks again; user reads: statuses_rejected."""
+def test_one_flipped_bit_moves_no_position(rests: bool) -> None:
+    """driver: uses no single implausible message, requests more; user reads: statuses_rejected."""
     bench = AptBench()
     bench.move(100.0)
     if not rests:
@@ -71,8 +71,8 @@ def test_flipped_bits(rests: bool) -> None:
 
 
 @pytest.mark.fault("bit flips")
-def test_two_running() -> None:
-    """driver: stops; user reads: two status messages running make no sense; check the cable."""
+def test_two_implausible_messages_in_a_row_stop_the_stage() -> None:
+    """driver: stops; user reads: two status messages in a row are implausible; check cable."""
     bench = moving()
     bench.model.disturbance.flips = 2
     bench.model.disturbance.flip_bit = 16 + 21
@@ -88,7 +88,7 @@ def test_two_running() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("encoder jumps")
-def test_encoder_jump(rests: bool) -> None:
+def test_an_encoder_jump_stops_the_stage(rests: bool) -> None:
     """driver: two readings stop it; user reads: the encoder jumped by ... mm; home again."""
     bench = AptBench()
     if not rests:
@@ -104,7 +104,7 @@ def test_encoder_jump(rests: bool) -> None:
 
 
 @pytest.mark.fault("carriage stalls")
-def test_stall() -> None:
+def test_a_stalled_carriage_is_stopped_and_disabled() -> None:
     """driver: profiled stop, immediate stop, disable; user reads: stuck at ... on its move."""
     bench = moving()
     bench.model.axis.freeze(bench.clock_ns())
@@ -120,7 +120,7 @@ def test_stall() -> None:
 
 
 @pytest.mark.fault("carriage stalls")
-def test_position_error() -> None:
+def test_a_position_error_counts_as_a_stall() -> None:
     """driver: the same as for a stall; user reads: the stage is stuck at ..."""
     bench = moving()
     bench.model.extra_bits = 0x4000
@@ -129,8 +129,8 @@ def test_position_error() -> None:
 
 
 @pytest.mark.fault("serial unplugged, silent")
-def test_unplug() -> None:
-    """driver: fails at once, every order after it, too; user reads: the stage's port failed: ..."""
+def test_an_unplugged_port_fails_at_once() -> None:
+    """driver: fails at once, as does every later order; user reads: the stage's port failed: ..."""
     bench = moving()
     bench.model.gone = True
     assert "port failed" in bench.failure()
@@ -141,8 +141,8 @@ def test_unplug() -> None:
 
 
 @pytest.mark.fault("serial unplugged, silent")
-def test_silent_link() -> None:
-    """driver: warns after 0.5 s, fails after 1.5 s; user reads: silent for 1.5 s; check power."""
+def test_a_controller_that_sends_nothing_fails() -> None:
+    """driver: warns after 0.5 s, fails after 1.5 s; user reads: sent no status for 1.5 s."""
     bench = AptBench()
     bench.model.mute = True
     bench.advance(0.7)
@@ -154,8 +154,8 @@ def test_silent_link() -> None:
 
 
 @pytest.mark.fault("limit switch")
-def test_limit_in_a_move() -> None:
-    """driver: stops, lets only back; user reads: met a limit at ... mm; move it back first."""
+def test_after_a_limit_in_a_move_only_the_way_back_is_free() -> None:
+    """driver: stops, allows only the way back; user reads: met a limit at ... mm; move it back."""
     bench = AptBench()
     bench.model.axis.obstacle_mm = 80.0
     bench.move(200.0, 100.0)
@@ -171,7 +171,7 @@ def test_limit_in_a_move() -> None:
 
 
 @pytest.mark.fault("completion message missing")
-def test_end_messages_missing() -> None:
+def test_motions_end_without_end_messages() -> None:
     """driver: finds the end of homing, move and stop in the status; user reads: nothing."""
     bench = AptBench(home=False)
     bench.model.withheld = {"moved", "stopped", "homed"}
@@ -186,8 +186,8 @@ def test_end_messages_missing() -> None:
 
 
 @pytest.mark.fault("completion message missing")
-def test_motion_without_end() -> None:
-    """driver: stops after the time it should take; user reads: does not end in time; look there."""
+def test_a_motion_without_end_is_stopped() -> None:
+    """driver: stops after the longest time it should take; user reads: does not end in time."""
     bench = AptBench()
     bench.stage.move_to(30.0, 100.0)
     bench.model.extra_bits = apt_messages.MOVING
@@ -195,8 +195,8 @@ def test_motion_without_end() -> None:
 
 
 @pytest.mark.fault("keep-alive missing")
-def test_keep_alive() -> None:
-    """driver: keeps alive from the writer's thread twice a second; user reads: nothing."""
+def test_the_keep_alive_is_sent_twice_a_second() -> None:
+    """driver: sends it from the writer's thread twice a second; user reads: nothing."""
     bench = AptBench()
     bench.advance(5.0)
     sent = bench.sent(KEEP_ALIVE)
@@ -205,8 +205,8 @@ def test_keep_alive() -> None:
 
 
 @pytest.mark.fault("keep-alive missing")
-def test_keep_alive_lost() -> None:
-    """driver: takes the silence for a dead link; user reads: silent for 1.5 s; check its power."""
+def test_without_keep_alive_the_link_fails() -> None:
+    """driver: fails as on a dead link; user reads: sent no status for 1.5 s; check its power ..."""
     bench = AptBench()
     for timer in bench.link._timers:
         if timer.period_ns == 500_000_000:
@@ -215,8 +215,8 @@ def test_keep_alive_lost() -> None:
 
 
 @pytest.mark.fault("disabled, not homed, move ignored")
-def test_not_enabled() -> None:
-    """driver: does not come up; user reads: does not enable the axis; check its front panel."""
+def test_an_axis_that_is_not_enabled_is_refused() -> None:
+    """driver: refuses to open; user reads: does not enable the axis; check its front panel."""
     bench = AptBench(home=False)
     bench.model.panel_disabled, bench.model.enabled = True, False
     with pytest.raises(DeviceError, match=r"does not enable the axis; check its front panel"):
@@ -224,7 +224,7 @@ def test_not_enabled() -> None:
 
 
 @pytest.mark.fault("disabled, not homed, move ignored")
-def test_disabled_later() -> None:
+def test_an_axis_disabled_in_a_move_fails() -> None:
     """driver: stops; user reads: does not have the axis enabled any more; configure and home."""
     bench = moving()
     bench.model.enabled = False
@@ -232,7 +232,7 @@ def test_disabled_later() -> None:
 
 
 @pytest.mark.fault("disabled, not homed, move ignored")
-def test_ignored_move() -> None:
+def test_an_ignored_move_fails() -> None:
     """driver: sees no motion within 0.3 s; user reads: does not begin its move within 0.3 s."""
     bench = AptBench()
     bench.model.ignores_moves = True
@@ -244,8 +244,8 @@ def test_ignored_move() -> None:
 
 @pytest.mark.parametrize("text", ["", "Motor over temperature"])
 @pytest.mark.fault("controller reports an error")
-def test_error_message(text: str) -> None:
-    """driver: stops; user reads: the controller's code and words, or to look at its display."""
+def test_an_error_message_stops_the_stage(text: str) -> None:
+    """driver: stops; user reads: the controller's code and text, or to look at its display."""
     bench = moving()
     bench.model.send_error(17, text)
     read = bench.failure()
@@ -254,8 +254,8 @@ def test_error_message(text: str) -> None:
 
 
 @pytest.mark.fault("controller reports an error")
-def test_fault_bits() -> None:
-    """driver: stops when two messages say so; user reads: controller reports over_temperature."""
+def test_fault_bits_stop_the_stage() -> None:
+    """driver: stops when two messages have them; user reads: reports over_temperature."""
     bench = moving()
     bench.model.extra_bits = 0x20000
     assert "reports over_temperature" in bench.failure()
@@ -264,7 +264,7 @@ def test_fault_bits() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("controller rebooted")
-def test_controller_restarts(rests: bool) -> None:
+def test_a_restarted_controller_must_be_homed(rests: bool) -> None:
     """driver: stops; user reads: does not have its reference any more; configure and home."""
     bench = AptBench()
     bench.move(60.0)
@@ -281,8 +281,8 @@ def test_controller_restarts(rests: bool) -> None:
 
 
 @pytest.mark.fault("late or double reply")
-def test_double_replies() -> None:
-    """driver: takes each answer once, by message and source; user reads: nothing."""
+def test_double_replies_count_once() -> None:
+    """driver: uses each answer once, by message and source; user reads: nothing."""
     bench = AptBench()
     bench.model.disturbance.repeats = 10_000
     bench.move(100.0)
@@ -291,8 +291,8 @@ def test_double_replies() -> None:
 
 
 @pytest.mark.fault("late or double reply")
-def test_late_reply() -> None:
-    """driver: asks again, and the late answer harms nobody; user reads: nothing."""
+def test_a_late_reply_is_requested_again() -> None:
+    """driver: requests again and drops the late answer; user reads: nothing."""
     late = {"ns": 0}
     bench = AptBench(late_ns=lambda: late["ns"])
     late["ns"] = 350_000_000
@@ -303,8 +303,8 @@ def test_late_reply() -> None:
 
 
 @pytest.mark.fault("host stalls")
-def test_host_stalls_in_a_move() -> None:
-    """driver: positions stay interpolated, the pause is filled in later; user reads: nothing."""
+def test_positions_are_exact_after_a_stall_in_a_move() -> None:
+    """driver: positions stay interpolated, the stall is filled afterwards; user reads: nothing."""
     bench = AptBench()
     bench.stage.move_to(200.0, 100.0)
     bench.advance(0.5)
@@ -320,8 +320,8 @@ def test_host_stalls_in_a_move() -> None:
 
 
 @pytest.mark.fault("host stalls")
-def test_host_stalls_as_a_move_begins() -> None:
-    """driver: an answer from before the order says nothing about the move; user reads: nothing."""
+def test_a_stall_as_a_move_begins_is_no_failure() -> None:
+    """driver: an answer from before the order does not count for the move; user reads: nothing."""
     bench = AptBench()
     for turn, stall_s in itertools.product(range(12), (0.35, 0.8)):
         bench.advance(0.007 * turn)
@@ -335,7 +335,7 @@ def test_host_stalls_as_a_move_begins() -> None:
 
 
 @pytest.mark.fault("shutdown at any time")
-def test_close_while_homing() -> None:
+def test_close_while_homing_stops_the_carriage() -> None:
     """driver: stops and closes within 2 s, twice if need be; user reads: nothing."""
     bench = AptBench(AptSettings(homing_mm_s=10.0), home=False, power_up_mm=150.0)
     bench.stage.home()

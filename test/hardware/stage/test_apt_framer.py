@@ -34,21 +34,21 @@ def test_frames_in_any_pieces() -> None:
 
 
 @pytest.mark.fault("garbage between frames")
-def test_garbage_between_frames() -> None:
+def test_garbage_between_frames_is_skipped() -> None:
     """driver: skips it byte by byte and counts; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
     for _ in range(200):
         garbage = chance.randbytes(chance.randrange(1, 40))
         framer = AptFramer()
         frames = framer.feed(status(1) + garbage, 0)
-        # What looks like the beginning of a frame is given up when nothing follows it.
+        # Bytes that look like the start of a frame are dropped when nothing follows them.
         frames += framer.feed(status(2), 60 * MS) + framer.feed(status(3), 120 * MS)
         frames += framer.feed(b"", 200 * MS)
         assert positions(frames) == [1, 2, 3]
         assert framer.skipped_bytes == len(garbage)
 
 
-def test_nothing_but_known_frames_for_the_host_passes() -> None:
+def test_only_known_frames_for_the_host_pass() -> None:
     good = status(7)
     wrong = {
         "identifier": b"\x93" + good[1:],
@@ -64,8 +64,8 @@ def test_nothing_but_known_frames_for_the_host_passes() -> None:
 
 
 @pytest.mark.fault("bytes lost")
-def test_lost_bytes() -> None:
-    """driver: loses one or two frames a cut, never more; user reads: broken_frames counted."""
+def test_a_lost_byte_costs_two_frames_at_most() -> None:
+    """driver: loses at most two frames for each; user reads: broken_frames in the diagnostics."""
     chance = random.Random(2)
     framer = AptFramer()
     kept = []
@@ -81,7 +81,7 @@ def test_lost_bytes() -> None:
     assert len(right.intersection(positions(kept))) >= 20_000 - 2 * cuts
 
 
-def test_incomplete_frame_is_given_up_after_50_ms() -> None:
+def test_an_incomplete_frame_is_dropped_after_50_ms() -> None:
     framer = AptFramer()
     assert framer.feed(status(1)[:12], 0) == []
     assert framer.feed(b"", 49 * MS) == []

@@ -1,4 +1,4 @@
-"""The link by itself, on a port that fails."""
+"""The link on a port that fails."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ class DeadPort:
         pass
 
 
-def test_whoever_hears_of_a_failure_may_use_the_link() -> None:
-    """As the reader does, which asks again while the listener waits for its lock."""
-    heard: list[DeviceError] = []
+def test_the_link_can_be_used_while_its_failure_is_handled() -> None:
+    """The reader may request a status while ``on_lost`` waits for its lock."""
+    failures: list[DeviceError] = []
 
     def on_lost(error: DeviceError) -> None:
         reader = threading.Thread(target=link.write, args=(b"again",), daemon=True)
         reader.start()
         reader.join(DEADLINE_S)
         assert not reader.is_alive()
-        heard.append(error)
+        failures.append(error)
 
     link = AptLink(DeadPort(), lambda frame, at_ns: None, on_lost)
     link.write(b"frame")
-    assert [str(error) for error in heard] == [
+    assert [str(error) for error in failures] == [
         "the stage's port failed: [Errno 5] Input/output error; check the cable, then configure "
         "again"
     ]
@@ -47,7 +47,7 @@ def test_whoever_hears_of_a_failure_may_use_the_link() -> None:
         link.send(b"frame")
 
 
-def test_request_that_cannot_be_sent_leaves_nothing_behind() -> None:
+def test_a_request_that_cannot_be_sent_leaves_nothing_behind() -> None:
     link = AptLink(DeadPort(), lambda frame, at_ns: None, lambda error: None)
     link.close()
     with pytest.raises(DeviceGoneError, match="port is closed"):

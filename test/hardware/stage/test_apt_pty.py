@@ -20,7 +20,7 @@ from eschorty_ros.hardware.stage import apt_port
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 from eschorty_ros.hardware.stage.apt_stage import AptStage, open_stage
 
-# To the far end it takes longer than anything that is waited for here.
+# To the far end it takes longer than any wait of these tests.
 SLOW_MM_S = 10.0
 
 
@@ -67,7 +67,7 @@ def test_home_move_stop_and_close(port: str, model: AptModel) -> None:
 
 
 @pytest.mark.fault("two clients")
-def test_second_client(port: str) -> None:
+def test_a_second_client_is_refused(port: str) -> None:
     """driver: the port is opened exclusively; user reads: another program holds ...; close it."""
     stage = opened(port)
     try:
@@ -78,7 +78,7 @@ def test_second_client(port: str) -> None:
 
 
 @pytest.mark.fault("serial unplugged, silent")
-def test_unplug_on_the_port(port: str, model: AptModel) -> None:
+def test_an_unplugged_port_ends_the_threads(port: str, model: AptModel) -> None:
     """driver: its threads end, orders fail; user reads: the stage's port failed; check cable."""
     stage = opened(port)
     model.gone = True
@@ -98,14 +98,14 @@ def test_unplug_on_the_port(port: str, model: AptModel) -> None:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("thread", ["apt reader", "apt writer"])
-def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
+def test_a_thread_that_ends_by_an_error_stops_the_stage(
     port: str, model: AptModel, thread: str
 ) -> None:
     stage = opened(port)
 
-    def mistake(*_: object) -> None:
+    def broken(*_: object) -> None:
         assert threading.current_thread().name == thread
-        raise ZeroDivisionError("nobody thought of it")
+        raise ZeroDivisionError("unexpected")
 
     try:
         stage.home()
@@ -113,13 +113,13 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
         stage.move_to(200.0, SLOW_MM_S)
         wait_until(lambda: model.axis.moving(time.monotonic_ns()), "motion")
         if thread == "apt reader":
-            stage._tracker.add_status = mistake  # type: ignore[method-assign]
+            stage._tracker.add_status = broken  # type: ignore[method-assign]
         else:
-            stage._link.call_every(1.0, mistake)
+            stage._link.call_every(1.0, broken)
         wait_until(lambda: failed(stage), "the failure")
         assert not stage.healthy
         for call in (stage.state, stage.home, lambda: stage.move_to(10.0, 10.0)):
-            with pytest.raises(DeviceError, match=r"driver failed: Zero.*nobody thought of it.*;"):
+            with pytest.raises(DeviceError, match=r"driver failed: Zero.*unexpected.*;"):
                 call()
         wait_until(lambda: not model.axis.moving(time.monotonic_ns()), "rest")
         assert model.axis.position_mm(time.monotonic_ns()) < 150.0
@@ -129,18 +129,18 @@ def test_a_thread_that_ends_by_a_mistake_stops_the_stage(
 
 
 @pytest.mark.fault("keep-alive missing")
-def test_blocked_callback(port: str, model: AptModel) -> None:
-    """driver: keeps alive while whoever listens to it hangs; user reads: nothing."""
+def test_the_keep_alive_continues_while_a_caller_hangs(port: str, model: AptModel) -> None:
+    """driver: sends it while another thread holds its lock; user reads: nothing."""
     stage = opened(port)
-    heard: list[float] = []
+    received_s: list[float] = []
     handle = model._handle
 
-    def listening(name: str, address: int, values: dict[str, int], at_ns: int) -> None:
+    def recording(name: str, address: int, values: dict[str, int], at_ns: int) -> None:
         if name == "keep_alive":
-            heard.append(time.monotonic())
+            received_s.append(time.monotonic())
         handle(name, address, values, at_ns)
 
-    model._handle = listening  # type: ignore[method-assign]
+    model._handle = recording  # type: ignore[method-assign]
     release = threading.Event()
 
     def hang() -> None:
@@ -151,7 +151,7 @@ def test_blocked_callback(port: str, model: AptModel) -> None:
         blocker = threading.Thread(target=hang)
         blocker.start()
         begun_s = time.monotonic()
-        wait_until(lambda: sum(at > begun_s for at in heard) >= 4, "four signs of life")
+        wait_until(lambda: sum(at > begun_s for at in received_s) >= 4, "four keep-alives")
         release.set()
         blocker.join()
         wait_until(lambda: stage.healthy, "fresh messages")
@@ -160,25 +160,25 @@ def test_blocked_callback(port: str, model: AptModel) -> None:
         stage.close()
 
 
-def test_a_host_that_stood_still_after_writing_has_written(
+def test_a_write_before_a_stall_of_the_host_is_no_failure(
     port: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened_port = apt_port.open_port(port)
     write = os.write
 
-    def stands_still(descriptor: int, data: bytes) -> int:
+    def stalls(descriptor: int, data: bytes) -> int:
         count = write(descriptor, data)
         time.sleep(2.0 * apt_port._WRITE_S)
         return count
 
     try:
-        monkeypatch.setattr(os, "write", stands_still)
+        monkeypatch.setattr(os, "write", stalls)
         assert opened_port.write(b"\x92\x04\x00\x00\x21\x01") == 6
     finally:
         opened_port.close()
 
 
-def test_a_port_that_takes_nothing_fails(tmp_path: Path) -> None:
+def test_a_port_that_takes_no_bytes_fails(tmp_path: Path) -> None:
     host, device = os.openpty()
     tty.setraw(device)
     opened_port = apt_port.open_port(os.ttyname(device))

@@ -45,7 +45,7 @@ def test_caps_are_the_least_of_settings_and_report() -> None:
 
 @pytest.mark.parametrize("rate_hz", [10.0, 50.0])
 def test_odometry_within_20_um_at_300_mm_s(rate_hz: float) -> None:
-    """Through the driver: jitter of the answers, the line's own time, polling, ramps and all."""
+    """With jitter of the answers, the line's own time, polling and ramps."""
     chance = random.Random(5)
     bench = AptBench(
         AptSettings(speed_max_mm_s=300.0, poll_hz=rate_hz),
@@ -53,16 +53,16 @@ def test_odometry_within_20_um_at_300_mm_s(rate_hz: float) -> None:
         late_ns=lambda: round(chance.uniform(0.0, 3e6)),
     )
     bench.move(5.0, 300.0)
-    told: dict[int, float] = {}
+    found: dict[int, float] = {}
     for target_mm in (215.0, 5.0):
         stage = bench.stage
         stage.move_to(target_mm, 300.0)
         while stage.state().moving:
             bench.advance(0.01)
             state = stage.state()
-            told[state.t_ns] = state.position_mm
-    t_ns = np.array(sorted(told))
-    places = np.array([told[int(t)] for t in t_ns])
+            found[state.t_ns] = state.position_mm
+    t_ns = np.array(sorted(found))
+    places = np.array([found[int(t)] for t in t_ns])
     true = np.array([bench.model.axis.position_mm(int(t)) for t in t_ns])
     worst_um = np.abs(places - true).max() * 1e3
     print(f"{rate_hz:g} Hz: {worst_um:.1f} um at most, {len(t_ns)} positions")
@@ -167,10 +167,10 @@ def test_close_stops_and_is_idempotent() -> None:
 @pytest.mark.parametrize("settings", [AptSettings(), BAY_2], ids=["kbd101", "bbd30x"])
 def test_pulses_every_2_mm_in_both_directions(settings: AptSettings) -> None:
     bench = AptBench(settings)
-    train = bench.stage.trigger
-    assert train is not None
-    assert (train.first_mm, train.interval_mm, train.count) == (2.0, 2.0, 109)
-    expected = [train.first_mm + k * train.interval_mm for k in range(train.count)]
+    pulses = bench.stage.trigger
+    assert pulses is not None
+    assert (pulses.first_mm, pulses.interval_mm, pulses.count) == (2.0, 2.0, 109)
+    expected = [2.0 * (k + 1) for k in range(109)]
     for target_mm, places in ((220.0, expected), (0.0, expected[::-1])):
         begun_ns = bench.clock_ns()
         bench.move(target_mm)
@@ -199,7 +199,7 @@ def test_no_pulses_when_the_interval_is_0() -> None:
     assert bench.model.trigger_pulses(EPOCH_NS, bench.clock_ns()) == []
 
 
-def test_everything_is_written_again_at_connect() -> None:
+def test_all_settings_are_written_at_each_connection() -> None:
     bench = AptBench()
     bench.model.reboot()
     bench.port.written.clear()
@@ -208,7 +208,7 @@ def test_everything_is_written_again_at_connect() -> None:
         assert bench.sent(id), hex(id)
 
 
-def test_a_silent_controller_and_an_empty_bay_are_named() -> None:
+def test_a_mute_controller_and_an_empty_bay_are_named() -> None:
     bench = AptBench(home=False)
     bench.model.mute = True
     with pytest.raises(DeviceError, match=r"sent no 'info'.*check its power"):
@@ -236,7 +236,7 @@ def test_wrong_settings_are_refused(wrong: dict, text: str) -> None:
 
 @pytest.mark.parametrize("set_s", [-2, -3600, 3600])
 @pytest.mark.parametrize("moving", [False, True], ids=["at rest", "moving"])
-def test_a_host_clock_that_is_set_leaves_the_odometry_going(set_s: int, moving: bool) -> None:
+def test_the_odometry_continues_after_the_host_clock_is_set(set_s: int, moving: bool) -> None:
     bench = AptBench()
     bench.move(10.0)
     if moving:
@@ -247,7 +247,7 @@ def test_a_host_clock_that_is_set_leaves_the_odometry_going(set_s: int, moving: 
     state = bench.stage.state()
     assert abs(state.t_ns - bench.host_clock_ns()) < 200_000_000
     true_mm = bench.model.axis.position_mm(state.t_ns - bench.clock_set_ns)
-    # On the way, readings alone tell where: they are as late as the line.
+    # In a move the position comes from readings alone, which are as late as the line.
     assert state.position_mm == pytest.approx(true_mm, abs=0.3 if moving else 1e-4)
     bench.until(lambda: not bench.stage.state().moving, 5.0)
     bench.move(40.0)

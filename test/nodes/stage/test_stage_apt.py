@@ -88,24 +88,27 @@ def test_moves_with_odometry_on_the_true_motion(
 
 
 @pytest.mark.fault("serial unplugged, silent")
-def test_unplug_under_the_node(port: str, model: AptModel, observer: Observer) -> None:
+def test_an_unplugged_stage_makes_the_node_leave_active(
+    port: str, model: AptModel, observer: Observer
+) -> None:
     """driver: the node leaves the active state; user reads: stage lost: the stage's port failed."""
     with NodeProcess(
         "eschorty_ros.nodes.stage.node", {**SETTINGS, "port": port}, domain=observer.domain
     ) as process:
-        told = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
+        reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
         observer.wait_for_state("stage", "active")
         model.gone = True
         wait_until(lambda: "stage lost: the stage's port failed" in process.output, "the log")
         wait_until(
-            lambda: any("port failed" in s.message for m in told for s in m.status), "diagnostics"
+            lambda: any("port failed" in s.message for m in reports for s in m.status),
+            "diagnostics",
         )
         assert process.interrupt() == 0
         assert "Traceback" not in process.output
 
 
 @pytest.mark.fault("shutdown at any time")
-def test_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
+def test_an_interrupt_while_homing_stops_the_carriage(tmp_path: Path, observer: Observer) -> None:
     """driver: stops the carriage, closes the port, within 2 s; user reads: nothing; exit code 0."""
     model = AptModel(time.time_ns, power_up_mm=150.0)
     with (
@@ -119,6 +122,6 @@ def test_interrupt_while_homing(tmp_path: Path, observer: Observer) -> None:
         wait_until(lambda: model.axis.moving(time.time_ns()), "homing")
         assert process.interrupt() == 0
         assert "Traceback" not in process.output
-        # What the process said last may still be on the line.
+        # The last bytes of the process may still be on the line.
         wait_until(lambda: not model.axis.moving(time.time_ns()), "rest")
         assert 1.0 < model.axis.position_mm(time.time_ns()) < 150.0
