@@ -19,7 +19,7 @@ TICK_NS = 200_000
 
 
 class MemoryPort:
-    """A port straight into the model."""
+    """A port that is connected to the model directly."""
 
     timeout: float | None = None
     in_waiting = 0
@@ -43,7 +43,7 @@ class MemoryPort:
 
 
 class AptBench:
-    """Driver, model and the time both live in.
+    """Driver, model, and the clock of both.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class AptBench:
         return EPOCH_NS + self.now_ns
 
     def host_clock_ns(self) -> int:
-        """The clock the driver stamps by, which somebody may have set by ``clock_set_ns``."""
+        """The clock by which the driver stamps, set by ``clock_set_ns``."""
         return self.clock_ns() + self.clock_set_ns
 
     def open(self) -> AptStage:
@@ -99,13 +99,13 @@ class AptBench:
             self.link.service()
 
     def advance(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the clock."""
         end_ns = self.now_ns + round(seconds * 1e9)
         while self.now_ns < end_ns:
             self._tick()
 
     def until(self, condition: Callable[[], bool], limit_s: float = 10.0) -> None:
-        """Let time pass until something holds."""
+        """Advance the clock until a condition holds."""
         end_ns = self.now_ns + round(limit_s * 1e9)
         while not condition():
             assert self.now_ns < end_ns, f"not within {limit_s:g} s"
@@ -117,7 +117,7 @@ class AptBench:
         self.until(lambda: not self.stage.state().moving, 60.0)
 
     def failure(self, limit_s: float = 5.0) -> str:
-        """What the user reads when the stage fails."""
+        """Return the error that the user reads when the stage fails."""
         text = ""
 
         def failed() -> bool:
@@ -135,9 +135,9 @@ class AptBench:
 
     @property
     def true_mm(self) -> float:
-        """Where the carriage is."""
+        """Position of the carriage."""
         return self.model.axis.position_mm(self.clock_ns())
 
     def sent(self, name_id: int) -> list[int]:
-        """Times (ns) at which the host wrote messages of an identifier."""
+        """Return when (ns) the host wrote messages of an identifier."""
         return [at for at, data in self.port.written if data[:2] == name_id.to_bytes(2, "little")]

@@ -1,4 +1,4 @@
-"""A stage that gives pulses to a camera whose clock drifts, with the truth known."""
+"""A stage that gives pulses to a camera with a drifting clock; the truth is known."""
 
 from __future__ import annotations
 
@@ -68,12 +68,12 @@ class StagePulses:
         return position
 
     def arrivals(self, late_ms=0.0, drift_ppm=50.0):
-        """The clock as arrivals show it."""
+        """Return the clock by arrivals that are late."""
         middle = int(self.edges[self.edges.size // 2])
         return ClockLine(middle, self.true.to_ns(middle) + round(late_ms * 1e6),
                          round(drift_ppm * 1e3))  # fmt: skip
 
     def error_um(self, fit):
-        """Worst error of a position at 300 mm/s over the time of the edges."""
+        """Return the largest error of a position at 300 mm/s over the time of the edges."""
         t = np.linspace(self.edges[0], self.edges[-1], 1000).astype(np.int64)
         return float(np.abs(fit.line.to_ns(t) - self.true.to_ns(t)).max()) * 300e-6

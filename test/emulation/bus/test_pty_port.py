@@ -15,15 +15,15 @@ EVERY_BYTE = bytes(range(256))
 
 
 class Echo:
-    """Answers what it is told."""
+    """Answers with the bytes it receives."""
 
     def __init__(self) -> None:
         self.gone = False
-        self.heard = b""
+        self.received = b""
         self._answer = b""
 
     def feed(self, data: bytes) -> None:
-        self.heard += data
+        self.received += data
         self._answer += data
 
     def step(self) -> bytes:
@@ -52,7 +52,7 @@ def test_it_can_be_opened_again(tmp_path: Path) -> None:
                 assert read(port, 3) == b"\x11\x0d\x03"
 
 
-def test_an_unplugged_model_hangs_up_and_comes_back(tmp_path: Path) -> None:
+def test_an_unplugged_model_hangs_up_and_returns(tmp_path: Path) -> None:
     model = Echo()
     with PtyPort(model, tmp_path / "port"):
         with serial.Serial(str(tmp_path / "port"), timeout=DEADLINE_S) as port:
@@ -67,12 +67,12 @@ def test_an_unplugged_model_hangs_up_and_comes_back(tmp_path: Path) -> None:
             assert read(port, 5) == b"again"
 
 
-def test_a_host_that_does_not_read_holds_nothing_up(tmp_path: Path) -> None:
+def test_a_host_that_does_not_read_blocks_nothing(tmp_path: Path) -> None:
     model = Echo()
     with PtyPort(model, tmp_path / "port"), serial.Serial(str(tmp_path / "port")) as port:
         for _ in range(100):
             port.write(bytes(1000))
-        wait_until(lambda: len(model.heard) == 100_000, "all bytes")
+        wait_until(lambda: len(model.received) == 100_000, "all bytes")
 
 
 def test_a_link_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:

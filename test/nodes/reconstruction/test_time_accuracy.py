@@ -160,7 +160,7 @@ def test_missing_and_spurious_edges_and_odometry_good_to_20_um():
     assert fit.spurious >= 4
 
 
-def test_expected_edges_that_do_not_come_are_told_and_arrivals_serve():
+def test_without_the_expected_edges_arrivals_give_the_clock():
     run = Run(50e-6, jitter)
     run.packets = Run(50e-6, jitter, missing=1.0).packets
     pipeline, report = run.scan("stage")
