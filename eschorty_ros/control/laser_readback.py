@@ -1,4 +1,4 @@
-"""What a generator was asked, what it reads back, and how that differs; no ROS."""
+"""What was requested of the laser, what its generator reads back, and how the two differ."""
 
 from __future__ import annotations
 
@@ -11,54 +11,28 @@ from eschorty_ros.hardware.base.protocols import LaserOutput, LaserReadback
 
 FREQUENCY_TOLERANCE = 1e-4
 DUTY_TOLERANCE = 2e-3
+_UNKNOWN = "laser state unknown: "
 
 
 @dataclass(frozen=True, slots=True)
-class LaserSnapshot:
-    """What was asked, what was read back, and why."""
+class LaserStatus:
+    """The output that was requested and why, and what the generator reads back."""
 
     requested: LaserOutput
-    told: LaserReadback
+    readback: LaserReadback
     reason: str
 
 
-def wrong_output(told: LaserReadback, requested: LaserOutput) -> str:
-    """How the output differs from what was requested, ``""`` when it does not or is unknown."""
-    if told.output in (requested, LaserOutput.UNKNOWN):
-        return ""
-    why = f" ({told.reason})" if told.reason else ""
-    return f"output reads back {told.output.name}, asked {requested.name}{why}"
-
-
-def wrong_waveform(told: LaserReadback, asked: Modulation | None) -> str:
-    """How the modulation differs from what was asked, ``""`` when it does not."""
-    if asked is None:
-        return ""
-    now = told.modulation
-    if not math.isclose(now.frequency_hz, asked.frequency_hz, rel_tol=FREQUENCY_TOLERANCE):
-        return f"frequency reads back {now.frequency_hz:g} Hz, asked {asked.frequency_hz:g} Hz"
-    if abs(now.duty - asked.duty) > DUTY_TOLERANCE:
-        return f"duty reads back {now.duty:g}, asked {asked.duty:g}"
-    if now.waveform != asked.waveform:
-        return f"waveform reads back {now.waveform}, asked {asked.waveform}"
-    return ""
-
-
-def unknown_text(text: str) -> str:
-    """Head a line with what it means, unless it says so itself."""
-    heading = "laser state unknown: "
-    return text if text.startswith(heading) else heading + text
-
-
 class LaserRecord:
-    """What was asked of a generator, and what is known of it; takes no lock.
+    """What was requested of a generator and what it read back last; takes no lock.
 
     Attributes
     ----------
     requested : LaserOutput
-    asked : Modulation or None
-    told : LaserReadback or None
-        The newest read-back, ``None`` before the first.
+    modulation : Modulation or None
+        The one that was requested.
+    readback : LaserReadback or None
+        The newest, ``None`` before the first.
     reason : str
         Why the output was requested so.
     unknown : str
@@ -67,46 +41,70 @@ class LaserRecord:
 
     def __init__(self) -> None:
         self.requested = LaserOutput.OFF
-        self.asked: Modulation | None = None
-        self.told: LaserReadback | None = None
+        self.modulation: Modulation | None = None
+        self.readback: LaserReadback | None = None
         self.reason = "off at start"
         self.unknown = ""
         self._warned: set[str] = set()
 
     @property
-    def snapshot(self) -> LaserSnapshot | None:
+    def status(self) -> LaserStatus | None:
         """What is known now, ``None`` before the first read-back."""
-        told = self.told
-        return None if told is None else LaserSnapshot(self.requested, told, self.reason)
+        readback = self.readback
+        return None if readback is None else LaserStatus(self.requested, readback, self.reason)
 
-    def calls_for_darkness(self, told: LaserReadback) -> str:
-        """Why ``told``, just heard, is a reason to switch off, ``""`` when it is none."""
-        if self.requested is LaserOutput.ON:
-            return self.difference(told)
-        return wrong_output(told, self.requested) or self.unknown
-
-    def hear(self, told: LaserReadback) -> list[str]:
-        """Note what the generator says; its warnings that are new."""
-        self.told = told
+    def receive(self, readback: LaserReadback) -> list[str]:
+        """Take a read-back; returns those of its warnings that are new."""
+        self.readback = readback
         self.unknown = ""
-        if told.output is LaserOutput.UNKNOWN:
-            self.unknown = unknown_text(told.reason or "the generator does not say")
-        fresh = [text for text in dict.fromkeys(told.warnings) if text not in self._warned]
+        if readback.output is LaserOutput.UNKNOWN:
+            self.unknown = _headed(readback.reason or "the generator does not report it")
+        fresh = [text for text in dict.fromkeys(readback.warnings) if text not in self._warned]
         self._warned.update(fresh)
         return fresh
 
-    def off_unread(self) -> LaserReadback | None:
-        """Read-back to assume when the generator has confirmed no more than that it is off."""
-        if self.told is None:
+    def assume_off(self) -> LaserReadback | None:
+        """Return the read-back to take when the generator has confirmed only that it is off."""
+        if self.readback is None:
             return None
-        return replace(self.told, output=LaserOutput.OFF, output_since_ns=time.time_ns())
+        return replace(self.readback, output=LaserOutput.OFF, output_since_ns=time.time_ns())
 
     def lose(self, error: Exception) -> None:
-        """Note that the output may be anything."""
-        self.unknown = unknown_text(str(error))
-        if self.told is not None:
-            self.told = replace(self.told, output=LaserOutput.UNKNOWN)
+        """Note that the output may be on or off."""
+        self.unknown = _headed(str(error))
+        if self.readback is not None:
+            self.readback = replace(self.readback, output=LaserOutput.UNKNOWN)
 
-    def difference(self, told: LaserReadback) -> str:
-        """How ``told`` differs from what was asked, ``""`` when it does not."""
-        return wrong_output(told, self.requested) or wrong_waveform(told, self.asked)
+    def difference(self, readback: LaserReadback) -> str:
+        """Return how a read-back differs from what was requested, ``""`` when it does not."""
+        return self._output_difference(readback) or self._modulation_difference(readback)
+
+    def must_disable(self, readback: LaserReadback) -> str:
+        """Return why the newest read-back demands that the output is disabled, ``""`` if not."""
+        if self.requested is LaserOutput.ON:
+            return self.difference(readback)
+        return self._output_difference(readback) or self.unknown
+
+    def _output_difference(self, readback: LaserReadback) -> str:
+        if readback.output in (self.requested, LaserOutput.UNKNOWN):
+            return ""
+        why = f" ({readback.reason})" if readback.reason else ""
+        return f"output reads back {readback.output.name}, asked {self.requested.name}{why}"
+
+    def _modulation_difference(self, readback: LaserReadback) -> str:
+        asked, found = self.modulation, readback.modulation
+        if asked is None:
+            return ""
+        if not math.isclose(found.frequency_hz, asked.frequency_hz, rel_tol=FREQUENCY_TOLERANCE):
+            return (
+                f"frequency reads back {found.frequency_hz:g} Hz, asked {asked.frequency_hz:g} Hz"
+            )
+        if abs(found.duty - asked.duty) > DUTY_TOLERANCE:
+            return f"duty reads back {found.duty:g}, asked {asked.duty:g}"
+        if found.waveform != asked.waveform:
+            return f"waveform reads back {found.waveform}, asked {asked.waveform}"
+        return ""
+
+
+def _headed(text: str) -> str:
+    return text if text.startswith(_UNKNOWN) else _UNKNOWN + text

@@ -1,4 +1,4 @@
-"""Keeps a laser dark unless its gate lets it be on; no ROS."""
+"""Carries out commands on the laser, and disables it when its interlock or a read-back demands."""
 
 from __future__ import annotations
 
@@ -6,37 +6,36 @@ import contextlib
 import threading
 from collections.abc import Callable, Iterator
 
-from eschorty_ros.control.laser_interlock import LaserGate
-from eschorty_ros.control.laser_readback import LaserRecord, LaserSnapshot
-from eschorty_ros.control.periodic_thread import Lookout
+from eschorty_ros.control.laser_interlock import LaserInterlock
+from eschorty_ros.control.laser_readback import LaserRecord, LaserStatus
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserModulator, LaserOutput, LaserReadback
-from eschorty_ros.hardware.base.stalls import OwnPauses
+from eschorty_ros.hardware.base.stalls import StallMeter
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 
 WATCH_PERIOD_S = 0.02
-_PATIENCE_S = 1.0
+_STOP_TIMEOUT_S = 1.0
 
 
-class LaserKeeper:
-    """Carries out commands on a laser and switches it off when its gate says so.
+class LaserSupervisor:
+    """Carries out commands on a laser and disables it when a condition for light fails.
 
-    Two threads run while it is open: one asks the gate, the other reads the generator back, and
-    switches off when that is not what was asked. Commands wait for each other; switching off waits
-    for none of them, and voids those that would lead to light.
+    Two watchdogs run while it is open: one checks the interlock, the other reads the generator back
+    and disables the output when that is not what was requested. Commands wait for each other;
+    disabling waits for none of them, and voids those that would lead to light.
 
     Parameters
     ----------
-    gate : LaserGate
-    living : callable
-        Whether the process means to go on; light ends when it does not.
-    changed : callable
-        Called with the snapshot after every change, in order.
+    interlock : LaserInterlock
+    running : callable
+        Whether the process means to go on; the output is disabled when it does not.
+    publish : callable
+        Called with the status after every change, in order.
     alarm : callable
         Called with one line when the device failed or its output is unknown.
     log : callable
-        Called with one line when the output was switched off for a reason of the keeper's own.
+        Called with one line when a watchdog disabled the output, and for warnings of the generator.
     readback_period_s : float
 
     Attributes
@@ -47,17 +46,17 @@ class LaserKeeper:
 
     def __init__(
         self,
-        gate: LaserGate,
-        living: Callable[[], bool],
-        changed: Callable[[LaserSnapshot], None],
+        interlock: LaserInterlock,
+        running: Callable[[], bool],
+        publish: Callable[[LaserStatus], None],
         alarm: Callable[[str], None],
         log: Callable[[str], None],
         readback_period_s: float,
     ) -> None:
-        self.gate = gate
-        self._living, self._changed, self._alarm, self._log = living, changed, alarm, log
+        self.interlock = interlock
+        self._running, self._publish, self._alarm, self._log = running, publish, alarm, log
         self._readback_period_s = readback_period_s
-        # Held briefly: by whoever tells the state and by whoever switches off.
+        # Held briefly, to publish the status, and to disable the output.
         self._lock = threading.RLock()
         # Held as long as a command or a read-back takes; taken before ``_lock``, if both are.
         self._commands = threading.Lock()
@@ -65,8 +64,8 @@ class LaserKeeper:
         self._in_flight = CommandsInFlight()
         self._laser: LaserModulator | None = None
         self._record = LaserRecord()
-        self._lookouts: list[Lookout] = []
-        self._pauses: OwnPauses
+        self._watchdogs: list[_Watchdog] = []
+        self._stalls: StallMeter
         self.switch_offs = 0
 
     @property
@@ -83,24 +82,22 @@ class LaserKeeper:
     def open(self, laser: LaserModulator, modulation: Modulation) -> None:
         """Take over a laser: off, with this modulation; raises ``DeviceError`` when refused."""
         with self._lock:
-            self._laser, self._record.asked = laser, modulation
+            self._laser, self._record.modulation = laser, modulation
             self._record.requested, self._record.reason = LaserOutput.OFF, "off at start"
-            self.gate.switched_off()
+            self.interlock.note_disabled()
         laser.disable()
         laser.configure(modulation)
-        told = laser.readback()
-        self._refuse_difference(told)
-        self._hear(told)
-        self._pauses = OwnPauses(WATCH_PERIOD_S)
-        self._lookouts = [
-            Lookout("laser watchdog", self._watch, WATCH_PERIOD_S, self._blind),
-            Lookout("laser read-back", self._read, self._readback_period_s, self._blind),
+        self._receive(self._checked_readback(laser))
+        self._stalls = StallMeter(WATCH_PERIOD_S)
+        self._watchdogs = [
+            _Watchdog("laser watchdog", self._check_interlock, WATCH_PERIOD_S, self._fail),
+            _Watchdog("laser read-back", self._check_readback, self._readback_period_s, self._fail),
         ]
 
     def close(self) -> None:
-        """Switch off and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
-        for lookout in self._lookouts:
-            lookout.end(_PATIENCE_S)
+        """Disable and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
+        for watchdog in self._watchdogs:
+            watchdog.stop()
         with self._in_flight.disabling("closed"), self._lock:
             laser, self._laser = self._laser, None
             if laser is None:
@@ -109,37 +106,36 @@ class LaserKeeper:
                 laser.close()
             except EschortyError as error:
                 self._record.lose(error)
-                self.tell()
+                self.report()
                 raise
             finally:
                 if not self.unknown:
-                    self._record.told = None
+                    self._record.readback = None
 
     def configure(self, modulation: Modulation) -> None:
         """Set another modulation; light that is on goes on with it, unless it is refused."""
         if self._laser is None:
             return
         with self._command() as (laser, _):
-            before, self._record.asked = self._record.asked, modulation
+            before, self._record.modulation = self._record.modulation, modulation
             try:
                 laser.configure(modulation)
-                told = laser.readback()
-                self._refuse_difference(told)
+                readback = self._checked_readback(laser)
             except EschortyError as error:
-                self._record.asked = before
-                self._end_light(error)
+                self._record.modulation = before
+                self._disable_failed(error)
                 raise
-            self._hear(told)
+            self._receive(readback)
 
     def arm(self) -> None:
         """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be."""
-        if self.gate.interlock_open:
+        if self.interlock.contact_open:
             raise DeviceError("laser refused: interlock open; close it")
         with self._command() as (laser, ticket):
             laser.arm()
             with self._lock:
                 self._in_flight.refuse_void(ticket)
-                self.gate.arm()
+                self.interlock.arm()
                 self._record.reason = "armed"
 
     def enable(self) -> None:
@@ -149,17 +145,16 @@ class LaserKeeper:
                 self._in_flight.refuse_void(ticket)
                 if self._record.requested is LaserOutput.ON:
                     return
-                refusal = self.gate.refusal()
+                refusal = self.interlock.refusal()
                 if refusal is not None:
                     raise DeviceError(f"laser refused: {refusal}")
                 self._record.requested = LaserOutput.ON
-                self.gate.switched_on()
+                self.interlock.note_enabled()
             try:
                 laser.enable()
-                told = laser.readback()
-                self._refuse_difference(told)
+                readback = self._checked_readback(laser)
             except EschortyError as error:
-                self._end_light(error)
+                self._disable_failed(error)
                 raise
             with self._lock:
                 try:
@@ -168,10 +163,10 @@ class LaserKeeper:
                     laser.disable()
                     raise
                 self._record.reason = "switched on by request"
-                self._hear(told)
+                self._receive(readback)
 
-    def switch_off(self, reason: str) -> None:
-        """Switch off before anything else; raises ``DeviceError`` when it is not confirmed."""
+    def disable(self, reason: str) -> None:
+        """Disable before anything else; raises ``DeviceError`` when it is not confirmed."""
         with self._in_flight.disabling(reason), self._lock:
             laser = self._laser
             if laser is None:
@@ -180,36 +175,42 @@ class LaserKeeper:
                 laser.disable()
             except EschortyError as error:
                 self._record.lose(error)
-                self.tell()
+                self.report()
                 raise DeviceError(self.unknown) from error
             finally:
                 self.switch_offs += self._record.requested is LaserOutput.ON
-                self.gate.switched_off()
+                self.interlock.note_disabled()
                 self._record.requested, self._record.reason = LaserOutput.OFF, reason
-            self._hear_off(laser)
+            readback: LaserReadback | None
+            try:
+                readback = laser.readback()
+            except EschortyError:
+                readback = self._record.assume_off()
+            if readback is not None:
+                self._receive(readback)
 
-    def darken(self, reason: str) -> bool:
-        """Switch off for a reason of the keeper's own; alarm when it is not confirmed."""
+    def trip(self, reason: str) -> bool:
+        """Disable for a reason that nothing requested; alarms when it is not confirmed."""
         try:
-            self.switch_off(reason)
+            self.disable(reason)
         except EschortyError as error:
             self._alarm(str(error))
             return False
         self._log(f"laser off: {reason}")
         return True
 
-    def tell(self) -> None:
-        """Tell the state as it is now."""
+    def report(self) -> None:
+        """Publish the status as it is now."""
         with self._lock:
-            snapshot = self.snapshot()
-            # While a command is under way nobody knows; what comes of it is told at its end.
-            if snapshot is not None and not self._commanding:
-                self._changed(snapshot)
+            status = self._record.status
+            # A command in progress publishes its outcome at its end.
+            if status is not None and not self._commanding:
+                self._publish(status)
 
-    def snapshot(self) -> LaserSnapshot | None:
+    def status(self) -> LaserStatus | None:
         """Return what is known now, ``None`` before the generator has been opened."""
         with self._lock:
-            return self._record.snapshot
+            return self._record.status
 
     @contextlib.contextmanager
     def _command(self) -> Iterator[tuple[LaserModulator, int]]:
@@ -226,74 +227,96 @@ class LaserKeeper:
             finally:
                 with self._lock:
                     self._commanding = False
-                    self.tell()
+                    self.report()
 
-    def _end_light(self, error: EschortyError) -> None:
-        """Switch off after a command that failed, unless somebody's switching off made it fail."""
-        with self._lock:
-            if self._record.requested is LaserOutput.ON:
-                self.switch_off(str(error))
-
-    def _hear(self, told: LaserReadback) -> None:
-        """Note what the generator says."""
-        for text in self._record.hear(told):
-            self._log(text)
-        self.tell()
-
-    def _hear_off(self, laser: LaserModulator) -> None:
-        """Note what the generator says after it has confirmed that it is off."""
-        told: LaserReadback | None
-        try:
-            told = laser.readback()
-        except EschortyError:
-            told = self._record.off_unread()
-        if told is not None:
-            self._hear(told)
-
-    def _refuse_difference(self, told: LaserReadback) -> None:
-        difference = self._record.difference(told)
+    def _checked_readback(self, laser: LaserModulator) -> LaserReadback:
+        readback = laser.readback()
+        difference = self._record.difference(readback)
         if difference:
             raise DeviceError(f"laser: {difference}; look at the generator")
+        return readback
 
-    def _blind(self, error: Exception) -> None:
-        self.darken(f"watching it failed: {error!r}")
-        self._alarm(f"laser: watching it failed: {error!r}")
-
-    def _watch(self) -> None:
-        pause_s = self._pauses.look()
-        # Under the lock: somebody may be switching off already.
+    def _disable_failed(self, error: EschortyError) -> None:
+        """Disable after a command that failed, unless disabling is what made it fail."""
         with self._lock:
-            if pause_s:
-                self.gate.forgive(pause_s)
-            reason = self.gate.must_end(self._pauses.looked_s)
-            if reason is None and not self._living() and self._record.requested is LaserOutput.ON:
+            if self._record.requested is LaserOutput.ON:
+                self.disable(str(error))
+
+    def _receive(self, readback: LaserReadback) -> None:
+        for text in self._record.receive(readback):
+            self._log(text)
+        self.report()
+
+    def _check_interlock(self) -> None:
+        stall_s = self._stalls.measure()
+        # Under the lock: the output may be being disabled already.
+        with self._lock:
+            if stall_s:
+                self.interlock.exclude_stall(stall_s)
+            reason = self.interlock.trip_reason(self._stalls.measured_s)
+            if reason is None and not self._running() and self._record.requested is LaserOutput.ON:
                 reason = "the node is shutting down"
             if reason is not None:
-                self.darken(reason)
+                self.trip(reason)
 
-    def _read(self) -> None:
+    def _check_readback(self) -> None:
         if not self._commands.acquire(blocking=False):
-            return  # A command is under way; it reads back itself.
+            return  # A command reads back itself.
         try:
-            self._read_and_compare()
+            ticket, laser = self._in_flight.ticket(), self._laser
+            if laser is not None:
+                self._read_and_compare(laser, ticket)
         finally:
             self._commands.release()
 
-    def _read_and_compare(self) -> None:
-        ticket, laser = self._in_flight.ticket(), self._laser
-        if laser is None:
-            return
+    def _read_and_compare(self, laser: LaserModulator, ticket: int) -> None:
         try:
-            told = laser.readback()
+            readback = laser.readback()
         except EschortyError as error:
             # Disabling may be what interrupted the read-back.
-            if not self._in_flight.is_void(ticket) and self.darken(f"not read back: {error}"):
+            if not self._in_flight.is_void(ticket) and self.trip(f"not read back: {error}"):
                 self._alarm(f"laser off: {error}")
             return
         with self._lock:
             if self._in_flight.is_void(ticket):
                 return
-            self._hear(told)
-            wrong = self._record.calls_for_darkness(told)
-            if wrong:
-                self.darken(wrong)
+            self._receive(readback)
+            reason = self._record.must_disable(readback)
+            if reason:
+                self.trip(reason)
+
+    def _fail(self, error: Exception) -> None:
+        self.trip(f"watching it failed: {error!r}")
+        self._alarm(f"laser: watching it failed: {error!r}")
+
+
+class _Watchdog:
+    """Calls ``check`` every ``period_s`` in a thread until ``stop``.
+
+    It ends with the first failure, with which it calls ``fail``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        check: Callable[[], None],
+        period_s: float,
+        fail: Callable[[Exception], None],
+    ) -> None:
+        self._check, self._period_s, self._fail = check, period_s, fail
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Begin no further check; wait up to 1 s for one in progress."""
+        self._stopped.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(_STOP_TIMEOUT_S)
+
+    def _run(self) -> None:
+        try:
+            while not self._stopped.wait(self._period_s):
+                self._check()
+        except Exception as error:
+            self._fail(error)

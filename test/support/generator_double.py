@@ -25,7 +25,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput, LaserReadback
 
 MAKE = "generator_double:GeneratorLaser"
-_INTERRUPTED = "the generator's settings: interrupted by switching off"
+_INTERRUPTED = "the generator's settings: switched off meanwhile"
 # Said where a generator says nothing: a time-out without the time.
 _MUTE = "mute"
 

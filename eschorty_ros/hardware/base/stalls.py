@@ -1,4 +1,4 @@
-"""How long this process itself stood still: time in which others' silence says nothing."""
+"""Time in which a process did not run: stalls of this one, the state of another one."""
 
 from __future__ import annotations
 
@@ -6,31 +6,48 @@ import time
 
 LEAST_S = 0.1
 
+_STATES = {"T": "stopped", "t": "stopped by a debugger", "Z": "dead", "X": "dead"}
 
-class OwnPauses:
-    """Measures by how much a loop's looks come late.
 
-    A machine that stands still (it swaps, or is a virtual one that is not run) makes every sign of
-    life grow old at once. Whoever judges silence leaves that time out; what dies is noticed by
-    other means than its silence. Judge it as of ``looked_s``: a pause may begin after a look.
+class StallMeter:
+    """Measures the stalls of this process by how late a loop's turns are.
+
+    A machine that stands still (it swaps, or is a virtual one that is not run) makes every received
+    heartbeat old at once. A watchdog excludes that time, and compares ages as of ``measured_s``: a
+    stall may begin after a measurement. A process that dies is noticed by other means.
 
     Parameters
     ----------
     period_s : float
-        How often the loop looks.
+        Time between two turns of the loop.
 
     Attributes
     ----------
-    looked_s : float
-        Time of the last look, steady clock.
+    measured_s : float
+        Time of the last measurement, steady clock.
     """
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
-        self.looked_s = time.monotonic()
+        self.measured_s = time.monotonic()
 
-    def look(self) -> float:
-        """Look; returns the seconds by which it is late, 0 when they are fewer than 0.1."""
-        before_s, self.looked_s = self.looked_s, time.monotonic()
-        late_s = self.looked_s - before_s - self._period_s
+    def measure(self) -> float:
+        """Return the seconds by which this turn is late, 0 when they are fewer than 0.1."""
+        before_s, self.measured_s = self.measured_s, time.monotonic()
+        late_s = self.measured_s - before_s - self._period_s
         return late_s if late_s >= LEAST_S else 0.0
+
+
+def process_fault(pid: int) -> str:
+    """Return why process ``pid`` runs no code of its own, ``""`` while it does.
+
+    A crash that dumps core keeps its descriptors open for as long as the dump takes.
+    """
+    try:
+        with open(f"/proc/{pid}/status", encoding="ascii", errors="replace") as stream:
+            status = stream.read()
+    except OSError:
+        return "gone"
+    if "\nCoreDumping:\t1" in status:
+        return "dumping core"
+    return _STATES.get(status.partition("\nState:\t")[2][:1], "")

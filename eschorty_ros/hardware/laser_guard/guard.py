@@ -1,8 +1,8 @@
-"""The laser's guard: a process that owns the generator and outlives whatever its owner dies of.
+"""The laser's guard: a process that owns the generator and outlives its owner.
 
-Started by ``GuardedLaser`` in a session of its own, deaf to the terminal's signals. It switches the
-output off when the process that started it ends in any way, dumps core, is stopped, or is silent
-for too long.
+``GuardedLaser`` starts it in a session of its own, where it ignores the terminal's signals. It
+disables the output when the process that started it ends in any way, dumps core, is stopped, or
+sends no heartbeat for too long.
 """
 
 from __future__ import annotations
@@ -24,28 +24,27 @@ from typing import Any
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserModulator, LaserOutput
-from eschorty_ros.hardware.base.stalls import OwnPauses
+from eschorty_ros.hardware.base.stalls import StallMeter, process_fault
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
-from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.laser_guard.messages import (
     Message,
     Wire,
     failure_message,
     readback_message,
-    standing_still,
 )
+from eschorty_ros.hardware.laser_guard.opening import maker, open_again
 
-_LOOK_S = 0.02
+_TURN_S = 0.02
 _RETRY_S = 0.25
-_INSIST_S = 30.0
-_SAY_S = 0.1
+_RETRIES_END_S = 30.0
+_PRINT_TIMEOUT_S = 0.1
 
 
 class Guard:
     """Serves one owner over a wire and watches it.
 
-    A worker thread carries out what may take long. Switching off is done by the watching thread
-    at once, beside whatever the worker does: the generator's driver lets ``disable`` overtake.
+    A worker thread carries out what may take long. The watching thread disables the output at once,
+    beside the worker: the generator's driver lets ``disable`` overtake other commands.
 
     Parameters
     ----------
@@ -57,18 +56,18 @@ class Guard:
     def __init__(self, wire: Wire, owner_pid: int) -> None:
         self._wire = wire
         self._owner_pid = owner_pid
-        self._silence_s = float("inf")
+        self._heartbeat_timeout_s = float("inf")
         self._make: Callable[[], LaserModulator] | None = None
         self._laser: LaserModulator | None = None
         self._jobs: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
         self._in_flight = CommandsInFlight()
         self._lit = False
         self._tripped = ""
-        # Why the output may be on although it was switched off, and who tries again.
+        # Why the output may be on although it was disabled, and the thread that retries.
         self._unknown = ""
-        self._insisting: threading.Thread | None = None
-        self._heard_s = time.monotonic()
-        self._pauses = OwnPauses(_LOOK_S)
+        self._retrying: threading.Thread | None = None
+        self._received_s = time.monotonic()
+        self._stalls = StallMeter(_TURN_S)
         self._closing: Message | None = None
 
     def run(self) -> None:
@@ -81,65 +80,74 @@ class Guard:
             poller.register(owner, select.POLLIN)
         try:
             while self._closing is None:
-                ready = dict(poller.poll(_LOOK_S * 1e3))
-                pause_s = self._pauses.look()
-                self._heard_s = min(self._heard_s + pause_s, self._pauses.looked_s)
+                ready = dict(poller.poll(_TURN_S * 1e3))
+                stall_s = self._stalls.measure()
+                self._received_s = min(self._received_s + stall_s, self._stalls.measured_s)
                 if owner in ready:
                     break
                 messages = self._wire.receive()
                 if messages is None:
                     break
                 for message in messages:
-                    self._take(message)
+                    self._handle(message)
                 if messages:
-                    # Only now: what has just been done may have taken its time.
-                    self._heard_s = time.monotonic()
+                    # After handling them, which may have taken some time.
+                    self._received_s = time.monotonic()
                 self._watch()
         finally:
             self._finish()
 
     def _owner_descriptor(self) -> int | None:
-        """Descriptor that tells of the owner's end even if a child of its keeps the wire open."""
+        """Return a descriptor that shows the owner's end even if a child of it keeps the wire."""
         try:
-            owner = os.pidfd_open(self._owner_pid)
+            return os.pidfd_open(self._owner_pid)
         except OSError:
             return None
-        return owner
 
-    def _take(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         command = message["do"]
-        if command == "beat":
+        if command == "heartbeat":
             return
         if command == "close":
             self._closing = message
         elif command == "disable":
-            self._answer(message, self._switch_off)
+            self._answer(message, self._disable)
         else:
             if command == "open":
-                self._silence_s = message["silence_s"]
+                self._heartbeat_timeout_s = message["heartbeat_timeout_s"]
             self._jobs.put((self._in_flight.ticket(), message))
 
     def _watch(self) -> None:
-        """Switch off for an owner that stands still or is silent; once, until armed again."""
+        """Trip for an owner that does not run or sends nothing; once, until armed again."""
         if self._tripped:
             return
-        why = standing_still(self._owner_pid)
-        if not why and self._pauses.looked_s - self._heard_s > self._silence_s:
-            why = f"silent for {self._silence_s:g} s"
-        if why:
-            self._tripped = f"laser guard: process {self._owner_pid} is {why}"
-            self._try_to_switch_off(self._tripped)
+        fault = process_fault(self._owner_pid)
+        if fault:
+            self._trip(f"is {fault}")
+        elif self._stalls.measured_s - self._received_s > self._heartbeat_timeout_s:
+            self._trip(f"has sent no heartbeat for {self._heartbeat_timeout_s:g} s")
 
-    def _switch_off(self) -> None:
+    def _trip(self, fault: str) -> None:
+        self._tripped = f"laser guard: process {self._owner_pid} {fault}"
+        lit = self._lit
+        try:
+            self._disable()
+        except Exception as error:
+            _print(f"{self._tripped}; {error}")
+        else:
+            if lit:
+                _print(f"{self._tripped}; output off")
+
+    def _disable(self) -> None:
         with self._in_flight.disabling("switched off meanwhile; arm it again"):
             if self._laser is None:
                 return
-            unknown, insisting = self._unknown, self._insisting
-            if unknown and insisting is not None and insisting.is_alive():
+            unknown, retrying = self._unknown, self._retrying
+            if unknown and retrying is not None and retrying.is_alive():
                 raise DeviceError(unknown)
             try:
-                if unknown and insisting is not None:
-                    # Whoever insisted has closed it.
+                if unknown and retrying is not None:
+                    # The retries have closed it.
                     self._open_again()
                 else:
                     self._laser.disable()
@@ -147,14 +155,14 @@ class Guard:
                 self._unknown = str(error)
                 if self._lit:
                     self._unknown = f"{error}; trying again"
-                    self._insisting = threading.Thread(target=self._insist, name="laser off")
-                    self._insisting.start()
+                    self._retrying = threading.Thread(target=self._retry, name="laser off")
+                    self._retrying.start()
                 raise
             self._lit, self._unknown = False, ""
 
-    def _insist(self) -> None:
-        """Open the generator anew until it is off; the means at hand have failed."""
-        end_s = time.monotonic() + _INSIST_S
+    def _retry(self) -> None:
+        """Open the generator again and again until its output is off."""
+        end_s = time.monotonic() + _RETRIES_END_S
         while self._unknown and time.monotonic() < end_s:
             time.sleep(_RETRY_S)
             try:
@@ -162,7 +170,7 @@ class Guard:
             except Exception as error:
                 self._unknown = f"{error}; trying again"
             else:
-                _say("laser guard: output off at last")
+                _print("laser guard: output off at last")
 
     def _open_again(self) -> None:
         assert self._laser is not None
@@ -173,29 +181,19 @@ class Guard:
         self._laser = open_again(self._make, serial)
         self._lit, self._unknown = False, ""
 
-    def _try_to_switch_off(self, reason: str) -> None:
-        lit = self._lit
-        try:
-            self._switch_off()
-        except Exception as error:
-            _say(f"{reason}; {error}")
-        else:
-            if lit:
-                _say(f"{reason}; output off")
-
     def _finish(self) -> None:
         if self._closing is not None:
             self._answer(self._closing, self._close)
         else:
-            self._try_to_switch_off(f"laser guard: process {self._owner_pid} is gone")
-        if self._insisting is not None:
-            self._insisting.join()
+            self._trip("is gone")
+        if self._retrying is not None:
+            self._retrying.join()
         if self._laser is not None:
             with contextlib.suppress(Exception):
                 self._laser.close()
 
     def _close(self) -> None:
-        self._switch_off()
+        self._disable()
         laser, self._laser = self._laser, None
         if laser is not None:
             laser.close()
@@ -224,9 +222,9 @@ class Guard:
         if command == "configure":
             return laser.configure(Modulation(**message["modulation"]))
         if command == "readback":
-            state = laser.readback()
-            self._lit |= state.output is not LaserOutput.OFF
-            return readback_message(replace(state, reason=state.reason or self._tripped))
+            readback = laser.readback()
+            self._lit |= readback.output is not LaserOutput.OFF
+            return readback_message(replace(readback, reason=readback.reason or self._tripped))
         self._in_flight.refuse_void(ticket)
         if command == "arm":
             laser.arm()
@@ -236,9 +234,8 @@ class Guard:
 
     def _open(self, message: Message) -> Message:
         self._make = maker(message["make"], message["settings"])
-        laser = self._make()
-        self._laser = laser
-        identity = laser.identity
+        self._laser = self._make()
+        identity = self._laser.identity
         return {
             "model": identity.model,
             "serial": identity.serial,
@@ -257,17 +254,17 @@ class Guard:
             raise
 
 
-def _say(text: str) -> None:
-    """Tell standard error; whoever reads it may be gone or stuck and is not waited for long."""
+def _print(text: str) -> None:
+    """Print to standard error; waits briefly, since its reader may be gone or stuck."""
 
     def write() -> None:
         with contextlib.suppress(OSError):
             os.write(2, f"{text}\n".encode())
 
-    writer = threading.Thread(target=write, name="laser guard's words", daemon=True)
+    writer = threading.Thread(target=write, name="laser guard's messages", daemon=True)
     with contextlib.suppress(RuntimeError):
         writer.start()
-        writer.join(_SAY_S)
+        writer.join(_PRINT_TIMEOUT_S)
 
 
 def main() -> None:
@@ -280,5 +277,5 @@ def main() -> None:
     try:
         Guard(Wire(end), owner_pid).run()
     except Exception:
-        _say(f"laser guard: {traceback.format_exc()}")
+        _print(f"laser guard: {traceback.format_exc()}")
         sys.exit(1)

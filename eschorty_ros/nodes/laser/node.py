@@ -1,4 +1,4 @@
-"""Laser node: gates the line through its generator, dark unless every condition for light holds."""
+"""Laser node: modulates the laser through its generator, off unless every condition holds."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
-from eschorty_ros.control.laser_interlock import LEASE, LaserGate
-from eschorty_ros.control.laser_readback import LaserSnapshot
-from eschorty_ros.control.laser_supervisor import LaserKeeper
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT, LaserInterlock
+from eschorty_ros.control.laser_readback import LaserStatus
+from eschorty_ros.control.laser_supervisor import LaserSupervisor
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, WAVEFORMS, Modulation
 from eschorty_ros.emulation.bench.folder import usb_spec
@@ -63,14 +63,13 @@ TABLE = (
 class LaserNode(DeviceNode):
     """``laser/arm``, ``laser/enable``, ``laser/heartbeat``, ``laser/interlock`` -> ``laser/state``.
 
-    ``laser/interlock`` (std_msgs/Bool): true means open, and open means dark. With
-    ``interlock_required`` it is open unless a message within ``interlock_timeout`` says closed,
-    else closed until one says open. Light ends when
-    ``laser/heartbeat`` (whoever wants light), ``camera/heartbeat`` or ``stage/heartbeat`` is stale
-    or its sender on this host dies, with an open interlock, after ``max_on_time``, and when the
-    generator does not read back as asked. This is looked after by threads on the steady clock,
-    also when the executor is stuck. Spin it with several threads: commands take their time,
-    heartbeats do not wait.
+    ``laser/interlock`` (std_msgs/Bool): true means open, and open means off. With
+    ``interlock_required`` it is open unless a message within ``interlock_timeout`` reports it
+    closed, else closed until one reports it open. The output is disabled when ``laser/heartbeat``
+    (of the client), ``camera/heartbeat`` or ``stage/heartbeat`` is stale or its sender on this host
+    dies, with an open interlock, after ``max_on_time``, and when the generator does not read back
+    as requested. Watchdog threads on the steady clock check this, also when the executor is stuck.
+    Spin it with several threads: commands take their time, heartbeats must not wait for them.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -78,36 +77,36 @@ class LaserNode(DeviceNode):
         self._state = self.create_publisher(
             LaserState, "laser/state", qos.latched(qos.STATE_HISTORY)
         )
-        gate = self._new_gate()
-        self._keeper = LaserKeeper(
-            gate,
-            living=self.context.ok,
-            changed=self._publish,
+        interlock = self._new_interlock()
+        self._supervisor = LaserSupervisor(
+            interlock,
+            running=self.context.ok,
+            publish=self._publish,
             alarm=self._alarm,
             log=self._log,
             readback_period_s=1.0 / self.parameters["readback_rate"],
         )
-        # Switching off must not wait for a command under way; the keeper keeps them in order.
+        # Disabling must not wait for a command in progress; the supervisor orders the others.
         control = ReentrantCallbackGroup()
         self.create_service(Trigger, "laser/arm", self._on_arm, callback_group=control)
         self.create_service(SetBool, "laser/enable", self._on_enable, callback_group=control)
-        signs = MutuallyExclusiveCallbackGroup()
+        reports = MutuallyExclusiveCallbackGroup()
         self.create_subscription(
-            Bool, "laser/interlock", self._on_interlock, qos.stream(10), callback_group=signs
+            Bool, "laser/interlock", self._on_interlock, qos.stream(10), callback_group=reports
         )
-        for topic in gate.topics:
+        for topic in interlock.topics:
             self.create_subscription(
                 Header,
                 topic,
                 partial(self._on_heartbeat, topic),
                 qos.heartbeat(),
-                callback_group=signs,
+                callback_group=reports,
             )
-        self.create_timer(1.0 / STATE_RATE_HZ, self._keeper.tell, clock=self.steady_clock)
+        self.create_timer(1.0 / STATE_RATE_HZ, self._supervisor.report, clock=self.steady_clock)
         diagnostics.Diagnostics(self, self._report)
 
     def open_device(self) -> None:
-        """Open the generator, dark, with the modulation of the parameters."""
+        """Open the generator, off, with the modulation of the parameters."""
         laser = drivers.make(
             "laser",
             _make_laser,
@@ -115,29 +114,29 @@ class LaserNode(DeviceNode):
             self.parameters,
             self.now_ns,
         )
-        self._keeper.open(laser, _modulation(dict(self.parameters)))
+        self._supervisor.open(laser, _modulation(dict(self.parameters)))
         self.get_logger().info(f"{laser.identity.model} {laser.identity.serial}: off")
 
     def start_device(self) -> None:
         """From here on the laser may be switched on."""
-        self._keeper.switch_off("ready")
+        self._supervisor.disable("ready")
 
     def stop_device(self) -> None:
-        """Switch off; an output that nobody confirms is told as unknown."""
+        """Disable; an output that is not confirmed off is reported as unknown."""
         try:
-            self._keeper.switch_off(self.failure or "not active")
+            self._supervisor.disable(self.failure or "not active")
         except EschortyError as error:
             self._alarm(str(error))
 
     def close_device(self) -> None:
-        """Switch off and release the generator; see ``stop_device``."""
+        """Disable and release the generator; see ``stop_device``."""
         try:
-            self._keeper.close()
+            self._supervisor.close()
         except EschortyError:
-            self._alarm(self._keeper.unknown)
+            self._alarm(self._supervisor.unknown)
 
-    def _new_gate(self) -> LaserGate:
-        timeouts = {LEASE: self.parameters["heartbeat_timeout"]}
+    def _new_interlock(self) -> LaserInterlock:
+        timeouts = {CLIENT_HEARTBEAT: self.parameters["heartbeat_timeout"]}
         names = self.parameters["watch"].replace(",", " ").split()
         for name in names if names != ["none"] else ():
             if name not in WATCHED:
@@ -146,11 +145,11 @@ class LaserNode(DeviceNode):
                     f"choose from {', '.join(WATCHED)}, or none"
                 )
             timeouts[f"{name}/heartbeat"] = self.parameters[f"{name}_timeout"]
-        return LaserGate(
+        return LaserInterlock(
             self.parameters["arm_timeout"],
             self.parameters["max_on_time"],
             timeouts,
-            interlock_timeout_s=(
+            contact_timeout_s=(
                 self.parameters["interlock_timeout"]
                 if self.parameters["interlock_required"]
                 else math.inf
@@ -158,7 +157,7 @@ class LaserNode(DeviceNode):
         )
 
     def _apply(self, values: dict[str, Any]) -> None:
-        self._keeper.configure(_modulation(values))
+        self._supervisor.configure(_modulation(values))
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = self._attempted(self._arm)
@@ -178,18 +177,18 @@ class LaserNode(DeviceNode):
 
     def _arm(self) -> str:
         self._refuse_inactive()
-        self._keeper.arm()
+        self._supervisor.arm()
         return "armed"
 
     def _enable(self) -> str:
         self._refuse_inactive()
-        self._keeper.enable()
+        self._supervisor.enable()
         return "switched on by request"
 
     def _disable(self) -> str:
         reason = "switched off by request"
         try:
-            self._keeper.switch_off(reason)
+            self._supervisor.disable(reason)
         except EschortyError as error:
             self._alarm(str(error))
             raise
@@ -200,43 +199,42 @@ class LaserNode(DeviceNode):
             raise DeviceError(f"laser refused: node is {self.state_label}; activate it first")
 
     def _on_interlock(self, message: Bool) -> None:
-        gate = self._keeper.gate
-        opens = message.data and not gate.interlock_open
-        gate.interlock_open = bool(message.data)
-        # Said again it is no news; the watchdog looks at it all the time.
+        interlock = self._supervisor.interlock
+        opens = message.data and not interlock.contact_open
+        interlock.receive_contact(bool(message.data))
+        # Only at the change; the watchdog checks the contact all the time.
         if opens:
-            self._keeper.darken("interlock open")
-        self._keeper.tell()
+            self._supervisor.trip("interlock open")
+        self._supervisor.report()
 
     def _on_heartbeat(self, topic: str, message: Header) -> None:
-        self._keeper.gate.beat(topic, message.frame_id)
+        self._supervisor.interlock.receive_heartbeat(topic, message.frame_id)
 
     def _alarm(self, text: str) -> None:
-        # As in _log.
         with contextlib.suppress(Exception):
             self.fault(text)
 
     def _log(self, text: str) -> None:
-        # On the way out there may be nobody left to tell.
+        # During shutdown the logger may be gone.
         with contextlib.suppress(Exception):
             self.get_logger().warning(text)
 
-    def _publish(self, snapshot: LaserSnapshot) -> None:
-        """Under the keeper's lock, so that stamp and state agree and every change is told."""
+    def _publish(self, status: LaserStatus) -> None:
+        """Publish under the supervisor's lock: stamp and state agree, and no change is lost."""
         if not self.context.ok():
             return
-        told, gate = snapshot.told, self._keeper.gate
+        readback, interlock = status.readback, self._supervisor.interlock
         message = LaserState(
-            requested=int(snapshot.requested),
-            output=int(told.output),
-            armed=gate.armed,
-            interlock_open=gate.interlock_open,
-            waveform=told.modulation.waveform,
-            frequency=told.modulation.frequency_hz,
-            duty=told.modulation.duty,
-            phase_epoch=stamp_from_ns(told.phase_epoch_ns or 0),
-            output_since=stamp_from_ns(told.output_since_ns),
-            reason=snapshot.reason,
+            requested=int(status.requested),
+            output=int(readback.output),
+            armed=interlock.armed,
+            interlock_open=interlock.contact_open,
+            waveform=readback.modulation.waveform,
+            frequency=readback.modulation.frequency_hz,
+            duty=readback.modulation.duty,
+            phase_epoch=stamp_from_ns(readback.phase_epoch_ns or 0),
+            output_since=stamp_from_ns(readback.output_since_ns),
+            reason=status.reason,
         )
         message.header.stamp = stamp_from_ns(self.now_ns())
         try:
@@ -247,31 +245,29 @@ class LaserNode(DeviceNode):
                 raise
 
     def _report(self) -> diagnostics.Report:
-        keeper = self._keeper
-        snapshot = keeper.snapshot()
-        output = snapshot.told.output if snapshot is not None else LaserOutput.OFF
+        supervisor = self._supervisor
+        interlock, status = supervisor.interlock, supervisor.status()
         values: dict[str, Any] = {
-            "device": keeper.device,
+            "device": supervisor.device,
             "state": self.state_label,
-            "output": output.name,
-            "requested": snapshot.requested.name if snapshot is not None else "OFF",
-            "armed": keeper.gate.armed,
-            "interlock_open": keeper.gate.interlock_open,
-            "reason": snapshot.reason if snapshot is not None else "",
-            "switch_offs": keeper.switch_offs,
+            "output": (status.readback.output if status else LaserOutput.OFF).name,
+            "requested": (status.requested if status else LaserOutput.OFF).name,
+            "armed": interlock.armed,
+            "interlock_open": interlock.contact_open,
+            "reason": status.reason if status else "",
+            "switch_offs": supervisor.switch_offs,
         }
-        if snapshot is not None:
-            values |= snapshot.told.counters
-        for topic, gap_s in keeper.gate.gap_max_s.items():
+        if status is not None:
+            values |= status.readback.counters
+        for topic, gap_s in interlock.gap_max_s.items():
             values[f"{topic} longest gap, s"] = gap_s
-        if keeper.unknown:
-            return diagnostics.ERROR, keeper.unknown, values
-        if self.failure:
-            return diagnostics.ERROR, self.failure, values
-        if snapshot is None:
+        failure = supervisor.unknown or self.failure
+        if failure:
+            return diagnostics.ERROR, failure, values
+        if status is None:
             return diagnostics.OK, self.state_label, values
-        level = diagnostics.WARN if keeper.gate.interlock_open else diagnostics.OK
-        return level, f"{output.name}: {snapshot.reason}", values
+        level = diagnostics.WARN if interlock.contact_open else diagnostics.OK
+        return level, f"{values['output']}: {status.reason}", values
 
 
 def _make_laser(parameters: Mapping[str, Any], _: drivers.ClockNs) -> GuardedLaser:

@@ -24,7 +24,7 @@ from eschorty_ros.control.instrument_monitor import (
     LaserStatus,
     ReconstructionStatus,
 )
-from eschorty_ros.control.laser_interlock import LEASE
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanFailure, ScanRequest, ScanSummary
 from eschorty_ros.hardware.base.protocols import LaserOutput
@@ -85,7 +85,7 @@ class InstrumentClient(PacedWaiting):
         self._node_timeout_s = node_timeout_s
         self._service_timeout_s = service_timeout_s
         self._beating = False
-        self._heartbeat = Heartbeat(node, LEASE, self._wants_light)
+        self._heartbeat = Heartbeat(node, CLIENT_HEARTBEAT, self._wants_light)
         self._sent: Any = None
 
     def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
@@ -190,7 +190,7 @@ class InstrumentClient(PacedWaiting):
         """See ``Instrument``."""
         self.tick()
         self._beating = True
-        self.wait(lambda: self._heartbeat.beating, self._service_timeout_s,
+        self.wait(lambda: self._heartbeat.healthy, self._service_timeout_s,
                   "laser: no heartbeat of its own")  # fmt: skip
         ends_s = time.monotonic() + self._service_timeout_s
         while refusal := self._arm_and_enable():

@@ -17,21 +17,21 @@ from pathlib import Path
 import generator_double
 import pytest
 from generator_double import MAKE, Generator
-from hours import Hours
+from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserOutput
-from eschorty_ros.hardware.laser.opening import maker, open_again
 from eschorty_ros.hardware.laser_guard import guard, guarded
-from eschorty_ros.hardware.laser_guard import messages as guard_wire
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
+from eschorty_ros.hardware.laser_guard.messages import Wire
+from eschorty_ros.hardware.laser_guard.opening import maker, open_again
 
 OFF_LIMIT_S = 0.25
-SILENCE_S = 0.5
+TIMEOUT_S = 0.5
 # Where silence is not the subject: a loaded machine may let the owner wait.
-PATIENT_S = 30.0
+LONG_S = 30.0
 TEST_FOLDER = str(Path(__file__).parents[2] / "support")
 
 
@@ -48,11 +48,9 @@ def device(tmp_path: Path) -> Iterator[Generator]:
 
 
 @contextlib.contextmanager
-def opened(
-    device: Generator, silence_s: float = PATIENT_S, **settings: str
-) -> Iterator[GuardedLaser]:
+def opened(device: Generator, timeout_s: float = LONG_S, **settings: str) -> Iterator[GuardedLaser]:
     """A laser that is closed whatever the test comes to."""
-    made = GuardedLaser(MAKE, {**device.settings, **settings}, silence_s=silence_s)
+    made = GuardedLaser(MAKE, {**device.settings, **settings}, heartbeat_timeout_s=timeout_s)
     try:
         yield made
     finally:
@@ -125,7 +123,7 @@ for number in (signal.SIGHUP, signal.SIGTERM):
     signal.signal(number, signal.SIG_DFL)  # inherited as ignored under nohup
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 laser = GuardedLaser(
-    "generator_double:GeneratorLaser", {"path": sys.argv[1]}, silence_s=float(sys.argv[2])
+    "generator_double:GeneratorLaser", {"path": sys.argv[1]}, heartbeat_timeout_s=float(sys.argv[2])
 )
 laser.arm()
 laser.enable()
@@ -160,11 +158,11 @@ class Owner:
         self,
         device: Generator,
         stderr: int = subprocess.DEVNULL,
-        silence_s: float = PATIENT_S,
+        timeout_s: float = LONG_S,
     ) -> None:
         self.device = device
         self.process = subprocess.Popen(
-            [sys.executable, "-c", OWNER, str(device.path), str(silence_s)],
+            [sys.executable, "-c", OWNER, str(device.path), str(timeout_s)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -222,13 +220,13 @@ def test_dark_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
 
 
 def test_dark_when_the_owner_hangs(device: Generator) -> None:
-    owner = Owner(device, silence_s=SILENCE_S)
+    owner = Owner(device, timeout_s=TIMEOUT_S)
     try:
         took_s = owner.die("gil")
     finally:
         owner.close()
     print(f"silent: dark after {took_s * 1e3:.1f} ms")
-    assert took_s < SILENCE_S + OFF_LIMIT_S
+    assert took_s < TIMEOUT_S + OFF_LIMIT_S
 
 
 def test_guard_is_deaf_to_the_terminal(owner: Owner) -> None:
@@ -276,14 +274,14 @@ def test_guard_runs_the_package_that_started_it(
 
 
 def test_silence_disarms_until_armed_again(device: Generator) -> None:
-    with opened(device, SILENCE_S) as laser:
+    with opened(device, TIMEOUT_S) as laser:
         light(laser)
         began_ns = time.monotonic_ns()
         ctypes.PyDLL(None).sleep(2)
-        assert device.off_after_s(began_ns) < SILENCE_S + OFF_LIMIT_S
+        assert device.off_after_s(began_ns) < TIMEOUT_S + OFF_LIMIT_S
         state = laser.readback()
         assert state.output is LaserOutput.OFF
-        assert "silent for 0.5 s" in state.reason
+        assert "no heartbeat for 0.5 s" in state.reason
         with pytest.raises(DeviceError, match="arm it again"):
             laser.enable()
         light(laser)
@@ -320,22 +318,22 @@ def test_closing_when_the_guard_has_just_died_is_dark(device: Generator, number:
 def test_a_guard_that_stood_still_itself_calls_nobody_silent(
     device: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hours = Hours(monkeypatch)
-    monkeypatch.setattr(guard, "time", hours)
+    clock = StallClock(monkeypatch)
+    monkeypatch.setattr(guard, "time", clock)
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    wire = guard_wire.Wire(here)
-    serving = threading.Thread(target=guard.Guard(guard_wire.Wire(there), os.getpid()).run)
+    wire = Wire(here)
+    serving = threading.Thread(target=guard.Guard(Wire(there), os.getpid()).run)
     serving.start()
     try:
         wire.send({"id": 0, "do": "open", "make": MAKE, "settings": device.settings,
-                   "silence_s": SILENCE_S})  # fmt: skip
+                   "heartbeat_timeout_s": TIMEOUT_S})  # fmt: skip
         for number, command in enumerate(("arm", "enable"), 1):
             wire.send({"id": number, "do": command})
         wait_until(device.lit, "light")
-        hours.pass_by(60.0)
+        clock.advance(60.0)
         assert device.lit()
-        for _ in range(int(SILENCE_S / 0.05) + 2):
-            hours.pass_by(0.05)
+        for _ in range(int(TIMEOUT_S / 0.05) + 2):
+            clock.advance(0.05)
         assert not device.lit()
     finally:
         here.close()
@@ -364,7 +362,7 @@ def test_switching_off_overtakes(device: Generator, tmp_path: Path) -> None:
         laser.disable()
         assert device.off_after_s(asked_ns) < OFF_LIMIT_S
         reader()
-        assert "interrupted by switching off" in str(failures[0])
+        assert "switched off meanwhile" in str(failures[0])
         laser.close()
 
 
@@ -372,7 +370,7 @@ def test_an_answer_that_comes_with_the_end_of_the_wait_counts(
     device: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(guarded, "_LATE_S", DEADLINE_S)
-    laser = GuardedLaser(MAKE, device.settings, silence_s=PATIENT_S, answer_s=1e-9)
+    laser = GuardedLaser(MAKE, device.settings, heartbeat_timeout_s=LONG_S, answer_timeout_s=1e-9)
     with contextlib.closing(laser):
         light(laser)
         assert laser.readback().output is LaserOutput.ON
@@ -406,7 +404,7 @@ def test_mute_generator_is_unknown_and_the_guard_insists(
     device: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A guard that is replaced for being slow does not insist.
-    monkeypatch.setattr(guarded, "OFF_S", PATIENT_S)
+    monkeypatch.setattr(guarded, "DISABLE_TIMEOUT_S", LONG_S)
     with opened(device) as laser:
         light(laser)
         device.press("MUTE")

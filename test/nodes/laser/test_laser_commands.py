@@ -20,7 +20,7 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from waiting import DEADLINE_S
 
-from eschorty_ros.control.laser_interlock import LEASE
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.nodes.laser.node import THREADS, LaserNode
 from eschorty_ros.nodes.ros import drivers, qos
 from eschorty_ros.nodes.ros.domain import free_domain
@@ -53,7 +53,7 @@ def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldL
 
 def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser: HeldLaser) -> None:
     observer.wait_for_state("laser", "active")
-    heart = observer.publisher(Header, LEASE, qos.heartbeat())
+    heart = observer.publisher(Header, CLIENT_HEARTBEAT, qos.heartbeat())
     wait_until(heart.get_subscription_count, "the heartbeat's subscriber")
     heart.publish(Header())
     wait_until(lambda: observer.call(Trigger, "laser/arm").success, "arming")

@@ -19,7 +19,7 @@ from ros_process import NodeProcess, Observer, ros_minus_steady_ns, told_after, 
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
-from eschorty_ros.control.laser_interlock import LEASE
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.emulation.awg.model import truth
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
@@ -92,7 +92,7 @@ class Bench:
             assert self.arm().success
             answer = self.enable()
             # The first beat may still be on its way.
-            assert answer.success or LEASE in answer.message, answer.message
+            assert answer.success or CLIENT_HEARTBEAT in answer.message, answer.message
             return bool(answer.success)
 
         wait_until(lit, "light")

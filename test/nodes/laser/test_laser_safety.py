@@ -76,7 +76,7 @@ class Bench:
         for name in self._stand_ins:
             if name not in self.beating:
                 topics = " ".join(f"{word}/heartbeat" for word in name.split())
-                self.beating[name] = self._process("beating", {"topics": topics})
+                self.beating[name] = self._process("heartbeat_sender", {"topics": topics})
 
     def lose(self, name: str, number: int = signal.SIGKILL) -> int:
         """Send a stand-in a deadly signal; the time of it."""

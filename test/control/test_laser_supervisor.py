@@ -1,4 +1,4 @@
-"""What the keeper does when commands, switching off and the generator's answers cross; no ROS."""
+"""Commands, disabling and the generator's answers that cross each other."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from held_laser import HeldLaser
-from hours import Hours
+from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
-from eschorty_ros.control.laser_interlock import LEASE, LaserGate
-from eschorty_ros.control.laser_supervisor import LaserKeeper
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT, LaserInterlock
+from eschorty_ros.control.laser_supervisor import LaserSupervisor
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
 
@@ -25,16 +25,16 @@ def laser() -> Iterator[HeldLaser]:
 
 
 @pytest.fixture
-def keeper(laser: HeldLaser) -> Iterator[LaserKeeper]:
-    made = LaserKeeper(
-        LaserGate(10.0, 60.0, {LEASE: 60.0}),
-        living=lambda: True,
-        changed=lambda snapshot: None,
+def supervisor(laser: HeldLaser) -> Iterator[LaserSupervisor]:
+    made = LaserSupervisor(
+        LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}),
+        running=lambda: True,
+        publish=lambda status: None,
         alarm=print,
         log=print,
         readback_period_s=0.02,
     )
-    made.gate.beat()
+    made.interlock.receive_heartbeat()
     made.open(laser, Modulation(70.0))
     yield made
     laser.go.set()
@@ -68,55 +68,55 @@ def in_thread(step: Callable[[], None], failures: list[str]) -> threading.Thread
     return thread
 
 
-def test_asked_for_light_again_it_stays_on(keeper: LaserKeeper, laser: HeldLaser) -> None:
-    keeper.arm()
-    keeper.enable()
-    keeper.enable()
+def test_enabled_twice_it_stays_on(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
+    supervisor.arm()
+    supervisor.enable()
+    supervisor.enable()
     assert laser.lit
     assert laser.lightings == 1
 
 
-def test_arming_does_not_outlive_a_switching_off(keeper: LaserKeeper, laser: HeldLaser) -> None:
+def test_arming_does_not_outlive_disabling(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
     laser.hold = "arm"
     failures: list[str] = []
-    arming = in_thread(keeper.arm, failures)
+    arming = in_thread(supervisor.arm, failures)
     assert laser.reached.wait(DEADLINE_S)
-    keeper.darken("interlock open")
+    supervisor.trip("interlock open")
     laser.go.set()
     arming.join()
     assert failures == ["laser refused: interlock open"]
     with pytest.raises(DeviceError, match="not armed"):
-        keeper.enable()
+        supervisor.enable()
     assert laser.lightings == 0
 
 
-def test_what_waited_while_it_was_switched_off_is_void(
-    keeper: LaserKeeper, laser: HeldLaser
+def test_commands_that_waited_while_it_was_disabled_are_void(
+    supervisor: LaserSupervisor, laser: HeldLaser
 ) -> None:
     laser.hold = "configure"
-    keeper._commands = turns = Turns()  # type: ignore[assignment]
+    supervisor._commands = turns = Turns()  # type: ignore[assignment]
     failures: list[str] = []
-    begun = [in_thread(lambda: keeper.configure(Modulation(80.0)), failures)]
+    begun = [in_thread(lambda: supervisor.configure(Modulation(80.0)), failures)]
     assert laser.reached.wait(DEADLINE_S)
-    begun.append(in_thread(keeper.arm, failures))
-    begun.append(in_thread(keeper.enable, failures))
+    begun.append(in_thread(supervisor.arm, failures))
+    begun.append(in_thread(supervisor.enable, failures))
     wait_until(lambda: turns.asked == 3, "all three waiting for their turn")
-    keeper.switch_off("switched off by request")
+    supervisor.disable("switched off by request")
     laser.go.set()
     for thread in begun:
         thread.join()
     assert failures == ["laser refused: switched off by request"] * 2
-    assert not keeper.gate.armed
+    assert not supervisor.interlock.armed
     assert laser.lightings == 0
 
 
 class Interrupted(HeldLaser):
-    """``enable`` is under way until switching off interrupts it, which goes on for a moment."""
+    """``enable`` lasts until ``disable`` interrupts it, which then lasts 50 ms longer."""
 
     def enable(self) -> None:
         self.reached.set()
         assert self.go.wait(DEADLINE_S)
-        raise DeviceError("interrupted by switching off")
+        raise DeviceError("switched off meanwhile")
 
     def disable(self) -> None:
         super().disable()
@@ -125,57 +125,59 @@ class Interrupted(HeldLaser):
             time.sleep(0.05)
 
 
-def test_the_reason_is_that_of_whoever_switched_off(keeper: LaserKeeper) -> None:
+def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(
+    supervisor: LaserSupervisor,
+) -> None:
     laser = Interrupted()
-    keeper.close()
-    keeper.open(laser, Modulation(70.0))
-    keeper.arm()
+    supervisor.close()
+    supervisor.open(laser, Modulation(70.0))
+    supervisor.arm()
     failures: list[str] = []
-    enabling = in_thread(keeper.enable, failures)
+    enabling = in_thread(supervisor.enable, failures)
     assert laser.reached.wait(DEADLINE_S)
-    keeper.darken("interlock open")
+    supervisor.trip("interlock open")
     enabling.join()
-    assert failures == ["interrupted by switching off"]
-    snapshot = keeper.snapshot()
-    assert snapshot is not None
-    assert snapshot.reason == "interlock open"
+    assert failures == ["switched off meanwhile"]
+    status = supervisor.status()
+    assert status is not None
+    assert status.reason == "interlock open"
 
 
-def test_a_pause_of_the_watcher_leaves_light_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    hours = Hours(monkeypatch)
+def test_stall_of_this_process_leaves_light_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = StallClock(monkeypatch)
     laser = HeldLaser()
-    gate = LaserGate(10.0, 600.0, {LEASE: 1.0}, now_s=hours.monotonic)
-    keeper = LaserKeeper(
-        gate,
-        living=lambda: True,
-        changed=lambda snapshot: None,
+    interlock = LaserInterlock(10.0, 600.0, {CLIENT_HEARTBEAT: 1.0}, now_s=clock.monotonic)
+    supervisor = LaserSupervisor(
+        interlock,
+        running=lambda: True,
+        publish=lambda status: None,
         alarm=print,
         log=print,
         readback_period_s=0.02,
     )
-    gate.beat()
-    keeper.open(laser, Modulation(70.0))
+    interlock.receive_heartbeat()
+    supervisor.open(laser, Modulation(70.0))
     try:
-        keeper.arm()
-        keeper.enable()
-        hours.pass_by(60.0)
+        supervisor.arm()
+        supervisor.enable()
+        clock.advance(60.0)
         assert laser.lit
         for _ in range(22):
-            hours.pass_by(0.05)
+            clock.advance(0.05)
         assert not laser.lit
-        snapshot = keeper.snapshot()
-        assert snapshot is not None
-        assert "laser/heartbeat older than 1 s" in snapshot.reason
+        status = supervisor.status()
+        assert status is not None
+        assert "laser/heartbeat older than 1 s" in status.reason
     finally:
-        keeper.close()
+        supervisor.close()
 
 
-def test_opened_again_it_is_watched_once(keeper: LaserKeeper, laser: HeldLaser) -> None:
+def test_opened_again_it_is_watched_once(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
     laser.hold = "readback"
     assert laser.reached.wait(DEADLINE_S)
-    keeper.close()
+    supervisor.close()
     laser.hold = ""
-    keeper.open(HeldLaser(), Modulation(70.0))
+    supervisor.open(HeldLaser(), Modulation(70.0))
     laser.go.set()
 
     once = ["laser read-back", "laser watchdog"]

@@ -1,0 +1,102 @@
+"""Heartbeats: the text that identifies the sender, and when a device's health stops them.
+
+The text is ``<place> <pid>``, and ``<place> <pid> stopped`` in the last ones. The place is the same
+for two processes that see each other's process ids.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from dataclasses import dataclass
+from functools import cache
+
+from eschorty_ros.hardware.base.stalls import process_fault
+
+_STOPPED = "stopped"
+CHECK_S = 0.02
+PERIOD_S = 0.1
+LAST_HEARTBEATS = 3
+# Drivers report a device as silent after longer times than this, and a device that runs is read
+# again within so many checks.
+STALL_S = 0.3
+RECOVERY_CHECKS = 10
+
+
+@cache
+def place() -> str:
+    """Return host and process id space of this process."""
+    return f"{socket.gethostname()}/{os.stat('/proc/self/ns/pid').st_ino}"
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """The process that sends a heartbeat."""
+
+    place: str
+    pid: int
+
+    def fault(self) -> str:
+        """Return why the process does not run, ``""`` while it does or on another host."""
+        fault = process_fault(self.pid) if self.place == place() else ""
+        return f"process {self.pid} is {fault}" if fault else ""
+
+
+def heartbeat_text(*, stopped: bool) -> str:
+    """Return the text of this process's heartbeat."""
+    return f"{place()} {os.getpid()}" + f" {_STOPPED}" * stopped
+
+
+def read_heartbeat(text: str) -> tuple[Sender | None, bool]:
+    """Return a heartbeat's sender (``None`` for another text) and whether it reports a stop."""
+    match text.split():
+        case [where, number] if number.isdecimal():
+            return Sender(where, int(number)), False
+        case [where, number, word] if number.isdecimal() and word == _STOPPED:
+            return Sender(where, int(number)), True
+        case _:
+            return None, False
+
+
+class HeartbeatSchedule:
+    """Decides at every check, ``CHECK_S`` apart, whether a heartbeat is due and what it reports.
+
+    While the device is healthy one is due every 0.1 s, and the last three report that it stopped.
+    After a stall of this process a device that was healthy has 0.2 s to be read again.
+
+    Attributes
+    ----------
+    healthy : bool
+        Whether the last heartbeat reported a healthy device.
+    """
+
+    def __init__(self) -> None:
+        self.healthy = False
+        self._left = 0
+        self._recovery_checks = 0
+        self._sent_s = 0.0
+
+    def check(self, healthy: bool, stall_s: float, now_s: float) -> str | None:
+        """Return the text of the heartbeat that is due, ``None`` when none is.
+
+        Parameters
+        ----------
+        healthy : bool
+            Whether the device is healthy now.
+        stall_s : float
+            Stall of this process since the check before.
+        now_s : float
+            Steady clock.
+        """
+        self._recovery_checks = (
+            RECOVERY_CHECKS if stall_s > STALL_S else max(self._recovery_checks - 1, 0)
+        )
+        healthy |= self.healthy and self._recovery_checks > 0
+        if healthy:
+            self._left = LAST_HEARTBEATS
+        due = healthy != self.healthy or now_s - self._sent_s >= PERIOD_S
+        if not due or self._left == 0:
+            return None
+        self.healthy, self._sent_s = healthy, now_s
+        self._left -= not healthy
+        return heartbeat_text(stopped=not healthy)
