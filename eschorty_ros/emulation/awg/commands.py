@@ -1,4 +1,4 @@
-"""What a UTG900E-like generator understands: its SCPI subset as the instrument parses it.
+"""The SCPI subset of a UTG900E-like generator, as the instrument parses it.
 
 Written from the command table of the instrument's family, not from the driver's profile.
 """
@@ -37,13 +37,13 @@ class ChannelState:
     limit_upper_v: float = LEVEL_LIMIT_V
 
     def set_load(self, load_ohm: float) -> None:
-        """Another load: the same source voltage is then told as other volts."""
+        """Set the load; the same source voltage then reads back as other volts."""
         factor = _divided(load_ohm) / _divided(self.load_ohm)
         self.high_v, self.low_v = self.high_v * factor, self.low_v * factor
         self.load_ohm = load_ohm
 
     def set_levels(self, high_v: float, low_v: float) -> None:
-        """Take levels that lie in range and in order, inside the clamp; ignore others."""
+        """Set levels that lie in range and in order, inside the clamp; ignore others."""
         if self.limit:
             high_v, low_v = self._clamped(high_v), self._clamped(low_v)
         bound = LEVEL_LIMIT_V * _divided(self.load_ohm)
@@ -75,13 +75,13 @@ def _command(
 
 
 def _keyword(word: str) -> str:
-    """Pattern of a SCPI keyword: its capitals alone, or the whole of it."""
+    """Return the pattern of a SCPI keyword: its capitals alone, or its long form."""
     short = "".join(letter for letter in word if not letter.islower())
     return f"(?:{re.escape(word)}|{re.escape(short)})"
 
 
 def match_keyword(words: tuple[str, ...], text: str) -> str | None:
-    """Long form in capitals of the keyword ``text`` is, ``None`` when it is none."""
+    """Return the long form, in capitals, of the keyword ``text``, ``None`` when it is none."""
     for word in words:
         if re.fullmatch(_keyword(word), text, re.I):
             return word.upper()
@@ -89,7 +89,7 @@ def match_keyword(words: tuple[str, ...], text: str) -> str | None:
 
 
 def _number(text: str, low: float, high: float) -> float | None:
-    """Plain decimal within bounds; anything else is ignored by the instrument."""
+    """Return a plain decimal within bounds; the instrument ignores anything else."""
     if re.fullmatch(r"[-+]?\d*\.?\d+", text) is None:
         return None
     value = float(text)
@@ -123,7 +123,7 @@ def _value(path: str, name: str, low: float, high: float, decimals: int) -> Comm
 
 
 def plain(value: float, decimals: int) -> str:
-    """Plain decimal without trailing zeros."""
+    """Return a plain decimal without trailing zeros."""
     text = f"{value:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
 
@@ -172,5 +172,5 @@ CHANNEL_COMMANDS = (
 
 
 def find_command(path: str) -> Command | None:
-    """Command of a channel by its path, in long or short form."""
+    """Return the command of a channel by its path, in long or short form."""
     return next((c for c in CHANNEL_COMMANDS if c.pattern.fullmatch(path)), None)

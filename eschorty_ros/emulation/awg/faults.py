@@ -1,26 +1,26 @@
-"""What can go wrong with the generator model, as switches."""
+"""Faults of the generator model, as switches."""
 
 from __future__ import annotations
 
 
 class AwgFaults:
-    """Switches of what goes wrong; counts run down to 0 with each time it went wrong.
+    """Switches of faults; a count runs down to 0 with each time its fault strikes.
 
     Attributes
     ----------
     lost_replies : int
-        Replies that never come.
+        Replies that never arrive.
     late_replies : int
-        Replies that come one request late: the next request gets them, unless cleared before.
+        Replies that arrive one request late: the next request gets them, unless cleared before.
     wrong_tags, wrong_kinds, short_headers, oversized, empty_packets : int
         Reply transfers with a wrong bTag, a wrong MsgID, fewer than 12 bytes, a TransferSize
         above what follows, an empty packet before them.
     transfer_bytes : int
-        Cut replies into transfers of this size without EOM; 0 = whole.
+        Cut replies into transfers of this size without EOM; 0 = uncut.
     newline : bool
         End replies with a newline.
     pending_clears : int
-        CHECK_CLEAR answers "pending" this often.
+        CHECK_CLEAR replies "pending" this often.
     no_clear : bool
         INITIATE_CLEAR stalls: the request is not known.
     ignored : set of str
@@ -45,7 +45,7 @@ class AwgFaults:
         self.changed: dict[str, str] = {}
 
     def take(self, name: str) -> bool:
-        """Whether fault ``name`` strikes now; counts it."""
+        """Return whether fault ``name`` strikes now; counts it."""
         left = getattr(self, name)
         if left > 0:
             setattr(self, name, left - 1)

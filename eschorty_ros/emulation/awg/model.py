@@ -1,9 +1,9 @@
 """A UTG900E-like waveform generator on an emulated USB bus, with the ways it fails.
 
-Quirks of the family kept: replies without a newline; a request for a reply where none is due is
-never answered; any command locks the front panel until ``:SYSTem:LOCK OFF``; a value out of range
-is ignored without a word; no error queue unless given one. Unconfirmed on hardware: everything
-after ``*RST`` and power-up, and that a load is told as scaled volts.
+Like the family it replies without a newline, never answers a request where no reply is due, locks
+the front panel at any command until ``:SYSTem:LOCK OFF``, silently ignores a value out of range,
+and has no error queue unless given one. Unconfirmed on hardware: everything after ``*RST`` and
+power-up, and that a load reads back as scaled volts.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ENDPOINT_OUT, ENDPOINT_IN = 0x01, 0x81
 PACKET = 64
 CHANNELS = 2
 THRESHOLD_V = 2.0
-"""A TTL laser input takes this for on."""
+"""Level at which a TTL laser input is on."""
 
 _REMEMBERED = 4096
 _HEADER = struct.Struct("<BBBBIB3x")
@@ -46,15 +46,15 @@ OnChange = Callable[[int, bool, Modulation], None]
 
 
 class AwgModel(EmulatedUsbDevice):
-    """The generator; channel 1 gates the laser.
+    """The generator; channel 1 modulates the laser.
 
     Parameters
     ----------
     clock_ns : callable
-        Time of the world, ns: that of ``on_change``.
+        Clock of ``on_change``, ns.
     log_path : path, optional
-        Gets ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and whenever output 1 is switched,
-        on disk before the command is answered: the instrument's own witness.
+        Gets a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and whenever output 1 is switched,
+        before the command is answered: the instrument's own evidence.
     serial : str
     wait : callable
         How a read waits, see ``EmulatedUsbDevice``.
@@ -105,7 +105,7 @@ class AwgModel(EmulatedUsbDevice):
         self.commands: deque[str] = deque(maxlen=_REMEMBERED)
         self.on_change: OnChange | None = None
         self._logged: bool | None = None
-        self._told: tuple[bool, Modulation] | None = None
+        self._light: tuple[bool, Modulation] | None = None
         self._message = b""
         self._replies: deque[bytes] = deque()
         self._reset_settings()
@@ -117,12 +117,12 @@ class AwgModel(EmulatedUsbDevice):
 
     @property
     def lit(self) -> bool:
-        """Whether output 1 reaches what the laser takes for on."""
+        """Whether output 1 reaches the level at which the laser is on."""
         state = self.channels[0]
         return state.output and max(state.high_v, state.low_v) >= THRESHOLD_V
 
     def power_up(self) -> None:
-        """Start afresh: outputs off, settings of the maker, panel free."""
+        """Start: outputs off, settings of the maker, panel free."""
         super().power_up()
         self._reset_settings()
 
@@ -132,7 +132,7 @@ class AwgModel(EmulatedUsbDevice):
             self.power_up()
 
     def touch(self, path: str, text: str, channel: int = 1) -> bool:
-        """Set something at the front panel; False when it is locked."""
+        """Set a value at the front panel; returns False when it is locked."""
         with self.mutex:
             command = find_command(path)
             if self.locked or command is None:
@@ -142,7 +142,7 @@ class AwgModel(EmulatedUsbDevice):
             return True
 
     def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
-        """Take a message, or a request for a reply."""
+        """Receive a message, or a request for a reply."""
         kind, tag, inverse, _, size, attributes = _HEADER.unpack_from(data)
         if tag == 0 or inverse != tag ^ 0xFF:
             self.stalled.add(endpoint)
@@ -164,7 +164,7 @@ class AwgModel(EmulatedUsbDevice):
         data: bytes | int,
         timeout_ms: int,
     ) -> bytes | int:
-        """INITIATE_CLEAR and CHECK_CLEAR; the rest as any device."""
+        """Answer INITIATE_CLEAR and CHECK_CLEAR, and the requests that every device knows."""
         if request_type == _CLASS_INTERFACE_IN and request == 5 and not self.faults.no_clear:
             self._message = b""
             self._replies.clear()
@@ -175,7 +175,7 @@ class AwgModel(EmulatedUsbDevice):
         return super().control(request_type, request, value, index, data, timeout_ms)
 
     def reset(self) -> None:
-        """Bus reset: what is under way is forgotten, the settings stay."""
+        """Reset the bus: messages in progress are dropped, the settings stay."""
         super().reset()
         self._message = b""
         self._replies.clear()
@@ -228,7 +228,7 @@ class AwgModel(EmulatedUsbDevice):
         return self.channels[int(found[1] or 1) - 1]
 
     def _answer(self, tag: int, wanted: int) -> None:
-        """Send what is due in one reply transfer; nothing due, nothing sent."""
+        """Send the reply that is due, if there is one, in one transfer."""
         faults = self.faults
         if not self._replies or faults.take("late_replies"):
             return
@@ -250,19 +250,19 @@ class AwgModel(EmulatedUsbDevice):
         self.reply(ENDPOINT_IN, data[:7] if faults.take("short_headers") else data)
 
     def _changed(self) -> None:
-        """Log the switch of output 1, tell the world the light."""
+        """Log a switch of output 1, and call ``on_change`` with the light."""
         if self.output is not self._logged:
             self._logged = self.output
             if self._log_path is not None:
                 with self._log_path.open("a", encoding="ascii") as log:
                     log.write(f"{time.monotonic_ns()} {'ON' if self.output else 'OFF'}\n")
-        told = (self.lit, self.modulation())
-        if self.on_change is not None and told != self._told:
-            self.on_change(self._clock_ns(), *told)
-        self._told = told
+        light = (self.lit, self.modulation())
+        if self.on_change is not None and light != self._light:
+            self.on_change(self._clock_ns(), *light)
+        self._light = light
 
     def modulation(self) -> Modulation:
-        """Gate that channel 1 makes; waveforms and frequencies no laser is gated with: nearest."""
+        """Return the modulation of channel 1, the nearest one that a laser can have."""
         state = self.channels[0]
         frequency_hz = min(max(state.frequency_hz, FREQUENCY_MIN_HZ), FREQUENCY_MAX_HZ)
         waveform = _WAVEFORMS.get(state.wave, "square")
@@ -271,6 +271,6 @@ class AwgModel(EmulatedUsbDevice):
 
 
 def truth(log_path: str | Path) -> list[tuple[int, str]]:
-    """Read a log: monotonic ns and ON or OFF, in order."""
+    """Return the lines of a log: monotonic ns and ON or OFF, in order."""
     lines = Path(log_path).read_text(encoding="ascii").splitlines()
     return [(int(t_ns), state) for t_ns, state in (line.split() for line in lines)]

@@ -8,7 +8,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    # Only names: the process that guards the laser starts without numpy.
+    # For annotations only: the process that guards the laser starts without numpy.
     from eschorty_ros.core.clocks import PulseTrain
     from eschorty_ros.core.modulation import Modulation
 
@@ -120,12 +120,11 @@ class LaserOutput(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class LaserReadback:
-    """What the generator says it does.
+    """Output and settings as the generator reports them.
 
-    ``phase_epoch_ns`` is the time of one rising edge, ``None`` where nobody knows it: a
-    generator does not tell its phase. ``reason`` says why the output is off or
-    unknown, when the driver knows. ``warnings`` are all oddities since opening that are no
-    failure, ``counters`` go to diagnostics.
+    ``phase_epoch_ns`` is the time of one rising edge, ``None`` where the generator does not report
+    its phase. ``reason`` is why the output is off or unknown, where the driver knows it.
+    ``warnings`` are all oddities since opening that are no failure, ``counters`` go to diagnostics.
     """
 
     output: LaserOutput
@@ -138,7 +137,7 @@ class LaserReadback:
 
 
 class LaserModulator(Protocol):
-    """The generator that gates the laser. Off at construction and after every failure."""
+    """The generator that modulates the laser. Off at construction and after every failure."""
 
     identity: DeviceIdentity
 

@@ -1,4 +1,4 @@
-"""The generator that gates the laser: dark unless told otherwise and read back to be so."""
+"""The generator that modulates the laser: its output is off unless enabled and read back so."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _WARNINGS_KEPT = 32
 class AwgLaser:
     """A waveform generator as laser modulator; off at construction and after every failure.
 
-    Thread-safe. ``disable`` may come at any time from any thread: whatever else is under way
+    Thread-safe. ``disable`` may be called at any time from any thread: the command in progress
     gives up before its next USB transfer.
 
     Parameters
@@ -47,12 +47,12 @@ class AwgLaser:
     Attributes
     ----------
     identity : DeviceIdentity
-        As ``*IDN?`` gives it.
+        As ``*IDN?`` reads.
 
     Raises
     ------
     DeviceError
-        No generator, or it does not confirm that it is off.
+        No generator, or it does not confirm that its output is off.
     """
 
     def __init__(self, settings: AwgSettings, clock_ns: Callable[[], int] = time.time_ns) -> None:
@@ -77,8 +77,7 @@ class AwgLaser:
         self._warnings: list[str] = []
         self._counters = dict.fromkeys(("openings", "faults", "retries", "switch_off_failures"), 0)
         self._open_channel: AwgChannel | None = None
-        # What the open generator is known by: its link's serial number, and the opening at which
-        # it was last asked for its identity.
+        # The same generator is opened again after a loss, and identified once per opening.
         self._link_serial = ""
         self._identified = 0
         self.identity = DeviceIdentity(self._profile.name, settings.serial)
@@ -92,14 +91,14 @@ class AwgLaser:
                 raise
 
     def configure(self, modulation: Modulation) -> None:
-        """Set everything from the load to the duty, read all back; a lit output is lit again.
+        """Make every setting and read it back; an output that is on is off meanwhile.
 
         Raises
         ------
         ArgumentError
-            For a modulation the generator cannot do; nothing has changed then.
+            For a modulation the generator cannot make; nothing has changed then.
         DeviceError
-            When the generator fails, or reads back something else; it is dark then.
+            When the generator fails, or reads back something else; its output is off then.
         """
         with self._command():
             wanted = wanted_settings(self._settings, self._profile, modulation)
@@ -113,7 +112,7 @@ class AwgLaser:
                 channel.unlock()
                 self._modulation, self._ready = modulation, True
                 if lit:
-                    self._light()
+                    self._enable()
 
     def arm(self) -> None:
         """Allow the next ``enable``; raises ``DeviceError`` when closed."""
@@ -126,7 +125,7 @@ class AwgLaser:
         Raises
         ------
         DeviceError
-            Not armed, not configured, a setting that is not as set, a failure: it is dark then.
+            Not armed, not configured, a setting that differs, a failure; the output is off then.
         """
         with self._command():
             if not self._armed:
@@ -135,18 +134,18 @@ class AwgLaser:
                 raise DeviceError(f"{NAME}: not configured since it was lost; configure it again")
             with self._disabled_on_failure():
                 self._armed = False
-                self._light()
+                self._enable()
 
     def disable(self) -> None:
-        """Switch off and disarm; idempotent, over in about 1 s, also when nothing answers.
+        """Switch the output off and disarm; idempotent; ends within about 1 s in any case.
 
-        OUTPut OFF, then levels down, then read back; else clear and again; else reset, open anew
-        and again.
+        Writes OUTPut OFF, lowers the levels, reads back; on a failure again after clearing the
+        link, and again after opening the generator again.
 
         Raises
         ------
         DeviceError
-            ``laser state unknown``: the generator did not confirm; ``readback`` says UNKNOWN.
+            ``laser state unknown``: the generator did not confirm; ``readback`` is UNKNOWN then.
         """
         with self._in_flight.disabling("switched off meanwhile"), self._lock:
             self._armed = False
@@ -155,12 +154,12 @@ class AwgLaser:
                 self._reason = ""
 
     def readback(self) -> LaserReadback:
-        """Read output and, while it is lit, levels and waveform back; UNKNOWN counts as on.
+        """Read the output back and, while it is on, levels and waveform; UNKNOWN counts as on.
 
         Raises
         ------
         DeviceError
-            The generator does not answer, or a lit output is not as it was set: dark then.
+            No reply, or an output that is on differs from its settings; it is off then.
         """
         with self._command():
             if self._open_channel is not None and self._output is not LaserOutput.UNKNOWN:
@@ -244,7 +243,7 @@ class AwgLaser:
             with suppress(DeviceError):
                 self._open_channel.unlock_at_once()
         first, last = str(failures[0]), str(failures[-1])
-        both = first if first == last else f"{first}; opened anew: {last}"
+        both = first if first == last else f"{first}; opened again: {last}"
         self._reason = f"{both}; treat the laser as on and switch the generator off by hand"
         self._counters["switch_off_failures"] += 1
         self._ready = False
@@ -272,14 +271,14 @@ class AwgLaser:
             channel.link.close()
 
     def _is_write_only(self) -> bool:
-        return self._open_channel is not None and not self._open_channel.asks
+        return self._open_channel is not None and not self._open_channel.reads_back
 
     def _warn(self, text: str) -> None:
         if text not in self._warnings and len(self._warnings) < _WARNINGS_KEPT:
             self._warnings.append(text)
 
     def _identify(self) -> None:
-        """Ask for the identity once per opening."""
+        """Read the identity once per opening."""
         if self._identified == self._counters["openings"]:
             return
         self.identity = self._channel.identify()
@@ -287,7 +286,7 @@ class AwgLaser:
         self._identified = self._counters["openings"]
 
     def _compare_output(self) -> None:
-        """Compare what was commanded with what the generator reads back."""
+        """Refuse an output, or a waveform that is on, that reads back as something else."""
         channel = self._channel
         on = channel.output()
         if on is not None and on != (self._output is LaserOutput.ON):
@@ -300,7 +299,7 @@ class AwgLaser:
             channel.verify_waveform()
         channel.unlock()
 
-    def _light(self) -> None:
+    def _enable(self) -> None:
         channel = self._channel
         channel.raise_levels()
         channel.verify()
@@ -319,7 +318,7 @@ class AwgLaser:
 
     @contextmanager
     def _command(self) -> Iterator[None]:
-        """Wait for a turn; the block gives up at its next transfer when ``disable`` is called."""
+        """Wait for a turn; the block gives up before its next transfer once it is void."""
         with self._lock:
             if self._closed:
                 raise DeviceError(f"{NAME}: closed; open it again")
@@ -351,10 +350,9 @@ class AwgLaser:
 
 
 def _open_link(settings: AwgSettings, profile: AwgProfile, serial: str) -> UsbTmc:
-    """Find the generator and claim it; ``serial`` counts where the settings name none.
+    """Find the generator and claim it; ``serial`` applies where the settings name none.
 
-    Raises ``DeviceError`` when there is none, or several, without permission, or when another
-    program holds it.
+    Raises ``DeviceError`` for none, several, no permission, and one that another program holds.
     """
     vendors = settings.vendors() or profile.usb.vendor_ids
 

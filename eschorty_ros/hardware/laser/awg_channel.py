@@ -21,14 +21,14 @@ Wanted = dict[str, Value]
 
 
 def wanted_settings(settings: AwgSettings, profile: AwgProfile, modulation: Modulation) -> Wanted:
-    """Every setting of a lit output, in the order in which it is safe to make them.
+    """Return every setting of a lit output, in the order in which it is safe to make them.
 
-    The load first, since it changes what a volt means; then the clamp, before any level.
+    The load is first, since it changes what a volt means; then the clamp, before any level.
 
     Raises
     ------
     ArgumentError
-        For what the generator cannot do.
+        For a modulation the generator cannot make.
     """
     if modulation.waveform not in profile.waveforms:
         raise ArgumentError(
@@ -58,11 +58,11 @@ def wanted_settings(settings: AwgSettings, profile: AwgProfile, modulation: Modu
 
 
 class AwgChannel:
-    """The output that gates the laser, over one link.
+    """The output that modulates the laser, over one link.
 
-    What reading back decides is the settings' ``readback``: ``required`` makes silence a
-    failure; ``best_effort`` stops asking after the first silence and goes on; ``off`` never asks.
-    A reply that contradicts what was set is a failure always.
+    The setting ``readback`` decides what a missing reply means: with ``required`` it is a failure,
+    with ``best_effort`` nothing is read back after it, with ``off`` nothing ever is. A reply that
+    contradicts a setting is always a failure.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class AwgChannel:
     refuse_void : callable
         Called before every transfer but those of ``disable``; raises to give up.
     warn : callable
-        Called with one line for what is odd but no failure.
+        Called with one line for an oddity that is no failure.
     counters : dict
         See ``Scpi``.
     """
@@ -92,12 +92,12 @@ class AwgChannel:
         self._profile = profile
         self._wanted: Wanted = {}
         self._lowered = False
-        self._silent = False
+        self._no_replies = False
         self._warn = warn
         own = settings.channel
         # This channel first.
         self._channels = (own, *(n for n in range(1, profile.channels + 1) if n != own))
-        # Spelt now, so that disabling only writes.
+        # Composed now, so that disabling only writes.
         outputs_off = [self._scpi.spelt("output", False, n) for n in self._channels]
         levels_down = [
             self._scpi.spelt("low", 0.0, own),
@@ -106,18 +106,18 @@ class AwgChannel:
         self._disabling = [self._scpi.message(text) for text in outputs_off + levels_down]
 
     @property
-    def asks(self) -> bool:
-        """Whether replies are to be expected."""
-        return self._settings.readback != "off" and not self._silent
+    def reads_back(self) -> bool:
+        """Whether settings are read back."""
+        return self._settings.readback != "off" and not self._no_replies
 
     def identify(self) -> DeviceIdentity:
-        """Ask for maker, model, serial and firmware; empty the error queue if there is one."""
-        reply = self._asked(lambda: self._scpi.ask(self._profile.identify))
+        """Return maker, model, serial and firmware; empties the error queue if there is one."""
+        reply = self._read_back(lambda: self._scpi.ask(self._profile.identify))
         if reply is None:
             return DeviceIdentity(self._profile.name, self.link.serial)
         if re.search(self._profile.model, reply) is None:
             self._warn(
-                f"{NAME}: it says {reply[:60]!r}, profile {self._profile.name} was asked for; "
+                f"{NAME}: it is {reply[:60]!r}, but the profile is {self._profile.name}; "
                 "check every setting on its display"
             )
         for error in self._scpi.drain_errors() or ():
@@ -128,7 +128,7 @@ class AwgChannel:
         )
 
     def apply(self, wanted: Wanted) -> None:
-        """Make every setting of a dark output, then read all of them back.
+        """Make every setting of a disabled output, then read all of them back.
 
         Raises
         ------
@@ -144,12 +144,12 @@ class AwgChannel:
         self.verify()
 
     def raise_levels(self) -> None:
-        """Set the levels that ``darken`` lowered as they were applied; raises ``DeviceError``."""
+        """Restore the levels that ``disable`` lowered; raises ``DeviceError``."""
         if self._lowered and "high" in self._wanted:
             self._set_levels(float(self._wanted["high"]), float(self._wanted["low"]))
 
     def verify(self) -> None:
-        """Read every setting back and compare; raises ``DeviceError`` naming what differs."""
+        """Read every setting back; raises ``DeviceError`` that names those that differ."""
         self._compare(self._wanted)
 
     def verify_waveform(self) -> None:
@@ -162,12 +162,12 @@ class AwgChannel:
         self._set("output", True)
 
     def output(self) -> bool | None:
-        """Whether the output is on; ``None`` where replies are not to be expected."""
+        """Return whether the output is on, ``None`` where nothing is read back."""
         found = self._get("output", self._settings.channel)
         return None if found is None else bool(found)
 
     def disable(self) -> None:
-        """OUTPut OFF on all channels, levels down, without a retry; then read back.
+        """Write OUTPut OFF for all channels and lower the levels, without a retry; read back.
 
         Raises
         ------
@@ -186,7 +186,7 @@ class AwgChannel:
         self.unlock()
 
     def unlock(self) -> None:
-        """Free the front panel: whoever stands there must be able to switch off by hand."""
+        """Free the front panel, where the output can be switched off by hand."""
         if self._profile.unlock is not None:
             self._scpi.command(self._profile.unlock)
 
@@ -199,7 +199,7 @@ class AwgChannel:
         self._scpi.set(name, value, self._settings.channel)
 
     def _set_levels(self, high: float, low: float) -> None:
-        """HIGH stays above LOW on the way: raising begins with HIGH, lowering with LOW."""
+        """Set both levels; HIGH stays above LOW: raising begins with HIGH, lowering with LOW."""
         found = self._get("high", self._settings.channel)
         present = self._profile.dark_high_v if found is None else float(found)
         levels: list[tuple[str, Value]] = [("high", high), ("low", low)]
@@ -219,11 +219,11 @@ class AwgChannel:
             )
 
     def _get(self, name: str, channel: int) -> Value | None:
-        return self._asked(lambda: self._scpi.get(name, channel))
+        return self._read_back(lambda: self._scpi.get(name, channel))
 
-    def _asked(self, query: Callable[[], Result]) -> Result | None:
-        """Reply, or ``None`` where the policy can do without."""
-        if not self.asks:
+    def _read_back(self, query: Callable[[], Result]) -> Result | None:
+        """Return the reply, ``None`` where the setting ``readback`` allows it to be missing."""
+        if not self.reads_back:
             return None
         try:
             return query()
@@ -232,7 +232,7 @@ class AwgChannel:
         except DeviceError as error:
             if self._settings.readback == "required":
                 raise
-            self._silent = True
+            self._no_replies = True
             self._warn(f"{NAME}: reading back given up, settings are not verified ({error})")
             return None
 

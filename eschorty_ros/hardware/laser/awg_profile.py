@@ -1,4 +1,4 @@
-"""How one family of waveform generators is spoken to: a YAML file with a schema."""
+"""The commands of one family of waveform generators: a YAML file with a schema."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SETTINGS = (
     "low",
     "duty",
 )
-"""Every profile describes these."""
+"""The settings that every profile describes."""
 
 Value = bool | float | str
 Texts = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
@@ -46,7 +46,7 @@ class UsbIds(Schema):
 
 
 class Replies(Schema):
-    """What switches look like in replies, and the units a number may carry."""
+    """Texts of switches in replies, and the units a number may carry."""
 
     on: Texts
     off: Texts
@@ -54,7 +54,7 @@ class Replies(Schema):
 
 
 class Setting(Schema):
-    """One setting: set by ``command value``, asked by ``command?``.
+    """One setting: set by ``command value``, read by ``command?``.
 
     ``minimum`` and ``maximum`` bound a number. A read-back equals what was set when it differs
     by ``tolerance`` plus ``tolerance_share`` of the value at most.
@@ -77,7 +77,7 @@ class Setting(Schema):
         return value
 
     def agrees(self, wanted: Value, found: Value) -> bool:
-        """Tell whether a read-back is what was set."""
+        """Return whether a read-back agrees with what was set."""
         if self.kind == "number":
             allowed = self.tolerance + self.tolerance_share * abs(float(wanted))
             return abs(float(found) - float(wanted)) <= allowed
@@ -86,7 +86,7 @@ class Setting(Schema):
         return bool(wanted) == bool(found)
 
     def check(self, name: str, value: Value) -> None:
-        """Raise ``ArgumentError`` for a number outside the instrument's bounds."""
+        """Refuse a number outside the instrument's bounds with ``ArgumentError``."""
         if self.kind != "number":
             return
         low = self.minimum if self.minimum is not None else float("-inf")
@@ -138,7 +138,7 @@ class AwgProfile(Schema):
 
 
 def same_keyword(spelt: str, found: str) -> bool:
-    """Tell whether a reply is a SCPI keyword in its long or short form, upper or lower case."""
+    """Return whether a reply is a SCPI keyword in its long or short form, upper or lower case."""
     short = "".join(letter for letter in spelt if not letter.islower())
     return found.upper() in (spelt.upper(), short)
 

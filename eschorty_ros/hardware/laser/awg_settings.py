@@ -1,4 +1,4 @@
-"""What a user sets about the generator that gates the laser."""
+"""The user's settings of the generator that modulates the laser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eschorty_ros.core.base.numbers import number, whole
 
 READBACK_POLICIES = ("required", "best_effort", "off")
 HIGH_LIMIT_V = 10.0
-"""More than any gate input takes."""
+"""Above the level of any laser's modulation input."""
 
 
 def _field(default: Any, description: str, unit: str = "", **more: Any) -> Any:
@@ -19,7 +19,7 @@ def _field(default: Any, description: str, unit: str = "", **more: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class AwgSettings:
-    """Generator, wiring and caution; the fields are the laser node's parameters.
+    """Generator, wiring and limits; the fields are the laser node's parameters.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class AwgSettings:
         self.vendors()
 
     def vendors(self) -> tuple[int, ...]:
-        """Vendor ids, empty for the profile's."""
+        """Return the vendor ids, none for the profile's."""
         try:
             return tuple(int(text, 16) for text in self.vendor_ids.split())
         except ValueError:

@@ -20,8 +20,8 @@ _NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([A-Za-z%]*)", re.ASC
 class Scpi:
     """Settings of one channel of one generator.
 
-    Every command is absolute, so that any may be sent twice: after a fault the link is cleared
-    and the command sent once more; a second fault is the caller's.
+    Every command is absolute and may be sent twice: after a fault the link is cleared and the
+    command is sent once more; a second fault is raised.
 
     Parameters
     ----------
@@ -50,12 +50,12 @@ class Scpi:
         self.command(self.spelt(name, value, channel))
 
     def get(self, name: str, channel: int) -> Value:
-        """Read ``name`` back: bool, float or keyword, as its kind says.
+        """Return the value of ``name``: bool, float or keyword, by its kind.
 
         Raises
         ------
         DeviceError
-            No answer, or twice one that is no value of that kind.
+            No reply, or twice one that is no value of that kind.
         """
         query = self._profile.settings[name].command.format(channel=channel) + "?"
         return self._attempt(lambda: self._parsed(name, query, self._ask(query)))
@@ -73,9 +73,9 @@ class Scpi:
         return (text + self._profile.terminator).encode("ascii")
 
     def drain_errors(self) -> list[str] | None:
-        """Empty the error queue, 32 entries at most; ``None`` when the generator has none.
+        """Empty the error queue and return its entries, ``None`` when the generator has none.
 
-        Asked without retry: silence or garbage mean that there is no queue, not a fault.
+        At most 32, without a retry: no reply or garbage mean that there is no queue, not a fault.
         """
         query = self._profile.error_queue
         if query is None:
@@ -105,26 +105,21 @@ class Scpi:
         return f"{setting.command.format(channel=channel)} {_text(value)}"
 
     def _attempt(self, step: Callable[[], Result]) -> Result:
-        self._refuse_void()
-        try:
-            return step()
-        except (DeviceGoneError, VoidedError):
-            raise
-        except DeviceError:
-            self._counters["faults"] += 1
+        retried = False
+        while True:
             self._refuse_void()
-            self._link.clear()
-        self._refuse_void()
-        self._counters["retries"] += 1
-        try:
-            return step()
-        except (DeviceGoneError, VoidedError):
-            raise
-        except DeviceError:
-            self._counters["faults"] += 1
-            self._refuse_void()
-            self._link.clear()
-            raise
+            try:
+                return step()
+            except (DeviceGoneError, VoidedError):
+                raise
+            except DeviceError:
+                self._counters["faults"] += 1
+                self._refuse_void()
+                self._link.clear()
+                if retried:
+                    raise
+            retried = True
+            self._counters["retries"] += 1
 
     def _write(self, text: str) -> None:
         self._link.write(self.message(text))
@@ -162,7 +157,7 @@ class Scpi:
 
 
 def _text(value: Value) -> str:
-    """Spell a value as SCPI: plain decimals, no exponents."""
+    """Return a value as SCPI text: plain decimals, no exponents."""
     if isinstance(value, bool):
         return "ON" if value else "OFF"
     if isinstance(value, str):

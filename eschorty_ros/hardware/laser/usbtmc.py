@@ -1,8 +1,8 @@
 """USBTMC on a pyusb device: messages out, replies in, every header checked.
 
-USB-IF "Universal Serial Bus Test and Measurement Class" 1.0, tables 1 to 9. Nothing here waits for
-a newline: a reply ends where its header says so (EOM), and nothing is asked for after that, since
-a second request for the same reply wedges some instruments until they are plugged in again.
+USB-IF "Universal Serial Bus Test and Measurement Class" 1.0, tables 1 to 9. A reply ends with the
+end of message (EOM) in its header, not with a newline, and nothing is requested after it: a second
+request for the same reply wedges some instruments until they are plugged in again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from eschorty_ros.hardware.base.usb import claim, release, translate
 
 INTERFACE_CLASS, INTERFACE_SUBCLASS = 0xFE, 0x03
 REPLY_LIMIT = 65_536
-"""Longest reply taken, bytes; more is an instrument that has lost its way."""
+"""Longest reply that is accepted, bytes."""
 
 _HEADER = struct.Struct("<BBBBIB3x")
 _MESSAGE_OUT, _REQUEST_IN, _REPLY_IN = 1, 2, 2
@@ -32,7 +32,7 @@ _CLEAR_TRIES = 32
 
 
 def is_usbtmc(device: usb.core.Device) -> bool:
-    """Tell whether a device has a USBTMC interface, from its descriptors alone."""
+    """Return whether a device has a USBTMC interface, from its descriptors alone."""
     return any(_is_tmc(interface) for configuration in device for interface in configuration)
 
 
@@ -48,7 +48,7 @@ class UsbTmc:
     ----------
     device : usb.core.Device
     name : str
-        What errors call the instrument.
+        Name of the instrument in errors.
     timeout_s : float
         Longest wait for one transfer.
 
@@ -87,7 +87,7 @@ class UsbTmc:
         self._send(header + message + bytes(-len(message) % 4), "sending a command")
 
     def read(self) -> bytes:
-        """Take one reply, joined up to its end of message.
+        """Return one reply, joined up to its end of message.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class UsbTmc:
         try:
             self._clear_buffers()
         except DeviceStallError:
-            pass  # It does not know the request.
+            pass  # The instrument does not know the request.
         finally:
             self._clear_halts()
 
@@ -182,14 +182,14 @@ class UsbTmc:
             raise translate(error, f"{self._name}: reading a reply") from error
 
     def _read_transfer(self) -> tuple[bytes, bool]:
-        """One reply transfer: its data, and whether the message ends with it.
+        """Return the data of one reply transfer, and whether the message ends with it.
 
-        The first packet is read alone: it tells the size, and a reply of whole packets that no
-        empty packet follows would block a larger read until the time-out.
+        The first packet is read alone: its header holds the size, and a reply of full packets that
+        no empty packet follows would block a larger read until the time-out.
         """
         header = _HEADER.pack(*self._tags(_REQUEST_IN), 0, _ASKED_AT_ONCE, 0)
         self._send(header, "asking for a reply")
-        # An empty packet may still end the transfer before.
+        # An empty packet may still end the previous transfer.
         data = self._receive(self._packet) or self._receive(self._packet)
         size, ended = self._checked(data)
         missing = _HEADER.size + size - len(data)
@@ -203,7 +203,7 @@ class UsbTmc:
         return data[_HEADER.size : _HEADER.size + size], ended
 
     def _checked(self, data: bytes) -> tuple[int, bool]:
-        """Size and end mark of a reply header that belongs to the last request."""
+        """Return size and end mark of a reply header; refuses one for another request."""
         if len(data) < _HEADER.size:
             raise DeviceError(f"{self._name}: a reply of {len(data)} bytes is too short")
         kind, tag, inverse, _, size, attributes = _HEADER.unpack_from(data)
@@ -225,7 +225,7 @@ class UsbTmc:
             if status != _STATUS_PENDING:
                 return
             if more & 1:
-                # Data that must be taken before the instrument can go on.
+                # The instrument goes on when this data has been read.
                 self._receive(self._packet)
             if time.monotonic() > ends:
                 break

@@ -1,4 +1,4 @@
-"""Opening a generator by the name of what opens it, and none but the lost one again."""
+"""Opening a generator by the name of its driver, and the same one again after a loss."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from eschorty_ros.hardware.base.protocols import LaserModulator
 
 
 def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
-    """Look up what opens the generator: ``module:callable`` with keywords.
+    """Return the function that opens the generator: ``module:callable`` with keywords.
 
     Raises
     ------
@@ -29,12 +29,12 @@ def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator
 
 
 def open_again(make: Callable[[], LaserModulator], serial: str) -> LaserModulator:
-    """Open the generator that was lost, dark; another one says nothing about its output.
+    """Open the generator that was lost, which disables its output.
 
     Raises
     ------
     DeviceError
-        It is not there.
+        It is not there, or there is another one, whose output proves nothing.
     """
     laser = make()
     found = laser.identity.serial
