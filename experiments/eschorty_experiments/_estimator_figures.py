@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from eschorty_ros.core.line import METHODS, WHOLE_COLUMN_METHODS
+from eschorty_ros.core.line import FULL_COLUMN_METHODS, METHODS
 from eschorty_ros.report.figures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WINDOWED = tuple(name for name in METHODS if name not in WHOLE_COLUMN_METHODS)
+WINDOWED = tuple(name for name in METHODS if name not in FULL_COLUMN_METHODS)
 
 
 class Case(NamedTuple):

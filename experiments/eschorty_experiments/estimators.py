@@ -20,7 +20,7 @@ from eschorty_experiments._estimator_figures import (
     bounds_figure,
     returns_figure,
 )
-from eschorty_ros.core.line import FWHM_PER_SIGMA, METHOD_NOISE, METHODS, estimate
+from eschorty_ros.core.line import FWHM_PER_SIGMA, METHOD_ERRORS, METHODS, estimate
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
@@ -181,7 +181,7 @@ def _cut(rng: np.random.Generator, columns: int) -> list[tuple[str, float, float
         offsets = np.arange(columns + 1) * CUT_EVENTS
         for method in METHODS:
             # Independent events: their mean scatters by s/sqrt(N), hence a factor of 1.
-            independent = 1.0 / METHOD_NOISE["mode_mean"].factor
+            independent = 1.0 / METHOD_ERRORS["mode_mean"].factor
             found = estimate(
                 drawn.rows.ravel(),
                 offsets,

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from line_events import encoded
 
 from eschorty_ros.core.evt3 import sort_readout
-from eschorty_ros.core.line import METHOD_NOISE, METHODS, SIGMA_FLOOR_PX, estimate
-from eschorty_ros.core.line._row import _uncut
+from eschorty_ros.core.line import METHOD_ERRORS, METHODS, SIGMA_FLOOR_PX, estimate
+from eschorty_ros.core.line.truncation import _fit_truncated
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Reconstructor, Settings
@@ -23,7 +23,7 @@ SEED = 20
 
 def lone_sigma_px(method):
     """Least sigma of a row without spread."""
-    return np.sqrt(1.0 / 12.0 + (METHOD_NOISE[method].floor * SIGMA_FLOOR_PX) ** 2)
+    return np.sqrt(1.0 / 12.0 + (METHOD_ERRORS[method].floor * SIGMA_FLOOR_PX) ** 2)
 
 
 AVERAGES = ("mean", "mode_mean")
@@ -196,9 +196,9 @@ def test_case_24_truncated_normal_is_inverted(sigma_px, measured):
             hazard = mpmath.npdf(alpha) / (1 - mpmath.ncdf(alpha))
             mean = sigma_px * (hazard - alpha)
             variance = sigma_px**2 * (1 + alpha * hazard - hazard**2)
-            centre, sigma, _, moved = _uncut(float(mean), float(variance), 20.0, sigma_px)
-            assert (sigma, moved) == (sigma_px, 0.0)
-            worst = max(worst, abs(centre - float(share) * sigma_px) / sigma_px)
+            fit = _fit_truncated(float(mean), float(variance), 20.0, sigma_px)
+            assert (fit.sigma, fit.moved) == (sigma_px, 0.0)
+            worst = max(worst, abs(fit.centre - float(share) * sigma_px) / sigma_px)
     measured("centre of a cut Gaussian from its visible part, sigma", worst, 1e-12)
 
 
@@ -217,7 +217,7 @@ def test_case_24_flat_line_narrower_than_its_window(method, row, bias_px):
         rows.append(line[line < 720.0].astype(int))
         offsets.append(offsets[-1] + rows[-1].size)
     # Independent events: their mean scatters by s/sqrt(N), hence a factor of 1.
-    independent = 1.0 / METHOD_NOISE["mode_mean"].factor
+    independent = 1.0 / METHOD_ERRORS["mode_mean"].factor
     found = estimate(np.concatenate(rows), offsets, method, sigma_factor=independent)
     error = found.row - row
     print(f"seed {SEED}: bias {np.median(error):.2f} px, sigma {np.median(found.sigma_row):.2f} px")

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.line import METHODS, RETURNS, WHOLE_COLUMN_METHODS, estimate
+from eschorty_ros.core.line import FULL_COLUMN_METHODS, METHODS, RETURNS, estimate
 
 ROWS = 720
-WINDOWED = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]
+WINDOWED = [name for name in METHODS if name not in FULL_COLUMN_METHODS]
 POLICIES = [(method, "strongest") for method in METHODS] + [
     (method, returns) for method in WINDOWED for returns in RETURNS if returns != "strongest"
 ]

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eschorty_ros.core.line import METHODS, RETURNS, WHOLE_COLUMN_METHODS
+from eschorty_ros.core.line import FULL_COLUMN_METHODS, METHODS, RETURNS
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
@@ -40,7 +40,7 @@ def scrambled(seed: int) -> bytes:
 
 whole_columns = st.tuples(st.sampled_from(METHODS), st.just("strongest"))
 windows = st.tuples(
-    st.sampled_from([name for name in METHODS if name not in WHOLE_COLUMN_METHODS]),
+    st.sampled_from([name for name in METHODS if name not in FULL_COLUMN_METHODS]),
     st.sampled_from(RETURNS),
 )
 hostile_settings = st.builds(

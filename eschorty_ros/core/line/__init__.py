@@ -1,47 +1,39 @@
 """From the events of one period to one row per column with its sigma."""
 
 from eschorty_ros.core.line.centroid import (
+    FULL_COLUMN_METHODS,
     FWHM_PER_SIGMA,
     HALF_WIDTH_PER_FWHM,
     METHODS,
     RETURNS,
-    WHOLE_COLUMN_METHODS,
     Centroids,
     check_method,
     estimate,
-    half_width_fixed,
 )
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
-from eschorty_ros.core.line.row_sigma import (
-    CLIPPED,
-    METHOD_NOISE,
-    OWN_PER_WIDTH2,
+from eschorty_ros.core.line.sigma import (
+    METHOD_ERRORS,
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
-    noise_of,
 )
-from eschorty_ros.core.line.smoothing import smooth
+from eschorty_ros.core.line.window import TIME_LIMIT_US
 
 __all__ = [
-    "CLIPPED",
+    "FULL_COLUMN_METHODS",
     "FWHM_PER_SIGMA",
     "HALF_WIDTH_PER_FWHM",
     "METHODS",
-    "METHOD_NOISE",
-    "OWN_PER_WIDTH2",
+    "METHOD_ERRORS",
     "RETURNS",
     "ROOT_12",
     "SIGMA_COMMON_PX",
     "SIGMA_FACTOR",
     "SIGMA_FLOOR_PX",
-    "WHOLE_COLUMN_METHODS",
+    "TIME_LIMIT_US",
     "Centroids",
     "check_method",
     "estimate",
     "events_per_row",
-    "half_width_fixed",
-    "noise_of",
     "relative_reflectance",
-    "smooth",
 ]

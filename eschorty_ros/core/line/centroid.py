@@ -3,46 +3,74 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import number, positive, whole
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line import _centroid as kernels
-from eschorty_ros.core.line._row import likelihood_size
-from eschorty_ros.core.line._window import BLOCK, FRACTION, ROW_BITS, ROW_LAST
-from eschorty_ros.core.line.row_sigma import (
-    OWN_PER_WIDTH2,
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.columns import grouped_columns
+from eschorty_ros.core.line.estimators import (
+    HALF_PER_SIGMA,
+    _edge_midpoint,
+    _fill_likelihood,
+    _gauss_ml,
+    _mean,
+    _median,
+    _variance,
+    likelihood_size,
+)
+from eschorty_ros.core.line.sigma import (
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
-    noise_of,
+    VARIANCE_PER_WIDTH2,
+    ErrorModel,
+    _clipping_variance,
+    _own_variance,
+    _shared_variance,
+    error_model,
+)
+from eschorty_ros.core.line.truncation import (
+    RowEstimate,
+    _correct_truncation,
+    _full_column_estimate,
+)
+from eschorty_ros.core.line.window import (
+    AMBIGUOUS,
+    FOUND,
+    FRACTION,
+    ROW_BITS,
+    ROW_LAST,
+    TOO_FEW,
+    Returns,
+    _densest_window,
+    _exceeds_background,
+    _full_column,
+    _mean_shift,
+    _padded,
+    _rows_nearer,
+    _second_return,
 )
 
 METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
-METHOD_CODES = {
-    "mode_mean": kernels.MODE_MEAN,
-    "mean": kernels.MEAN,
-    "median": kernels.MEDIAN,
-    "gauss_ml": kernels.GAUSS_ML,
-    "edge_mid": kernels.EDGE_MID,
-}
-WHOLE_COLUMN_METHODS = ("mean", "median")
+FULL_COLUMN_METHODS = ("mean", "median")
 RETURNS = ("strongest", "first", "last", "all")
-RETURN_CODES = {
-    "strongest": kernels.STRONGEST,
-    "first": kernels.FIRST,
-    "last": kernels.LAST,
-    "all": kernels.ALL,
-}
 HALF_WIDTH_PER_FWHM = 1.3
 FWHM_PER_SIGMA = 2.3548200450309493
+
+# Codes are places in the tuples above. The methods up to MEAN are a window's mean.
+_MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID = range(5)
+_STRONGEST, _FIRST, _LAST, _ALL = range(4)
+# A full column wider than this many times the line's variance holds background.
+_BACKGROUND_FREE = 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class Centroids:
-    """One entry per column, shape (columns,); NaN (and 0 events) where it gave no row.
+    """One entry per column, shape (columns,); NaN (and 0 events) where there is no row.
 
     With ``returns="all"`` the arrays but ``ambiguous`` have shape (columns, 2), nearest first.
 
@@ -59,7 +87,7 @@ class Centroids:
     ambiguous : bool
         Two separate, equally dense groups of events where the strongest is asked for: no row.
     edge : bool
-        The first or last row of the sensor cuts the footprint, which ``sigma_row`` allows for.
+        The first or last row of the sensor cuts the line, which ``sigma_row`` allows for.
     """
 
     row: NDArray[np.float64]
@@ -70,31 +98,120 @@ class Centroids:
     edge: NDArray[np.bool_]
 
 
+class Estimator(NamedTuple):
+    """Settings of an estimator.
+
+    ``half_max`` is the half width of a window for the line at its widest, fixed point, and
+    ``line_variance`` the variance of its rows there. With ``seeded`` the search begins at the
+    column's last row, or at its neighbour's.
+    """
+
+    method: int
+    returns: int
+    seeded: bool
+    events_min: int
+    rows: int
+    half_max: int
+    line_variance: float
+    error_model: ErrorModel
+
+
+class Rows(NamedTuple):
+    """The returns of each column, shape (returns, columns), NaN where there is none.
+
+    The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
+    neighbours share. ``ambiguous`` has shape (columns,).
+    """
+
+    row: NDArray[np.float64]
+    sigma2: NDArray[np.float64]
+    common2: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    events: NDArray[np.int64]
+    mean_dt_us: NDArray[np.int64]
+    truncated: NDArray[np.bool_]
+    ambiguous: NDArray[np.bool_]
+
+
+class Scratch(NamedTuple):
+    """Zeroed counts per row, and room for the table of the likelihood."""
+
+    row_counts: NDArray[np.int64]
+    likelihood: NDArray[np.float64]
+
+
+class PeriodSums(NamedTuple):
+    """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns."""
+
+    squares: float
+    freedom: int
+    too_few_events: int
+    ambiguous: int
+    two_returns: int
+
+
 def half_width_fixed(fwhm_px: float) -> int:
-    """Half width of the averaging window for a line of ``fwhm_px``, fixed point."""
+    """Return the half width of the averaging window for a line of ``fwhm_px``, fixed point."""
     positive("fwhm_px", fwhm_px)
     return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), 3 * FRACTION)
 
 
 def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
-    """Codes of a method and of the returns it reports, for the kernels.
+    """Return the codes of a method and of the returns it reports.
 
     Raises
     ------
     ArgumentError
-        When there is no such method or policy, or the method cannot tell returns apart.
+        When there is no such method or choice of returns, or the method does not separate returns.
     """
-    if not isinstance(method, str) or method not in METHOD_CODES:
+    if not isinstance(method, str) or method not in METHODS:
         raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(METHODS)}")
-    if not isinstance(returns, str) or returns not in RETURN_CODES:
+    if not isinstance(returns, str) or returns not in RETURNS:
         raise ArgumentError(f"returns is {returns!r}; choose one of {', '.join(RETURNS)}")
-    if method in WHOLE_COLUMN_METHODS and returns != "strongest":
-        windowed = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]
+    if method in FULL_COLUMN_METHODS and returns != "strongest":
+        windowed = [name for name in METHODS if name not in FULL_COLUMN_METHODS]
         raise ArgumentError(
             f"returns is {returns!r} and {method!r} takes a column as a whole; choose "
             f"'strongest', or one of {', '.join(windowed)} as centroid"
         )
-    return METHOD_CODES[method], RETURN_CODES[returns]
+    return METHODS.index(method), RETURNS.index(returns)
+
+
+def make_estimator(
+    method: str,
+    returns: str,
+    *,
+    seeded: bool,
+    events_min: int,
+    rows: int,
+    line_width_px: float,
+    model: ErrorModel,
+) -> Estimator:
+    """Return the settings of an estimator from checked values, see `estimate`."""
+    method_code, returns_code = check_method(method, returns)
+    return Estimator(
+        method=method_code,
+        returns=returns_code,
+        seeded=seeded,
+        events_min=events_min,
+        rows=rows,
+        half_max=half_width_fixed(line_width_px),
+        line_variance=VARIANCE_PER_WIDTH2 * line_width_px**2,
+        error_model=model,
+    )
+
+
+def make_scratch(half_max: int) -> Scratch:
+    """Return the scratch memory for windows of the half width ``half_max`` and narrower."""
+    return Scratch(np.zeros(1 << ROW_BITS, np.int64), np.empty(likelihood_size(half_max)))
+
+
+def empty_rows(returns: int, columns: int) -> Rows:
+    """Return the rows of ``columns`` columns without any return."""
+    shape = returns, columns
+    events, mean_dt_us = np.zeros((2, *shape), np.int64)
+    truncated, ambiguous = np.zeros(shape, np.bool_), np.zeros(columns, np.bool_)
+    return Rows(*np.full((4, *shape), np.nan), events, mean_dt_us, truncated, ambiguous)
 
 
 def estimate(
@@ -110,7 +227,7 @@ def estimate(
     sigma_floor_px: float = SIGMA_FLOOR_PX,
     sigma_common_px: float = SIGMA_COMMON_PX,
 ) -> Centroids:
-    """Row of the line in each column of a CSR layout, every column on its own.
+    """Return the row of the line in each column, every column on its own.
 
     Parameters
     ----------
@@ -122,12 +239,12 @@ def estimate(
         ``mode_mean`` averages the densest window (half width 1.3 x ``line_width_px``, at most 5
         mean-shift steps) and ignores background elsewhere. ``gauss_ml`` goes on from there to the
         greatest likelihood of a Gaussian of ``line_width_px`` on uniform background; ``edge_mid``
-        takes the middle between the window's quantiles 1/8 and 7/8, the edges of the footprint.
-        ``mean`` and ``median`` use the whole column (``mean`` is the method of the paper).
+        takes the middle between the window's quantiles 1/8 and 7/8, the edges of the line.
+        ``mean`` and ``median`` use the full column (``mean`` is the method of the paper).
     returns : {"strongest", "first", "last", "all"}
-        What to give where a second surface stands behind the first: another window at least
-        2 x ``line_width_px`` away whose inner half holds at least half as many events, and more
-        than background explains. ``first`` is the one at the least row, hence the nearest.
+        Which returns to give where a second surface stands behind the first: another window at
+        least 2 x ``line_width_px`` away whose inner half holds at least half as many events, and
+        more than background explains. ``first`` is the one at the least row, hence the nearest.
     line_width_px : float
         Full width of the line at half maximum, rows.
     height : int
@@ -135,67 +252,67 @@ def estimate(
     events_min : int
         Columns with fewer events in the window give NaN.
     sigma_factor, sigma_floor_px, sigma_common_px : float
-        Error model of ``sigma_row``, see `row_sigma`.
+        Error model of ``sigma_row``, see `sigma`.
 
     Returns
     -------
     Centroids
+
+    Raises
+    ------
+    ArgumentError
+        When rows, offsets or a parameter lie outside what is described above.
 
     Notes
     -----
     Every method is exactly symmetric under mirroring and shifting of the rows and does not depend
     on their order. Of equally dense windows the one that ends with more events wins, then the
     narrower one; overlapping ones are merged; two separate equal ones give NaN where the strongest
-    is asked for, since any choice would prefer a direction, and are both returns otherwise.
+    is asked for, since any choice would prefer a direction, and are both returned otherwise.
 
     A window that the sensor's edge cuts holds part of a Gaussian: the three windowed methods give
-    the row of the whole line (truncated normal), ``mean`` and ``median`` a sigma that covers it.
+    the row of the full line (truncated normal), ``mean`` and ``median`` a sigma that covers it.
 
-    Raises
-    ------
-    ArgumentError
-        When rows, offsets or a parameter lie outside what is described above.
+    Examples
+    --------
+    Two columns; the second has a background event at row 40, far from its line.
+
+    >>> found = estimate([300, 301, 302, 299, 300, 301, 40], [0, 3, 7])
+    >>> found.row
+    array([301., 300.])
+    >>> found.events
+    array([3, 3])
     """
-    code, policy = check_method(method, returns)
     row_array = _checked_rows(rows, height)
     offset_array = _checked_offsets(offsets, row_array.size)
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
     whole("events_min", events_min, 1, 1 << 31)
-    noise = noise_of(method, sigma_factor, sigma_floor_px, sigma_common_px)
-    half = half_width_fixed(line_width_px)
-    estimator = kernels.Estimator(
-        code, policy, False, events_min, height, half, OWN_PER_WIDTH2 * line_width_px**2, noise
+    check_method(method, returns)
+    estimator = make_estimator(
+        method,
+        returns,
+        seeded=False,
+        events_min=events_min,
+        rows=height,
+        line_width_px=line_width_px,
+        model=error_model(method, sigma_factor, sigma_floor_px, sigma_common_px),
     )
-    columns = _padded_columns(row_array, offset_array)
-    found = kernels.empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
-    scratch = kernels.Scratch(np.zeros(1 << ROW_BITS, np.int64), np.empty(likelihood_size(half)))
-    counters = np.zeros(1, kernels.COUNTERS)[0]
-    kernels._estimate_columns(columns, half, estimator, found, scratch, counters)
-    one = slice(None) if returns == "all" else 0
-    row, sigma, variance, events, cut = (
-        np.ascontiguousarray(values.T[:, one])
+    found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
+    columns, scratch = grouped_columns(row_array, offset_array), make_scratch(estimator.half_max)
+    _estimate_columns(columns, estimator.half_max, estimator, found, scratch)
+    by_column = slice(None) if returns == "all" else 0
+    row, sigma, width, events, truncated = (
+        np.ascontiguousarray(values.T[:, by_column])
         for values in (
             found.row,
             np.sqrt(found.sigma2 + found.common2),
-            found.variance,
+            np.sqrt(found.variance),
             found.events,
-            found.cut,
+            found.truncated,
         )
     )
-    return Centroids(row, sigma, np.sqrt(variance), events, found.ambiguous, cut)
-
-
-def _padded_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> kernels.Columns:
-    """Return the columns of a CSR layout with room to pad each to whole blocks."""
-    counts = np.diff(offsets)
-    sizes = -(-counts // BLOCK) * BLOCK
-    starts = np.cumsum(sizes) - sizes
-    packed = np.empty(int(sizes.sum()), np.uint32)
-    packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
-    return kernels.Columns(
-        packed, starts, counts.astype(np.uint32), np.full(counts.size, -1, np.int64)
-    )
+    return Centroids(row, sigma, width, events, found.ambiguous, truncated)
 
 
 def _checked_rows(rows: ArrayLike, height: int) -> NDArray[np.uint32]:
@@ -225,3 +342,153 @@ def _checked_offsets(offsets: ArrayLike, size: int) -> NDArray[np.int64]:
             "start at 0, never fall, end at the number of rows"
         )
     return wide
+
+
+@kernel
+def _is_windowed(method):
+    return method != _MEAN and method != _MEDIAN
+
+
+@kernel
+def _search(packed, column, half, estimator):
+    """Search a column for the window of its line."""
+    if not _is_windowed(estimator.method):
+        window = _full_column(packed, column)
+        status = FOUND if column.events >= estimator.events_min else TOO_FEW
+        return Returns(status, False, window, window)
+    found = _densest_window(packed, column, half)
+    events = found.window.sums.events
+    line = events
+    if found.status == AMBIGUOUS:
+        line += found.other.sums.events
+    others = column.events - line
+    if events < estimator.events_min or not _exceeds_background(line, others, half, estimator.rows):
+        return Returns(TOO_FEW, False, found.window, found.other)
+    return found
+
+
+@kernel
+def _find(packed, column, half, estimator, seed):
+    """Find the window of a column's line, from the row ``seed`` on if it is 0 or more."""
+    if seed >= 0:
+        window = _mean_shift(packed, column, seed, half, 0, ROW_LAST)
+        events = window.sums.events
+        # Otherwise a window elsewhere may hold more.
+        if events >= estimator.events_min and 2 * events > column.events:
+            return Returns(FOUND, False, window, window)
+    return _search(packed, column, half, estimator)
+
+
+@kernel
+def _all_returns(packed, column, half, estimator, found):
+    """Look for a second return beside the one that was found.
+
+    Two equally strong ones are undecided only where the strongest is asked for.
+    """
+    if found.status == TOO_FEW:
+        return found
+    if found.status == AMBIGUOUS:
+        return Returns(FOUND, True, found.window, found.other)
+    return _second_return(packed, column, half, estimator.rows, estimator.events_min, found.window)
+
+
+@kernel
+def _row_in_window(packed, column, window, other, half, estimator, scratch):
+    """Return the row of the return in ``window`` by a method that reads its events again.
+
+    ``other`` is the column's second return, or ``window`` itself when there is none.
+    """
+    method = estimator.method
+    if method == _MEDIAN:
+        return _median(packed, column, scratch.row_counts)
+    if method == _EDGE_MID:
+        return _edge_midpoint(packed, column, window.first, window.last, scratch.row_counts)
+    first, last = np.int64(0), np.int64(ROW_LAST)
+    if other.centre != window.centre:
+        first, last = _rows_nearer(window.centre, other.centre)
+    return _gauss_ml(packed, column, window, first, last, half, estimator.rows, scratch.likelihood)
+
+
+@kernel
+def _row_estimate(row, variance, line_variance, window, half, estimator):
+    """Return the row with its own variance, corrected where the edge of the sensor cuts it."""
+    events, rows, model = window.sums.events, estimator.rows, estimator.error_model
+    if not _is_windowed(estimator.method):
+        return _full_column_estimate(row, variance, line_variance, events, rows, model)
+    sigma2 = _own_variance(variance, line_variance, events, row, rows, model)
+    if window.first == 0 or window.last >= rows - 1.0:
+        return _correct_truncation(row, sigma2, variance, window, half, rows, model)
+    return RowEstimate(row, sigma2, False)
+
+
+@kernel
+def _reported(returns, found):
+    """Return the windows to report, nearest (least row) first; the same twice when it is one."""
+    a, b = found.window, found.other
+    if not found.second or returns == _STRONGEST:
+        return a, a
+    near, far = (a, b) if a.centre < b.centre else (b, a)
+    return (far, near) if returns == _LAST else (near, far)
+
+
+@kernel
+def _estimate_columns(columns, half, estimator, out, scratch):
+    """Estimate the rows of every column into ``out`` and empty the columns."""
+    out.row[:] = np.nan
+    squares = 0.0
+    freedom, few, ambiguous, two = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    neighbour = np.int64(-1)
+    windowed = _is_windowed(estimator.method)
+    packed, model = columns.packed, estimator.error_model
+    line_variance = min((half / HALF_PER_SIGMA) ** 2, estimator.line_variance)
+    if estimator.method == _GAUSS_ML:
+        scratch = Scratch(scratch.row_counts, _fill_likelihood(scratch.likelihood, half))
+    for c in range(columns.counts.size):
+        n = np.int64(columns.counts[c])
+        columns.counts[c] = 0
+        out.ambiguous[c] = False
+        if n < estimator.events_min:
+            few += n > 0
+            continue
+        column = _padded(packed, columns.starts[c], n)
+        last = columns.seeds[c]
+        seed = np.int64(-1)
+        if windowed and estimator.seeded:
+            seed = last if last >= 0 else neighbour
+        found = _find(packed, column, half, estimator, seed)
+        if estimator.returns != _STRONGEST:
+            found = _all_returns(packed, column, half, estimator, found)
+        if found.status != FOUND:
+            out.ambiguous[c] = found.status == AMBIGUOUS
+            ambiguous += found.status == AMBIGUOUS
+            few += found.status == TOO_FEW
+            continue
+        columns.seeds[c] = neighbour = found.window.centre
+        two += found.second
+        window, other = _reported(estimator.returns, found)
+        for k in range(2 if found.second and estimator.returns == _ALL else 1):
+            variance = _variance(window.sums)
+            row = _mean(window)
+            if estimator.method > _MEAN:
+                row = _row_in_window(packed, column, window, other, half, estimator, scratch)
+            estimate = _row_estimate(row, variance, line_variance, window, half, estimator)
+            if not windowed:
+                columns.seeds[c] = np.int64(np.rint(FRACTION * row))
+            common2 = _shared_variance(columns.seeds[c], last, model)
+            # Until a profile has shown the line's width, no part of it can be known to be missing.
+            if not estimate.truncated and half < estimator.half_max:
+                common2 += _clipping_variance(variance, line_variance, model)
+            used = window.sums.events
+            out.row[k, c] = estimate.row
+            out.sigma2[k, c] = estimate.sigma2
+            out.common2[k, c] = common2
+            out.variance[k, c] = variance
+            out.events[k, c] = used
+            out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / used))
+            out.truncated[k, c] = estimate.truncated
+            narrow = variance <= _BACKGROUND_FREE * estimator.line_variance
+            if not estimate.truncated and (windowed or narrow):
+                squares += variance * (used - 1)
+                freedom += used - 1
+            window, other = other, window
+    return PeriodSums(squares, freedom, few, ambiguous, two)

@@ -1,67 +1,127 @@
-"""Smoothing of a profile over its columns."""
+"""Smoothing of a profile over its columns, and rejection of isolated points.
+
+Arrays have shape (returns, columns) and hold NaN where there is no return.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import number, reals, whole
-from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line._smoothing import Smoothing, _smooth
+from eschorty_ros.core.base.kernel import kernel
+
+# Columns to either side in which a weak point needs a neighbour.
+_ISOLATION_REACH = 2
 
 
-def smooth(
-    row: NDArray[np.float64],
-    sigma_row: NDArray[np.float64],
-    half_width: int = 2,
-    gate_px: float = 2.0,
-    common_px: float = 0.0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Average each column with symmetric pairs of neighbours.
+class Smoothing(NamedTuple):
+    """Settings of smoothing and isolation, and the smoothed rows with their variance."""
 
-    Parameters
-    ----------
-    row, sigma_row : ndarray of float64, shape (columns,)
-        NaN where a column is not lit.
-    half_width : int
-        Pairs at most; 0 returns copies.
-    gate_px : float
-        Both columns of a pair must be lit and this close in rows to the centre; the first pair
-        that is not ends the average.
-    common_px : float
-        Part of every ``sigma_row`` that neighbours share, at most the smallest of them.
+    half_width: int
+    gate_px: float
+    isolation_gate_px: float
+    isolation_events: int
+    isolated: NDArray[np.bool_]
+    row: NDArray[np.float64]
+    sigma2: NDArray[np.float64]
 
-    Returns
-    -------
-    row, sigma_row : ndarray of float64, shape (columns,)
 
-    Notes
-    -----
-    Pairs leave a linear slope as it is. No average reaches across a step larger than the gate and
-    no dark column is filled. Beyond the common part the columns' errors are independent, so the
-    variance of the mean of n columns is the sum of theirs over n squared. The common part stays:
-    neighbours on a flat surface meet the pixel rows at the same place, and so does their error.
+@kernel
+def _nearest(row, c, target):
+    """Return the return of column ``c`` whose row is nearest to ``target``; the first if none."""
+    best = 0
+    for k in range(1, row.shape[0]):
+        if abs(row[k, c] - target) < abs(row[best, c] - target) or np.isnan(row[best, c]):
+            best = k
+    return best
 
-    Raises
-    ------
-    ArgumentError
-        When shapes differ, or a parameter is negative.
+
+@kernel
+def _partner(row, k, c, other):
+    """Return the offset and index of the return of ``other`` on the surface of ``k`` of ``c``.
+
+    Each of the two is the nearest to the other among its column's returns; the offset is NaN when
+    they are not.
     """
-    rows = np.ascontiguousarray(reals("row", row))
-    sigma = np.ascontiguousarray(reals("sigma_row", sigma_row))
-    if rows.ndim != 1 or rows.shape != sigma.shape:
-        raise ArgumentError(
-            f"row has shape {rows.shape} and sigma_row {sigma.shape}; give two equal axes"
-        )
-    if (sigma < 0.0).any():
-        raise ArgumentError(f"sigma_row is {np.nanmin(sigma)}; choose 0 or more")
-    whole("half_width", half_width, 0, 1 << 31)
-    number("gate_px", gate_px, 0.0)
-    number("common_px", common_px, 0.0)
-    out_row, out_sigma2 = np.empty((2, 1, rows.size))
-    own2 = np.maximum(sigma * sigma - common_px * common_px, 0.0)
-    common2 = sigma * sigma - own2
-    none = np.zeros((1, rows.size), np.bool_)
-    settings = Smoothing(half_width, float(gate_px), 0.0, 0, none, out_row, out_sigma2)
-    _smooth(rows[None], own2[None], common2[None], settings)
-    return out_row[0], np.sqrt(out_sigma2[0])
+    index = _nearest(row, other, row[k, c])
+    if _nearest(row, c, row[index, other]) != k:
+        return np.nan, index
+    return row[index, other] - row[k, c], index
+
+
+@kernel
+def _smooth(row, sigma2, common2, smoothing):
+    """Average each point with symmetric pairs of neighbours; returns how many were averaged.
+
+    The pairs grow outwards and end at the first one that is incomplete or beyond the gate: a slope
+    stays, no average reaches across a larger step, no dark column is filled. The columns' own
+    variances ``sigma2`` are independent, so that of the mean of n is their sum over n squared;
+    ``common2`` is what neighbours share, as they meet the pixel rows at the same place, and stays.
+    """
+    half_width, gate = smoothing.half_width, smoothing.gate_px
+    out_row, out_sigma2 = smoothing.row, smoothing.sigma2
+    returns, columns = row.shape
+    smoothed = 0
+    for k in range(returns):
+        for c in range(columns):
+            out_row[k, c] = row[k, c]
+            out_sigma2[k, c] = sigma2[k, c] + common2[k, c]
+            centre = row[k, c]
+            if np.isnan(centre):
+                continue
+            total = 0.0
+            variance = sigma2[k, c]
+            used = 1
+            for j in range(1, half_width + 1):
+                if c < j or c + j >= columns:
+                    break
+                before, after = 0, 0
+                left = row[0, c - j] - centre
+                right = row[0, c + j] - centre
+                if returns > 1:
+                    left, before = _partner(row, k, c, c - j)
+                    right, after = _partner(row, k, c, c + j)
+                if not (abs(left) <= gate and abs(right) <= gate):
+                    break
+                total += left + right
+                variance += sigma2[before, c - j] + sigma2[after, c + j]
+                used += 2
+            if used > 1:
+                out_row[k, c] = centre + total / used
+                out_sigma2[k, c] = common2[k, c] + variance / (used * used)
+                smoothed += 1
+    return smoothed
+
+
+@kernel
+def _is_isolated(row, k, c, gate):
+    returns, columns = row.shape
+    for other in range(max(c - _ISOLATION_REACH, 0), min(c + _ISOLATION_REACH + 1, columns)):
+        for index in range(returns):
+            if other != c and abs(row[index, other] - row[k, c]) <= gate:
+                return False
+    return True
+
+
+@kernel
+def _reject_isolated(row, events, smoothing):
+    """Make weak points without a neighbour near in rows NaN; returns their number."""
+    isolated = smoothing.isolated
+    returns, columns = row.shape
+    count = 0
+    for k in range(returns):
+        for c in range(columns):
+            isolated[k, c] = (
+                not np.isnan(row[k, c])
+                and events[k, c] < smoothing.isolation_events
+                and _is_isolated(row, k, c, smoothing.isolation_gate_px)
+            )
+            count += isolated[k, c]
+    if count > 0:
+        for k in range(returns):
+            for c in range(columns):
+                if isolated[k, c]:
+                    row[k, c] = np.nan
+    return count

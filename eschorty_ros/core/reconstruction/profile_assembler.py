@@ -1,24 +1,30 @@
-"""Columns of the open period and the points of the closed ones."""
+"""Cut events into modulation periods and turn each into the rows of a profile."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import exact, whole
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line import CLIPPED, OWN_PER_WIDTH2, check_method, half_width_fixed, noise_of
-from eschorty_ros.core.line import _binning as binning
-from eschorty_ros.core.line._centroid import (
-    COUNTERS,
-    Columns,
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.evt3 import EventArrays
+from eschorty_ros.core.line.centroid import (
     Estimator,
+    Rows,
     Scratch,
+    _estimate_columns,
     empty_rows,
+    make_estimator,
+    make_scratch,
 )
-from eschorty_ros.core.line._row import likelihood_size
-from eschorty_ros.core.line._smoothing import Smoothing
-from eschorty_ros.core.line._window import BLOCK, ROW_BITS, ROW_LAST
+from eschorty_ros.core.line.columns import Columns, _append, empty_columns
+from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
+from eschorty_ros.core.line.sigma import CLIPPED, error_model
+from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
+from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import phase_gate
 from eschorty_ros.core.optics import RangeModel
@@ -26,12 +32,76 @@ from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
 
 _OUTPUT_PROFILES = 64
+_HALF_MIN = 3 * FRACTION
+_WIDTH_MIN_DOF = 64
+_COUNTERS = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            "events_binned",
+            "events_before_first_edge",
+            "events_outside_sensor",
+            "events_over_column_limit",
+            "events_gated",
+            "periods_closed",
+            "periods_empty",
+            "columns_too_few_events",
+            "columns_ambiguous",
+            "columns_isolated",
+            "columns_smoothed",
+            "columns_two_returns",
+        )
+    ]
+)
+# ``phase`` is one of the three below, ``half`` the half width of a window for the open period in
+# fixed point, ``rows`` the number of rows in the output.
+_STATE = np.dtype([(name, np.int64) for name in ("period", "edge_us", "phase", "half", "rows")])
+_CLOSED, _EMPTY, _FILLED = 0, 1, 2
+
+
+class _Edges(NamedTuple):
+    """Times and numbers of the beginnings of periods."""
+
+    t_us: NDArray[np.int64]
+    period: NDArray[np.int64]
+
+
+class _Output(NamedTuple):
+    """Rows of closed periods as in `LineRows`; arrays of equal length."""
+
+    period: NDArray[np.int64]
+    edge_us: NDArray[np.int64]
+    t_us: NDArray[np.int64]
+    column: NDArray[np.uint16]
+    row: NDArray[np.float64]
+    sigma_row: NDArray[np.float64]
+    width_px: NDArray[np.float64]
+    events: NDArray[np.uint32]
+    return_index: NDArray[np.uint8]
+
+
+class _Memory(NamedTuple):
+    """Settings and memory of the pass from events to rows."""
+
+    columns: Columns
+    estimator: Estimator
+    smoothing: Smoothing
+    rows: Rows
+    scratch: Scratch
+    output: _Output
+
+
+class _Progress(NamedTuple):
+    """First event and first edge that are left."""
+
+    event: int
+    edge: int
 
 
 class ProfileAssembler:
-    """Takes events and edges in time order, gives the rows of profiles.
+    """Turns events and edges in time order into the rows of profiles.
 
-    All memory the compiled pass works on lives here and is reused from period to period.
+    All memory of the compiled pass is allocated here and reused from period to period.
 
     Parameters
     ----------
@@ -51,22 +121,22 @@ class ProfileAssembler:
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
-        self._counters = np.zeros(1, COUNTERS)[0]
-        self._state = np.zeros(1, binning.STATE)[0]
-        self._assembly = _assembly(settings, model)
+        self._counters = np.zeros(1, _COUNTERS)[0]
+        self._state = np.zeros(1, _STATE)[0]
+        self._memory = _allocate(settings, model)
 
     def restart(self, modulation: Modulation) -> None:
-        """Forget the open period, the seeds and the line's width; gate by ``modulation``."""
+        """Drop the open period, the last rows and the line's width; gate by ``modulation``."""
         self._gate = phase_gate(modulation, self._gate_us)
-        self._state["open"] = binning.CLOSED
-        self._state["half"] = self._assembly.estimator.half_max
-        self._assembly.columns.counts[:] = 0
-        self._assembly.columns.seeds[:] = -1
+        self._state["phase"] = _CLOSED
+        self._state["half"] = self._memory.estimator.half_max
+        self._memory.columns.counts[:] = 0
+        self._memory.columns.seeds[:] = -1
 
     @property
     def counters(self) -> dict[str, int]:
         """Counts by name."""
-        return dict(zip(COUNTERS.names or (), self._counters.item(), strict=True))
+        return dict(zip(_COUNTERS.names or (), self._counters.item(), strict=True))
 
     def merge(
         self,
@@ -88,26 +158,26 @@ class ProfileAssembler:
         edges, indices : int64, equal length
             Times and numbers of the periods' beginnings; those before ``first_edge`` are done.
         drain : bool
-            No more events come before the last edge: deal with all edges.
+            No more events come before the last edge: all edges are processed.
 
         Returns
         -------
         int
-            First edge not dealt with.
+            First edge that is left.
         """
         size = exact("t", t, np.int64).size
-        events = binning.EventArrays(
+        events = EventArrays(
             np.ascontiguousarray(t),
             exact("x", x, np.uint16, size),
             exact("y", y, np.uint16, size),
             exact("p", p, np.uint8, size),
         )
         times = exact("edges", edges, np.int64)
-        beginnings = binning.Edges(times, exact("indices", indices, np.int64, times.size))
-        progress = binning.Progress(0, whole("first_edge", first_edge, 0, times.size))
+        beginnings = _Edges(times, exact("indices", indices, np.int64, times.size))
+        progress = _Progress(0, whole("first_edge", first_edge, 0, times.size))
         while True:
-            progress = binning._bin(
-                events, beginnings, progress, drain, self._gate, self._assembly, self._state,
+            progress = _merge(
+                events, beginnings, progress, drain, self._gate, self._memory, self._state,
                 self._counters,
             )  # fmt: skip
             if progress.event == size and (progress.edge == times.size or not drain):
@@ -116,70 +186,64 @@ class ProfileAssembler:
 
     def close(self) -> None:
         """Close the open period if it holds events; it stays open for further ones."""
-        if self._state["open"] == binning.FILLED:
+        if self._state["phase"] == _FILLED:
             none = np.empty(0, dtype=np.int64)
             nowhere = np.empty(0, dtype=np.uint16)
             edge, period = (np.array([self._state[name]]) for name in ("edge_us", "period"))
             self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, period, 0, True)
 
     def take(self) -> LineRows:
-        """Rows of the periods closed since the last call."""
+        """Return the rows of the periods closed since the last call."""
         self._collect()
         done, self._done = self._done, []
         return done[0] if len(done) == 1 else LineRows.concatenate(done)
 
     def _collect(self) -> None:
-        """Copy the output buffer's rows and empty it."""
-        n = int(self._state["points"])
-        self._state["points"] = 0
-        if n == 0:
-            return
-        points = self._assembly.points._asdict()
-        self._done.append(LineRows(**{name: values[:n].copy() for name, values in points.items()}))
+        """Copy the rows of the output and empty it."""
+        n = int(self._state["rows"])
+        self._state["rows"] = 0
+        if n:
+            output = self._memory.output._asdict()
+            self._done.append(
+                LineRows(**{name: values[:n].copy() for name, values in output.items()})
+            )
 
 
-def _assembly(settings: Settings, model: RangeModel) -> binning.Assembly:
-    columns = model.columns
-    stride = settings.column_limit + BLOCK
-    method, returns = check_method(settings.centroid, settings.returns)
-    half_max = half_width_fixed(settings.line_width_px)
-    noise = noise_of(
-        settings.centroid, settings.sigma_factor, settings.sigma_floor_px,
-        settings.sigma_common_px,
-        # What an edge of reflectance does is compensated, what one of range does is not.
-        0.5 * CLIPPED if settings.reflectance_compensation == "on" else CLIPPED,
-    )  # fmt: skip
-    planes = 2 if settings.returns == "all" else 1
-    size = _OUTPUT_PROFILES * planes * columns
-    return binning.Assembly(
-        columns=Columns(
-            packed=np.empty(columns * stride, np.uint32),
-            starts=np.arange(columns) * stride,
-            counts=np.zeros(columns, np.uint32),
-            seeds=np.full(columns, -1, np.int64),
+def _allocate(settings: Settings, model: RangeModel) -> _Memory:
+    estimator = make_estimator(
+        settings.centroid,
+        settings.returns,
+        seeded=True,
+        events_min=settings.events_min,
+        rows=model.rows,
+        line_width_px=settings.line_width_px,
+        model=error_model(
+            settings.centroid,
+            settings.sigma_factor,
+            settings.sigma_floor_px,
+            settings.sigma_common_px,
+            # The effect of an edge of reflectance is compensated, that of one of range is not.
+            0.5 * CLIPPED if settings.reflectance_compensation == "on" else CLIPPED,
         ),
-        estimator=Estimator(
-            method=method,
-            returns=returns,
-            seeded=True,
-            events_min=settings.events_min,
-            rows=model.rows,
-            half_max=half_max,
-            line_variance=OWN_PER_WIDTH2 * settings.line_width_px**2,
-            noise=noise,
-        ),
+    )
+    returns = 2 if settings.returns == "all" else 1
+    shape = returns, model.columns
+    size = _OUTPUT_PROFILES * returns * model.columns
+    return _Memory(
+        columns=empty_columns(model.columns, settings.column_limit),
+        estimator=estimator,
         smoothing=Smoothing(
             half_width=settings.smoothing_half_width,
             gate_px=float(settings.smoothing_gate_px),
             isolation_gate_px=float(settings.isolation_gate_px),
             isolation_events=settings.isolation_events,
-            isolated=np.zeros((planes, columns), np.bool_),
-            row=np.zeros((planes, columns)),
-            sigma2=np.zeros((planes, columns)),
+            isolated=np.zeros(shape, np.bool_),
+            row=np.zeros(shape),
+            sigma2=np.zeros(shape),
         ),
-        rows=empty_rows(planes, columns),
-        scratch=Scratch(np.zeros(1 << ROW_BITS, np.int64), np.empty(likelihood_size(half_max))),
-        points=binning.Points(
+        rows=empty_rows(*shape),
+        scratch=make_scratch(estimator.half_max),
+        output=_Output(
             *np.empty((3, size), np.int64),
             np.empty(size, np.uint16),
             *np.empty((3, size)),
@@ -187,3 +251,101 @@ def _assembly(settings: Settings, model: RangeModel) -> binning.Assembly:
             np.empty(size, np.uint8),
         ),
     )
+
+
+@kernel
+def _adapted_half(half, sums, half_max):
+    """Return the half width for the next period: 1.3 x the width of this one's rows, averaged."""
+    if sums.freedom < _WIDTH_MIN_DOF:
+        return half
+    wanted = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
+    return np.int64(min(max(np.rint(0.5 * (half + wanted)), _HALF_MIN), half_max))
+
+
+@kernel
+def _write(rows, smoothing, state, output):
+    """Write the period's rows behind ``state.rows``, by column, nearest return first."""
+    returns, columns = rows.row.shape
+    i = state.rows
+    for c in range(columns):
+        index = 0
+        for k in range(returns):
+            if np.isnan(rows.row[k, c]):
+                continue
+            output.period[i] = state.period
+            output.edge_us[i] = state.edge_us
+            output.t_us[i] = state.edge_us + rows.mean_dt_us[k, c]
+            output.column[i] = c
+            output.row[i] = smoothing.row[k, c]
+            output.sigma_row[i] = np.sqrt(smoothing.sigma2[k, c])
+            output.width_px[i] = np.sqrt(rows.variance[k, c])
+            output.events[i] = rows.events[k, c]
+            output.return_index[i] = index
+            index += 1
+            i += 1
+    state.rows = i
+
+
+@kernel
+def _close(memory, state, counters):
+    """Turn the open period into rows."""
+    columns, estimator, smoothing, rows, scratch, output = memory
+    sums = _estimate_columns(columns, state.half, estimator, rows, scratch)
+    state.half = _adapted_half(state.half, sums, estimator.half_max)
+    counters.periods_closed += 1
+    counters.columns_too_few_events += sums.too_few_events
+    counters.columns_ambiguous += sums.ambiguous
+    counters.columns_two_returns += sums.two_returns
+    counters.columns_isolated += _reject_isolated(rows.row, rows.events, smoothing)
+    counters.columns_smoothed += _smooth(rows.row, rows.sigma2, rows.common2, smoothing)
+    _write(rows, smoothing, state, output)
+
+
+@kernel
+def _fill(events, first, limit_us, columns, rows, gate, state, counters):
+    """Sort the events before ``limit_us`` into the open period; returns the first left."""
+    if state.phase == _CLOSED:
+        i = first
+        while i < events.t.size and events.t[i] < limit_us:
+            i += 1
+        counters.events_before_first_edge += i - first
+        return i
+    state.phase = _FILLED
+    appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
+    refused = appended.over_limit + appended.outside + appended.gated
+    counters.events_binned += appended.next - first - refused
+    counters.events_over_column_limit += appended.over_limit
+    counters.events_outside_sensor += appended.outside
+    counters.events_gated += appended.gated
+    return appended.next
+
+
+@kernel
+def _merge(events, edges, progress, drain, gate, memory, state, counters):
+    """Merge events with edges from ``progress`` on.
+
+    A period is closed when an event reaches its end or, with ``drain``, when the events are
+    through. The result is short of all events and edges when the output has no room for another
+    profile.
+    """
+    columns, rows = memory.columns, memory.estimator.rows
+    rows_max = memory.output.row.size - memory.rows.row.size
+    i, edge = progress
+    t = events.t
+    far = np.int64(1 << 62)
+    while True:
+        limit_us = edges.t_us[edge] if edge < edges.t_us.size else far
+        if i < t.size and t[i] < limit_us:
+            i = _fill(events, i, limit_us, columns, rows, gate, state, counters)
+        if edge == edges.t_us.size or (i == t.size and not drain):
+            return _Progress(i, edge)
+        if state.phase == _FILLED:
+            if state.rows > rows_max:
+                return _Progress(i, edge)
+            _close(memory, state, counters)
+        elif state.phase == _EMPTY:
+            counters.periods_empty += 1
+        state.phase = _EMPTY
+        state.edge_us = edges.t_us[edge]
+        state.period = edges.period[edge]
+        edge += 1

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import TIME_LIMIT, octets
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
-from eschorty_ros.core.line import relative_reflectance
-from eschorty_ros.core.line._window import TIME_LIMIT_US
+from eschorty_ros.core.line import TIME_LIMIT_US, relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.optics import Calibration

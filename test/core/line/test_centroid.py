@@ -9,17 +9,17 @@ from scipy.stats import norm
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.line import (
-    METHOD_NOISE,
+    FULL_COLUMN_METHODS,
+    METHOD_ERRORS,
     METHODS,
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
-    WHOLE_COLUMN_METHODS,
     estimate,
 )
 
 SEED = 20260
-WINDOWED = [name for name in METHODS if name not in WHOLE_COLUMN_METHODS]
+WINDOWED = [name for name in METHODS if name not in FULL_COLUMN_METHODS]
 
 
 def drawn(fwhm: float, events: int, share: float, columns: int = 3000):
@@ -118,7 +118,7 @@ def test_line_cut_by_the_sensor_is_not_biased(method, row):
     sigma, events, columns = 8.493, 100, 1500
     rows = np.rint(rng.normal(row, sigma, (columns, 4 * events)))
     rows = np.stack([line[(line >= 0) & (line <= 719)][:events] for line in rows]).astype(int)
-    independent = 1.0 / METHOD_NOISE["mode_mean"].factor
+    independent = 1.0 / METHOD_ERRORS["mode_mean"].factor
     offsets = np.arange(columns + 1) * events
     found = estimate(rows.ravel(), offsets, method, line_width_px=20.0, sigma_factor=independent)
     error = found.row - row
@@ -151,7 +151,7 @@ def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
         error = found.row[0] - 300.0
         assert abs(error) <= 2.0 * found.sigma_row[0], strays
         sigma[strays] = found.sigma_row[0]
-    own = METHOD_NOISE["mean"]
+    own = METHOD_ERRORS["mean"]
     floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2 + SIGMA_COMMON_PX**2
     spread2 = (own.factor * SIGMA_FACTOR) ** 2 * line.var(ddof=1) / line.size
     assert sigma[0] == pytest.approx(np.sqrt(floor2 + spread2), rel=1e-12)

@@ -4,62 +4,66 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from line_events import encoded
 
-from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line import smooth
+from eschorty_ros.core.evt3 import sort_readout
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+
+CALIBRATION = load_calibration("config_3")
+COMMON_PX = 0.2
+
+
+def smoothed(row, half_width=2):
+    """Row and sigma by column after smoothing; ``row`` is in quarters, NaN where it is dark."""
+    lit = np.flatnonzero(np.isfinite(row))
+    x = np.repeat(lit, 4)
+    y = np.floor(row[x] + np.tile([0.0, 0.25, 0.5, 0.75], lit.size)).astype(int)
+    events = sort_readout(np.full(x.size, 2000), x, y, np.ones(x.size, np.uint8))
+    reconstructor = Reconstructor(
+        CALIBRATION,
+        Modulation(70.0, on_edge_us=1000),
+        Settings(smoothing_half_width=half_width, sigma_common_px=COMMON_PX, isolation_events=0),
+    )
+    found = Profiles.concatenate([reconstructor.push(encoded(events)), reconstructor.flush()])
+    out, sigma = np.full((2, row.size), np.nan)
+    out[found.column], sigma[found.column] = found.row, found.sigma_row
+    return out, sigma
 
 
 def test_linear_slope_is_unbiased_everywhere():
-    row = 300 + 0.3 * np.arange(50)
-    out, _ = smooth(row, np.full(50, 0.4))
-    np.testing.assert_allclose(out, row, rtol=0, atol=1e-12)
+    row = 300 + 0.25 * np.arange(50)
+    np.testing.assert_allclose(smoothed(row)[0], row, rtol=0, atol=1e-12)
+
+
+def test_each_row_is_the_mean_of_the_columns_around_it():
+    rng = np.random.default_rng(5)
+    row = 300 + 0.25 * rng.integers(-4, 5, 1280)
+    mean = np.convolve(row, np.full(5, 0.2), "valid")
+    np.testing.assert_allclose(smoothed(row)[0][2:-2], mean, rtol=0, atol=1e-12)
 
 
 def test_step_is_not_blurred():
     row = np.where(np.arange(40) < 20, 300.0, 305.0)
-    out, _ = smooth(row, np.full(40, 0.4), half_width=5)
-    np.testing.assert_array_equal(out, row)
+    np.testing.assert_array_equal(smoothed(row, half_width=5)[0], row)
 
 
-def test_dark_columns_stay_dark_and_stop_the_average():
+def test_dark_columns_stay_dark_and_end_the_average():
     row = np.full(20, 300.0)
     row[10] = np.nan
-    out, sigma = smooth(row, np.full(20, 0.4))
+    out, sigma = smoothed(row)
+    alone = smoothed(row, half_width=0)[1]
     np.testing.assert_array_equal(np.isnan(out), np.isnan(row))
-    assert sigma[9] == pytest.approx(0.4)
-    assert sigma[5] == pytest.approx(0.4 / np.sqrt(5))
+    assert sigma[9] == pytest.approx(alone[9], rel=1e-12)
+    assert sigma[5] < alone[5]
 
 
-def test_sigma_matches_the_scatter():
-    rng = np.random.default_rng(5)
-    row = 300 + rng.normal(0, 0.3, 20_000)
-    out, sigma = smooth(row, np.full(row.size, 0.3), half_width=2)
-    assert np.std(out - 300) == pytest.approx(np.sqrt(np.mean(sigma**2)), rel=0.05)
-
-
-def test_common_part_of_the_error_does_not_average_out():
-    rng = np.random.default_rng(6)
-    common = np.repeat(rng.normal(0, 0.2, 4000), 5)
-    row = 300 + common + rng.normal(0, 0.3, common.size)
-    out, sigma = smooth(row, np.full(row.size, np.hypot(0.2, 0.3)), common_px=0.2)
-    centres = slice(2, None, 5)
-    expected = np.sqrt(np.mean(sigma[centres] ** 2))
-    assert np.std(out[centres] - 300) == pytest.approx(expected, rel=0.05)
-
-
-def test_zero_width_copies():
-    row = np.array([1.0, 2.0, 3.0])
-    out, sigma = smooth(row, np.ones(3), half_width=0)
+@pytest.mark.parametrize("half_width", [0, 1, 2, 5])
+def test_the_columns_own_variance_averages_out_and_the_shared_one_stays(half_width):
+    row = np.full(20, 300.0)
+    own2 = smoothed(row, half_width=0)[1] ** 2 - COMMON_PX**2
+    out, sigma = smoothed(row, half_width)
     np.testing.assert_array_equal(out, row)
-    np.testing.assert_array_equal(sigma, np.ones(3))
-
-
-@pytest.mark.parametrize("options", [{"half_width": -1}, {"gate_px": float("nan")}])
-def test_bad_arguments_are_refused(options):
-    with pytest.raises(ArgumentError):
-        smooth(np.zeros(3), np.zeros(3), **options)
-
-
-def test_mismatched_shapes_are_refused():
-    with pytest.raises(ArgumentError):
-        smooth(np.zeros(3), np.zeros(4))
+    expected = np.sqrt(COMMON_PX**2 + own2[10] / (2 * half_width + 1))
+    assert sigma[10] == pytest.approx(expected, rel=1e-12)

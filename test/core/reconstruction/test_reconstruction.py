@@ -14,7 +14,7 @@ from line_events import encoded, line_events
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder, sort_readout
-from eschorty_ros.core.line import METHOD_NOISE, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
+from eschorty_ros.core.line import METHOD_ERRORS, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import (
@@ -241,7 +241,7 @@ def test_one_event_and_constant_columns():
     found, _ = run(encoded(events), settings=Settings(events_min=1, isolation_events=0))
     assert found.column.tolist() == [5, 9]
     assert found.row.tolist() == [300.0, 400.0]
-    floor_px = METHOD_NOISE["mode_mean"].floor * SIGMA_FLOOR_PX
+    floor_px = METHOD_ERRORS["mode_mean"].floor * SIGMA_FLOOR_PX
     expected = np.sqrt(1 / 12 + floor_px**2 + SIGMA_COMMON_PX**2)
     np.testing.assert_allclose(found.sigma_row, expected)
     assert found.t_us.tolist() == [2000, 3010]

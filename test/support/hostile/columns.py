@@ -7,19 +7,13 @@ from typing import Any
 import numpy as np
 from line_events import blank_profiles
 
-from eschorty_ros.core.line import centroid, reflectance, row_sigma, smoothing
+from eschorty_ros.core.line import centroid, reflectance
 from eschorty_ros.core.reconstruction import paper_method as reference
-from eschorty_ros.core.reconstruction import (
-    profile_assembler,
-    profiles,
-    settings,
-    step_compensation,
-)
+from eschorty_ros.core.reconstruction import profiles, settings
 from hostile.kinds import (
     HUGE,
     Call,
     Kind,
-    exactly,
     integers,
     number,
     octets,
@@ -29,23 +23,14 @@ from hostile.kinds import (
 )
 from hostile.subjects import (
     COLUMNS,
-    EVENT_KINDS,
-    EVENTS,
     LASER,
     MODEL,
     POINTS,
     ROWS,
     TIMES,
     N,
-    method,
 )
 from hostile.surface import parameters
-
-
-def an_assembler() -> profile_assembler.ProfileAssembler:
-    assembler = profile_assembler.ProfileAssembler(settings.Settings(), MODEL)
-    assembler.restart(LASER)
-    return assembler
 
 
 def blank_settings() -> dict[str, Any]:
@@ -62,26 +47,6 @@ def settings_kind(name: str, value: Any) -> Kind:
 
 
 CALLS: dict[str, Call] = {
-    "centroid.half_width_fixed": Call(
-        centroid.half_width_fixed, {"fwhm_px": 5.0}, {"fwhm_px": number(0.0)}
-    ),
-    "row_sigma.noise_of": Call(
-        row_sigma.noise_of,
-        {
-            "method": "mean",
-            "sigma_factor": 0.2,
-            "sigma_floor_px": 0.2,
-            "sigma_common_px": 0.1,
-            "clipped": 0.6,
-        },
-        {
-            "method": text(),
-            "sigma_factor": number(-1.0),
-            "sigma_floor_px": number(-1.0),
-            "sigma_common_px": number(-1.0),
-            "clipped": number(-1.0),
-        },
-    ),
     "centroid.check_method": Call(
         centroid.check_method,
         {"method": "mode_mean", "returns": "all"},
@@ -116,35 +81,6 @@ CALLS: dict[str, Call] = {
         },
         {"method": "centroid"},
     ),
-    "step_compensation.StepCompensator.flush": Call(
-        step_compensation.StepCompensator(settings.Settings(), MODEL, LASER).flush, {}
-    ),
-    "step_compensation.StepCompensator": Call(
-        step_compensation.StepCompensator,
-        {"settings": settings.Settings(), "model": MODEL, "modulation": LASER},
-    ),
-    "step_compensation.StepCompensator.push": Call(
-        step_compensation.StepCompensator(settings.Settings(), MODEL, LASER).push,
-        {"profiles": blank_profiles(3)},
-    ),
-    "profile_assembler.ProfileAssembler": Call(
-        profile_assembler.ProfileAssembler, {"settings": settings.Settings(), "model": MODEL}
-    ),
-    "profile_assembler.ProfileAssembler.restart": Call(
-        method(an_assembler, "restart"), {"modulation": LASER}
-    ),
-    "profile_assembler.ProfileAssembler.merge": Call(
-        method(an_assembler, "merge"),
-        dict(EVENTS, edges=TIMES[:2], indices=TIMES[:2], first_edge=0, drain=True),
-        dict(
-            EVENT_KINDS,
-            edges=exactly("i8", 2, alone=True),
-            indices=exactly("i8", 2),
-            first_edge=whole(-1, 3),
-        ),
-    ),
-    "profile_assembler.ProfileAssembler.close": Call(method(an_assembler, "close"), {}),
-    "profile_assembler.ProfileAssembler.take": Call(method(an_assembler, "take"), {}),
     "profiles.LineRows.empty": Call(profiles.LineRows.empty, {}),
     "profiles.LineRows.concatenate": Call(
         profiles.Profiles.concatenate, {"parts": [blank_profiles(3)]}
@@ -237,22 +173,5 @@ CALLS: dict[str, Call] = {
         settings.Settings,
         blank_settings(),
         {name: settings_kind(name, value) for name, value in blank_settings().items()},
-    ),
-    "smoothing.smooth": Call(
-        smoothing.smooth,
-        {
-            "row": np.ones(N),
-            "sigma_row": np.ones(N),
-            "half_width": 1,
-            "gate_px": 2.0,
-            "common_px": 0.1,
-        },
-        {
-            "row": vector(finite=False, size=N),
-            "sigma_row": vector(-1.0, finite=False, size=N),
-            "half_width": whole(-1),
-            "gate_px": number(-1.0),
-            "common_px": number(-1.0),
-        },
     ),
 }

@@ -1,0 +1,90 @@
+"""Events of a period sorted into columns."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US
+from eschorty_ros.core.modulation.phase_gate import _outside
+
+
+class Columns(NamedTuple):
+    """Packed events by column: ``counts`` of them from ``starts`` on, with room for padding.
+
+    ``seeds`` are the last rows of the lines, fixed point; -1 for none.
+    """
+
+    packed: NDArray[np.uint32]
+    starts: NDArray[np.int64]
+    counts: NDArray[np.uint32]
+    seeds: NDArray[np.int64]
+
+
+class Appended(NamedTuple):
+    """First event left, and the numbers of events not appended, by reason."""
+
+    next: int
+    over_limit: int
+    outside: int
+    gated: int
+
+
+def empty_columns(columns: int, limit: int) -> Columns:
+    """Return ``columns`` empty columns with room for ``limit`` events each."""
+    stride = limit + BLOCK
+    return Columns(
+        packed=np.empty(columns * stride, np.uint32),
+        starts=np.arange(columns) * stride,
+        counts=np.zeros(columns, np.uint32),
+        seeds=np.full(columns, -1, np.int64),
+    )
+
+
+def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Columns:
+    """Return columns of which ``c`` has the events ``rows[offsets[c]:offsets[c + 1]]``."""
+    counts = np.diff(offsets)
+    sizes = -(-counts // BLOCK) * BLOCK
+    starts = np.cumsum(sizes) - sizes
+    packed = np.empty(int(sizes.sum()), np.uint32)
+    packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
+    return Columns(packed, starts, counts.astype(np.uint32), np.full(counts.size, -1, np.int64))
+
+
+@kernel
+def _append(events, first, limit_us, edge_us, columns, rows, gate):
+    """Append the events before ``limit_us`` that the gate lets through to `empty_columns`."""
+    t, x, y, p = events
+    packed, counts = columns.packed, columns.counts
+    size = np.uintp(counts.size)
+    stride = np.uintp(packed.size) // size
+    room = np.uint32(stride - np.uintp(BLOCK))
+    rows_end = np.uint32(rows)
+    i = np.uintp(first)
+    end = np.uintp(t.size)
+    over_limit = 0
+    outside = 0
+    gated = 0
+    gating = gate.length_us > 0.0
+    while i < end and t[i] < limit_us:
+        c = np.uintp(x[i])
+        r = np.uint32(y[i])
+        dt = t[i] - edge_us
+        if c < size and r < rows_end:
+            n = counts[c]
+            if gating and _outside(dt, p[i], gate):
+                gated += 1
+            elif n < room:
+                packed[c * stride + np.uintp(n)] = np.uint32(
+                    (np.uint32(min(dt, TIME_LIMIT_US - 1)) << np.uint32(ROW_BITS)) | r
+                )
+                counts[c] = n + np.uint32(1)
+            else:
+                over_limit += 1
+        else:
+            outside += 1
+        i += np.uintp(1)
+    return Appended(np.int64(i), over_limit, outside, gated)

@@ -1,0 +1,176 @@
+"""Error model of a row, by estimator.
+
+The variance of a row has two parts. Smoothing over columns lessens the column's own::
+
+    a^2 min(s^2, s0^2) / N + floor^2 + b^2 (s^2 - s0^2) / N
+
+with s the standard deviation of the N rows used and s0 that of the line itself. The first term is
+small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
+from the mismatch of the pixels' thresholds, which more events of the same pixels do not lessen. The
+last term is for events beyond the line's own, which scatter independently. Neighbouring columns
+share the other part::
+
+    common^2 + motion^2 * shift of the line since the last profile + (jump * that shift)^2
+             + (clipped * rows missing to the line's full width)^2
+
+The last term is for lines that an edge of the scene clips; a dark surface looks narrow, too, and
+gets a larger sigma than it needs. The constants are fitted to the simulated scenes of the report's
+sigma experiment, at 70, 300 and 1000 Hz; `sigma_factor`, `sigma_floor_px` and `sigma_common_px`
+adapt them to an instrument.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eschorty_ros.core.base.arrays import number
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.window import FRACTION
+
+SIGMA_FACTOR = 0.05
+SIGMA_FLOOR_PX = 0.28
+SIGMA_COMMON_PX = 0.045
+SIGMA_LIMIT = 1e6
+# Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
+VARIANCE_PER_WIDTH2 = 1.25 / 12.0
+CLIPPED = 0.6
+
+# A line that moves further lies on another surface: its last row carries no information.
+_SHIFT_MAX_PX = 8.0
+# Standard deviation over the shift of a line that jumps.
+_JUMP = 0.2
+# Scatter of the full width of a line that is not clipped, rows.
+_WIDTH_SCATTER_PX = 0.7
+
+
+class MethodErrors(NamedTuple):
+    """An estimator's multiples of factor and floor, its ``b``, and its ``motion``."""
+
+    factor: float
+    floor: float
+    background: float
+    motion: float
+
+
+METHOD_ERRORS = {
+    "mode_mean": MethodErrors(0.2, 0.89, 0.4, 0.20),
+    "mean": MethodErrors(0.4, 0.672, 1.0, 0.18),
+    "median": MethodErrors(0.2, 0.935, 1.48, 0.11),
+    "gauss_ml": MethodErrors(0.2, 0.91, 0.4, 0.20),
+    "edge_mid": MethodErrors(0.243, 0.885, 0.42, 0.18),
+}
+
+
+class ErrorModel(NamedTuple):
+    """Coefficients of the two parts of a row's variance."""
+
+    factor: float
+    floor: float
+    common: float
+    motion: float
+    background: float
+    clipped: float
+    median: bool
+
+
+def error_model(
+    method: str,
+    sigma_factor: float = SIGMA_FACTOR,
+    sigma_floor_px: float = SIGMA_FLOOR_PX,
+    sigma_common_px: float = SIGMA_COMMON_PX,
+    clipped: float = CLIPPED,
+) -> ErrorModel:
+    """Return the error model of an estimator.
+
+    Parameters
+    ----------
+    method : str
+        One of ``centroid.METHODS``.
+    sigma_factor : float
+        Factor ``a`` on s/sqrt(N).
+    sigma_floor_px : float
+        Part of a column's standard deviation that more events do not lessen.
+    sigma_common_px : float
+        Part that neighbouring columns share and smoothing does not lessen.
+    clipped : float
+        Standard deviation over the rows missing to the line's full width.
+
+    Raises
+    ------
+    ArgumentError
+        When a value is negative or not finite.
+    """
+    own = METHOD_ERRORS[method]
+    return ErrorModel(
+        factor=own.factor * number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT),
+        floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT),
+        common=float(number("sigma_common_px", sigma_common_px, 0.0, SIGMA_LIMIT)),
+        motion=own.motion,
+        background=own.background,
+        clipped=clipped,
+        median=method == "median",
+    )
+
+
+@kernel
+def _background(excess, count, row, rows):
+    """Return the number of background events, evenly spread, behind ``excess`` variance.
+
+    The second value is the share of their mean square distance that they have in common, as most of
+    them lie on one side of a line away from the middle.
+    """
+    offset = 0.5 * (rows - 1.0) - row
+    square = rows * rows / 12.0 + offset * offset
+    return excess * count / square, offset * offset / square
+
+
+@kernel
+def _own_variance(variance, line_variance, count, row, rows, model):
+    """Return the variance of one column's row, px squared, without what its neighbours share.
+
+    What a column has beyond ``line_variance`` comes from events that do not repeat from pixel to
+    pixel and scatter independently. Without any spread the row has the variance of its
+    quantisation, a twelfth.
+    """
+    floor2 = model.floor**2
+    sigma2 = model.factor**2 * min(variance, line_variance) / count + floor2
+    excess = variance - line_variance
+    if excess > 0.0:
+        events, shared = _background(excess, count, row, rows)
+        coherent = 1.0 + max(events - 1.0, 0.0) * shared
+        if model.median:
+            # A background event moves the median by half the distance of two of the line's events.
+            step2 = 3.0 * line_variance / (count * count)
+            sigma2 += model.background**2 * events * coherent * step2
+        else:
+            sigma2 += model.background**2 * excess / count * coherent
+    if count < 2 or variance == 0.0:
+        sigma2 = max(sigma2, 1.0 / 12.0 + floor2)
+    return sigma2
+
+
+@kernel
+def _shared_variance(centre, last, model):
+    """Return the variance that neighbouring columns share, from the line's shift.
+
+    ``centre`` is the line's row and ``last`` that of the last profile, fixed point, negative when
+    there was none. Pixels keep a memory of where the line was: on a surface that recedes, points
+    lag behind.
+    """
+    shift = 0.0
+    if last >= 0:
+        shift = min(abs(centre - last) / FRACTION, _SHIFT_MAX_PX)
+    return model.common**2 + model.motion**2 * shift + (_JUMP * shift) ** 2
+
+
+@kernel
+def _clipping_variance(variance, line_variance, model):
+    """Return the variance of a row whose events spread less than the line.
+
+    An edge of range or reflectance within the line's thickness leaves only a part of it, and the
+    middle of that part lies off the line by up to half of what is missing.
+    """
+    missing = np.sqrt(12.0) * (np.sqrt(line_variance) - np.sqrt(variance)) - _WIDTH_SCATTER_PX
+    return (model.clipped * max(missing, 0.0)) ** 2

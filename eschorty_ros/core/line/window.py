@@ -1,0 +1,355 @@
+"""Search for the densest window of a column, and for a second return beside it.
+
+An event is one uint32: the row in the low 10 bits, the time since the period's edge (us) in the
+upper 22. A column's events are padded with ``PAD`` to a multiple of ``BLOCK`` entries, so that the
+inner loops run on full vector registers without a remainder.
+
+All sums are integers, hence exact and independent of the order of the events and of the row they
+are counted from. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places,
+rounded half to even: mirroring the rows mirrors every window exactly. Half widths and gaps are
+fixed-point numbers, too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eschorty_ros.core.base.kernel import kernel
+
+ROW_BITS = 10
+ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
+ROW_LAST = 1022
+TIME_LIMIT_US = 1 << (32 - ROW_BITS)
+PAD = np.uint32(0xFFFFFFFF)
+BLOCK = 32
+FRACTION_BITS = 6
+FRACTION = 1 << FRACTION_BITS
+FOUND, TOO_FEW, AMBIGUOUS = 0, 1, 2
+
+_ITERATIONS_MAX = 5
+_ONE_BITS = np.uint32(20)
+_ONE = np.uint32(1 << 20)
+# Entries summed in 32 bits: 512 times (row or row squared or time) still fits.
+_CHUNK = np.uintp(512)
+_PAIRWISE_MAX = 192
+# No event has this row: nothing is avoided.
+_NOWHERE = -(1 << 40)
+# Chance of a false second return per column: one in this many, at most.
+_FALSE_SECOND = 1000.0
+
+
+class Column(NamedTuple):
+    """Place of one column in the packed events: ``events`` from ``start`` on, padded to blocks."""
+
+    start: int
+    events: int
+    blocks: int
+
+
+class Sums(NamedTuple):
+    """Sums over the events of a range of rows; d is the row minus the first row of the range."""
+
+    events: int
+    d: int
+    d2: int
+    time_us: int
+
+
+class Window(NamedTuple):
+    """Sums over the events of rows first..last, and their mean in fixed point."""
+
+    first: int
+    last: int
+    sums: Sums
+    centre: int
+
+
+class Returns(NamedTuple):
+    """Window of a column's strongest return and, if there is a ``second``, of the other one.
+
+    Where the status is ``AMBIGUOUS`` the two are equally strong.
+    """
+
+    status: int
+    second: bool
+    window: Window
+    other: Window
+
+
+class _Densest(NamedTuple):
+    """Most events in a box, and the lowest and the highest row whose box holds so many."""
+
+    events: int
+    lowest: int
+    highest: int
+
+
+@kernel
+def _padded(packed, start, events):
+    """Fill the last block behind the column's events and return its place."""
+    blocks = (events + BLOCK - 1) // BLOCK
+    for i in range(events, blocks * BLOCK):
+        packed[start + i] = PAD
+    return Column(start, events, blocks)
+
+
+@kernel
+def _window_sums(packed, column, first, last):
+    """Return the sums over rows first..last.
+
+    The number of events and the sum of d share one register lane: a chunk's sum of d stays below
+    ``_ONE``.
+    """
+    base = np.uint32(first)
+    span = np.uint32(last - first)
+    events = np.int64(0)
+    sum_d = np.int64(0)
+    sum_d2 = np.int64(0)
+    sum_time = np.int64(0)
+    begin = np.uintp(column.start)
+    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
+    while begin < padded:
+        end = min(begin + _CHUNK, padded)
+        both = np.uint32(0)
+        d2 = np.uint32(0)
+        ts = np.uint32(0)
+        for i in range(begin, end):
+            v = packed[i]
+            d = np.uint32((v & ROW_MASK) - base)
+            inside = d <= span
+            both = np.uint32(both + (np.uint32(d + _ONE) if inside else np.uint32(0)))
+            d2 = np.uint32(d2 + (np.uint32(d * d) if inside else np.uint32(0)))
+            ts = np.uint32(ts + ((v >> np.uint32(ROW_BITS)) if inside else np.uint32(0)))
+        events += np.int64(both >> _ONE_BITS)
+        sum_d += np.int64(both & (_ONE - np.uint32(1)))
+        sum_d2 += np.int64(d2)
+        sum_time += np.int64(ts)
+        begin = end
+    return Sums(events, sum_d, sum_d2, sum_time)
+
+
+@kernel
+def _window_events(packed, column, first, last):
+    """Return the number of events in rows first..last."""
+    base = np.uint32(first)
+    span = np.uint32(last - first)
+    events = np.int64(0)
+    begin = np.uintp(column.start)
+    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
+    while begin < padded:
+        end = min(begin + _CHUNK, padded)
+        inside = np.uint32(0)
+        for i in range(begin, end):
+            d = np.uint32((packed[i] & ROW_MASK) - base)
+            inside = np.uint32(inside + np.uint32(d <= span))
+        events += np.int64(inside)
+        begin = end
+    return events
+
+
+@kernel
+def _limits(centre, half, first, last):
+    """Return the first and last row within ``half`` of ``centre`` and within first..last."""
+    low = (centre - half + FRACTION - 1) >> FRACTION_BITS
+    high = (centre + half) >> FRACTION_BITS
+    return max(low, first), min(high, last)
+
+
+@kernel
+def _full_column(packed, column):
+    """Return the window over all rows; its centre is not known and given as -1."""
+    sums = _window_sums(packed, column, 0, ROW_LAST)
+    return Window(np.int64(0), np.int64(ROW_LAST), sums, np.int64(-1))
+
+
+@kernel
+def _mean_shift(packed, column, centre, half, first, last):
+    """Move a window to the mean of its events, ``_ITERATIONS_MAX`` times at most.
+
+    It stops when the mean moves by less than a sixteenth of the half width: a window of three
+    standard deviations would gain less than a hundredth of one. It stays within rows first..last.
+    """
+    low, high = _limits(centre, half, first, last)
+    sums = _window_sums(packed, column, low, high)
+    for _ in range(_ITERATIONS_MAX - 1):
+        if sums.events == 0:
+            break
+        moved = np.int64(np.rint((sums.events * low + sums.d) * FRACTION / sums.events))
+        step = abs(moved - centre)
+        centre = moved
+        if step * 16 <= half:
+            break
+        low, high = _limits(centre, half, first, last)
+        sums = _window_sums(packed, column, low, high)
+    return Window(low, high, sums, centre)
+
+
+@kernel
+def _densest_pairwise(packed, column, radius, avoid, gap):
+    best = np.int64(0)
+    lowest = np.int64(ROW_LAST)
+    highest = np.int64(0)
+    for i in range(column.start, column.start + column.events):
+        row = np.int64(packed[i] & ROW_MASK)
+        if abs(row * FRACTION - avoid) < gap:
+            continue
+        support = _window_events(packed, column, max(row - radius, 0), min(row + radius, ROW_LAST))
+        if support > best:
+            best, lowest, highest = support, row, row
+        elif support == best:
+            lowest = min(lowest, row)
+            highest = max(highest, row)
+    return _Densest(best, lowest, highest)
+
+
+@kernel
+def _densest_histogram(packed, column, radius, avoid, gap):
+    size = 1 << ROW_BITS
+    below = np.zeros(size + 1, np.int64)
+    for i in range(column.start, column.start + column.events):
+        below[(packed[i] & ROW_MASK) + np.uint32(1)] += 1
+    for row in range(size):
+        below[row + 1] += below[row]
+    best = np.int64(0)
+    lowest = np.int64(ROW_LAST)
+    highest = np.int64(0)
+    for row in range(size):
+        if below[row + 1] == below[row] or abs(row * FRACTION - avoid) < gap:
+            continue
+        support = below[min(row + radius, ROW_LAST) + 1] - below[max(row - radius, 0)]
+        if support > best:
+            best, lowest, highest = support, np.int64(row), np.int64(row)
+        elif support == best:
+            highest = np.int64(row)
+    return _Densest(best, lowest, highest)
+
+
+@kernel
+def _densest(packed, column, half, avoid, gap):
+    """Find the box of half the window's width, around an event, that holds most events.
+
+    Events nearer than ``gap`` to ``avoid`` are no centres of a box.
+    """
+    radius = max(half >> (FRACTION_BITS + 1), 1)
+    if column.events <= _PAIRWISE_MAX:
+        return _densest_pairwise(packed, column, radius, avoid, gap)
+    return _densest_histogram(packed, column, radius, avoid, gap)
+
+
+@kernel
+def _rows_nearer(centre, other):
+    """Return the range of rows nearer to ``centre`` than to ``other``, without the one between."""
+    both = centre + other
+    if centre < other:
+        return 0, (both - 1) >> (FRACTION_BITS + 1)
+    return max((both >> (FRACTION_BITS + 1)) + 1, 0), ROW_LAST
+
+
+@kernel
+def _mean_shift_beside(packed, column, half, seed, avoid):
+    """Run the mean shift from ``seed`` over the rows nearer to it than to ``avoid``."""
+    first, last = _rows_nearer(seed, avoid)
+    return _mean_shift(packed, column, seed, half, first, last)
+
+
+@kernel
+def _resolve_tie(packed, column, half, densest, avoid):
+    """Run the mean shift from the equally dense rows and choose without preferring a direction.
+
+    The window with more events wins, then the one with the smaller spread. Windows that overlap are
+    restarted from their common mean; two separate windows without any difference are ambiguous.
+    """
+    a = _mean_shift_beside(packed, column, half, densest.lowest * FRACTION, avoid)
+    if densest.lowest == densest.highest:
+        return Returns(FOUND, False, a, a)
+    b = _mean_shift_beside(packed, column, half, densest.highest * FRACTION, avoid)
+    if a.sums.events != b.sums.events:
+        return Returns(FOUND, False, a if a.sums.events > b.sums.events else b, b)
+    spread_a = a.sums.events * a.sums.d2 - a.sums.d * a.sums.d
+    spread_b = b.sums.events * b.sums.d2 - b.sums.d * b.sums.d
+    if spread_a != spread_b:
+        return Returns(FOUND, False, a if spread_a < spread_b else b, b)
+    if a.centre == b.centre:
+        return Returns(FOUND, False, a, b)
+    if abs(a.centre - b.centre) <= 2 * half:
+        middle = np.int64(np.rint((a.centre + b.centre) / 2.0))
+        return Returns(FOUND, False, _mean_shift_beside(packed, column, half, middle, avoid), b)
+    return Returns(AMBIGUOUS, True, a, b)
+
+
+@kernel
+def _densest_window(packed, column, half):
+    """Find the densest window of a column."""
+    return _resolve_tie(packed, column, half, _densest(packed, column, half, _NOWHERE, 0), _NOWHERE)
+
+
+@kernel
+def _exceeds_background(events, others, half, rows):
+    """Return whether a window holds more ``events`` than background of the others' density.
+
+    The background is uniform; the excess has to reach 4 standard deviations.
+    """
+    width = (2 * half) / FRACTION + 1.0
+    if width >= rows:
+        return True
+    expected = others * width / (rows - width)
+    excess = events - expected
+    return excess > 0.0 and excess * excess > 16.0 * expected
+
+
+@kernel
+def _is_significant(events, others, half, rows):
+    """Return whether background hardly ever puts ``events`` into any window of a column.
+
+    ``others`` events lie outside the two windows. The test is Chernoff's bound on the Poisson tail,
+    times the number of windows the search chooses from; one more background event than observed
+    guards against none observed.
+    """
+    width = (2 * half) / FRACTION + 1.0
+    expected = (others + 1.0) * width / max(rows - 2.0 * width, width)
+    if events <= expected:
+        return False
+    improbable = events * np.log(events / expected) - (events - expected)
+    return improbable > np.log(_FALSE_SECOND * max(2.0 * rows / width, 1.0))
+
+
+@kernel
+def _box_events(packed, column, centre, half):
+    low, high = _limits(centre, half >> 1, 0, ROW_LAST)
+    return _window_events(packed, column, low, high)
+
+
+@kernel
+def _second_return(packed, column, half, rows, events_min, a):
+    """Look for another surface than that of window ``a``.
+
+    It lies 2 full widths at half maximum away or more (the half width of a window is 1.3 of them),
+    the box around it holds at least half as many events as that around ``a``, and background does
+    not explain it.
+    """
+    alone = Returns(FOUND, False, a, a)
+    gap = half * 20 // 13
+    rest = column.events - a.sums.events
+    if rest < events_min or 3 * rest < a.sums.events:
+        return alone
+    strength = _box_events(packed, column, a.centre, half)
+    densest = _densest(packed, column, half, a.centre, gap)
+    if 3 * densest.events < strength:
+        return alone
+    second = _resolve_tie(packed, column, half, densest, a.centre)
+    b = second.window
+    if second.status != FOUND or abs(a.centre - b.centre) < gap:
+        return alone
+    if 2 * _box_events(packed, column, b.centre, half) < strength:
+        return alone
+    if abs(a.centre - b.centre) <= 2 * half:
+        # The windows overlap: each keeps to its side of the middle.
+        centre_a, centre_b = a.centre, b.centre
+        a = _mean_shift_beside(packed, column, half, centre_a, centre_b)
+        b = _mean_shift_beside(packed, column, half, centre_b, centre_a)
+    if a.sums.events < events_min or b.sums.events < events_min:
+        return alone
+    others = column.events - a.sums.events - b.sums.events
+    return Returns(FOUND, _is_significant(b.sums.events, others, half, rows), a, b)
