@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 
 NS_PER_US = 1_000
 DRIFT_MAX_PPB = 200_000
+Time = TypeVar("Time", int, NDArray[np.int64])
 T_US_LIMIT = TIME_LIMIT // NS_PER_US
 _PPB_TIMES_US = 1_000_000
 # Each iteration leaves 2e-4 of the error, the largest drift.
@@ -48,11 +49,7 @@ class ClockLine:
         whole("origin_ns", self.origin_ns, -TIME_LIMIT, TIME_LIMIT)
         whole("drift_ppb", self.drift_ppb, -DRIFT_MAX_PPB, DRIFT_MAX_PPB)
 
-    @overload
-    def to_ns(self, t_us: int) -> int: ...
-    @overload
-    def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
-    def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+    def to_ns(self, t_us: Time) -> Time:
         """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         if isinstance(t_us, np.ndarray):
             since = _within("t_us", t_us, T_US_LIMIT) - self.origin_us
@@ -61,11 +58,7 @@ class ClockLine:
         since_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT) - self.origin_us
         return int(self._elapsed_ns(since_us)) + self.origin_ns
 
-    @overload
-    def to_us(self, t_ns: int) -> int: ...
-    @overload
-    def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
-    def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+    def to_us(self, t_ns: Time) -> Time:
         """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
         if isinstance(t_ns, np.ndarray):
             return self._since_us(_within("t_ns", t_ns, TIME_LIMIT) - self.origin_ns)

@@ -237,7 +237,7 @@ class _Leg:
         self.from_ns = from_ns
 
     def plan(self) -> MotionPlan | None:
-        """Return the motion as estimated; ``None`` if unknown."""
+        """Return the motion from its estimated start; ``None`` if readings contradict it."""
         return None
 
     def add(self, reading: _Reading) -> None:
@@ -277,14 +277,12 @@ class _Move(_Leg):
         self._fits = True
 
     def plan(self) -> MotionPlan | None:
-        """Return the motion from its estimated start; ``None`` when readings contradict it."""
         if not self._fits:
             return None
         start_s = self._not_before_s if self._timing is None else self._timing.start_s
         return replace(self._shape, start_ns=self.from_ns + round(start_s * 1e9))
 
     def add(self, reading: _Reading) -> None:
-        """Estimate the start again with one reading more."""
         shape, tolerance_mm = self._shape, self._tolerance_mm
         if abs(reading.position_mm - shape.position_mm) <= tolerance_mm:
             if reading.earliest_ns is not None and self._timing is None:
@@ -311,7 +309,6 @@ class _Move(_Leg):
         return self._usual if self._timing is None else self._timing.delays
 
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
-        """Return the lowest and highest position between two times; ``None`` if unknown."""
         if not self._fits:
             return None
         if self._timing is None:
@@ -425,11 +422,9 @@ class _Stop(_Leg):
         self._last: _Reading | None = None
 
     def plan(self) -> MotionPlan | None:
-        """Return the ramp from its estimated start."""
         return self._plan
 
     def add(self, reading: _Reading) -> None:
-        """Estimate the start from the place of rest."""
         last, self._last = self._last, reading
         if last is None or abs(last.position_mm - reading.position_mm) > self._tolerance_mm:
             return
@@ -450,7 +445,6 @@ class _Stop(_Leg):
         self.residual_mm = abs(self._plan.end_mm - reading.position_mm)
 
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
-        """Return the range from here to the end of the interrupted motion."""
         places = float(self._plan.position_mm), self._before.end_mm
         return min(places), max(places)
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from typing import overload
-
-import numpy as np
-from numpy.typing import NDArray
-
 from eschorty_ros.core.base.arrays import TIME_LIMIT, whole
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.clocks.clock_line import T_US_LIMIT, ClockLine
+from eschorty_ros.core.clocks.clock_line import T_US_LIMIT, ClockLine, Time
 from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
 
 
@@ -42,7 +37,9 @@ class SensorClock:
 
     def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
         self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
-        self._fixed = None if zero_ns is None else ClockLine(0, _zero(zero_ns))
+        self._fixed = None
+        if zero_ns is not None:
+            self._fixed = ClockLine(0, whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT))
         self._adopted: ClockLine | None = None
         self._envelope = LowerEnvelope(window_ns)
         self._last: tuple[int, int] | None = None
@@ -107,19 +104,11 @@ class SensorClock:
         """Use ``line``, known from edges, unless a zero was announced; ``None`` for arrivals."""
         self._adopted = line
 
-    @overload
-    def to_ns(self, t_us: int) -> int: ...
-    @overload
-    def to_ns(self, t_us: NDArray[np.int64]) -> NDArray[np.int64]: ...
-    def to_ns(self, t_us: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+    def to_ns(self, t_us: Time) -> Time:
         """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         return self._known().to_ns(t_us)
 
-    @overload
-    def to_us(self, t_ns: int) -> int: ...
-    @overload
-    def to_us(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]: ...
-    def to_us(self, t_ns: int | NDArray[np.int64]) -> int | NDArray[np.int64]:
+    def to_us(self, t_ns: Time) -> Time:
         """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
         return self._known().to_us(t_ns)
 
@@ -130,7 +119,3 @@ class SensorClock:
                 "the ROS time of sensor time 0 is unknown; announce it or observe a packet first"
             )
         return line
-
-
-def _zero(zero_ns: int) -> int:
-    return whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT)

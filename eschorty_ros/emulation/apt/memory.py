@@ -6,9 +6,10 @@ from eschorty_ros.core.clocks.pulses import PulseTrain
 from eschorty_ros.emulation.apt.axis import PulsePattern
 from eschorty_ros.hardware.stage.apt_messages import Scale
 
-_KINDS = ("velocity", "home", "ports", "pulses", "rack_trigger")
-REQUESTS = frozenset(f"request_{kind}" for kind in _KINDS)
-SETTINGS = frozenset(f"set_{kind}" for kind in (*_KINDS, "rack_trigger_state"))
+SETTINGS = frozenset(
+    f"set_{kind}"
+    for kind in ("velocity", "home", "ports", "pulses", "rack_trigger", "rack_trigger_state")
+)
 _FORWARD, _REVERSE, _BOTH = 0x0D, 0x0E, 0x0F
 
 Values = dict[str, int]

@@ -12,11 +12,10 @@ from collections.abc import Callable
 from eschorty_ros.core.clocks.motion import MotionPlan
 from eschorty_ros.emulation.apt.axis import EMERGENCY_MM_S2, Axis
 from eschorty_ros.emulation.apt.frames import CommandParser, pack_answer
-from eschorty_ros.emulation.apt.memory import REQUESTS, SETTINGS, Memory
+from eschorty_ros.emulation.apt.memory import SETTINGS, Memory
 from eschorty_ros.emulation.apt.wire import Disturbance, Wire
 from eschorty_ros.hardware.stage import apt_messages as apt
 
-_UPDATE_NS = 100_000_000
 # Status messages without a keep-alive after which it sends no more.
 _UNACKNOWLEDGED_MAX = 50
 
@@ -100,7 +99,6 @@ class AptModel:
         self.enabled = self.homed = False
         self._memory.reset()
         self._ending = ""
-        self._updates_ns: int | None = None
         self._unacknowledged = 0
 
     def reboot(self) -> None:
@@ -130,9 +128,6 @@ class AptModel:
             for name, address, values in self._commands.feed(data):
                 self._handle(name, address, values, at_ns)
         self._complete(now_ns)
-        while self._updates_ns is not None and self._updates_ns <= now_ns:
-            self._send_status("status", self._updates_ns)
-            self._updates_ns += _UPDATE_NS
         return b"".join(data for _, data in self._out.receive(now_ns))
 
     def send_error(self, code: int, text: str = "") -> None:
@@ -160,10 +155,6 @@ class AptModel:
         match name:
             case "keep_alive":
                 self._unacknowledged = 0
-            case "start_updates":
-                self._updates_ns = at_ns + _UPDATE_NS
-            case "stop_updates":
-                self._updates_ns = None
             case "set_enabled":
                 self.enabled = values["state"] == 1 and not self.panel_disabled
                 if not self.enabled:
@@ -220,14 +211,11 @@ class AptModel:
                 self._send_status("status", at_ns)
             case "request_axis":
                 self._send_axis(at_ns)
-            case "request_enabled":
-                self._send("enabled", at_ns=at_ns, channel=1, state=1 if self.enabled else 2)
-            case _ if name in REQUESTS:
+            case "request_velocity" | "request_pulses" | "request_rack_trigger":
                 kind = name.removeprefix("request_")
                 values = self._memory.get(kind)
                 if values is not None:
-                    reply = "home_parameters" if kind == "home" else kind
-                    self._send(reply, at_ns=at_ns, **values)
+                    self._send(kind, at_ns=at_ns, **values)
 
     def _send_info(self, address: int, at_ns: int) -> None:
         model = b"BBD301" if self._rack else b"KBD101"
@@ -266,23 +254,12 @@ class AptModel:
         )
 
     def _bits(self, at_ns: int) -> int:
-        ending = self._ending
-        return (
-            self.extra_bits
-            | self.axis.bits(at_ns, bool(ending), self.enabled)
-            | sum(
-                mask
-                for mask, holds in (
-                    (0x0000_0100, True),
-                    (0x0000_0200, ending == "homed"),
-                    (0x0000_0400, self.homed),
-                    (0x0000_1000, self.enabled),
-                    (0x1000_0000, True),
-                    (0x8000_0000, self.enabled),
-                )
-                if holds
-            )
-        )
+        # Motor connected, power ok; homing; homed; tracking, enabled.
+        bits = 0x1000_0100
+        bits |= 0x200 if self._ending == "homed" else 0
+        bits |= apt.HOMED if self.homed else 0
+        bits |= 0x1000 | apt.ENABLED if self.enabled else 0
+        return self.extra_bits | bits | self.axis.bits(at_ns, bool(self._ending), self.enabled)
 
     def _send(
         self, name: str, source: int = 0, at_ns: int | None = None, **values: int | bytes

@@ -68,11 +68,9 @@ TO_CONTROLLER: Final = {
     for layout in (
         Layout("disconnect", 0x0002),
         Layout("request_info", 0x0005),
-        Layout("start_updates", 0x0011),
         Layout("stop_updates", 0x0012),
         Layout("request_bay", 0x0060, ("bay",)),
         Layout("set_enabled", 0x0210, ("channel", "state")),
-        Layout("request_enabled", 0x0211, _CHANNEL),
         Layout("set_rack_trigger", 0x0260, _RACK_TRIGGER, "6H8iH"),
         Layout("request_rack_trigger", 0x0261, _CHANNEL),
         Layout("set_rack_port", 0x0263, ("port", "mode", "source"), "3H"),
@@ -80,7 +78,6 @@ TO_CONTROLLER: Final = {
         Layout("set_velocity", 0x0413, _VELOCITY, "H3i"),
         Layout("request_velocity", 0x0414, _CHANNEL),
         Layout("set_home", 0x0440, _HOME, "3H2i"),
-        Layout("request_home", 0x0441, _CHANNEL),
         Layout("home", 0x0443, _CHANNEL),
         Layout("move_absolute", 0x0453, ("channel", "position"), "Hi"),
         Layout("stop", 0x0465, ("channel", "mode")),
@@ -90,7 +87,6 @@ TO_CONTROLLER: Final = {
         Layout("set_profile_mode", 0x04E3, ("channel", "mode", "jerk"), "2HI4x"),
         Layout("request_axis", 0x04F1, _CHANNEL),
         Layout("set_ports", 0x0523, _PORTS, "6H"),
-        Layout("request_ports", 0x0524, _CHANNEL),
         Layout("set_pulses", 0x0526, ("channel", *_PULSES), "H8i"),
         Layout("request_pulses", 0x0527, _CHANNEL),
     )
@@ -109,10 +105,8 @@ _INCOMING = (
     Layout("bay", 0x0061, ("bay", "state")),
     Layout("error", 0x0080),
     Layout("error_text", 0x0081, ("message", "code", "text"), "2H64s"),
-    Layout("enabled", 0x0212, ("channel", "state")),
     Layout("rack_trigger", 0x0262, _RACK_TRIGGER, "6H8iH"),
     Layout("velocity", 0x0415, _VELOCITY, "H3i"),
-    Layout("home_parameters", 0x0442, _HOME, "3H2i"),
     Layout("homed", 0x0444, _CHANNEL),
     Layout("moved", 0x0464, _CHANNEL),
     Layout("moved", 0x0464, _STATUS, "HihHI"),
@@ -128,8 +122,6 @@ _INCOMING = (
         ),
         "3H16s2I5i24x",
     ),
-    Layout("ports", 0x0525, _PORTS[:-1], "5H"),
-    Layout("ports", 0x0525, _PORTS, "6H"),
     Layout("pulses", 0x0528, ("channel", *_PULSES), "H8i"),
 )
 
@@ -172,10 +164,8 @@ STATUS_BITS: Final = {
     0x40000000: "error",
     0x80000000: "enabled",
 }
-HARD_LIMITS: Final = 0x3
 LIMITS: Final = 0xF
 MOVING: Final = 0xF0
-HOMING: Final = 0x200
 HOMED: Final = 0x400
 SETTLED: Final = 0x2000
 POSITION_ERROR: Final = 0x4000

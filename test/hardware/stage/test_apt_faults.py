@@ -12,7 +12,7 @@ from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.hardware.stage import apt_messages
 from eschorty_ros.hardware.stage.apt_setup import AptSettings
 
-STOP, ENABLE, STATUS_REQUEST, KEEP_ALIVE = 0x0465, 0x0210, 0x0490, 0x0492
+DISCONNECT, STOP, KEEP_ALIVE = 0x0002, 0x0465, 0x0492
 
 
 def moving(speed_mm_s: float = 100.0, **model: object) -> AptBench:
@@ -254,7 +254,7 @@ def test_an_error_message_stops_the_stage(text: str) -> None:
 
 
 @pytest.mark.fault("controller reports an error")
-def test_fault_bits_stop_the_stage() -> None:
+def test_reported_faults_stop_the_stage() -> None:
     """driver: stops when two messages have them; user reads: reports over_temperature."""
     bench = moving()
     bench.model.extra_bits = 0x20000
@@ -345,3 +345,6 @@ def test_close_while_homing_stops_the_carriage() -> None:
     bench.stage.close()
     assert bench.now_ns - begun_ns < 2_000_000_000
     assert not bench.model.axis.moving(bench.clock_ns())
+    assert bench.sent(DISCONNECT)
+    with pytest.raises(DeviceError, match="closed"):
+        bench.stage.move_to(10.0, 10.0)

@@ -25,7 +25,6 @@ PULSES = {
 PACKED = [
     (apt.pack("disconnect", 0x50), oracle.hw_disconnect(0x50, 1)),
     (apt.pack("request_info", 0x11), oracle.hw_req_info(0x11, 1)),
-    (apt.pack("start_updates", BAY), oracle.hw_start_updatemsgs(BAY, 1)),
     (apt.pack("stop_updates", BAY), oracle.hw_stop_updatemsgs(BAY, 1)),
     (apt.pack("request_bay", 0x11, bay=2), oracle.rack_req_bayused(0x11, 1, 2)),
     (
@@ -109,7 +108,6 @@ INCOMING = [
     (0x0464, struct.pack("<HihHI", 1, 4_400_000, 0, 3, 0x8000_2400)),
     (0x0466, struct.pack("<HihHI", 1, 5, 0, 3, 0x8000_2400)),
     (0x0415, struct.pack("<H3i", 1, 0, 13_744, 13_421_773)),
-    (0x0442, struct.pack("<3H2i", 1, 2, 1, 1_342_177, 0)),
     (0x0528, struct.pack("<H8i", 1, *PULSES.values())),
 ]
 

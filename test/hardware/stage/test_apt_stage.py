@@ -150,20 +150,6 @@ def test_a_stage_left_moving_is_stopped_at_connect() -> None:
     bench.move(20.0)
 
 
-def test_close_stops_and_is_idempotent() -> None:
-    bench = AptBench()
-    bench.stage.move_to(200.0, 50.0)
-    bench.advance(0.5)
-    begun_ns = bench.now_ns
-    bench.stage.close()
-    bench.stage.close()
-    assert bench.now_ns - begun_ns < 2_000_000_000
-    assert not bench.model.axis.moving(bench.clock_ns())
-    assert bench.sent(0x0002)
-    with pytest.raises(DeviceError, match="closed"):
-        bench.stage.move_to(10.0, 10.0)
-
-
 @pytest.mark.parametrize("settings", [AptSettings(), BAY_2], ids=["kbd101", "bbd30x"])
 def test_pulses_every_2_mm_in_both_directions(settings: AptSettings) -> None:
     bench = AptBench(settings)
