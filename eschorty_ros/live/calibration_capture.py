@@ -14,7 +14,7 @@ from eschorty_ros.core.calibration import (
     KnownTarget,
     Targets,
     find_posts,
-    fit_targets,
+    fit,
     match_posts,
     moving_target,
 )
@@ -210,9 +210,7 @@ def _residuals(targets: Targets | None, nominal: Calibration) -> NDArray[np.floa
     if targets is None or len(targets) < 2:
         return np.empty(0)
     try:
-        fit = fit_targets(
-            targets.row, targets.range_mm, nominal.model(), sigma_row_px=targets.sigma_row_px
-        )
+        rows = Targets(targets.row, targets.range_mm, targets.sigma_row_px)
+        return fit(rows, nominal.model()).residual_px
     except EschortyError:
         return np.empty(0)
-    return fit.residual_px

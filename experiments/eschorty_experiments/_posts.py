@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from eschorty_ros.core.base.arrays import Array
-from eschorty_ros.core.calibration import CalibrationFit, fit_targets
+from eschorty_ros.core.calibration import CalibrationFit, Targets, fit
 from eschorty_ros.core.optics import Design
 
 SIGMA_ROW_PX = 0.3
@@ -82,8 +82,8 @@ def see_posts(build: Design, nominal: Design, rng: np.random.Generator) -> Posts
     columns = model.magnification(true_row) * POST_MM / pixel_mm + edges[1] - edges[0]
     magnification = columns * pixel_mm / POST_MM
     slope, start = np.polyfit(row, magnification, 1)
-    fit = fit_targets(row, ranges, nominal.model, sigma_row_px=SIGMA_ROW_PX)
-    return Posts(ranges, row, magnification, fit, Line(float(slope), float(-start / slope)))
+    found = fit(Targets(row, ranges, SIGMA_ROW_PX), nominal.model)
+    return Posts(ranges, row, magnification, found, Line(float(slope), float(-start / slope)))
 
 
 def pulls(posts: Posts, build: Design) -> Array:

@@ -32,10 +32,6 @@ TESTED_ELSEWHERE = {
     # All their arguments are objects of the package, or they take none.
     "offline.reconstruct_recording", "offline.stage_speed_mm_s", "warm_up.warm_up",
     "calibration.Calibration.model", "files.config_folders",
-    "calibration_diagnostics.listed",
-    "calibration_diagnostics.k_profile", "calibration_diagnostics.leave_one_out_px",
-    "calibration_diagnostics.prior_ratios", "calibration_diagnostics.verdicts",
-    "calibration_identity.refuse_other_instrument",
     # Their arguments go to moving_target and match_posts.
     "recorded_targets.recorded_moving_target", "recorded_targets.recorded_posts",
     # Every key of the file has its own test in test/core/optics/test_calibration_file.py.

@@ -3,24 +3,16 @@
 from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
 from eschorty_ros.core.calibration.calibrate import METHODS, CalibrationReport, Method, calibrate
 from eschorty_ros.core.calibration.fit import (
-    COLUMN_TERMS,
     K_PRIOR_SHARE,
-    PARAMETERS,
     PRIOR_SIGMA,
-    WIDTH_BIAS,
     CalibrationFit,
     fit,
-    fit_targets,
 )
-from eschorty_ros.core.calibration.identity import refuse_other_instrument
-from eschorty_ros.core.calibration.posts import (
-    KnownTarget,
-    Post,
-    find_posts,
-    match_posts,
-    moving_target,
-)
+from eschorty_ros.core.calibration.moving_target import moving_target
+from eschorty_ros.core.calibration.post_finder import Post, find_posts
+from eschorty_ros.core.calibration.post_matching import KnownTarget, match_posts
 from eschorty_ros.core.calibration.recorded_targets import recorded_moving_target, recorded_posts
+from eschorty_ros.core.calibration.residuals import COLUMN_TERMS, PARAMETERS, WIDTH_BIAS
 from eschorty_ros.core.calibration.targets import SIGMA_ROW_PX, Targets
 from eschorty_ros.core.calibration.targets_file import (
     DISTANCE_COLUMNS,
@@ -50,13 +42,11 @@ __all__ = [
     "calibrate",
     "find_posts",
     "fit",
-    "fit_targets",
     "match_posts",
     "moving_target",
     "read_distances",
     "read_targets",
     "recorded_moving_target",
     "recorded_posts",
-    "refuse_other_instrument",
     "write_targets",
 ]

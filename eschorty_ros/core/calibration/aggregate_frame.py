@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from numba import int64, types, uint16, uint32
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import exact, whole
-from eschorty_ros.core.calibration._aggregate import count_events
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.optics import PIXELS_MAX
+
+_COUNT_MAX = (1 << 32) - 1
+_U2 = types.Array(uint16, 1, "C", readonly=True)
 
 
 class Pixels(Protocol):
-    """Events with columns ``x`` and rows ``y``, as the decoder hands them out."""
+    """Events with columns ``x`` and rows ``y``, as the decoder returns them."""
 
     @property
     def x(self) -> NDArray[np.uint16]:
@@ -35,9 +39,7 @@ class AggregateFrame:
     ----------
     counts : ndarray of uint32, shape (rows, columns)
     events : int
-        Events counted.
-    outside : int
-        Events outside the sensor, not counted.
+        Events counted; those outside the sensor are not.
     """
 
     def __init__(self, columns: int, rows: int) -> None:
@@ -45,7 +47,6 @@ class AggregateFrame:
         whole("rows", rows, 1, PIXELS_MAX)
         self.counts = np.zeros((rows, columns), np.uint32)
         self.events = 0
-        self.outside = 0
 
     def add(self, events: Pixels) -> None:
         """Count ``events``, in any order.
@@ -57,15 +58,26 @@ class AggregateFrame:
         """
         x = exact("x", events.x, np.uint16)
         y = exact("y", events.y, np.uint16, x.size)
-        outside = count_events(self.counts, x, y)
-        self.outside += outside
-        self.events += x.size - outside
+        self.events += _count(self.counts, x, y)
 
     def image(self) -> NDArray[np.uint8]:
-        """Draw the frame, (rows, columns) uint8; the brightest of 1000 pixels is white."""
+        """Return the frame as a grey picture, (rows, columns); 1 in 1000 lit pixels is white."""
         lit = self.counts[self.counts > 0]
         if not lit.size:
             return np.zeros(self.counts.shape, np.uint8)
         white = max(float(np.quantile(lit, 0.999)), 1.0)
         # The root keeps faint posts visible beside bright ones.
         return np.rint(255.0 * np.sqrt(np.minimum(self.counts / white, 1.0))).astype(np.uint8)
+
+
+@kernel(int64(uint32[:, ::1], _U2, _U2))
+def _count(counts, x, y):
+    """Add each event on the sensor to its pixel, which saturates; return how many they are."""
+    rows, columns = counts.shape
+    inside = 0
+    for i in range(x.size):
+        if y[i] < rows and x[i] < columns:
+            inside += 1
+            if counts[y[i], x[i]] < _COUNT_MAX:
+                counts[y[i], x[i]] += uint32(1)
+    return inside

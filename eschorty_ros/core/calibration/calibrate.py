@@ -1,4 +1,4 @@
-"""From targets to a calibration that says how good it is."""
+"""From targets to a calibration with its diagnostics."""
 
 from __future__ import annotations
 
@@ -12,16 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import Array
-from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.calibration._checks import (
-    check_targets,
-    checked_free,
-    checked_priors,
-    refuse_pairs,
-    refuse_unknowable,
-)
-from eschorty_ros.core.calibration._model import WIDTH_BIAS, Observed
-from eschorty_ros.core.calibration._robust import TARGETS_MIN, inliers
+from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.diagnostics import (
     LISTED,
     KProfile,
@@ -36,20 +27,28 @@ from eschorty_ros.core.calibration.fit import (
     PAPER_FREE,
     PRIOR_SIGMA,
     CalibrationFit,
+    check_targets,
+    checked_free,
+    checked_priors,
     fit,
 )
+from eschorty_ros.core.calibration.residuals import WIDTH_BIAS, Observed
+from eschorty_ros.core.calibration.robust import inliers
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import Calibration, RangeModel
 
 Method = Literal["paper", "joint"]
 
 METHODS: tuple[Method, ...] = ("paper", "joint")
+# Among fewer targets an outlier cannot be identified.
+_ROBUST_TARGETS_MIN = 5
+_CONTRADICTION_SIGMA = 6.0
 _CHANNELS = ("row", "width", "spacing")
 
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A target that no calibration used.
+    """A target that the fit left out.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationReport:
-    """A calibration with everything that tells how far to trust it.
+    """A calibration with the diagnostics of its fit.
 
     Attributes
     ----------
@@ -108,21 +107,18 @@ class CalibrationReport:
 
     @property
     def residual_mm(self) -> Array:
-        """Range as the fit reads it minus the known range, mm, shape (n,)."""
-        return self.fit.model.range_mm(self.targets.row, self._column) - self.targets.range_mm
+        """Range by the fit minus the known range, mm, shape (n,)."""
+        model = self.fit.model
+        column = np.nan_to_num(self.targets.column, nan=model.principal_column)
+        return model.range_mm(self.targets.row, column) - self.targets.range_mm
 
     def range_sigma_mm(
         self, row: ArrayLike, sigma_row: ArrayLike = 0.0, column: ArrayLike | None = None
     ) -> Array:
-        """Give the standard deviation of a range by its row, mm: fit and centroid together."""
+        """Return the standard deviation of a range by its row, mm: fit and centroid together."""
         model = self.fit.model
         own = self.fit.range_sigma_mm(model.range_mm(row, column), column)
         return np.hypot(own, model.range_sigma_mm(row, sigma_row, column))
-
-    @property
-    def _column(self) -> Array:
-        """Where the targets stand; the principal column where unknown."""
-        return np.nan_to_num(self.targets.column, nan=self.fit.model.principal_column)
 
 
 def calibrate(
@@ -135,7 +131,7 @@ def calibrate(
     robust: bool | None = None,
     date: str | None = None,
 ) -> CalibrationReport:
-    """Fit a build to targets and judge the result.
+    """Fit a build to targets and diagnose the result.
 
     Parameters
     ----------
@@ -152,8 +148,8 @@ def calibrate(
         Standard deviations instead of `PRIOR_SIGMA`, for parameters that are free; infinity for
         no prior.
     robust : bool, optional
-        Whether targets that do not follow the curve are found and left out; needs five targets.
-        By default with ``joint`` alone.
+        Find targets that do not follow the curve and leave them out; needs five targets. By
+        default with ``joint`` alone.
     date : str, optional
         ISO date for the file.
 
@@ -167,24 +163,39 @@ def calibrate(
         When an argument is out of bounds, a target off the sensor, or two targets are the same.
     FitError
         When the targets do not determine the parameters or contradict each other.
+
+    Examples
+    --------
+    >>> from eschorty_ros.core.calibration import Targets, calibrate
+    >>> from eschorty_ros.core.optics import load_calibration
+    >>> posts = Targets(row=[87.9, 246.1, 395.6, 545.0], range_mm=[850.0, 1000.0, 1200.0, 1500.0])
+    >>> report = calibrate(posts, load_calibration("config_3"), "paper")
+    >>> report.calibration.parameters_fitted
+    ('k_prime_px', 'b_prime_px')
+    >>> print(report.verdicts[0], report.range_sigma_mm(row=360.0, sigma_row=0.3).round(2))
+    identifiable 0.49
     """
     design = nominal.model()
     names = checked_free(_free(method, free, targets))
     priors = _priors(method, prior_sigma, names, design)
     check_targets(targets, design, names)
-    refuse_pairs(targets, design)
-    refuse_unknowable(targets, names)
+    _refuse_pairs(targets, design)
+    _refuse_undetermined(targets, names)
     used = np.ones(len(targets), dtype=bool)
     rejected: tuple[Rejected, ...] = ()
     if _wants_rejection(method, robust, len(targets)):
         used, rejected = _rejection(targets, design, names, priors)
     kept = targets.select(used)
     found = fit(kept, design, names, prior_sigma=priors)
-    said = verdicts(kept, design, found)
+    lines = verdicts(kept, design, found)
     if rejected:
-        names_left_out = listed([entry.label for entry in rejected[:LISTED]], len(rejected))
-        said = (*said, f"{len(rejected)} of {len(targets)} targets rejected: {names_left_out}")
-    residual, alone = _residuals(targets, used, design, found)
+        labels = listed([entry.label for entry in rejected[:LISTED]], len(rejected))
+        lines = (*lines, f"{len(rejected)} of {len(targets)} targets rejected: {labels}")
+    residual = Observed.of(targets, design, names).residual(found.values)
+    # A target that was left out may lie in front of the focal line of the others' curve.
+    residual_px = np.full(len(targets), np.nan) if residual is None else residual[:, 0]
+    alone_px = residual_px.copy()
+    alone_px[used] = leave_one_out_px(kept, design, found)
     return CalibrationReport(
         calibration=_calibration(nominal, found, kept, method, date),
         nominal=nominal,
@@ -192,12 +203,12 @@ def calibrate(
         targets=targets,
         used=used,
         fit=found,
-        residual_px=residual,
-        leave_one_out_px=alone,
+        residual_px=residual_px,
+        leave_one_out_px=alone_px,
         rejected=rejected,
         profile=k_profile(kept, design, found),
         prior_ratio=prior_ratios(found),
-        verdicts=said,
+        verdicts=lines,
     )
 
 
@@ -231,20 +242,71 @@ def _priors(
     return {name: spread for name, spread in priors.items() if spread != math.inf}
 
 
-def _wants_rejection(method: Method, robust: bool | None, size: int) -> bool:
-    if robust and size < TARGETS_MIN:
-        raise ArgumentError(
-            f"robust is True with {size} targets; give {TARGETS_MIN} or more, or leave it out"
+def _refuse_pairs(targets: Targets, design: RangeModel) -> None:
+    """Refuse the same target twice, and two that exclude each other.
+
+    Both are neighbours when the targets are sorted by range, then by row.
+    """
+    place = np.nan_to_num(targets.column, nan=-1.0)
+    rows_per_mm = -design.product_mm_px / (targets.range_mm + design.b_mm) ** 2
+    sigma = np.hypot(targets.sigma_row_px, rows_per_mm * targets.sigma_range_mm)
+    for same, other in (("range_mm", "row"), ("row", "range_mm")):
+        order = np.lexsort((getattr(targets, other), place, getattr(targets, same)))
+        one, next_one = order[:-1], order[1:]
+        twin = (getattr(targets, same)[one] == getattr(targets, same)[next_one]) & (
+            place[one] == place[next_one]
         )
-    return robust if robust is not None else method == "joint" and size >= TARGETS_MIN
+        for i, j in zip(one[twin], next_one[twin], strict=True):
+            apart = abs(targets.row[i] - targets.row[j]) + rows_per_mm[i] * abs(
+                targets.range_mm[i] - targets.range_mm[j]
+            )
+            pair = f"targets {targets.labels[i]} and {targets.labels[j]}"
+            where = f"row {targets.row[i]:g} and range_mm {targets.range_mm[i]:g}"
+            if apart == 0.0:
+                raise ArgumentError(f"{pair} are the same, {where}; remove one")
+            if apart > _CONTRADICTION_SIGMA * math.hypot(sigma[i], sigma[j]):
+                raise FitError(
+                    f"{pair} contradict each other: {where} against row {targets.row[j]:g} and "
+                    f"range_mm {targets.range_mm[j]:g}, {apart:.1f} px apart; correct one"
+                )
+
+
+def _refuse_undetermined(targets: Targets, names: tuple[str, ...]) -> None:
+    distinct = np.unique(targets.range_mm).size
+    if distinct < 2:
+        raise FitError(
+            f"range_mm holds {distinct} different ranges (condition number inf); give targets at "
+            "2 different ranges or more"
+        )
+    if set(names) == {WIDTH_BIAS}:
+        raise ArgumentError(
+            f"free is {WIDTH_BIAS} alone, which is no part of a build; add parameters"
+        )
+    if {"k_mm", "k_prime_px"} <= set(names) and not targets.lateral:
+        raise FitError(
+            "k_mm and k_prime_px are both free without sizes (condition number inf): ranges show "
+            "only their product; give sizes or spacings of targets, or fix k_mm"
+        )
+    if WIDTH_BIAS in names and not targets.has_width.any():
+        raise FitError(
+            f"{WIDTH_BIAS} is free without sizes (condition number inf); give width_px and size_mm "
+            "of targets, or fix it"
+        )
+
+
+def _wants_rejection(method: Method, robust: bool | None, size: int) -> bool:
+    if robust and size < _ROBUST_TARGETS_MIN:
+        raise ArgumentError(
+            f"robust is True with {size} targets; give {_ROBUST_TARGETS_MIN} or more, or leave it "
+            "out"
+        )
+    return robust if robust is not None else method == "joint" and size >= _ROBUST_TARGETS_MIN
 
 
 def _rejection(
     targets: Targets, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
 ) -> tuple[NDArray[np.bool_], tuple[Rejected, ...]]:
-    observed = Observed.of(targets, design)
-    if not {"k_mm", WIDTH_BIAS} & set(names):
-        observed = observed.rows_only()
+    observed = Observed.of(targets, design, names)
     kept, distance = inliers(observed, design, names, priors)
     rejected = []
     for index in np.flatnonzero(~kept).tolist():
@@ -253,23 +315,12 @@ def _rejection(
             Rejected(
                 index,
                 targets.labels[index],
-                f"{_CHANNELS[channel]} {observed.seen[index, channel]:.1f} px at "
+                f"{_CHANNELS[channel]} {observed.measured[index, channel]:.1f} px at "
                 f"{targets.range_mm[index]:.0f} mm lies {abs(distance[index, channel]):.1f} sigma "
                 "from the curve of the others",
             )
         )
     return kept, tuple(rejected)
-
-
-def _residuals(
-    targets: Targets, used: NDArray[np.bool_], design: RangeModel, found: CalibrationFit
-) -> tuple[Array, Array]:
-    seen = Observed.of(targets, design).residual(found.values)
-    # A target that was left out lies in front of the focal line of the others' curve.
-    residual = np.full(len(targets), np.nan) if seen is None else seen[:, 0]
-    alone = residual.copy()
-    alone[used] = leave_one_out_px(targets.select(used), design, found)
-    return residual, alone
 
 
 def _calibration(

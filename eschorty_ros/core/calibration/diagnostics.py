@@ -1,4 +1,4 @@
-"""How far a calibration can be trusted: leave-one-out, profile of k, share of the priors."""
+"""Diagnostics of a fit: leave-one-out, profile of k, share of the priors, verdicts."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ import numpy as np
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
-from eschorty_ros.core.calibration._model import COLUMN_TERMS, WIDTH_BIAS, Observed
-from eschorty_ros.core.calibration._solvers import Problem, solve
 from eschorty_ros.core.calibration.fit import (
     CONDITION_WARNING,
     PRIOR_SIGMA,
     CalibrationFit,
     fit,
+    solve,
 )
+from eschorty_ros.core.calibration.residuals import COLUMN_TERMS, WIDTH_BIAS, Observed, Problem
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
-PRIOR_SHARE = math.sqrt(0.5)
-"""Above this ratio of standard deviations a prior tells more than the targets."""
-RESIDUAL_SIGMA = 3.0
 LISTED = 4
 """Targets that a verdict names."""
+# Above this ratio of standard deviations a prior determines more than the targets.
+_PRIOR_SHARE = math.sqrt(0.5)
+_RESIDUAL_SIGMA = 3.0
 _MARGIN = 0.05
 _FAR_SHARE = 0.25
-# Of Gaussian errors.
+# Share of Gaussian errors beyond three sigma.
 _SHARE_BEYOND = 0.0027
 _PROFILE_POINTS = 41
 _PROFILE_SIGMA = 4.0
 _CHI_SQUARE_95 = 3.841
+# A fit in a thousand has a larger chi-square.
 _RARE = 1e-3
 
 
@@ -54,21 +55,20 @@ class KProfile:
 
 
 def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KProfile | None:
-    """Profile likelihood of k within four standard deviations.
+    """Return the profile likelihood of k within four standard deviations.
 
-    ``None`` where k was fixed, or no k lets the other parameters be found.
+    ``None`` where k was fixed, or the other parameters are not determined for any k.
     """
     if "k_mm" not in found.free:
         return None
-    at = found.free.index("k_mm")
-    half = _PROFILE_SIGMA * math.sqrt(found.covariance[at, at])
+    half = _PROFILE_SIGMA * found.sigmas["k_mm"]
     # At a k of 0 or less there is no build.
     low = max(found.model.k_mm - half, 0.1 * found.model.k_mm)
     k_mm = np.linspace(low, found.model.k_mm + half, _PROFILE_POINTS)
     free = tuple(name for name in found.free if name != "k_mm")
     priors = {name: value for name, value in found.prior_sigma.items() if name != "k_mm"}
     chi_square = np.full(k_mm.size, np.nan)
-    observed = Observed.of(targets, design)
+    observed = Observed.of(targets, design, found.free)
     for index, value in enumerate(k_mm.tolist()):
         try:
             problem, values = solve(observed, replace(design, k_mm=value), free, priors)
@@ -83,32 +83,31 @@ def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KP
 
 
 def _interval(k_mm: Array, delta: Array) -> tuple[float, float]:
+    """Return where the profile crosses its 95 % level below and above its minimum."""
     best = int(np.nanargmin(delta))
-    low, high = -math.inf, math.inf
-    for index in range(best, 0, -1):
-        if delta[index - 1] > _CHI_SQUARE_95:
-            low = float(np.interp(_CHI_SQUARE_95, delta[[index, index - 1]],
-                                  k_mm[[index, index - 1]]))  # fmt: skip
-            break
-    for index in range(best, k_mm.size - 1):
-        if delta[index + 1] > _CHI_SQUARE_95:
-            high = float(np.interp(_CHI_SQUARE_95, delta[[index, index + 1]],
-                                   k_mm[[index, index + 1]]))  # fmt: skip
-            break
-    return low, high
+    ends = []
+    for side, open_end in (
+        (np.arange(best, -1, -1), -math.inf),
+        (np.arange(best, k_mm.size), math.inf),
+    ):
+        above = np.flatnonzero(delta[side] > _CHI_SQUARE_95)
+        if above.size:
+            crossing = side[above[0] - 1 : above[0] + 1]
+            ends.append(float(np.interp(_CHI_SQUARE_95, delta[crossing], k_mm[crossing])))
+        else:
+            ends.append(open_end)
+    return ends[0], ends[1]
 
 
 def leave_one_out_px(targets: Targets, design: RangeModel, found: CalibrationFit) -> Array:
-    """Row of each target minus the row that the others predict, shape (n,).
+    """Return the row of each target minus the row that the others predict, shape (n,).
 
     By the leverage of each target, which is exact where the model is linear. NaN where the others
     do not determine the parameters.
     """
-    observed = Observed.of(targets, design)
-    if not np.isfinite(found.lateral_residual_px).any():
-        observed = observed.rows_only()
+    observed = Observed.of(targets, design, found.free)
     problem = Problem(observed, design, found.free, found.prior_sigma, found.values)
-    white = problem.distance(found.values)
+    white = problem.whitened(found.values)
     left = np.eye(white.shape[1]) - problem.leverage(found.values, found.covariance)
     alone = np.linalg.eigvalsh(left)[:, 0] < 1e-9
     left[alone] = np.eye(white.shape[1])
@@ -118,15 +117,14 @@ def leave_one_out_px(targets: Targets, design: RangeModel, found: CalibrationFit
 
 
 def prior_ratios(found: CalibrationFit) -> dict[str, float]:
-    """Posterior over prior standard deviation of each parameter that has a prior."""
-    sigma = dict(zip(found.free, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
-    return {name: sigma[name] / spread for name, spread in found.prior_sigma.items()}
+    """Return posterior over prior standard deviation of each parameter that has a prior."""
+    return {name: found.sigmas[name] / spread for name, spread in found.prior_sigma.items()}
 
 
 def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tuple[str, ...]:
-    """One line each: ``identifiable`` where it is, then every reservation with its remedy."""
+    """Return ``identifiable`` where it is, then a line for every reservation with its remedy."""
     ratios = prior_ratios(found)
-    held = {name: ratio for name, ratio in ratios.items() if ratio > PRIOR_SHARE}
+    held = {name: ratio for name, ratio in ratios.items() if ratio > _PRIOR_SHARE}
     lines = []
     if found.condition_number <= CONDITION_WARNING and found.dof > 0 and not held:
         lines.append("identifiable")
@@ -137,8 +135,8 @@ def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tup
             f"sigma of {found.prior_sigma[name]:g}{_remedy(name)}"
         )
     for name, spread in found.prior_sigma.items():
-        pull = (found.values[name] - _centre(design, name)) / spread
-        if abs(pull) > RESIDUAL_SIGMA:
+        pull = (found.values[name] - getattr(design, name, 0.0)) / spread
+        if abs(pull) > _RESIDUAL_SIGMA:
             lines.append(
                 f"{name} lies {abs(pull):.1f} prior sigmas from the design; check the nominal "
                 "build or widen its prior"
@@ -155,12 +153,8 @@ def _remedy(name: str) -> str:
     return "; spread the targets over the range"
 
 
-def _centre(design: RangeModel, name: str) -> float:
-    return 0.0 if name == WIDTH_BIAS else float(getattr(design, name))
-
-
 def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[str]:
-    """Say when known sizes contradict a k that stayed as designed."""
+    """Return a line when known sizes contradict a k that stayed as designed."""
     if "k_mm" in found.free or not targets.lateral:
         return []
     names, priors = ["k_mm", *found.free], dict(found.prior_sigma)
@@ -171,9 +165,9 @@ def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[
         freed = fit(targets, design, names, prior_sigma=priors)
     except FitError:
         return []
-    k_mm, sigma = freed.model.k_mm, math.sqrt(freed.covariance[0, 0])
+    k_mm, sigma = freed.model.k_mm, freed.sigmas["k_mm"]
     away = abs(k_mm - design.k_mm) / sigma
-    if away <= RESIDUAL_SIGMA:
+    if away <= _RESIDUAL_SIGMA:
         return []
     return [
         f"sizes contradict k_mm: they say {k_mm:.3f} with a sigma of {sigma:.3f}, {away:.1f} sigma "
@@ -182,7 +176,7 @@ def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[
 
 
 def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:
-    """Say where the sensor sees farther or nearer than the targets, and how they are laid out."""
+    """Return lines about ranges that the targets do not cover or cover too thinly."""
     model, lines = found.model, []
     first, last = float(targets.row.min()), float(targets.row.max())
     margin = _MARGIN * model.rows
@@ -217,22 +211,22 @@ def _residuals(targets: Targets, found: CalibrationFit) -> list[str]:
             "targets or state larger sigmas"
         )
     ratio = np.abs(found.residual_px) / found.sigma_px
-    beyond = np.flatnonzero(ratio > RESIDUAL_SIGMA)
+    beyond = np.flatnonzero(ratio > _RESIDUAL_SIGMA)
     by_chance = _SHARE_BEYOND * len(targets)
-    if beyond.size > by_chance + RESIDUAL_SIGMA * math.sqrt(by_chance):
+    if beyond.size > by_chance + _RESIDUAL_SIGMA * math.sqrt(by_chance):
         worst = beyond[np.argsort(-ratio[beyond], kind="stable")][:LISTED].tolist()
         each = [
             f"{targets.labels[i]} {found.residual_px[i]:+.2f} px = {ratio[i]:.1f} sigma"
             for i in worst
         ]
         lines.append(
-            f"{beyond.size} of {len(targets)} targets have residuals beyond {RESIDUAL_SIGMA:g} "
+            f"{beyond.size} of {len(targets)} targets have residuals beyond {_RESIDUAL_SIGMA:g} "
             f"sigma: {listed(each, beyond.size)}; measure them again"
         )
     return lines
 
 
 def listed(first: list[str], count: int) -> str:
-    """``first`` in one line, and how many more there are."""
+    """Return ``first`` in one line, and how many more there are."""
     rest = count - len(first)
     return ", ".join(first) + (f" and {rest} more" if rest else "")

@@ -1,52 +1,40 @@
-"""Fitting the range equation to targets at known ranges (Eq. 2).
+"""Fitting the range equation (Eq. 2) to targets at known ranges.
 
 Residuals are counted in rows: there the errors are, and a far target does not outweigh the near
-ones. Sign conventions as in :class:`~eschorty_ros.core.optics.range_model.RangeModel`.
+ones. Sign conventions as in :class:`~eschorty_ros.core.optics.RangeModel`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import Array, broadcast, reals
-from eschorty_ros.core.base.errors import FitError
-from eschorty_ros.core.calibration._checks import (
-    check_targets,
-    checked_free,
-    checked_priors,
-)
-from eschorty_ros.core.calibration._least_squares import condition_number, covariance
-from eschorty_ros.core.calibration._model import (
+from eschorty_ros.core.base.arrays import Array, broadcast, positive, reals
+from eschorty_ros.core.base.errors import ArgumentError, FitError
+from eschorty_ros.core.calibration.residuals import (
     COLUMN_TERMS,
+    EVERY,
     PARAMETERS,
     WIDTH_BIAS,
     Observed,
+    Problem,
+    Values,
+    condition_number,
+    covariance,
     row_derivative,
     values_of,
 )
-from eschorty_ros.core.calibration._solvers import PAPER_FREE, Problem, build, solve
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
-__all__ = [
-    "COLUMN_TERMS",
-    "CONDITION_WARNING",
-    "K_PRIOR_SHARE",
-    "PAPER_FREE",
-    "PARAMETERS",
-    "PRIOR_SIGMA",
-    "WIDTH_BIAS",
-    "CalibrationFit",
-    "fit",
-    "fit_targets",
-]
-
 CONDITION_WARNING = 1e3
+PAPER_FREE = ("k_prime_px", "b_prime_px")
+"""What the paper fits: k and b stay at their design values."""
 PRIOR_SIGMA = {
     "k_prime_px": 3000.0,
     "b_mm": 3.0,
@@ -57,11 +45,18 @@ PRIOR_SIGMA = {
 }
 """How far a build is expected from its design; k lies within `K_PRIOR_SHARE` of it."""
 K_PRIOR_SHARE = 0.01
+_REWEIGHTINGS = 3
+_TOLERANCE = float(np.finfo(np.float64).eps)
+# A robust search only finds out which targets a least-squares fit uses.
+_START_TOLERANCE = 1e-9
+_EVALUATIONS_MAX = 500
+# Residual of an impossible build: finite, its square too, and larger than any other.
+_IMPOSSIBLE = 1e50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationFit:
-    """What a set of targets says about a build.
+    """A build fitted to targets, with its uncertainty.
 
     Attributes
     ----------
@@ -76,8 +71,6 @@ class CalibrationFit:
         Row as measured minus row as fitted.
     sigma_px : ndarray of float64, shape (n,)
         Standard deviation of each residual: row and range error together.
-    lateral_residual_px, lateral_sigma_px : ndarray of float64, shape (n, 2)
-        The same for widths and spacings; NaN where there is none or k stays fixed.
     width_bias_px : float
         Columns by which lit targets appear too wide; 0 unless fitted.
     prior_sigma : dict of str to float
@@ -97,8 +90,6 @@ class CalibrationFit:
     covariance: Array
     residual_px: Array
     sigma_px: Array
-    lateral_residual_px: Array
-    lateral_sigma_px: Array
     width_bias_px: float
     prior_sigma: dict[str, float]
     condition_number: float
@@ -116,8 +107,16 @@ class CalibrationFit:
         """Every parameter by name, fitted or not."""
         return values_of(self.model) | {WIDTH_BIAS: self.width_bias_px}
 
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviation of every fitted parameter by name."""
+        return dict(zip(self.free, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
     def range_sigma_mm(self, range_mm: ArrayLike, column: ArrayLike | None = None) -> Array:
-        """One-sigma error of a range, mm, that the fit's own uncertainty causes; any shape."""
+        """Return the standard deviation that the fit's uncertainty causes in a range, mm.
+
+        Both arguments may have any shape.
+        """
         model, p = self.model, self.values
         depth = reals("range_mm", range_mm) + model.b_mm
         depth = np.where(depth > 0.0, depth, np.nan)
@@ -132,35 +131,6 @@ class CalibrationFit:
             return np.asarray(np.sqrt(np.einsum("...i,ij,...j", slope, self.covariance, slope)))
 
 
-def fit_targets(
-    row: ArrayLike,
-    range_mm: ArrayLike,
-    design: RangeModel,
-    free: Sequence[str] = PAPER_FREE,
-    *,
-    sigma_row_px: ArrayLike = 0.3,
-    sigma_range_mm: ArrayLike = 0.0,
-    prior_sigma: Mapping[str, float] | None = None,
-) -> CalibrationFit:
-    """Weighted least squares of Eq. 2 on bare rows and ranges.
-
-    Parameters
-    ----------
-    row, range_mm : array_like of float, shape (n,)
-        Where the targets appear, px, and their ranges from the mechanical datum, mm.
-    sigma_row_px, sigma_range_mm : array_like of float, scalar or shape (n,)
-        Their standard deviations.
-    design, free, prior_sigma
-        As in `fit`, which also says what is raised.
-
-    Returns
-    -------
-    CalibrationFit
-    """
-    targets = Targets(row, range_mm, sigma_row_px, sigma_range_mm)
-    return fit(targets, design, free, prior_sigma=prior_sigma)
-
-
 def fit(
     targets: Targets,
     design: RangeModel,
@@ -168,7 +138,7 @@ def fit(
     *,
     prior_sigma: Mapping[str, float] | None = None,
 ) -> CalibrationFit:
-    """Weighted least squares of Eq. 2, and of known sizes where k is free.
+    """Fit Eq. 2 by weighted least squares, and known sizes with it where k is free.
 
     Parameters
     ----------
@@ -202,24 +172,28 @@ def fit(
     -----
     Ranges depend on k and k' only through their product, so freeing both needs sizes, spacings or
     a prior on one.
+
+    Examples
+    --------
+    >>> from eschorty_ros.core.calibration import Targets, fit
+    >>> from eschorty_ros.core.optics import RangeModel
+    >>> design = RangeModel(k_mm=24.06, k_prime_px=-36500.0, b_mm=0.0, b_prime_px=-1084.0)
+    >>> targets = Targets(row=[108.0, 352.5, 596.0], range_mm=[900.0, 1200.0, 1800.0])
+    >>> found = fit(targets, design)
+    >>> found.free
+    ('k_prime_px', 'b_prime_px')
+    >>> print(found.model.range_mm(352.0).round(1), found.range_sigma_mm(1200.0).round(2))
+    1199.7 0.28
     """
     names = checked_free(free)
     priors = checked_priors(prior_sigma, names)
     priors = {name: spread for name, spread in priors.items() if spread != math.inf}
     check_targets(targets, design, names)
-    observed = Observed.of(targets, design)
-    if not {"k_mm", WIDTH_BIAS} & set(names):
-        observed = observed.rows_only()
-    problem, values = solve(observed, design, names, priors)
-    return _result(problem, build(design, values), values[WIDTH_BIAS])
-
-
-def _result(problem: Problem, model: RangeModel, width_bias_px: float) -> CalibrationFit:
-    values = values_of(model) | {WIDTH_BIAS: width_bias_px}
-    free = problem.free(values)
-    scaled = problem.jacobian(free)
-    condition = condition_number(scaled)
-    dof = scaled.shape[0] - len(problem.names)
+    problem, values = solve(Observed.of(targets, design, names), design, names, priors)
+    model, at = build(design, values), problem.free(values)
+    jacobian = problem.jacobian(at)
+    condition = condition_number(jacobian)
+    dof = jacobian.shape[0] - len(names)
     verdicts = []
     if condition > CONDITION_WARNING:
         verdicts.append(
@@ -228,22 +202,211 @@ def _result(problem: Problem, model: RangeModel, width_bias_px: float) -> Calibr
         )
     if dof == 0:
         verdicts.append("no degrees of freedom: residuals say nothing; add targets")
-    seen, white = problem.observed.residual(values), problem.residual(free)
-    if seen is None or white is None:
+    residual, white = problem.observed.residual(values), problem.residual(at)
+    if residual is None or white is None:
         raise FitError("the targets lead to no possible build; check them")
-    known = problem.observed.known[:, 1:]
     return CalibrationFit(
         model,
-        problem.names,
-        covariance(scaled),
-        seen[:, 0],
+        names,
+        covariance(jacobian),
+        residual[:, 0],
         problem.sigma_px[:, 0],
-        np.where(known, seen[:, 1:], np.nan),
-        np.where(known, problem.sigma_px[:, 1:], np.nan),
-        width_bias_px,
-        problem.priors,
+        values[WIDTH_BIAS],
+        priors,
         condition,
         dof,
         math.fsum(white * white),
         tuple(verdicts),
     )
+
+
+def solve(
+    observed: Observed, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
+) -> tuple[Problem, Values]:
+    """Return the problem and the parameters of its smallest sum of squares.
+
+    Raises
+    ------
+    FitError
+        When the targets do not determine the parameters.
+    """
+    closed = set(names) == set(PAPER_FREE) and not priors and not observed.known[:, 1:].any()
+    values = values_of(design)
+    # A range error weighs with the slope of the curve, which the fit has yet to find.
+    for _ in range(1 + _REWEIGHTINGS * bool(observed.sigma_range_mm.any())):
+        problem = Problem(observed, design, names, priors, values)
+        if not names:
+            return problem, values
+        refuse_singular(problem, values)
+        if closed:
+            values = _straight_line(observed, problem.sigma_px[:, 0], design)
+        else:
+            values = search(problem, values)
+        build(design, values)
+    return problem, values
+
+
+def _straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Values:
+    """Row = K x - b' on x = 1 / (R + b), centred: one column of condition 1."""
+    rows = observed.measured[:, 0]
+    x = 1.0 / (observed.range_mm + design.b_mm)
+    weight = 1.0 / (sigma * sigma)
+    total = math.fsum(weight)
+    x_mean, row_mean = math.fsum(weight * x) / total, math.fsum(weight * rows) / total
+    u, v = (x - x_mean) / sigma, (rows - row_mean) / sigma
+    length = math.sqrt(math.fsum(u * u))
+    product = math.fsum((u / length) * v) / length
+    # What rounding left in the means comes back through the mean residual.
+    rest = math.fsum(weight * (rows - row_mean - product * (x - x_mean))) / total
+    return values_of(design) | {
+        "k_prime_px": product / design.k_mm,
+        "b_prime_px": product * x_mean - row_mean - rest,
+    }
+
+
+def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -> Values:
+    """Return the values of the smallest sum of squares, from ``start`` on.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : Values
+    cauchy_scale : float, optional
+        Residuals of targets count by Cauchy's loss beyond this many standard deviations; those of
+        priors stay squared.
+
+    Raises
+    ------
+    FitError
+        When the search does not converge.
+    """
+    # Importing it takes 0.3 s, which only a calibration has to spend.
+    from scipy.optimize import least_squares
+
+    robust = cauchy_scale is not None
+    tolerance = _START_TOLERANCE if robust else _TOLERANCE
+    targets = int(problem.observed.known.sum())
+
+    def residual(free: Array) -> Array:
+        found = problem.residual(free)
+        return np.full(targets + len(problem.priors), _IMPOSSIBLE) if found is None else found
+
+    def loss(square: Array) -> Array:
+        rho = np.stack([square, np.ones_like(square), np.zeros_like(square)])
+        softened = 1.0 + square[:targets]
+        rho[:, :targets] = np.log(softened), 1.0 / softened, -1.0 / softened**2
+        return rho
+
+    begin = problem.free(start)
+    found = least_squares(
+        residual,
+        begin,
+        problem.jacobian,
+        method="trf" if robust else "lm",
+        x_scale="jac",
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance,
+        loss=loss if robust else "linear",
+        f_scale=cauchy_scale or 1.0,
+        max_nfev=_EVALUATIONS_MAX,
+    )
+    if not found.success:
+        condition = condition_number(problem.jacobian(begin))
+        raise FitError(
+            f"the search for {', '.join(problem.names)} does not end (condition number "
+            f"{condition:.3g}); add targets at other ranges or a prior_sigma"
+        )
+    return problem.values(found.x)
+
+
+def build(design: RangeModel, values: Values) -> RangeModel:
+    """Return the build with these parameters.
+
+    Raises
+    ------
+    FitError
+        When there is no such build.
+    """
+    try:
+        named: dict[str, Any] = {name: values[name] for name in (*PARAMETERS, *COLUMN_TERMS)}
+        return replace(design, **named)
+    except ArgumentError as error:
+        raise FitError(f"the targets lead to no possible build: {error}; check them") from error
+
+
+def refuse_singular(problem: Problem, values: Mapping[str, float]) -> None:
+    """Raise FitError with cause and remedy where the scaled Jacobian lacks rank."""
+    observed, names, priors = problem.observed, set(problem.names), set(problem.priors)
+    rows, ranges = observed.measured[:, 0], observed.range_mm
+    if rows.size > 1 and np.ptp(rows) == 0.0 and np.ptp(ranges) > 0.0:
+        raise FitError(
+            f"row is {rows[0]:g} for all {rows.size} targets (condition number inf); "
+            "give targets whose rows move with their range"
+        )
+    condition = condition_number(problem.jacobian(problem.free(values)))
+    if math.isfinite(condition):
+        return
+    sized = bool(observed.known[:, 1:].any())
+    if {"k_mm", "k_prime_px"} <= names and not sized and not {"k_mm", "k_prime_px"} & priors:
+        remedy = (
+            "ranges show only the product k_mm k_prime_px: give sizes or spacings of targets, "
+            "fix one or give it a prior_sigma"
+        )
+    elif WIDTH_BIAS in names - priors and not sized:
+        remedy = "only targets of known size show a width bias: give sizes or fix width_bias_px"
+    else:
+        remedy = f"give targets at {max(len(names - priors), 2)} different ranges or more"
+    raise FitError(
+        f"free is {', '.join(problem.names)} and range_mm holds {np.unique(ranges).size} different "
+        f"ranges: singular, condition number {condition:g}; {remedy}"
+    )
+
+
+def check_targets(targets: Targets, design: RangeModel, names: tuple[str, ...]) -> None:
+    """Refuse no targets, and targets off the sensor or behind the focal line, by name."""
+    if not len(targets):
+        raise FitError("there are 0 targets (condition number inf); give targets at known ranges")
+    off = (targets.row < -0.5) | (targets.row > design.rows - 0.5)
+    if off.any():
+        at = int(np.flatnonzero(off)[0])
+        raise ArgumentError(
+            f"row of target {targets.labels[at]} is {targets.row[at]:g}; the sensor has rows 0 to "
+            f"{design.rows - 1}"
+        )
+    behind = targets.range_mm + design.b_mm <= 0.0
+    if behind.any():
+        raise ArgumentError(
+            f"range_mm is {targets.range_mm[behind][0]:g}; choose ranges beyond -b_mm = "
+            f"{-design.b_mm:g} mm"
+        )
+    if set(COLUMN_TERMS) & set(names) and np.isnan(targets.column).any():
+        at = int(np.flatnonzero(np.isnan(targets.column))[0])
+        raise ArgumentError(
+            f"column of target {targets.labels[at]} is unknown; give the column of every target "
+            f"or fix {' and '.join(COLUMN_TERMS)}"
+        )
+
+
+def checked_free(free: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of free parameters; ArgumentError for an unknown or repeated one."""
+    names = tuple(free) if isinstance(free, list | tuple) else (free,)
+    known = all(isinstance(name, str) and name in EVERY for name in names)
+    if not (names and known and len(set(names)) == len(names)):
+        raise ArgumentError(f"free is {free!r}; name each once, of {', '.join(EVERY)}")
+    return names
+
+
+def checked_priors(
+    prior_sigma: Mapping[str, float] | None, names: tuple[str, ...]
+) -> dict[str, float]:
+    """Return the priors' standard deviations; ArgumentError for one of no free parameter."""
+    if not isinstance(prior_sigma, Mapping | None):
+        raise ArgumentError(f"prior_sigma is {prior_sigma!r}; give a number for each name")
+    priors = dict(prior_sigma or {})
+    for name, spread in priors.items():
+        if name not in names:
+            raise ArgumentError(f"prior_sigma names {name!r}; free is {', '.join(names)}")
+        if spread != math.inf:
+            positive(f"prior_sigma of {name}", spread)
+    return priors

@@ -7,22 +7,21 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import number, positive, reals, whole, whole_vector
+from eschorty_ros.core.base.arrays import number, reals, whole
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.post_finder import COLUMNS_MIN, GRID_SIGMA_PX
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.line import SIGMA_FLOOR_PX
-from eschorty_ros.core.optics import PIXELS_MAX
 from eschorty_ros.core.reconstruction import Profiles
 
-SIGMA_STAGE_MM = 0.01
-"""How well an encoder tells where the target is."""
+# Standard deviation of a stage position by the encoder.
+_SIGMA_STAGE_MM = 0.01
 _NEAREST_MM = 1.0
 _SEEN_SHARE = 0.5
 _OUTLIER_PX = 4.0
 _PAIRED_MAX = 300
+# A moving line is seen late by this much; the other way round on the way back.
 _LATE_PX = 0.23
-"""A moving line is seen late by this much; the other way round on the way back."""
 
 
 def moving_target(
@@ -31,8 +30,6 @@ def moving_target(
     range_at_zero_mm: float,
     *,
     range_per_stage: float = 1.0,
-    sigma_stage_mm: float = SIGMA_STAGE_MM,
-    columns: tuple[int, int] | None = None,
     blocks: int = 1,
 ) -> Targets:
     """Turn every profile of a moving flat target into a target of known range.
@@ -48,24 +45,20 @@ def moving_target(
         Stage position at each point's time, as ``StageTrack.position_mm`` gives it; points with
         NaN are left out.
     range_at_zero_mm : float
-        Range of the target with the stage at 0.
+        Range of the target with the stage at 0. Its error moves all targets alike: it is an error
+        of ``b`` that no number of profiles shows.
     range_per_stage : float
         Range gained per stage travel: 1 when the stage moves the target away along the sheet,
         -1 towards the sensor, the cosine of the angle in between.
-    sigma_stage_mm : float
-        Standard deviation of a stage position. An error of ``range_at_zero_mm`` moves all targets
-        alike: it is ``b``, and no number of profiles shows it.
-    columns : tuple of int, optional
-        First and last column of the target; by default those seen in half of the profiles.
     blocks : int
-        Targets per profile, side by side: with several the fit can tell how ``b'`` varies along
-        the line.
+        Targets per profile, side by side: several determine how ``b'`` varies along the line.
 
     Returns
     -------
     Targets
-        By time, then column; ``label`` is the stage position in mm. Profiles that are more than
-        4 px off what the others say, or show the target in few columns, are left out.
+        By time, then column, in the columns that half of the profiles show; ``label`` is the stage
+        position in mm. Profiles more than 4 px off the line through the others, or with the target
+        in few columns, are left out.
 
     Raises
     ------
@@ -83,15 +76,10 @@ def moving_target(
     number("range_at_zero_mm", range_at_zero_mm)
     if number("range_per_stage", range_per_stage, -1.0, 1.0) == 0.0:
         raise ArgumentError("range_per_stage is 0; the stage must change the target's range")
-    positive("sigma_stage_mm", sigma_stage_mm)
     whole("blocks", blocks, 1, 64)
-    if columns is not None:
-        ends = whole_vector("columns", columns, np.int64, 0, PIXELS_MAX)
-        if ends.size != 2 or ends[0] > ends[1]:
-            raise ArgumentError(f"columns is {columns!r}; give the first and the last one")
     used = np.isfinite(position) & np.isfinite(profiles.row) & (profiles.return_index == 0)
     profiles, position = profiles.select(used), position[used]
-    low, high = columns if columns is not None else _seen_columns(profiles)
+    low, high = _seen_columns(profiles)
     inside = (profiles.column >= low) & (profiles.column <= high)
     profiles, position = profiles.select(inside), position[inside]
     if high - low + 1 < COLUMNS_MIN * blocks:
@@ -102,15 +90,15 @@ def moving_target(
     block = (profiles.column.astype(np.int64) - low) * blocks // (high - low + 1)
     _, period = np.unique(profiles.edge_us, return_inverse=True)
     group = period * blocks + block
-    return _measured(profiles, position, group, range_at_zero_mm, range_per_stage, sigma_stage_mm)
+    return _measured(profiles, position, group, range_at_zero_mm, range_per_stage)
 
 
 def _seen_columns(profiles: Profiles) -> tuple[int, int]:
-    """First and last column in which half of the profiles show something."""
+    """Return the first and last column in which half of the profiles show something."""
     seen = np.bincount(profiles.column)
     often = np.flatnonzero(seen >= max(_SEEN_SHARE * profiles.profile_count, 1.0))
     if not often.size:
-        raise FitError("no column shows a target in half of the profiles; give its columns")
+        raise FitError("no column shows a target in half of the profiles; check laser and focus")
     return int(often[0]), int(often[-1])
 
 
@@ -120,9 +108,8 @@ def _measured(
     group: NDArray[np.int64],
     range_at_zero_mm: float,
     range_per_stage: float,
-    sigma_stage_mm: float,
 ) -> Targets:
-    """One target for each group of points with enough columns that agree."""
+    """Return a target for each group of points with enough columns that agree."""
     order = np.lexsort((profiles.row, group))
     group, row, position = group[order], profiles.row[order], position[order]
     column = profiles.column[order].astype(np.float64)
@@ -152,7 +139,7 @@ def _measured(
         row=centre[enough],
         range_mm=range_mm,
         sigma_row_px=np.hypot(scatter, math.hypot(GRID_SIGMA_PX, _LATE_PX))[enough],
-        sigma_range_mm=sigma_stage_mm * math.fabs(range_per_stage),
+        sigma_range_mm=_SIGMA_STAGE_MM * math.fabs(range_per_stage),
         column=mean(column)[enough],
         labels=[f"stage {mm:.3f} mm" for mm in at_mm.tolist()],
     )

@@ -1,4 +1,4 @@
-"""Posts in an aggregated frame: where each one is, how wide, and how surely."""
+"""Posts in an aggregated frame: their rows, columns and widths with standard deviations."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import Array, number, whole
+from eschorty_ros.core.base.arrays import Array, number
 from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
 from eschorty_ros.core.line import HALF_WIDTH_PER_FWHM, SIGMA_FLOOR_PX
 
-LINE_WIDTH_PX = 20.0
 COLUMNS_MIN = 8
+"""Columns of the narrowest target; a narrower run is no post."""
 _ROW_JUMP_PX = 4.0
 _GAP_COLUMNS = 2
 _INNER = 0.6
@@ -21,10 +21,12 @@ _SIGNIFICANCE = 6.0
 _CENTRING_STEPS = 12
 _HOT_SHARE, _HOT_COUNTS = 2.0, 10.0
 GRID_SIGMA_PX = 0.15
-"""What the pixels' grid hides of a resting line in all columns alike: 0.05 px RMS with the noise of
-simulated pixels, 0.3 px without any."""
+"""Error of a resting line's row that the pixels' grid causes in all columns alike.
+
+It is 0.05 px RMS with the noise of simulated pixels, 0.3 px without any.
+"""
+# A column sees the post or does not: an edge between two columns is known to this.
 _EDGE_SIGMA_PX = 12.0**-0.5
-"""A column sees the post or does not: an edge between two columns is known to this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +38,7 @@ class Post:
     column, row : float
         Its middle between the two edges, and the line's row there, px.
     sigma_row : float
-        Standard deviation of ``row``, px: the scatter of its columns, and what the pixels' grid
-        hides from all of them alike.
+        Standard deviation of ``row``, px: the scatter of its columns and `GRID_SIGMA_PX`.
     width_px, sigma_width_px : float
         Columns between its edges, where the counts fall to half of the plateau.
     events : int
@@ -56,17 +57,8 @@ class Post:
     row_cut: bool = False
     column_cut: bool = False
 
-    @property
-    def at_edge(self) -> bool:
-        """Whether any edge of the sensor cuts it."""
-        return self.row_cut or self.column_cut
 
-
-def find_posts(
-    frame: AggregateFrame,
-    line_width_px: float = LINE_WIDTH_PX,
-    columns_min: int = COLUMNS_MIN,
-) -> list[Post]:
+def find_posts(frame: AggregateFrame, line_width_px: float = 20.0) -> list[Post]:
     """Find runs of neighbouring columns whose line keeps its row.
 
     The row of a column is the centroid of the counts in a window around the line's densest
@@ -79,8 +71,6 @@ def find_posts(
     frame : AggregateFrame
     line_width_px : float
         Full width of the line at half maximum, rows.
-    columns_min : int
-        Narrower runs are no posts.
 
     Returns
     -------
@@ -92,15 +82,13 @@ def find_posts(
     ArgumentError
         For a width outside the sensor.
     """
-    rows, columns = frame.counts.shape
-    width = number("line_width_px", line_width_px, 0.5, rows)
-    whole("columns_min", columns_min, 1, columns)
+    width = number("line_width_px", line_width_px, 0.5, len(frame.counts))
     columns_image = _Columns(frame.counts, max(HALF_WIDTH_PER_FWHM * width, 3.0))
     posts = []
     for first, last in columns_image.runs():
-        if last - first + 1 >= columns_min:
+        if last - first + 1 >= COLUMNS_MIN:
             posts.append(columns_image.post(first, last, 0.5 * HALF_WIDTH_PER_FWHM * width))
-    return [post for post in posts if post.width_px >= columns_min]
+    return [post for post in posts if post.width_px >= COLUMNS_MIN]
 
 
 class _Columns:
@@ -126,7 +114,7 @@ class _Columns:
         self.lit = self.excess > least
 
     def _sum(self, cumulated: Array, row: Array | float) -> Array:
-        """Sum within ``half_px`` of ``row`` in every column, with parts of the outer pixels."""
+        """Return each column's sum within ``half_px`` of ``row``, outer pixels in part."""
         column = np.arange(self.columns)
         ends = []
         for end in (row - self.half_px, row + self.half_px + 1.0):
@@ -149,7 +137,7 @@ class _Columns:
         return np.clip(centre, 0.0, self.rows - 1.0)
 
     def runs(self) -> list[tuple[int, int]]:
-        """First and last column of runs that keep their row; a few dark columns are bridged."""
+        """Return first and last column of runs that keep their row, across a few dark columns."""
         runs: list[tuple[int, int]] = []
         for column in np.flatnonzero(self.lit).tolist():
             index = self._continued(runs, column)
@@ -160,7 +148,7 @@ class _Columns:
         return runs
 
     def _continued(self, runs: list[tuple[int, int]], column: int) -> int | None:
-        """Index of the run that ``column`` goes on with."""
+        """Return the index of the run that ``column`` continues."""
         for index in range(len(runs) - 1, -1, -1):
             last = runs[index][1]
             if column - last > _GAP_COLUMNS + 1:
@@ -194,7 +182,7 @@ class _Columns:
         )
 
     def _row_at(self, column: float, width: float) -> tuple[float, float]:
-        """Row in the middle and its standard deviation, from a parabola or a mean."""
+        """Return the row at ``column`` and its standard deviation, from a parabola or a mean."""
         reach = 0.5 * _INNER * width
         near = np.arange(max(round(column - reach), 0), round(column + reach) + 1)
         near = near[near < self.columns]
@@ -206,8 +194,8 @@ class _Columns:
             powers = (0, 1, 2) if seen.size >= _CURVED_MIN else (0,)
             design = np.stack([at**power for power in powers], axis=1)
             weights, *_ = np.linalg.lstsq(design, seen, rcond=None)
-            whole_at = (near - column) / max(reach, 1.0)
-            model = sum(w * whole_at**p for w, p in zip(weights, powers, strict=True))
+            all_at = (near - column) / max(reach, 1.0)
+            model = sum(w * all_at**p for w, p in zip(weights, powers, strict=True))
             freedom = max(seen.size - len(powers), 1)
             scatter = float(np.sqrt(np.sum((seen - design @ weights) ** 2) / freedom))
             scatter = max(scatter, SIGMA_FLOOR_PX)
@@ -220,7 +208,7 @@ class _Columns:
 
 
 def _without_hot_pixels(counts: NDArray[np.uint32]) -> Array:
-    """Limit each pixel to what a line through it could give, judged by its row's neighbours."""
+    """Limit each pixel's count to what a line gives by the count of its row's neighbours."""
     value = counts.astype(np.float64)
     beside = np.zeros_like(value)
     beside[:, 1:] = value[:, :-1]
@@ -234,7 +222,7 @@ def _inner(first: int, last: int) -> slice:
 
 
 def _edge(along: Array, half: float) -> tuple[float, bool]:
-    """How far from its first entry ``along`` falls below ``half`` for good; whether it is cut."""
+    """Return how far from its start ``along`` stays below ``half``, and whether it never does."""
     low = np.flatnonzero(along < half)
     for index in low.tolist():
         beyond = along[index : index + _GAP_COLUMNS + 1]

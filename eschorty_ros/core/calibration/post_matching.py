@@ -1,4 +1,4 @@
-"""Which post is which: measured posts against a list of known distances."""
+"""Matching of measured posts to a list of known distances."""
 
 from __future__ import annotations
 
@@ -7,19 +7,75 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.calibration._post_lines import KnownTarget, LineSearch
+import numpy as np
+
+from eschorty_ros.core.base.arrays import number, number_or_nan, positive
+from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.post_finder import Post
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.optics import RangeModel
 
 _HINT_COLUMNS = 20.0
 _HINT_ROWS = 30.0
+# How far kk' (a share) and b' (rows) may lie from the nominal build's.
+_SCALE_TOLERANCE = 0.15
+_OFFSET_TOLERANCE_PX = 120.0
+_SIZE_TOLERANCE = 0.3
+_ROW_TOLERANCE_PX = 3.0
+_SIGMAS = 5.0
+# Another assignment must be this many times worse, in squared shares of the tolerance.
+_CLEARLY, _CLOSE = 4.0, 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class KnownTarget:
+    """A target of known range.
+
+    Parameters
+    ----------
+    range_mm, sigma_range_mm : float
+        Range of its front along the sheet from the mechanical datum, and how well it is known.
+    size_mm : float
+        Width along the laser line; NaN when unknown.
+    column, row : float
+        Where it should be seen, px; NaN when anywhere.
+    label : str
+        Its name in messages; its range by default.
+
+    Raises
+    ------
+    ArgumentError
+        For a range or size that is not positive.
+    """
+
+    range_mm: float
+    sigma_range_mm: float = 0.0
+    size_mm: float = math.nan
+    column: float = math.nan
+    row: float = math.nan
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        positive("range_mm", self.range_mm)
+        number("sigma_range_mm", self.sigma_range_mm, 0.0)
+        for name in ("size_mm", "column", "row"):
+            number_or_nan(name, getattr(self, name))
+        if self.size_mm <= 0.0:
+            raise ArgumentError(f"size_mm is {self.size_mm!r}; choose a positive number or NaN")
+        if not isinstance(self.label, str):
+            raise ArgumentError(f"label is {self.label!r}; give a text")
+        if not self.label:
+            object.__setattr__(self, "label", f"{self.range_mm:g} mm")
+
+    @property
+    def hinted(self) -> bool:
+        """Whether the column or row where it should be seen is known."""
+        return not (math.isnan(self.column) and math.isnan(self.row))
 
 
 @dataclass(frozen=True, slots=True)
 class PostMatch:
-    """Which posts are known targets, and what fits nothing.
+    """Posts matched to known targets, and what matches nothing.
 
     Attributes
     ----------
@@ -39,7 +95,7 @@ class PostMatch:
 def match_posts(
     posts: Sequence[Post], known: Sequence[KnownTarget], nominal: RangeModel
 ) -> PostMatch:
-    """Give every known target the post it is.
+    """Find the post that every known target is.
 
     A target with a pixel hint is the post nearest to the hint. The others follow from what the
     range equation demands whatever its constants: rows are a straight line in ``1 / (R + b)``.
@@ -51,7 +107,7 @@ def match_posts(
     posts : sequence of Post
     known : sequence of KnownTarget
     nominal : RangeModel
-        The build as designed: ``kk'`` is trusted to 15 %, ``b'`` to 120 rows.
+        The build as designed: ``kk'`` holds within 15 %, ``b'`` within 120 rows.
 
     Returns
     -------
@@ -66,25 +122,19 @@ def match_posts(
     """
     if not known:
         raise ArgumentError("known is empty; give the targets' ranges")
-    reasons: dict[int, str] = {}
-    pairs = _by_hint(posts, known, reasons)
-    free_posts = [
-        i for i, post in enumerate(posts)
-        if i not in reasons and i not in {p for p, _ in pairs} and not post.row_cut
-    ]  # fmt: skip
+    pairs = _by_hint(posts, known)
+    matched = {i for i, _ in pairs}
+    free_posts = [i for i, post in enumerate(posts) if i not in matched and not post.row_cut]
     free_known = [j for j, target in enumerate(known) if not target.hinted]
     _refuse_equal_ranges([known[j] for j in free_known])
-    search = LineSearch([posts[i] for i in free_posts], [known[j] for j in free_known], nominal)
-    found = search.best()
-    pairs += [(free_posts[i], free_known[j]) for i, j in found]
+    search = _LineSearch([posts[i] for i in free_posts], [known[j] for j in free_known], nominal)
+    pairs += [(free_posts[i], free_known[j]) for i, j in search.best()]
     pairs.sort(key=lambda pair: known[pair[1]].range_mm)
-    rejected = _left_over(posts, known, pairs, reasons, search)
+    rejected = _left_over(posts, known, pairs, search)
     return PostMatch(_targets(posts, known, pairs), tuple(pairs), rejected)
 
 
-def _by_hint(
-    posts: Sequence[Post], known: Sequence[KnownTarget], reasons: dict[int, str]
-) -> list[tuple[int, int]]:
+def _by_hint(posts: Sequence[Post], known: Sequence[KnownTarget]) -> list[tuple[int, int]]:
     pairs: list[tuple[int, int]] = []
     for j, target in enumerate(known):
         if not target.hinted:
@@ -97,9 +147,7 @@ def _by_hint(
             taken = any(i == p for p, _ in pairs)
             if max(aside, above) <= 1.0 and not taken and (not best or aside + above < best[0]):
                 best = aside + above, i
-        if best is not None and posts[best[1]].row_cut:
-            reasons[best[1]] = "the sensor's edge cuts its line"
-        elif best is not None:
+        if best is not None and not posts[best[1]].row_cut:
             pairs.append((best[1], j))
     return pairs
 
@@ -118,25 +166,129 @@ def _refuse_equal_ranges(known: Sequence[KnownTarget]) -> None:
             )
 
 
+class _LineSearch:
+    """Lines ``row = slope / (R + b) + offset`` through two posts each, and the posts near them."""
+
+    def __init__(
+        self, posts: Sequence[Post], known: Sequence[KnownTarget], nominal: RangeModel
+    ) -> None:
+        self._nominal = nominal
+        self._row = np.array([post.row for post in posts])
+        self._inverse = 1.0 / (np.array([t.range_mm for t in known]) + nominal.b_mm)
+        sigma_row = np.array([post.sigma_row for post in posts])
+        slope = -nominal.product_mm_px * self._inverse**2
+        sigma_range = slope * np.array([target.sigma_range_mm for target in known])
+        spread = np.hypot(sigma_row[:, np.newaxis], sigma_range[np.newaxis, :])
+        self._tolerance = np.maximum(_SIGMAS * spread, _ROW_TOLERANCE_PX)
+        self._allowed = np.array(
+            [[_size_fits(post, target, nominal) for target in known] for post in posts], bool
+        ).reshape(len(posts), len(known))
+        self._line: tuple[float, float] | None = None
+
+    def best(self) -> list[tuple[int, int]]:
+        """Return the pairs that most posts agree with."""
+        found: dict[tuple[tuple[int, int], ...], float] = {}
+        for first, second, slope, offset in self._lines():
+            pairs = self._agreeing(slope, offset)
+            if (first not in pairs) or (second not in pairs):
+                continue
+            key = tuple(pairs)
+            found[key] = self._misfit(key)[0]
+        if not found:
+            return []
+        most = max(len(pairs) for pairs in found)
+        ranked = sorted((misfit, pairs) for pairs, misfit in found.items() if len(pairs) == most)
+        least, best = ranked[0]
+        if len(ranked) > 1 and ranked[1][0] < _CLEARLY * least + _CLOSE:
+            raise FitError(
+                f"{most} posts agree with the known ranges in more than one way; give sizes, "
+                "pixel hints, or posts at uneven distances"
+            )
+        _, slope, offset = self._misfit(best)
+        self._line = slope, offset
+        return list(best)
+
+    def row_of(self, target: KnownTarget) -> float:
+        """Return the row of ``target`` by the line found, NaN without one."""
+        if self._line is None:
+            return math.nan
+        return self._line[0] / (target.range_mm + self._nominal.b_mm) + self._line[1]
+
+    def _lines(self) -> list[tuple[tuple[int, int], tuple[int, int], float, float]]:
+        """Return every line through two pairs that a build near the nominal one could have."""
+        low, high = (self._nominal.product_mm_px * (1.0 + side * _SCALE_TOLERANCE)
+                     for side in (1, -1))  # fmt: skip
+        candidates = np.argwhere(self._allowed)
+        lines = []
+        for k, (i, j) in enumerate(candidates):
+            others = candidates[k + 1 :]
+            rise = self._row[others[:, 0]] - self._row[i]
+            run = self._inverse[others[:, 1]] - self._inverse[j]
+            slope = np.divide(rise, run, out=np.full(rise.shape, np.nan), where=run != 0.0)
+            offset = self._row[i] - slope * self._inverse[j]
+            plausible = (low <= slope) & (slope <= high) & (others[:, 0] != i)
+            plausible &= np.abs(offset + self._nominal.b_prime_px) <= _OFFSET_TOLERANCE_PX
+            for at in np.flatnonzero(plausible).tolist():
+                pair = int(others[at, 0]), int(others[at, 1])
+                lines.append(((int(i), int(j)), pair, float(slope[at]), float(offset[at])))
+        return lines
+
+    def _agreeing(self, slope: float, offset: float) -> list[tuple[int, int]]:
+        """Return pairs within their tolerance of the line, each post and target once.
+
+        The nearest pairs are taken first.
+        """
+        away = np.abs(self._row[:, np.newaxis] - (slope * self._inverse + offset)[np.newaxis, :])
+        away = np.where(self._allowed, away / self._tolerance, np.inf)
+        pairs: list[tuple[int, int]] = []
+        posts, targets = set(), set()
+        close = np.argwhere(away <= 1.0)
+        for i, j in close[np.argsort(away[close[:, 0], close[:, 1]], kind="stable")].tolist():
+            if i not in posts and j not in targets:
+                posts.add(i)
+                targets.add(j)
+                pairs.append((i, j))
+        return sorted(pairs)
+
+    def _misfit(self, pairs: Sequence[tuple[int, int]]) -> tuple[float, float, float]:
+        """Return the mean squared share of the tolerance about the pairs' own line, and the line.
+
+        The line is its slope and offset.
+        """
+        i, j = np.array(pairs).T
+        centre = float(self._inverse[j].mean())
+        at = self._inverse[j] - centre
+        slope = float((at * self._row[i]).sum() / (at * at).sum())
+        offset = float(self._row[i].mean()) - slope * centre
+        residual = (self._row[i] - slope * self._inverse[j] - offset) / self._tolerance[i, j]
+        return float((residual**2).mean()), slope, offset
+
+
+def _size_fits(post: Post, target: KnownTarget, nominal: RangeModel) -> bool:
+    if math.isnan(target.size_mm) or post.column_cut:
+        return True
+    magnified = nominal.k_mm / (target.range_mm + nominal.b_mm)
+    expected = target.size_mm * magnified / (nominal.pixel_um * 1e-3)
+    slack = _SIZE_TOLERANCE * expected + _SIGMAS * post.sigma_width_px
+    return abs(post.width_px - expected) <= slack
+
+
 def _left_over(
     posts: Sequence[Post],
     known: Sequence[KnownTarget],
     pairs: Sequence[tuple[int, int]],
-    reasons: dict[int, str],
-    search: LineSearch,
+    search: _LineSearch,
 ) -> tuple[str, ...]:
     lines = []
+    matched, found = ({pair[side] for pair in pairs} for side in (0, 1))
     for i, post in enumerate(posts):
-        if i in {p for p, _ in pairs}:
-            continue
-        reason = reasons.get(i)
-        if reason is None and post.row_cut:
-            reason = "the sensor's edge cuts its line"
-        if reason is None:
+        if i not in matched:
             reason = "no known target belongs there"
-        lines.append(f"post at column {post.column:.0f}, row {post.row:.1f}: {reason}")
+            if post.row_cut:
+                reason = "the sensor's edge cuts its line"
+            lines.append(f"post at column {post.column:.0f}, row {post.row:.1f}: {reason}")
     for j, target in enumerate(known):
-        if j in {k for _, k in pairs}:
+        if j in found:
             continue
         row = search.row_of(target)
         if target.hinted:

@@ -6,14 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from eschorty_ros.core.base.errors import CalibrationError, FitError
-from eschorty_ros.core.calibration.posts import (
-    AggregateFrame,
-    KnownTarget,
-    PostMatch,
-    find_posts,
-    match_posts,
-    moving_target,
-)
+from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
+from eschorty_ros.core.calibration.moving_target import moving_target
+from eschorty_ros.core.calibration.post_finder import find_posts
+from eschorty_ros.core.calibration.post_matching import KnownTarget, PostMatch, match_posts
 from eschorty_ros.core.calibration.targets import Targets
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.optics import Calibration
@@ -30,7 +26,7 @@ def recorded_posts(
     nominal: Calibration,
     progress: Callable[[int, int], Any] | None = None,
 ) -> PostMatch:
-    """Find the posts in all events of a recording and tell which is which.
+    """Find the posts in all events of a recording and match them to the known targets.
 
     Parameters
     ----------
@@ -82,7 +78,7 @@ def recorded_moving_target(
     blocks: int = 1,
     progress: Callable[[int, int], Any] | None = None,
 ) -> Targets:
-    """Take every profile of a flat target that the stage moves along the range as a target.
+    """Return a target for every profile of a flat target that the stage moves along the range.
 
     Parameters
     ----------

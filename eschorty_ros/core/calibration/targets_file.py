@@ -14,7 +14,7 @@ from pathlib import Path
 from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.base.files import atomic_write
-from eschorty_ros.core.calibration.posts import KnownTarget
+from eschorty_ros.core.calibration.post_matching import KnownTarget
 from eschorty_ros.core.calibration.targets import SIGMA_ROW_PX, SIGMA_WIDTH_PX, Targets
 
 SIGMA_RANGE_MM = 1.0

@@ -6,6 +6,7 @@ from eschorty_ros.core.optics.calibration_file import (
     Calibration,
     config_file,
     load_calibration,
+    refuse_other_instrument,
     save_calibration,
 )
 from eschorty_ros.core.optics.design import design, design_for_ranges
@@ -32,5 +33,6 @@ __all__ = [
     "design",
     "design_for_ranges",
     "load_calibration",
+    "refuse_other_instrument",
     "save_calibration",
 ]

@@ -36,6 +36,13 @@ PARAMETERS = (
     "b_prime_2_px",
     "principal_column",
 )
+_OF_THE_INSTRUMENT = {
+    "name": "build",
+    "columns": "sensor columns",
+    "rows": "sensor rows",
+    "pixel_um": "pixel pitch in um",
+    "roi_px": "window that the camera reads out",
+}
 
 Positive = Annotated[float, Field(gt=0.0)]
 # A strict tuple refuses the list that YAML makes of it; its items stay strict.
@@ -189,6 +196,15 @@ def load_calibration(name_or_path: str | os.PathLike[str]) -> Calibration:
     ------
     CalibrationError
         One line naming file, key, value and remedy.
+
+    Examples
+    --------
+    >>> from eschorty_ros.core.optics import load_calibration
+    >>> build = load_calibration("config_3")
+    >>> build.k_prime_px, build.b_prime_px
+    (-37261.86, -1142.74)
+    >>> print(build.model().range_mm([0, 719]).round(1))
+    [ 784.6 2116. ]
     """
     path = _find(name_or_path)
     data = read_yaml(path, CalibrationError)
@@ -216,6 +232,28 @@ def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> 
         raise CalibrationError(f"{path}: the calibration does not survive YAML; check its texts")
     with atomic_write(path) as stream:
         stream.write(text.encode())
+
+
+def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None:
+    """Refuse a calibration that was made with another sensor, window or build.
+
+    Parameters
+    ----------
+    candidate, active : Calibration
+        The one that is to replace, and the one that is in use.
+
+    Raises
+    ------
+    CalibrationError
+        Names the first key that differs and both values.
+    """
+    for key, meaning in _OF_THE_INSTRUMENT.items():
+        theirs, ours = getattr(candidate, key), getattr(active, key)
+        if theirs != ours:
+            raise CalibrationError(
+                f"the calibration's {key} ({meaning}) is {theirs!r} and the instrument's "
+                f"{ours!r}; load one made with this instrument, or start it with the other one"
+            )
 
 
 def _is_bare_name(text: str) -> bool:

@@ -11,8 +11,13 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
-from eschorty_ros.core.calibration import Targets, refuse_other_instrument, write_targets
-from eschorty_ros.core.optics import Calibration, load_calibration, save_calibration
+from eschorty_ros.core.calibration import Targets, write_targets
+from eschorty_ros.core.optics import (
+    Calibration,
+    load_calibration,
+    refuse_other_instrument,
+    save_calibration,
+)
 from eschorty_ros.msg import ActiveCalibration as ActiveCalibrationMessage
 from eschorty_ros.nodes.reconstruction.calibration_messages import active_message
 from eschorty_ros.nodes.ros import qos

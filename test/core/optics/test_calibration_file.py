@@ -14,7 +14,13 @@ from pydantic import ValidationError
 
 from eschorty_ros.core.base import files
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
-from eschorty_ros.core.optics import BUILDS, Calibration, load_calibration, save_calibration
+from eschorty_ros.core.optics import (
+    BUILDS,
+    Calibration,
+    load_calibration,
+    refuse_other_instrument,
+    save_calibration,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 PRINTED = {
@@ -39,7 +45,7 @@ def keys() -> dict[str, Any]:
 
 
 def fitted() -> Calibration:
-    return Calibration.model_validate({**keys(), **FIT, "k_mm": 24.1})
+    return Calibration.model_validate({**keys(), **FIT, "k_mm": 24.1, "roi_px": (10, 9, 120, 40)})
 
 
 @pytest.mark.parametrize("build", BUILDS)
@@ -232,3 +238,29 @@ def test_reading_a_calibration_needs_no_ros_and_no_compiler() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"name": "config_1"}, r"name \(build\) is 'config_1' and the instrument's 'config_3'"),
+        ({"columns": 640}, "columns .* 640 .* 1280"),
+        ({"rows": 480}, "rows .* 480 .* 720"),
+        ({"pixel_um": 15.0}, "pixel_um .* 15.0 .* 4.86"),
+        ({"roi_px": (0, 100, 1280, 400)}, r"roi_px .* \(0, 100, 1280, 400\) .* None"),
+    ],
+)
+def test_a_calibration_of_another_instrument_is_refused_by_name(
+    change: dict[str, Any], words: str
+) -> None:
+    active = load_calibration("config_3")
+    refuse_other_instrument(load_calibration("config_3_as_built"), active)
+    with pytest.raises(CalibrationError, match=words):
+        refuse_other_instrument(active.model_copy(update=change), active)
+
+
+@pytest.mark.parametrize("window", [(0, 0, 1281, 720), (-1, 0, 10, 10), (0, 700, 10, 30),
+                                    (0, 0, 0, 10)])  # fmt: skip
+def test_a_window_off_the_sensor_is_refused(window: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="roi_px"):
+        Calibration.model_validate(keys() | {"roi_px": window})

@@ -1,4 +1,4 @@
-"""Which targets follow one curve: least median of squares, then Cauchy's loss, then a cut."""
+"""Targets that follow one curve: least median of squares, then Cauchy's loss, then a cut."""
 
 from __future__ import annotations
 
@@ -9,30 +9,35 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import FitError
-from eschorty_ros.core.calibration._least_squares import condition_number, covariance
-from eschorty_ros.core.calibration._model import Observed, Values, values_of
-from eschorty_ros.core.calibration._solvers import Problem, refuse_singular, search
+from eschorty_ros.core.calibration.fit import refuse_singular, search
+from eschorty_ros.core.calibration.residuals import (
+    Observed,
+    Problem,
+    Values,
+    condition_number,
+    covariance,
+    values_of,
+)
 from eschorty_ros.core.optics import RangeModel
 
 Mask = NDArray[np.bool_]
 
-TARGETS_MIN = 5
-"""With fewer targets nobody can tell which one is wrong."""
-CUT_SIGMA = 4.0
-SCALE_MAX = 10.0
-"""Beyond this many times the stated sigmas the targets contradict each other."""
+_CUT_SIGMA = 4.0
+# Beyond this many times the stated sigmas the targets contradict each other.
+_SCALE_MAX = 10.0
 # 95 % efficiency on Gaussian errors.
 _CAUCHY = 2.385
+# Median absolute deviation to standard deviation of Gaussian errors.
+_MAD = 1.4826
 _ITERATIONS = 15
 _SCALE_CONVERGED = 1e-3
 _PAIRED_MAX = 40
-_MAD = 1.4826
 
 
 def inliers(
     observed: Observed, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
 ) -> tuple[Mask, Array]:
-    """Tell the targets that one curve explains.
+    """Find the targets that one curve explains.
 
     Returns
     -------
@@ -51,52 +56,17 @@ def inliers(
     before = 0.0
     for _ in range(_ITERATIONS):
         problem = Problem(observed, design, names, priors, values)
-        scale = _scale(problem.distance(values), observed.known)
+        scale = _scale(problem.whitened(values), observed.known)
         if abs(scale - before) < _SCALE_CONVERGED * scale:
             break
         values, before = search(problem, values, cauchy_scale=_CAUCHY * scale), scale
     return _cut(observed, design, names, priors, values)
 
 
-def _cut(
-    observed: Observed,
-    design: RangeModel,
-    names: tuple[str, ...],
-    priors: Mapping[str, float],
-    values: Values,
-) -> tuple[Mask, Array]:
-    """Refit what lies within the cut until that no longer changes."""
-    every = Problem(observed, design, names, priors, values)
-    distance = every.distance(values)
-    kept = np.zeros(len(observed), dtype=bool)
-    for _ in range(_ITERATIONS):
-        # Once the wrong ones are out they no longer widen the cut.
-        better = observed.known & kept[:, None] if kept.any() else observed.known
-        scale = _scale(distance, better)
-        before, kept = kept, np.abs(distance).max(axis=1) <= CUT_SIGMA * scale
-        _refuse_chaos(kept, scale, observed)
-        if np.array_equal(kept, before):
-            break
-        part = Problem(observed.select(kept), design, names, priors, values)
-        values = search(part, values)
-        every = Problem(observed, design, names, priors, values)
-        spread = _spread(part, values)
-        distance = every.distance(values)
-        if spread is not None:
-            own = np.einsum("nii->ni", every.leverage(values, spread))
-            distance = np.where(kept[:, None], distance, distance / np.sqrt(1.0 + own))
-    return kept, distance
-
-
-def _spread(problem: Problem, values: Values) -> Array | None:
-    jacobian = problem.jacobian(problem.free(values))
-    return covariance(jacobian) if np.isfinite(condition_number(jacobian)) else None
-
-
 def _least_median(observed: Observed, design: RangeModel) -> Values:
     """Line through two targets with the smallest median residual; k and b of the design."""
     x = 1.0 / (observed.range_mm + design.b_mm)
-    rows, sigma = observed.seen[:, 0], observed.sigma[:, 0]
+    rows, sigma = observed.measured[:, 0], observed.sigma[:, 0]
     sigma = np.hypot(sigma, design.product_mm_px * x * x * observed.sigma_range_mm)
     chosen = np.argsort(x, kind="stable")
     if chosen.size > _PAIRED_MAX:
@@ -123,13 +93,43 @@ def _least_median(observed: Observed, design: RangeModel) -> Values:
     }
 
 
+def _cut(
+    observed: Observed,
+    design: RangeModel,
+    names: tuple[str, ...],
+    priors: Mapping[str, float],
+    values: Values,
+) -> tuple[Mask, Array]:
+    """Refit the targets within the cut until they are the same ones."""
+    every = Problem(observed, design, names, priors, values)
+    distance = every.whitened(values)
+    kept = np.zeros(len(observed), dtype=bool)
+    for _ in range(_ITERATIONS):
+        # Once the outliers are out they no longer widen the cut.
+        better = observed.known & kept[:, None] if kept.any() else observed.known
+        scale = _scale(distance, better)
+        before, kept = kept, np.abs(distance).max(axis=1) <= _CUT_SIGMA * scale
+        _refuse_contradictions(kept, scale, observed)
+        if np.array_equal(kept, before):
+            break
+        part = Problem(observed.select(kept), design, names, priors, values)
+        values = search(part, values)
+        every = Problem(observed, design, names, priors, values)
+        distance = every.whitened(values)
+        jacobian = part.jacobian(part.free(values))
+        if np.isfinite(condition_number(jacobian)):
+            own = np.einsum("nii->ni", every.leverage(values, covariance(jacobian)))
+            distance = np.where(kept[:, None], distance, distance / np.sqrt(1.0 + own))
+    return kept, distance
+
+
 def _scale(distance: Array, known: Mask) -> float:
-    """How much larger the residuals of the better half are than stated; at least 1."""
+    """Return how much larger the better half's residuals are than stated; at least 1."""
     return max(1.0, _MAD * float(np.median(np.abs(distance[known]))))
 
 
-def _refuse_chaos(kept: Mask, scale: float, observed: Observed) -> None:
-    if scale > SCALE_MAX:
+def _refuse_contradictions(kept: Mask, scale: float, observed: Observed) -> None:
+    if scale > _SCALE_MAX:
         raise FitError(
             f"the targets contradict each other: even the better half lies {scale:.0f} times "
             "farther from any curve than their sigmas allow; check ranges, which target is which "
