@@ -1,4 +1,4 @@
-"""The `eschorty` command."""
+"""The command `eschorty`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COMMANDS = {
     "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
     "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
     "view": "Draw a cloud, or open it in a window.",
-    "info": "Say what a file or recording holds.",
+    "info": "Show what a file or recording holds.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",
 }
@@ -36,11 +36,11 @@ class LazyGroup(click.Group):
     """Imports a command's module when the command runs, so that ``--help`` answers at once."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Command names in the order a newcomer needs them."""
+        """Return the command names in the order a newcomer needs them."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Command of that name, ``None`` when there is none."""
+        """Return the command of that name, ``None`` when there is none."""
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f"eschorty_ros.cli.{cmd_name}")
@@ -53,8 +53,8 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; stated failures become one line, Ctrl-C exit code 130."""
-        # A terminal that knows no degree sign gets a question mark.
+        """Run a command; an error of the package becomes one line, Ctrl-C exit code 130."""
+        # A terminal without a degree sign gets a question mark.
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")
@@ -63,7 +63,7 @@ class LazyGroup(click.Group):
         except EschortyError as error:
             raise StatedFailure(" ".join(str(error).split())) from error
         except BrokenPipeError:
-            # Whoever reads the output has had enough; click ends it quietly.
+            # The reader of the output closed it; click ends without a message.
             raise
         except OSError as error:
             raise StatedFailure(_unusable(error)) from error
@@ -73,7 +73,7 @@ class LazyGroup(click.Group):
 
 
 def _unusable(error: OSError) -> str:
-    """Tell which file cannot be used, and why, in one line."""
+    """Return one line that names the file and the reason."""
     if error.filename is None:
         return f"cannot go on: {error.strerror or error}; check disk and output"
     return f"cannot use {error.filename}: {error.strerror}; check the path"

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import datetime
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.calibration_sources import known, recorded
+from eschorty_ros.cli.console import pairs, progress_bar, show, table
+from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
+from eschorty_ros.core.base.errors import FitError
 
 if TYPE_CHECKING:
-    from eschorty_ros.core.calibration import Method
+    from eschorty_ros.core.calibration import CalibrationReport, KnownTarget, Method, Targets
+    from eschorty_ros.core.optics import Calibration
 
-BLOCKS = 8
-"""Targets side by side that a moving target gives when the fit asks for roll or smile."""
+# Targets side by side in a profile of a moving target when roll or smile is fitted.
+_BLOCKS = 8
 
 
 @click.command("calibrate")
@@ -120,8 +125,8 @@ def command(
     """Calibrate a build on targets at known ranges.
 
     SOURCE is a CSV file of targets or a recording folder; several count together. Writes a
-    calibration.yaml for --calibration of the other commands, and a page that shows how far to
-    trust it. When the targets do not determine the build nothing is written, and an existing
+    calibration.yaml for --calibration of the other commands, and a page with its
+    uncertainty. When the targets do not determine the build nothing is written, and an existing
     file stays.
 
     \b
@@ -141,7 +146,7 @@ def command(
     \b
     Verdicts
       identifiable        the targets determine every fitted parameter
-      prior dominates X   X comes from the design: more targets, or another spread, tell it
+      prior dominates X   X comes from the design; add targets or spread them
       extrapolates ...    ranges outside of what the targets cover are not backed by them
 
     \b
@@ -165,23 +170,20 @@ def command(
         if sources or moving is not None or free or prior or robust is not None:
             raise click.UsageError("--fake takes no SOURCE, --moving, --free, --prior or --robust")
         _check_out(out)
-        from eschorty_ros.cli.calibrate_simulated import calibrate_simulated
-
-        calibrate_simulated(known(distances, range_sigma), nominal, as_built, method, out)
+        _calibrate_simulated(_known(distances, range_sigma), nominal, as_built, method, out)
         return
     _check_usage(sources, out, distances, moving)
     priors = _priors(prior)
-    from eschorty_ros.cli.calibration_output import finish
     from eschorty_ros.core.calibration import COLUMN_TERMS, Targets, calibrate, read_targets
     from eschorty_ros.core.optics import load_calibration
 
     design = load_calibration(nominal)
     made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
     # What varies across the columns shows in several targets side by side.
-    blocks = BLOCKS if set(COLUMN_TERMS) & set(free) else 1
+    blocks = _BLOCKS if set(COLUMN_TERMS) & set(free) else 1
     targets = Targets.concatenate(
         [
-            recorded(source, design, distances, moving, range_per_stage, range_sigma, blocks)
+            _recorded(source, design, distances, moving, range_per_stage, range_sigma, blocks)
             if source.is_dir()
             else read_targets(source, sigma_row_px=row_sigma, sigma_range_mm=range_sigma)
             for source in sources
@@ -196,7 +198,7 @@ def command(
         robust=robust,
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
     )
-    finish(report, made_with, out)
+    _finish(report, made_with, out)
 
 
 def _check_usage(
@@ -221,7 +223,7 @@ def _check_out(out: Path) -> None:
 
 
 def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
-    """NAME=SIGMA as a mapping; ``none`` becomes infinity."""
+    """Return NAME=SIGMA as a mapping; ``none`` becomes infinity."""
     priors = {}
     for text in given:
         name, equals, value = text.partition("=")
@@ -232,3 +234,144 @@ def _priors(given: tuple[str, ...]) -> dict[str, float] | None:
         if not equals:
             raise click.UsageError(f"--prior is {text!r}; write NAME=SIGMA, such as b_mm=3")
     return priors or None
+
+
+def _recorded(
+    source: Path,
+    design: Calibration,
+    distances: str | None,
+    moving: float | None,
+    range_per_stage: float,
+    range_sigma: float,
+    blocks: int,
+) -> Targets:
+    """Find the targets of a recording: posts, or one target moved by the stage."""
+    from eschorty_ros.core.calibration import recorded_moving_target, recorded_posts
+    from eschorty_ros.core.storage import load_recording
+
+    recording = load_recording(source)
+    with progress_bar("reading") as report:
+
+        def progress(done: int, total: int) -> None:
+            report(done / max(total, 1), "")
+
+        if moving is not None:
+            return recorded_moving_target(
+                recording, design, moving, range_per_stage=range_per_stage, blocks=blocks,
+                progress=progress,
+            )  # fmt: skip
+        match = recorded_posts(recording, _known(distances, range_sigma), design, progress)
+    for line in match.rejected:
+        click.echo(f"left out: {line}")
+    if match.targets is None:
+        raise FitError(
+            f"--distances is {distances}; no post lies where they say, check the ranges and "
+            "--nominal"
+        )
+    return match.targets
+
+
+def _known(distances: str | None, range_sigma: float) -> list[KnownTarget]:
+    """Read the posts' ranges: a list in mm, a CSV file, or those of the simulated scene."""
+    from eschorty_ros.core.calibration import KnownTarget, read_distances
+    from eschorty_ros.core.optics import config_file
+
+    if distances is None:
+        return read_distances(config_file("posts.csv"))
+    try:
+        ranges = [float(part) for part in distances.split(",")]
+    except ValueError:
+        return read_distances(distances, sigma_range_mm=range_sigma)
+    return [KnownTarget(range_mm, range_sigma) for range_mm in ranges]
+
+
+def _finish(report: CalibrationReport, made_with: Mapping[str, str], out: Path) -> None:
+    """Write the calibration and its page; print parameters, rejected targets and verdicts."""
+    from eschorty_ros.core.base.files import atomic_write
+    from eschorty_ros.core.optics import save_calibration
+    from eschorty_ros.report.calibration_page import calibration_html
+
+    page = calibration_html(report, made_with)
+    save_calibration(report.calibration, out)
+    with atomic_write(out.with_suffix(".html")) as stream:
+        stream.write(page.encode())
+    _show(report)
+    click.echo(str(out))
+    click.echo(str(out.with_suffix(".html")))
+
+
+def _show(report: CalibrationReport) -> None:
+    from eschorty_ros.report.calibration_page import parameters
+    from eschorty_ros.report.page import number
+
+    used = int(report.used.sum())
+    made = table(
+        f"{report.calibration.id}: {used} of {len(report.targets)} targets, residual "
+        f"{number(report.calibration.residual_rms_px or 0.0)} px, reduced chi-square "
+        f"{number(report.fit.reduced_chi_square)}",
+        *("", "value", "sigma", "design", "prior sigma"),
+    )
+    for entry in parameters(report):
+        sigma = "fixed" if math.isnan(entry.sigma) else number(entry.sigma)
+        prior = "" if math.isnan(entry.prior) else number(entry.prior)
+        made.add_row(entry.name, number(entry.value), sigma, number(entry.nominal), prior)
+    show(made)
+    for left_out in report.rejected:
+        click.echo(f"rejected: {left_out.label}: {left_out.reason}")
+    for line in report.verdicts:
+        click.echo(f"verdict: {line}")
+
+
+def _calibrate_simulated(
+    known: list[KnownTarget], nominal: str, as_built: str, method: Method, out: Path
+) -> None:
+    """Run all nodes on an emulated bench that is built ``as_built``, and calibrate there.
+
+    Writes the calibration with its page, and the sum of all events as a picture; prints the range
+    errors of the design and of the calibration.
+    """
+    one_calibration = nodes_module("one_process.calibration", make="test")
+    from matplotlib.image import imsave
+
+    from eschorty_ros.core.calibration import calibrate
+    from eschorty_ros.core.optics import load_calibration
+
+    design, built = load_calibration(nominal), load_calibration(as_built)
+    with ended_by_signals(), TemporaryDirectory(prefix="eschorty_") as folder:
+        job = one_calibration.OneCalibration(
+            tuple(known), folder, calibration=nominal, as_built=as_built, method=method
+        )
+        with progress_bar("calibrating") as feedback:
+            outcome = one_calibration.calibrate_once(job, feedback)
+    if outcome.calibration is None or outcome.targets is None:
+        raise FitError(outcome.message)
+    report = calibrate(outcome.targets, design, method, date=outcome.calibration.date)
+    _finish(report, {"targets from": "nine simulated posts", "design": nominal}, out)
+    shown = {f"target {entry.label}: {entry.reason}" for entry in report.rejected}
+    for line in outcome.rejected:
+        if line not in shown:
+            click.echo(f"rejected: {line}")
+    picture = out.with_suffix(".png")
+    imsave(picture, outcome.frame, cmap="gray", vmin=0, vmax=255)
+    _print_errors(picture, design, report.calibration, built)
+
+
+def _print_errors(
+    picture: Path, design: Calibration, made: Calibration, built: Calibration
+) -> None:
+    import numpy as np
+
+    true_mm = np.linspace(800.0, 2100.0, 131)
+    true_row = built.model().row(true_mm)
+
+    def rms_mm(calibration: Calibration) -> str:
+        error = calibration.model().range_mm(true_row) - true_mm
+        return f"{float(np.sqrt(np.mean(error**2))):.2f} mm"
+
+    pairs(
+        str(picture),
+        {
+            "range RMS 0.8-2.1 m, as designed": rms_mm(design),
+            "range RMS 0.8-2.1 m, calibrated": rms_mm(made),
+        },
+    )

@@ -16,7 +16,7 @@ Report = Callable[[float, str], None]
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Report]:
-    """Progress bar on stderr; silent when stderr is no terminal."""
+    """Show a progress bar on stderr when that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -40,7 +40,7 @@ def progress_bar(title: str) -> Iterator[Report]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Make an empty table; the first column is left aligned, the others right."""
+    """Return an empty table; the first column is left aligned, the others right."""
     from rich import box
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""What the commands share that run all nodes in this process."""
+"""Shared by the commands that run all nodes in this process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eschorty_ros.core.base.errors import EschortyError
 
 
 def nodes_module(name: str, make: str) -> ModuleType:
-    """Import a module of ``nodes``; a missing ROS 2 is a stated failure.
+    """Return a module of ``nodes``; EschortyError without ROS 2.
 
     ``make`` is the Makefile's target that does the same with all set-up.
     """
@@ -29,9 +29,9 @@ def nodes_module(name: str, make: str) -> ModuleType:
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Within it SIGTERM and SIGINT end the process the orderly way.
+    """Make SIGTERM and SIGINT raise, so that every clean-up runs and the laser is disabled.
 
-    A shell's background job starts with SIGINT ignored; a laser must go off all the same.
+    A shell starts a background job with SIGINT ignored.
     """
     handlers = {signal.SIGTERM: _terminated, signal.SIGINT: signal.default_int_handler}
     previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}

@@ -57,7 +57,7 @@ _SWEEP = (
 
 
 def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add what to scan and how to a command: scene, laser, stage, optical build, pixels, seed."""
+    """Add the options of scene, laser, stage, optical build, pixels and seed to a command."""
     for option in reversed(_SWEEP):
         command = option(command)
     return command

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 
 class SettingsCommand(click.Command):
-    """Adds one option per reconstruction setting, read from the settings themselves."""
+    """A command with one option per reconstruction setting, read from the settings themselves."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """Options of the command and of the settings."""
+        """Return the options of the command and of the settings."""
         return [*super().get_params(ctx), *setting_options()]
 
 
 def setting_options() -> list[click.Parameter]:
-    """One click option per field of `Settings`."""
+    """Return one click option per field of `Settings`."""
     from eschorty_ros.core.reconstruction import Settings
 
     options: list[click.Parameter] = []

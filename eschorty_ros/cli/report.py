@@ -45,7 +45,7 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
     Each finding is a number with the band it must lie in. Needs no ROS.
 
     The page is written again after every experiment, so one that is interrupted (Ctrl-C) keeps
-    what is done. An experiment that fails leaves the others: the page says where it failed.
+    what is done. When an experiment fails the others still run; the page shows where it failed.
 
     \b
     Examples:

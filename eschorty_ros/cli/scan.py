@@ -79,7 +79,7 @@ def command(
 
 
 def _check(scene: str, calibration: str) -> None:
-    """Refuse what is no scene or calibration before any node starts."""
+    """Refuse an unknown scene or calibration before any node starts."""
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.simulation.scenes import named
 
@@ -88,7 +88,7 @@ def _check(scene: str, calibration: str) -> None:
 
 
 def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
-    """Write cloud and picture, print the table; a scan that failed or is empty raises."""
+    """Write cloud and picture, print the table; DeviceError for a failed or empty scan."""
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.core.storage import write_cloud
     from eschorty_ros.report import accuracy, figures
