@@ -1,4 +1,4 @@
-"""How far a cloud is from a known scene, and how much of the scene it holds."""
+"""Range errors of a cloud against a known scene, and its completeness."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from eschorty_ros.report.profiles import profile_index
 
 
 class KnownScene(Protocol):
-    """What the truth of a cloud is computed from; every simulated scene is one."""
+    """A scene with known ranges; every simulated scene is one."""
 
     def range_mm(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
     ) -> NDArray[np.float64]:
-        """Range in mm, shape (len(stage_mm), len(columns)); NaN where the sheet hits nothing."""
+        """Return ranges in mm, shape (len(stage_mm), len(columns)); NaN without a surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Accuracy:
     Attributes
     ----------
     periods : int
-        Modulation periods wholly within the sweep.
+        Modulation periods that lie entirely within the sweep.
     points : int
         All points of the cloud.
     expected_points, found_points : int
@@ -94,7 +94,7 @@ class Accuracy:
 def stage_and_range_mm(
     points: NDArray[np.void], stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Stage position and range of every point, undoing ``P = (R, 0, Z) + s t_hat``.
+    """Return stage position and range of every point, undoing ``P = (R, 0, Z) + s t_hat``.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def true_range_mm(
     stage_mm: NDArray[np.float64],
     columns: NDArray[np.integer[Any]],
 ) -> NDArray[np.float64]:
-    """Range of the scene at one stage position and column per point.
+    """Return the range of the scene at one stage position and column per point.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def true_range_mm(
 def lit_columns(
     scene: KnownScene, model: RangeModel, positions_mm: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether each column sees the scene within the sensor's rows, shape (positions, columns)."""
+    """Return where a column sees the scene within the rows, shape (positions, columns)."""
     columns = np.arange(model.columns, dtype=np.int64)
     near_mm, far_mm = model.range_limits_mm
     lit = np.zeros((len(positions_mm), model.columns), dtype=np.bool_)
@@ -170,17 +170,17 @@ def range_error_mm(
     model: RangeModel,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> NDArray[np.float64]:
-    """Measured minus true range of every point in mm; NaN where the scene holds nothing."""
+    """Return measured minus true range of every point in mm; NaN where the scene is empty."""
     stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
     return np.asarray(range_mm - true_range_mm(scene, model, stage_mm, points["column"]))
 
 
-def whole_periods(
+def complete_periods(
     points: NDArray[np.void],
     sweep: Sweep,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Find the modulation periods that lie within the sweep from one end to the other.
+    """Return the modulation periods that lie within the sweep from one end to the other.
 
     The points place one period on the stage; the others follow one pitch apart, whether they
     have points or not. Without any point the periods are taken to begin with the sweep.
@@ -196,7 +196,7 @@ def whole_periods(
     positions_mm : ndarray of float64
         Stage position at the middle of the events of each period.
     number : ndarray of int64, shape (n,)
-        Which of them a point belongs to, -1 for none.
+        Index of a point's period, -1 for none.
     """
     pitch = sweep.pitch_mm
     low, high = sorted((sweep.start_mm, sweep.stop_mm))
@@ -240,7 +240,7 @@ def measure(
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
-    positions, number = whole_periods(points, sweep, stage_direction)
+    positions, number = complete_periods(points, sweep, stage_direction)
     lit = lit_columns(scene, model, positions)
     with_point = np.zeros_like(lit)
     with_point[number[number >= 0], points["column"][number >= 0]] = True

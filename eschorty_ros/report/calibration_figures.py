@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 SIGMA_ROW_PX = 0.3
 """Centroid error of a measurement that the range sigma is drawn for."""
-MANY, FEW = 60, 6
-"""More targets than `MANY` are drawn small; a number goes to `FEW` rejected ones at most."""
+# More targets than _MANY are drawn small; at most _FEW rejected ones get a number.
+_MANY, _FEW = 60, 6
 SYMBOLS = {
     "k_mm": "k (mm)",
     "k_prime_px": "k' (px)",
@@ -30,7 +30,7 @@ SYMBOLS = {
     "b_prime_2_px": "b'2 (px)",
     WIDTH_BIAS: "width bias (px)",
 }
-# What moves together, most telling first.
+# Correlated parameters, the most informative pair first.
 _PAIRS = (
     ("k_prime_px", "b_prime_px"),
     ("b_mm", "b_prime_px"),
@@ -43,7 +43,7 @@ _CHI_SQUARE_95 = {1: 3.841, 2: 5.991}
 
 
 def curve_figure(report: CalibrationReport) -> Figure:
-    """Range over row with the targets, and the standard deviation of a range over row."""
+    """Draw range over row with the targets, and the standard deviation of a range over row."""
     figure = new_figure(11.0, 4.6)
     curve, sigma = figure.subplots(1, 2)
     model, nominal = report.fit.model, report.nominal.model()
@@ -79,7 +79,7 @@ def curve_figure(report: CalibrationReport) -> Figure:
 
 
 def residual_figure(report: CalibrationReport) -> Figure:
-    """Residuals in rows with their sigmas, and in mm against one row and the depth of field."""
+    """Draw residuals in rows with sigmas, and in mm against one row and the depth of field."""
     figure = new_figure(11.0, 4.6)
     in_rows, in_mm = figure.subplots(1, 2)
     targets, used, fit = report.targets, report.used, report.fit
@@ -89,7 +89,7 @@ def residual_figure(report: CalibrationReport) -> Figure:
     in_rows.fill_between(at[used][order], -band, band, color="0.9", label="± 3 sigma")
     size = _marker(report)
     in_rows.plot(at[used], residual[used], "o", color="C1", ms=size, label="used")
-    if len(targets) <= MANY:
+    if len(targets) <= _MANY:
         in_rows.plot(at[used], alone[used], "o", mfc="none", color="C0", ms=8, label="left out")
     limit = 1.3 * float(np.nanmax(np.abs([*band, *residual[used], *alone[used]])))
     _rejected(in_rows, at[~used], residual[~used], limit, size)
@@ -118,7 +118,7 @@ def residual_figure(report: CalibrationReport) -> Figure:
 
 
 def depth_of_field(report: CalibrationReport, range_mm: Array) -> Array:
-    """Half depth of field at these ranges, mm (Eq. 3)."""
+    """Return half the depth of field at these ranges, mm (Eq. 3)."""
     model, build = report.fit.model, report.nominal
     return depth_of_field_mm(
         model.k_mm / (range_mm + model.b_mm),
@@ -130,7 +130,7 @@ def depth_of_field(report: CalibrationReport, range_mm: Array) -> Array:
 
 
 def magnification_figure(report: CalibrationReport) -> Figure:
-    """Magnification over row with what sizes and spacings say, and the profile of k."""
+    """Draw magnification over row with sizes and spacings, and the profile of k."""
     profile = report.profile
     figure = new_figure(11.0 if profile else 6.5, 4.6)
     axes = figure.add_subplot(1, 2 if profile else 1, 1)
@@ -247,17 +247,17 @@ def _interval(axes: Axes, report: CalibrationReport, name: str) -> None:
 
 
 def _marker(report: CalibrationReport) -> float:
-    """Size of a point, smaller where they would hide each other."""
-    return 6.0 if len(report.targets) <= MANY else 2.0
+    """Return the size of a point, smaller where points would hide each other."""
+    return 6.0 if len(report.targets) <= _MANY else 2.0
 
 
 def _rejected(axes: Axes, at: Array, residual: Array, limit: float, size: float) -> None:
-    """Crosses, at the rim where they lie beyond it, with their number if they are few."""
+    """Draw crosses, at the rim where they lie beyond it, with their number if they are few."""
     if not at.size:
         return
     axes.plot(at, np.clip(residual, -0.93 * limit, 0.93 * limit), "x", color="C3", ms=size,
               label="rejected")  # fmt: skip
-    if at.size > FEW:
+    if at.size > _FEW:
         return
     for x, y in zip(at, residual, strict=True):
         if abs(y) > limit:

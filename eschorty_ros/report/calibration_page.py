@@ -39,7 +39,7 @@ _FIGURES: tuple[tuple[Callable[[CalibrationReport], Figure], str], ...] = (
         drawn.magnification_figure,
         "Magnification over row (Eq. 1): a straight line that reaches 0 at row -b', where the "
         "range is infinite. Points are known sizes (less the width bias) and spacings; they alone "
-        "tell k from k'. With k fitted, right: how chi-square rises when k is held elsewhere.",
+        "separate k from k'. With k fitted, right: how chi-square rises when k is held elsewhere.",
     ),
     (
         drawn.covariance_figure,
@@ -62,7 +62,7 @@ class Parameter:
 
 
 def calibration_html(report: CalibrationReport, made_with: Mapping[str, str]) -> str:
-    """Text of the page.
+    """Return the text of the page.
 
     Parameters
     ----------
@@ -93,15 +93,14 @@ def calibration_html(report: CalibrationReport, made_with: Mapping[str, str]) ->
 
 
 def parameters(report: CalibrationReport) -> list[Parameter]:
-    """Every parameter of the build, those of no interest left out."""
+    """Return every parameter of the build; column terms and width bias only where fitted."""
     fit, nominal = report.fit, report.nominal.model()
-    sigma = dict(zip(fit.free, np.sqrt(np.diag(fit.covariance)).tolist(), strict=True))
     extra = [name for name in (*COLUMN_TERMS, WIDTH_BIAS) if name in fit.free]
     return [
         Parameter(
             name,
             fit.values[name],
-            sigma.get(name, math.nan),
+            fit.sigmas.get(name, math.nan),
             float(getattr(nominal, name, 0.0)),
             fit.prior_sigma.get(name, math.nan),
             report.prior_ratio.get(name, math.nan),
@@ -138,7 +137,7 @@ def _picture(figure: Figure, caption: str) -> Picture:
 
 
 def _targets(report: CalibrationReport) -> list[list[float | str]]:
-    """One line each: what was seen, what remains, and whether it was used."""
+    """Return a line for each target: measured, residuals, and the reason if it was rejected."""
     targets, model = report.targets, report.fit.model
     reasons = {entry.index: entry.reason for entry in report.rejected}
     step = model.range_per_row_mm(targets.range_mm)
@@ -159,7 +158,7 @@ def _targets(report: CalibrationReport) -> list[list[float | str]]:
 
 
 def _sigmas(report: CalibrationReport) -> list[list[float]]:
-    """Row, range, step of a row, sigma of the calibration, and with a centroid."""
+    """Return lines of row, range, step of a row, sigma of the calibration, and with a centroid."""
     model = report.fit.model
     rows = np.linspace(0.0, model.rows - 1.0, ROWS_SHOWN)
     ranges = model.range_mm(rows)

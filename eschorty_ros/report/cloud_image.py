@@ -31,7 +31,7 @@ class Grid:
 
 
 def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
-    """Sort the points into modulation periods.
+    """Return the points sorted into modulation periods.
 
     Raises
     ------
@@ -57,16 +57,16 @@ def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
 def image_of(
     grid: Grid, points: NDArray[np.void], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """``values`` of the points as an image, shape (profiles, columns); NaN where there is none."""
+    """Return values of the points as an image, shape (profiles, columns); NaN without a point."""
     image = np.full((len(grid.stage_mm), grid.columns), np.nan)
     image[grid.profile, points["column"].astype(np.intp)] = values
     return image
 
 
 def line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rising limits of the lines of a map, one more than there are lines.
+    """Return the rising limits of a map's lines, one more than there are lines.
 
-    The stage accelerates, so that lines differ in height; a stage at rest leaves no height to draw.
+    The stage accelerates, so that lines differ in height; a stage at rest gives lines of height 1.
     """
     at = np.sort(stage_mm)
     if at[-1] - at[0] < 1e-6:

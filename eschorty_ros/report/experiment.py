@@ -1,4 +1,4 @@
-"""What an experiment of the report hands over: findings with their bands, tables and figures."""
+"""Results of an experiment of the report: findings with their bands, tables and figures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Effort:
     seed: int = 1
 
     def choose(self, full: int, fast: int) -> int:
-        """``full``, or ``fast`` in a fast run."""
+        """Return ``full``, or ``fast`` in a fast run."""
         return fast if self.fast else full
 
 
@@ -41,7 +41,7 @@ class Finding:
     Attributes
     ----------
     name : str
-        What the number is, without its value.
+        Its name, without the value.
     value, low, high : float
         ``-inf`` or ``inf`` for an open end.
     unit : str
@@ -55,7 +55,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """Whether the value lies in its band; NaN never does."""
+        """True when the value lies in its band; NaN never does."""
         return self.low <= self.value <= self.high
 
 
@@ -70,7 +70,7 @@ class DataTable:
     rows : sequence of sequence
         Numbers or text, one entry per column.
     shown : bool
-        Whether the page shows it; the data behind a figure need not be.
+        Show it on the page; the data behind a figure need not be.
     """
 
     columns: Sequence[str]

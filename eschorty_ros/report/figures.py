@@ -33,7 +33,7 @@ def scan_figure(
     title: str = "",
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Figure:
-    """Depth map and 3-D view; with the error known, its map and its histogram too.
+    """Draw depth map and 3-D view; with the error known, its map and its histogram too.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def design_figure(
     depth_of_field_mm: NDArray[np.float64],
     title: str,
 ) -> Figure:
-    """Range over row, sampling and depth of field over range; all arrays of one shape, mm."""
+    """Draw range over row, sampling and depth of field over range; arrays of one shape, mm."""
     figure = new_figure(12.0, 4.2)
     figure.suptitle(title)
     axes = figure.add_subplot(1, 3, 1)
@@ -113,7 +113,7 @@ def design_figure(
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Empty figure that belongs to no window."""
+    """Return an empty figure that belongs to no window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -138,14 +138,14 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 
 def _central(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Limits that a few stray points do not stretch."""
+    """Return limits that a few outliers do not stretch."""
     low, high = np.nanpercentile(values, [0.5, 99.5])
     margin = max(0.05 * (high - low), 0.5)
     return float(low - margin), float(high + margin)
 
 
 def _error_bound(error_mm: NDArray[np.float64]) -> float:
-    """Symmetric limit that shows the noise; depth edges saturate it."""
+    """Return a symmetric limit that shows the noise; depth edges saturate it."""
     size_mm = np.abs(error_mm[np.isfinite(error_mm)])
     return max(3.0 * float(np.percentile(size_mm, 68.0)), 1e-3) if size_mm.size else 1.0
 

@@ -51,7 +51,7 @@ def write_page(
 
 
 def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0) -> str:
-    """Text of the page; parameters as in `write_page`."""
+    """Return the text of the page; parameters as in `write_page`."""
     return render(
         "page.html.jinja",
         title=TITLE,
@@ -85,7 +85,7 @@ def render(template: str, **values: Any) -> str:
 
 
 def number(value: float | int | str) -> str:
-    """Value as a reader wants it: text and whole numbers as they are, else four digits or more.
+    """Return a value as text: text and integers as they are, else four digits or more.
 
     Large values keep two decimals; the CSV file has every digit.
     """
@@ -108,17 +108,17 @@ def number(value: float | int | str) -> str:
 
 
 def breakable(name: str) -> Markup:
-    """Name that may wrap after each underscore."""
+    """Return a name that may wrap after each underscore."""
     return Markup("_<wbr>").join(name.split("_"))
 
 
 def reading(finding: Finding) -> str:
-    """Value of a finding with its unit."""
+    """Return the value of a finding with its unit."""
     return f"{number(finding.value)} {finding.unit}".rstrip()
 
 
 def band(finding: Finding) -> str:
-    """Band of a finding in words."""
+    """Return the band of a finding in words."""
     low, high = number(finding.low), number(finding.high)
     if math.isinf(finding.low) and math.isinf(finding.high):
         return "any"

@@ -1,4 +1,4 @@
-"""Which modulation period each point of a cloud belongs to, from the points alone."""
+"""The modulation period of each point of a cloud, from the points alone."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ RETURNS_APART = 0.2
 
 
 def period_s(points: NDArray[np.void]) -> float:
-    """Modulation period of a cloud in seconds, NaN when no column has two points.
+    """Return the modulation period of a cloud in seconds, NaN when no column has two points.
 
-    A column's points lie whole periods apart and mostly one, so their distances in time give a
-    first guess; straight-line fits over doubling spans then sharpen it. Two returns of one period
-    lie a small part of it apart and are left out of the guess.
+    A column's points lie a multiple of the period apart, mostly one, so their distances in time
+    give a first guess; straight-line fits over doubling spans then refine it. Two returns of one
+    period lie a small part of it apart and are left out of the guess.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def period_s(points: NDArray[np.void]) -> float:
 
 
 def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
-    """Give every point the number of its modulation period, the first being 0.
+    """Return the number of every point's modulation period, the first being 0.
 
     Parameters
     ----------
@@ -77,5 +77,5 @@ def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
 
 
 def _phase(turns: NDArray[np.float64]) -> float:
-    """Circular mean of the fractional part, -0.5 to 0.5."""
+    """Return the circular mean of the fractional part, -0.5 to 0.5."""
     return float(np.angle(np.mean(np.exp(2j * np.pi * turns)))) / (2.0 * np.pi)

@@ -1,4 +1,4 @@
-"""What a report was made with."""
+"""Versions and machine that a report was made with."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LIBRARIES = ("numpy", "numba", "matplotlib")
 
 
 def provenance(effort: Effort) -> dict[str, str]:
-    """Versions, machine, seed and effort, as text by name."""
+    """Return versions, machine, seed and effort, as text by name."""
     made = {
         "Made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "eschorty_ros": eschorty_ros.__version__,
@@ -31,7 +31,7 @@ def provenance(effort: Effort) -> dict[str, str]:
 
 
 def cpu_model() -> str:
-    """Name of the processor as the system gives it."""
+    """Return the name of the processor as the system gives it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Running experiments one after the other and writing what they hand over."""
+"""Running experiments one after the other and writing their results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Picture:
     file : str
         Name beside the page.
     caption, alt : str
-        What it shows; what is drawn where, for those who cannot see it.
+        Its content in words; what is drawn where, for readers without the picture.
     width_px, height_px : int
     """
 
@@ -48,7 +48,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table as written: ``file`` beside the page, and what the page itself shows of it."""
+    """A table as written: ``file`` beside the page, and its data for the page itself."""
 
     file: str
     caption: str
@@ -99,18 +99,18 @@ def run_sections(
 ) -> Iterator[Section]:
     """Run experiments in order; yield each as soon as its files are written.
 
-    An experiment that fails becomes a section that says so; the next one runs.
+    An experiment that fails becomes a section with its failure; the next one runs.
 
     Parameters
     ----------
     names : sequence of str
     load : callable
-        Gives the experiment of a name.
+        Returns the experiment of a name.
     effort : Effort
     folder : Path
         Existing folder for the files, named after experiment and stem.
     progress : callable
-        Told the share of all experiments done.
+        Called with the share of all experiments done.
 
     Yields
     ------
@@ -151,7 +151,7 @@ def run_sections(
 
 
 def describe(figure: Figure) -> str:
-    """Say what is drawn where: title, axes and named lines of every part of a figure."""
+    """Return what is drawn where: title, axes and named lines of every part of a figure."""
     parts = []
     for axes in figure.axes:
         x, y = axes.get_xlabel(), axes.get_ylabel()
@@ -169,7 +169,7 @@ def describe(figure: Figure) -> str:
 
 
 def csv_text(table: DataTable) -> str:
-    """Header line and rows; numbers with every digit they have."""
+    """Return header line and rows; numbers with every digit they have."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(table.columns)

@@ -123,7 +123,7 @@ def test_periods_that_the_ends_cut_do_not_count(backwards):
         points["y"] *= -1.0
         ends = (-ends[0], -ends[1])
     sweep = accuracy.Sweep(*ends, 50.0, 70.0)
-    positions, number = accuracy.whole_periods(points, sweep)
+    positions, number = accuracy.complete_periods(points, sweep)
     np.testing.assert_allclose(np.abs(positions), np.arange(1, 10) * PITCH_MM, atol=0.01)
     assert np.bincount(number[number >= 0]).tolist() == [1000] * 9
 
