@@ -146,12 +146,12 @@ def magnification_figure(report: CalibrationReport) -> Figure:
         (targets.width_px - bias, targets.size_mm, targets.sigma_width_px, "o", "C1", "sizes"),
         (targets.spacing_px, targets.spacing_mm, targets.sigma_spacing_px, "s", "C4", "spacings"),
     )
-    for seen, true_mm, sigma, marker, colour, name in sized:
-        known = report.used & np.isfinite(seen * true_mm)
+    for columns, true_mm, sigma, marker, colour, name in sized:
+        known = report.used & np.isfinite(columns * true_mm)
         if known.any():
             scale = pixel_mm / true_mm[known]
             axes.errorbar(
-                targets.row[known], seen[known] * scale, 3.0 * sigma[known] * scale, fmt=marker,
+                targets.row[known], columns[known] * scale, 3.0 * sigma[known] * scale, fmt=marker,
                 color=colour, ms=_marker(report), lw=1, capsize=2, label=f"{name} ± 3 sigma",
             )  # fmt: skip
     axes.axvspan(model.rows - 0.5, 1.05 * -model.b_prime_px, color="0.93", label="off the sensor")
@@ -177,7 +177,7 @@ def _profile(axes: Axes, report: CalibrationReport) -> None:
     axes.axvline(report.fit.model.k_mm, color="C1", label="fitted")
     axes.axvline(report.nominal.object_scale_mm, color="0.5", ls="--", label="nominal")
     axes.set(
-        xlabel="k (mm)", ylabel="chi-square above its minimum", title="What the targets say of k",
+        xlabel="k (mm)", ylabel="chi-square above its minimum", title="k from the targets",
         ylim=(0.0, 4.0 * limit),
     )  # fmt: skip
     axes.legend(fontsize="small", loc="upper center")
@@ -185,7 +185,7 @@ def _profile(axes: Axes, report: CalibrationReport) -> None:
 
 
 def covariance_figure(report: CalibrationReport) -> Figure:
-    """Ellipses that hold the truth with 39 and 95 %, pair by pair, with the design."""
+    """Draw ellipses that hold the truth with 39 and 95 %, pair by pair, with the design."""
     free = report.fit.free
     shown = [pair for pair in _PAIRS if set(pair) <= set(free)][:_PANELS]
     if not shown:

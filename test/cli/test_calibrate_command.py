@@ -75,7 +75,7 @@ def test_the_papers_method_keeps_k_and_b(targets_csv, tmp_path):
     assert html_check.faults(out.with_suffix(".html")) == []
 
 
-def test_free_parameters_and_priors_are_taken(targets_csv, tmp_path):
+def test_free_parameters_and_priors_are_used(targets_csv, tmp_path):
     out = tmp_path / "made.yaml"
     done = run(targets_csv, "--free", "k_prime_px", "--free", "b_mm", "--prior", "b_mm=none",
                "--out", out)  # fmt: skip
@@ -196,7 +196,7 @@ def test_the_python_example_of_the_documentation_runs(targets_csv, monkeypatch, 
     assert load_calibration("calibration.yaml").parameters_fitted[0] == "k_mm"
 
 
-def test_the_documentation_names_every_column_verdict_and_prior():
+def test_the_documentation_names_every_column_and_prior():
     page = (Path(__file__).parents[2] / "docs" / "calibration.md").read_text()
     for name in (*TARGET_COLUMNS, *DISTANCE_COLUMNS, *PRIOR_SIGMA):
         assert name in page, name

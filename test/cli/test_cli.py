@@ -124,7 +124,7 @@ def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
     assert str(error.strerror) in result.stderr
 
 
-def test_a_place_that_cannot_be_written_is_told_before_the_work(monkeypatch, recording, tmp_path):
+def test_an_unwritable_output_is_refused_before_the_work(monkeypatch, recording, tmp_path):
     def work(*_arguments):
         raise AssertionError("hours of work before the refusal")
 
@@ -219,7 +219,7 @@ def test_reconstruct_offers_every_setting(recording, tmp_path):
     assert run("reconstruct", recording, "--out", tmp_path / "cloud.xyz").exit_code == 2
 
 
-def test_info_tells_what_a_recording_and_a_raw_file_hold(recording):
+def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
     result = run("info", recording)
     assert result.exit_code == 0, result.output
     for words in ("config_3", "70 Hz", "ranges", "events/s", "1280 x 720"):

@@ -1,4 +1,4 @@
-"""Targets at known ranges: what a calibration is fitted to."""
+"""Targets at known ranges, to which a calibration is fitted."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from eschorty_ros.core.base.arrays import Array, reals, selection, short
 from eschorty_ros.core.base.errors import ArgumentError
 
 SIGMA_ROW_PX = 0.3
-"""Standard deviation of a centroid when nothing better is known."""
+"""Standard deviation of a centroid by default."""
 SIGMA_WIDTH_PX = 0.4
-"""The same of a width or a spacing: the difference of two edges or centres."""
+"""Standard deviation of a width or a spacing, the difference of two edges or centres."""
 
 _ALWAYS = ("row", "range_mm", "sigma_row_px", "sigma_range_mm")
 _SIZES = (
@@ -27,7 +27,7 @@ _POSITIVE_OR_UNKNOWN = tuple(name for names in _SIZES for name in names)
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class Targets:
-    """Rows at which targets of known range appear, with what else is known of them.
+    """Rows of targets at known ranges, with their widths, spacings and standard deviations.
 
     Every argument is a scalar for all targets or one entry for each. Attributes are float64 of
     shape (n,) and read-only.
@@ -49,7 +49,7 @@ class Targets:
         Columns between the centres of two marks at this range, its standard deviation, and the
         true distance; NaN where unknown. Blooming does not move centres.
     labels : sequence of str, optional
-        What messages and reports call the targets; ``1``, ``2``, ... by default.
+        Names of the targets in messages and reports; ``1``, ``2``, ... by default.
 
     Raises
     ------
@@ -140,18 +140,18 @@ class Targets:
 
     @property
     def lateral(self) -> int:
-        """Number of known sizes and spacings: what tells k from k'."""
+        """Number of known sizes and spacings, which separate k from k'."""
         return int(self.has_width.sum() + self.has_spacing.sum())
 
     def select(self, which: ArrayLike) -> Targets:
-        """Targets at these indices, or where this mask is true."""
+        """Return the targets at these indices, or where this mask is true."""
         index = np.arange(len(self))[selection("which", which, len(self))]
         numbers = {name: getattr(self, name)[index] for name in _NUMBERS}
         return Targets(**numbers, labels=tuple(self.labels[i] for i in index))
 
     @staticmethod
     def concatenate(parts: Sequence[Targets]) -> Targets:
-        """All targets of ``parts`` in their order, with their labels.
+        """Return all targets of ``parts`` in their order, with their labels.
 
         Raises
         ------

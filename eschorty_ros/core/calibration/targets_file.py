@@ -1,4 +1,4 @@
-"""Targets and distances as CSV files that a person writes."""
+"""Targets and distances as CSV files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def read_targets(
         CSV with a header line: ``row`` and ``range_mm``, and any of ``row_sigma``,
         ``range_sigma_mm``, ``column``, ``width_px``, ``width_sigma_px``, ``size_mm``,
         ``spacing_px``, ``spacing_sigma_px``, ``spacing_mm``, ``label``, in any order. An empty
-        cell means unknown; lines that begin with ``#`` are remarks.
+        cell means unknown; lines that begin with ``#`` are comments.
     sigma_row_px, sigma_range_mm : float
         Standard deviations where the file gives none.
 
@@ -85,7 +85,7 @@ def write_targets(path: str | os.PathLike[str], targets: Targets) -> None:
     Parameters
     ----------
     path : path
-        Appears whole or not at all.
+        Written atomically.
     targets : Targets
 
     Raises
@@ -106,7 +106,7 @@ def write_targets(path: str | os.PathLike[str], targets: Targets) -> None:
 def read_distances(
     path: str | os.PathLike[str], *, sigma_range_mm: float = SIGMA_RANGE_MM
 ) -> list[KnownTarget]:
-    """Read what is known of the posts of a recording, one a line.
+    """Read the known distances of the posts of a recording, one a line.
 
     Parameters
     ----------

@@ -45,23 +45,22 @@ _OF_THE_INSTRUMENT = {
 }
 
 Positive = Annotated[float, Field(gt=0.0)]
-# A strict tuple refuses the list that YAML makes of it; its items stay strict.
+# A strict tuple refuses a YAML list; its items stay strict.
 Vector = Annotated[tuple[float, float, float], Field(strict=False)]
 Window = Annotated[tuple[int, int, int, int], Field(strict=False)]
 
 
 class Calibration(Schema):
-    """Everything that turns rows and columns of one build into millimetres.
+    """The optical build that turns rows and columns into millimetres.
 
     The keys are those of ``calibration.yaml``, with the unit in the name. Signs as in
-    `RangeModel`; the sign of ``theta_prime_deg`` tells the side
-    to which the sensor is tilted. ``k_mm`` left out means ``focal_length_mm / sin(theta_deg)``,
-    unrounded. ``roi_px`` is the window that the camera reads out, ``[first column, first row,
-    columns, rows]``; left out it is the whole sensor. ``b_prime_1_px`` and ``b_prime_2_px`` are
-    roll and smile of the laser line, 0 unless fitted. ``stage_direction`` is the unit vector of
-    stage travel in ``eschorty_link``.
+    `RangeModel`; the sign of ``theta_prime_deg`` is the side to which the sensor is tilted.
+    ``k_mm`` left out means ``focal_length_mm / sin(theta_deg)``, unrounded. ``roi_px`` is the
+    window that the camera reads out, ``[first column, first row, columns, rows]``; left out it is
+    the whole sensor. ``b_prime_1_px`` and ``b_prime_2_px`` are roll and smile of the laser line,
+    0 unless fitted. ``stage_direction`` is the unit vector of stage travel in ``eschorty_link``.
     The keys from ``id`` on describe a fit: ``covariance`` belongs to ``parameters_fitted`` in
-    that order and in their units, ``range_mm`` is the span the fit has seen.
+    that order and in their units, ``range_mm`` is the span of the targets.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -215,7 +214,7 @@ def load_calibration(name_or_path: str | os.PathLike[str]) -> Calibration:
 
 
 def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> None:
-    """Write a calibration; the file appears whole or not at all.
+    """Write a calibration atomically.
 
     Keys that were never given are left out, so a derived ``k_mm`` stays derived.
 
@@ -275,7 +274,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def config_file(name: str) -> Path:
-    """Path of a file that lies in ``config/``.
+    """Return the path of a file in ``config/``.
 
     Raises
     ------

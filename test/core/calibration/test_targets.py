@@ -60,6 +60,6 @@ def test_faults_name_the_target_and_the_remedy(change, message):
     assert "\n" not in str(refused.value)
 
 
-def test_nothing_to_join_is_said():
+def test_no_parts_are_refused():
     with pytest.raises(ArgumentError, match="parts is empty"):
         Targets.concatenate([])

@@ -26,7 +26,7 @@ def test_a_bare_list_is_enough(tmp_path):
     assert targets.lateral == 0
 
 
-def test_every_column_in_any_order_with_gaps_and_remarks(tmp_path):
+def test_every_column_in_any_order_with_gaps_and_comments(tmp_path):
     text = (
         "\ufeff# posts of Monday\r\nlabel, range_mm,row,size_mm,width_px,row_sigma,column\r\n\r\n"
         "near,820,49.5,25.4,154.0,0.2,100\r\n#left out,1,1,1,1,1,1\r\nfar , 2050,702.1,,,,\r\n"
@@ -96,7 +96,7 @@ def test_faults_name_file_line_and_column(tmp_path, text, message):
     assert "\n" not in str(refused.value)
 
 
-def test_what_cannot_be_read_is_said(tmp_path):
+def test_a_path_that_cannot_be_read_is_named(tmp_path):
     for path in (tmp_path, tmp_path / "absent.csv"):
         with pytest.raises(FormatError, match="cannot read"):
             read_targets(path)

@@ -182,7 +182,7 @@ def test_faults_name_file_key_value_and_remedy(
         (b"? [a, b]\n: 1\n", "correct the YAML|no such key"),
     ],
 )
-def test_what_is_no_calibration_file_is_said(tmp_path: Path, content: bytes, part: str) -> None:
+def test_a_file_that_is_no_calibration_is_named(tmp_path: Path, content: bytes, part: str) -> None:
     file = tmp_path / "broken.yaml"
     file.write_bytes(content)
     with pytest.raises(CalibrationError, match=part) as caught:
@@ -191,7 +191,7 @@ def test_what_is_no_calibration_file_is_said(tmp_path: Path, content: bytes, par
     assert "broken.yaml" in str(caught.value)
 
 
-def test_unknown_names_and_paths_are_said(tmp_path: Path) -> None:
+def test_unknown_names_and_paths_are_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"'config_9'.*nominal, config_1"):
         load_calibration("config_9")
     with pytest.raises(CalibrationError, match=r"cannot read .*absent\.yaml"):
@@ -202,7 +202,7 @@ def test_unknown_names_and_paths_are_said(tmp_path: Path) -> None:
         load_calibration("")
 
 
-def test_a_name_that_names_itself_ends(tmp_path: Path) -> None:
+def test_a_file_that_holds_an_unknown_name_is_refused(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("config_9\n")
     with pytest.raises(CalibrationError, match="'config_9'"):
         load_calibration(tmp_path / "c.yaml")
