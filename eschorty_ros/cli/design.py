@@ -122,19 +122,8 @@ def _print(build: Design, range_mm: NDArray[np.float64]) -> None:
 def _draw(build: Design, range_mm: NDArray[np.float64], out: Path) -> None:
     from eschorty_ros.report import figures
 
-    at = build.at(range_mm)
     title = (
         f"f {build.focal_length_mm:g} mm, f/{build.f_number:g}, "
         f"sensor tilt {build.theta_prime_deg:.2f}°"
     )
-    figures.save(
-        figures.design_figure(
-            at.range_mm,
-            at.row,
-            at.range_per_row_mm,
-            at.lateral_pitch_mm,
-            at.depth_of_field_mm,
-            title,
-        ),
-        out,
-    )
+    figures.save(figures.design_figure(build.at(range_mm), title), out)

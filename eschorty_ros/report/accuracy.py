@@ -64,10 +64,8 @@ class Accuracy:
         Modulation periods that lie entirely within the sweep.
     points : int
         All points of the cloud.
-    expected_points, found_points : int
-        Columns lit in the middle of those periods, summed, and those of them with a point.
     completeness : float
-        ``found_points / expected_points``.
+        Share of the columns lit in the middle of those periods that have a point.
     error_median_mm, error_p95_mm : float
         Median and 95th percentile of the absolute range error.
     bias_mm : float
@@ -80,8 +78,6 @@ class Accuracy:
 
     periods: int
     points: int
-    expected_points: int
-    found_points: int
     completeness: float
     error_median_mm: float
     error_p95_mm: float
@@ -254,8 +250,6 @@ def measure(
     return Accuracy(
         periods=len(positions),
         points=len(points),
-        expected_points=expected,
-        found_points=found,
         completeness=found / expected if expected else nan,
         error_median_mm=nan if empty else float(np.median(size)),
         error_p95_mm=nan if empty else float(np.percentile(size, 95.0)),

@@ -6,6 +6,7 @@ Every function returns a matplotlib figure that belongs to no window; `save` wri
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.report.accuracy import stage_and_range_mm
-from eschorty_ros.report.cloud_image import Grid, grid_of, image_of, line_edges
+from eschorty_ros.report.profiles import period_s, profile_index
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from eschorty_ros.core.optics import DesignTable
 
 POINTS_IN_3D = 30_000
 TICKS_IN_3D = 5
@@ -79,29 +82,22 @@ def scan_figure(
     return figure
 
 
-def design_figure(
-    range_mm: NDArray[np.float64],
-    row: NDArray[np.float64],
-    sampling_mm: NDArray[np.float64],
-    lateral_mm: NDArray[np.float64],
-    depth_of_field_mm: NDArray[np.float64],
-    title: str,
-) -> Figure:
-    """Draw range over row, sampling and depth of field over range; arrays of one shape, mm."""
+def design_figure(table: DesignTable, title: str) -> Figure:
+    """Draw range over row, and sampling and depth of field over range."""
     figure = new_figure(12.0, 4.2)
     figure.suptitle(title)
     axes = figure.add_subplot(1, 3, 1)
-    axes.plot(row, range_mm)
+    axes.plot(table.row, table.range_mm)
     axes.set(xlabel="sensor row (px)", ylabel="range (mm)", title="Range over row")
     axes.grid(alpha=0.3)
     axes = figure.add_subplot(1, 3, 2)
-    axes.plot(range_mm, sampling_mm, label="range step of one row")
-    axes.plot(range_mm, lateral_mm, label="lateral step of one column")
+    axes.plot(table.range_mm, table.range_per_row_mm, label="range step of one row")
+    axes.plot(table.range_mm, table.lateral_pitch_mm, label="lateral step of one column")
     axes.set(xlabel="range (mm)", ylabel="step (mm/px)", title="Sampling", ylim=(0.0, None))
     axes.legend()
     axes.grid(alpha=0.3)
     axes = figure.add_subplot(1, 3, 3)
-    axes.plot(range_mm, depth_of_field_mm)
+    axes.plot(table.range_mm, table.depth_of_field_mm)
     axes.set(
         xlabel="range (mm)",
         ylabel="± depth of field (mm)",
@@ -137,6 +133,70 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
         raise ArgumentError(f"cannot write the picture {path}: {error}") from error
 
 
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """A cloud as an image: one line per modulation period, one pixel per column.
+
+    Attributes
+    ----------
+    columns : int
+        Width of ``values``.
+    stage_mm : ndarray of float64, shape (profiles,)
+        Median stage position of each line.
+    profile : ndarray of int64, shape (n,)
+        Line of every point.
+    """
+
+    columns: int
+    stage_mm: NDArray[np.float64]
+    profile: NDArray[np.int64]
+
+
+def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
+    """Return the points sorted into modulation periods.
+
+    Raises
+    ------
+    ArgumentError
+        When the cloud is empty.
+    """
+    if len(points) == 0:
+        raise ArgumentError("the cloud holds 0 points; there is nothing to draw")
+    period = period_s(points)
+    profile = (
+        profile_index(points, period) if period > 0.0 else np.zeros(len(points), dtype=np.int64)
+    )
+    lines = int(profile.max()) + 1
+    counts = np.bincount(profile, minlength=lines)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        middle = np.bincount(profile, weights=stage_mm, minlength=lines) / counts
+    index = np.arange(lines)
+    known = counts > 0
+    positions = np.interp(index, index[known], middle[known])
+    return Grid(int(points["column"].max()) + 1, positions, profile)
+
+
+def image_of(
+    grid: Grid, points: NDArray[np.void], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return values of the points as an image, shape (profiles, columns); NaN without a point."""
+    image = np.full((len(grid.stage_mm), grid.columns), np.nan)
+    image[grid.profile, points["column"].astype(np.intp)] = values
+    return image
+
+
+def _line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rising limits of a map's lines, one more than there are lines.
+
+    The stage accelerates, so that lines differ in height; a stage at rest gives lines of height 1.
+    """
+    at = np.sort(stage_mm)
+    if at[-1] - at[0] < 1e-6:
+        return at[0] + np.linspace(-0.5, 0.5, at.size + 1)
+    between = 0.5 * (at[1:] + at[:-1])
+    return np.concatenate(([2 * at[0] - between[0]], between, [2 * at[-1] - between[-1]]))
+
+
 def _central(values: NDArray[np.float64]) -> tuple[float, float]:
     """Return limits that a few outliers do not stretch."""
     low, high = np.nanpercentile(values, [0.5, 99.5])
@@ -160,7 +220,7 @@ def _map(
 ) -> None:
     artist = axes.pcolorfast(
         np.arange(grid.columns + 1) - 0.5,
-        line_edges(grid.stage_mm),
+        _line_edges(grid.stage_mm),
         image if grid.stage_mm[-1] >= grid.stage_mm[0] else image[::-1],
         cmap=colours,
         vmin=limits[0],

@@ -14,9 +14,6 @@ from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.report.experiment import Finding
 from eschorty_ros.report.sections import Section
 
-TITLE = "Event-based Scheimpflug LiDAR: the report"
-PAGE = "index.html"
-
 
 def write_page(
     folder: Path, sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0
@@ -44,17 +41,9 @@ def write_page(
     ArgumentError
         When the page cannot be written.
     """
-    path = folder / PAGE
-    with atomic_write(path) as stream:
-        stream.write(page_html(sections, made_with, pending).encode())
-    return path
-
-
-def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0) -> str:
-    """Return the text of the page; parameters as in `write_page`."""
-    return render(
+    page = render(
         "page.html.jinja",
-        title=TITLE,
+        title="Event-based Scheimpflug LiDAR: the report",
         sections=sections,
         made_with=made_with,
         pending=pending,
@@ -63,6 +52,10 @@ def page_html(sections: Sequence[Section], made_with: Mapping[str, str], pending
         failed=[section for section in sections if section.failure],
         seconds=sum(section.seconds for section in sections),
     )
+    path = folder / "index.html"
+    with atomic_write(path) as stream:
+        stream.write(page.encode())
+    return path
 
 
 def render(template: str, **values: Any) -> str:

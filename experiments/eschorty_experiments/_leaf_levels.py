@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Result
 from eschorty_ros.report.accuracy import stage_and_range_mm
-from eschorty_ros.report.cloud_image import grid_of, image_of
-from eschorty_ros.report.figures import new_figure
+from eschorty_ros.report.figures import grid_of, image_of, new_figure
 from eschorty_ros.simulation.scenes import LEVELS, SEPARATION_MM, Leaves
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE
-from eschorty_ros.report import cloud_image, figures
+from eschorty_ros.report import figures
 
 
 def step_cloud(lines=24, columns=320):
@@ -78,12 +78,10 @@ def test_without_truth_there_is_no_error_map(tmp_path):
 
 def test_the_depth_map_holds_each_point_once():
     points, _ = step_cloud()
-    stage, range_mm = figures.stage_and_range_mm(points)
-    grid = cloud_image.grid_of(points, stage)
-    image = cloud_image.image_of(grid, points, range_mm)
-    assert image.shape == (24, 320)
-    np.testing.assert_allclose(image.ravel(), range_mm)
-    np.testing.assert_allclose(grid.stage_mm, np.arange(24) * 0.7, atol=1e-4)
+    (image,) = figures.scan_figure(points).axes[0].images
+    assert image.get_array().shape == (24, 320)
+    np.testing.assert_allclose(image.get_array().ravel(), points["x"] * 1e3, rtol=1e-6)
+    np.testing.assert_allclose(image.get_extent(), (-0.5, 319.5, -0.35, 23.5 * 0.7), atol=1e-4)
 
 
 def test_one_profile_draws(tmp_path):

@@ -10,7 +10,7 @@ from eschorty_ros.core.optics.calibration_file import (
     save_calibration,
 )
 from eschorty_ros.core.optics.design import design, design_for_ranges
-from eschorty_ros.core.optics.optical_build import Design
+from eschorty_ros.core.optics.optical_build import Design, DesignTable
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXELS_MAX,
@@ -27,6 +27,7 @@ __all__ = [
     "POLE_MARGIN_PX",
     "Calibration",
     "Design",
+    "DesignTable",
     "RangeModel",
     "config_file",
     "depth_of_field_mm",
