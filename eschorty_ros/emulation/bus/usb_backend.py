@@ -15,7 +15,6 @@ from eschorty_ros.emulation.bus.usb_device import (
     DIRECTION_IN,
     EmulatedUsbDevice,
     UsbFault,
-    UsbIdentity,
 )
 
 Buffer = array.array | bytearray | memoryview
@@ -45,14 +44,10 @@ class Handle:
 
     def __init__(self, device: EmulatedUsbDevice):
         self.device = device
+        self.identity = device.identity
         self.bus = device.bus
         self.address = device.address
         self.closed = False
-
-    @property
-    def identity(self) -> UsbIdentity:
-        """Descriptors of the device."""
-        return self.device.identity
 
     def live(self) -> EmulatedUsbDevice:
         """Return the device; raises when it was closed, unplugged or plugged in again."""

@@ -7,6 +7,7 @@ import errno
 import json
 import socket
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -132,6 +133,15 @@ def _first(link: _Link, op: Op, number: int) -> bytes:
     return answer
 
 
+def _forwarded(op: Op) -> Callable[..., int]:
+    """Return the backend's method that forwards ``op`` with its numbers."""
+
+    def method(_: RemoteBackend, dev_handle: _RemoteHandle, *numbers: int) -> int:
+        return int.from_bytes(dev_handle.main.call(op, numbers), "little")
+
+    return method
+
+
 class RemoteBackend(DescriptorBackend):
     """pyusb's backend interface on the socket of a ``UsbServer``; the bus is empty without one.
 
@@ -172,26 +182,17 @@ class RemoteBackend(DescriptorBackend):
 
     def set_configuration(self, dev_handle: _RemoteHandle, config_value: int) -> None:
         """Accept the only configuration."""
-        dev_handle.main.call(Op.CONFIGURATION)
+        dev_handle.main.call(Op.GET_CONFIGURATION)
 
-    def get_configuration(self, dev_handle: _RemoteHandle) -> int:
-        """Return the only configuration."""
-        dev_handle.main.call(Op.CONFIGURATION)
-        return 1
-
-    def set_interface_altsetting(
-        self, dev_handle: _RemoteHandle, intf: int, altsetting: int
-    ) -> None:
-        """Reset the device side of the interface."""
-        dev_handle.main.call(Op.ALT_SETTING, (intf, altsetting))
-
-    def claim_interface(self, dev_handle: _RemoteHandle, intf: int) -> None:
-        """Claim the interface for this handle alone."""
-        dev_handle.main.call(Op.CLAIM, (intf,))
-
-    def release_interface(self, dev_handle: _RemoteHandle, intf: int) -> None:
-        """Release the interface."""
-        dev_handle.main.call(Op.RELEASE, (intf,))
+    get_configuration = _forwarded(Op.GET_CONFIGURATION)
+    set_interface_altsetting = _forwarded(Op.SET_INTERFACE_ALTSETTING)
+    claim_interface = _forwarded(Op.CLAIM_INTERFACE)
+    release_interface = _forwarded(Op.RELEASE_INTERFACE)
+    clear_halt = _forwarded(Op.CLEAR_HALT)
+    reset_device = _forwarded(Op.RESET_DEVICE)
+    is_kernel_driver_active = _forwarded(Op.IS_KERNEL_DRIVER_ACTIVE)
+    detach_kernel_driver = _forwarded(Op.DETACH_KERNEL_DRIVER)
+    attach_kernel_driver = _forwarded(Op.ATTACH_KERNEL_DRIVER)
 
     def bulk_write(
         self, dev_handle: _RemoteHandle, ep: int, intf: int, data: array.array[int], timeout: int
@@ -231,26 +232,6 @@ class RemoteBackend(DescriptorBackend):
         return int.from_bytes(
             link.call(Op.CONTROL, numbers, bytes(view), timeout_ms=timeout), "little"
         )
-
-    def clear_halt(self, dev_handle: _RemoteHandle, ep: int) -> None:
-        """Clear a stall."""
-        dev_handle.main.call(Op.CLEAR_HALT, (ep,))
-
-    def reset_device(self, dev_handle: _RemoteHandle) -> None:
-        """Reset the device."""
-        dev_handle.main.call(Op.RESET)
-
-    def is_kernel_driver_active(self, dev_handle: _RemoteHandle, intf: int) -> bool:
-        """Return whether a kernel driver holds the interface."""
-        return dev_handle.main.call(Op.DRIVER_ACTIVE, (intf,)) == b"\x01"
-
-    def detach_kernel_driver(self, dev_handle: _RemoteHandle, intf: int) -> None:
-        """Take the interface from the kernel driver."""
-        dev_handle.main.call(Op.DRIVER_DETACH, (intf,))
-
-    def attach_kernel_driver(self, dev_handle: _RemoteHandle, intf: int) -> None:
-        """Give the interface back to the kernel driver."""
-        dev_handle.main.call(Op.DRIVER_ATTACH, (intf,))
 
 
 def backend(path: str) -> RemoteBackend:

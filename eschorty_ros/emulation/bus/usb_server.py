@@ -24,7 +24,13 @@ import usb.core
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.emulation.bus.usb_backend import EmulatedBackend, Handle
 from eschorty_ros.emulation.bus.usb_device import EmulatedUsbDevice
-from eschorty_ros.emulation.bus.usb_wire import Closed, Op, receive_request, send_answer
+from eschorty_ros.emulation.bus.usb_wire import (
+    NUMBERS,
+    Closed,
+    Op,
+    receive_request,
+    send_answer,
+)
 
 
 class UsbServer:
@@ -133,6 +139,8 @@ class _Session:
         handle = self._handle
         if handle is None:
             raise usb.core.USBError("no such handle", -4, errno.ENODEV)
+        if op == Op.JOIN:
+            return b""
         if op == Op.READ:
             return self._read(handle, *numbers[:3])
         if op == Op.CONTROL:
@@ -140,7 +148,8 @@ class _Session:
         if op == Op.WRITE:
             count = self._backend.bulk_write(handle, numbers[0], 0, data, numbers[1])
             return count.to_bytes(4, "little")
-        return self._simple(handle, op, numbers[0], numbers[1])
+        result = getattr(self._backend, op.name.lower())(handle, *numbers[: NUMBERS[op]])
+        return int(result or 0).to_bytes(4, "little")
 
     def end(self) -> None:
         """Close the device that this link opened."""
@@ -182,25 +191,3 @@ class _Session:
             handle, kind, request & 0xFF, value, index, buffer, timeout
         )
         return buffer[:count] if to_host else memoryview(count.to_bytes(4, "little"))
-
-    def _simple(self, handle: Handle, op: Op, first: int, second: int) -> bytes:
-        backend = self._backend
-        if op == Op.CLAIM:
-            backend.claim_interface(handle, first)
-        elif op == Op.RELEASE:
-            backend.release_interface(handle, first)
-        elif op == Op.ALT_SETTING:
-            backend.set_interface_altsetting(handle, first, second)
-        elif op == Op.CONFIGURATION:
-            backend.get_configuration(handle)
-        elif op == Op.CLEAR_HALT:
-            backend.clear_halt(handle, first)
-        elif op == Op.RESET:
-            backend.reset_device(handle)
-        elif op == Op.DRIVER_ACTIVE:
-            return bytes([backend.is_kernel_driver_active(handle, first)])
-        elif op == Op.DRIVER_DETACH:
-            backend.detach_kernel_driver(handle, first)
-        elif op == Op.DRIVER_ATTACH:
-            backend.attach_kernel_driver(handle, first)
-        return b""

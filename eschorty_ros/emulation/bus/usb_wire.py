@@ -14,23 +14,37 @@ _ANSWER = struct.Struct("<II")
 
 
 class Op(IntEnum):
-    """Operations, named after those of pyusb's backend interface."""
+    """Operations; those of ``NUMBERS`` have the names of methods of pyusb's backend."""
 
     LIST = 0
     OPEN = 1
     JOIN = 2
-    CLAIM = 3
-    RELEASE = 4
-    ALT_SETTING = 5
-    CONFIGURATION = 6
-    CONTROL = 7
-    WRITE = 8
-    READ = 9
+    CONTROL = 3
+    WRITE = 4
+    READ = 5
+    CLAIM_INTERFACE = 6
+    RELEASE_INTERFACE = 7
+    SET_INTERFACE_ALTSETTING = 8
+    GET_CONFIGURATION = 9
     CLEAR_HALT = 10
-    RESET = 11
-    DRIVER_ACTIVE = 12
-    DRIVER_DETACH = 13
-    DRIVER_ATTACH = 14
+    RESET_DEVICE = 11
+    IS_KERNEL_DRIVER_ACTIVE = 12
+    DETACH_KERNEL_DRIVER = 13
+    ATTACH_KERNEL_DRIVER = 14
+
+
+NUMBERS = {
+    Op.CLAIM_INTERFACE: 1,
+    Op.RELEASE_INTERFACE: 1,
+    Op.SET_INTERFACE_ALTSETTING: 2,
+    Op.GET_CONFIGURATION: 0,
+    Op.CLEAR_HALT: 1,
+    Op.RESET_DEVICE: 0,
+    Op.IS_KERNEL_DRIVER_ACTIVE: 1,
+    Op.DETACH_KERNEL_DRIVER: 1,
+    Op.ATTACH_KERNEL_DRIVER: 1,
+}
+"""How many numbers an operation takes that is only forwarded to the backend."""
 
 
 Request = tuple[Op, tuple[int, int, int, int], bytearray]

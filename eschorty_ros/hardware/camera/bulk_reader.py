@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import array
 import ctypes
+import functools
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,10 +25,19 @@ from eschorty_ros.core.base.errors import (
 )
 from eschorty_ros.hardware.base.usb import translate
 
+TRANSFERS = 20
 TRANSFER_BYTES = 128 << 10
+_TRANSFER_TIMEOUT_MS = 100
+_CANCEL_WAITS = 50
+_CANCEL_WAIT_S = 0.02
+_DRAIN_MAX = 64
+_DRAIN_MS = 10
 _NAME = "camera: reading events"
 
 ClockNs = Callable[[], int]
+
+_LEAKED: list[Any] = []
+"""Transfers that libusb did not give back."""
 
 
 class BulkReader(Protocol):
@@ -98,16 +108,6 @@ def drain(device: usb.core.Device, endpoint: int, buffer: array.array[int]) -> N
             device.read(endpoint, buffer, _DRAIN_MS)
 
 
-_DRAIN_MAX = 64
-_DRAIN_MS = 10
-
-
-TRANSFERS = 20
-_TRANSFER_TIMEOUT_MS = 100
-_CANCEL_TURNS = 50
-_CANCEL_TURN_S = 0.02
-
-
 def make_reader(
     backend: usb.backend.IBackend, device: usb.core.Device, endpoint: int, clock_ns: ClockNs
 ) -> BulkReader:
@@ -133,11 +133,9 @@ def _queueing_library(backend: usb.backend.IBackend) -> Any | None:
     return libusb1
 
 
-_LIBRARIES: dict[str, ctypes.CDLL] = {}
-
-
+@functools.cache
 def _library(path: str) -> ctypes.CDLL:
-    return _LIBRARIES.setdefault(path, ctypes.CDLL(path))
+    return ctypes.CDLL(path)
 
 
 class AsyncReader:
@@ -194,12 +192,6 @@ class AsyncReader:
         self._synchronous.resume()
         self._queue_all()
 
-    def _queue_all(self) -> None:
-        self._failure = None
-        self._stopping = False
-        for _ in range(TRANSFERS):
-            self._queue_new()
-
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """Return the oldest completed transfer, handling libusb's events until there is one."""
         if not self._received and self._failure is None:
@@ -216,10 +208,10 @@ class AsyncReader:
         for transfer in self._transfers:
             # libusb refuses to cancel a completed transfer, without further effect.
             self._library.libusb_cancel_transfer(transfer)
-        for _ in range(_CANCEL_TURNS):
+        for _ in range(_CANCEL_WAITS):
             if not self._pending:
                 break
-            self._handle_events(_CANCEL_TURN_S)
+            self._handle_events(_CANCEL_WAIT_S)
         if self._pending:
             # libusb still owns them: 2.5 MB are leaked, because freeing them would crash.
             _LEAKED.append((self._transfers, self._buffers, self._on_completed))
@@ -228,25 +220,29 @@ class AsyncReader:
                 self._library.libusb_free_transfer(transfer)
         self._transfers, self._buffers, self._pending = [], [], 0
 
-    def _queue_new(self) -> None:
-        transfer = self._library.libusb_alloc_transfer(0)
-        if not transfer:
-            raise DeviceError("camera: no memory for USB transfers; close other programs")
-        buffer = ctypes.create_string_buffer(TRANSFER_BYTES)
-        self._transfers.append(transfer)
-        self._buffers.append(buffer)
-        self._library.libusb_fill_bulk_transfer(
-            transfer,
-            self._handle,
-            self._endpoint,
-            buffer,
-            TRANSFER_BYTES,
-            self._on_completed,
-            None,
-            _TRANSFER_TIMEOUT_MS,
-        )
-        self._pending += 1
-        self._submit(transfer)
+    def _queue_all(self) -> None:
+        library = self._library
+        self._failure = None
+        self._stopping = False
+        for _ in range(TRANSFERS):
+            transfer = library.libusb_alloc_transfer(0)
+            if not transfer:
+                raise DeviceError("camera: no memory for USB transfers; close other programs")
+            buffer = ctypes.create_string_buffer(TRANSFER_BYTES)
+            self._transfers.append(transfer)
+            self._buffers.append(buffer)
+            library.libusb_fill_bulk_transfer(
+                transfer,
+                self._handle,
+                self._endpoint,
+                buffer,
+                TRANSFER_BYTES,
+                self._on_completed,
+                None,
+                _TRANSFER_TIMEOUT_MS,
+            )
+            self._pending += 1
+            self._submit(transfer)
 
     def _submit(self, transfer: Any) -> None:
         code = self._library.libusb_submit_transfer(transfer)
@@ -285,6 +281,3 @@ class AsyncReader:
         code = library.libusb_handle_events_timeout(self._context, ctypes.byref(wait))
         if code and code != library.LIBUSB_ERROR_INTERRUPTED:
             self._fail(DeviceError, f"libusb error {code} while handling events")
-
-
-_LEAKED: list[Any] = []

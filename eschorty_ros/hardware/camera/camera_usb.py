@@ -7,10 +7,8 @@ hardware.
 from __future__ import annotations
 
 import array
-import struct
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import usb.backend
 import usb.core
@@ -22,9 +20,8 @@ from eschorty_ros.hardware.camera import treuzell
 from eschorty_ros.hardware.camera.bulk_reader import drain
 
 NAME = "EVK4 camera"
-VENDOR = 0x04B4
-PRODUCT = 0x00F5
-
+_VENDOR = 0x04B4
+_PRODUCT = 0x00F5
 _INTERFACE = 0
 _INTERFACE_CLASS = (0xFF, 0x19, 0x00)
 _DIRECTIONS = (usb.util.ENDPOINT_IN, usb.util.ENDPOINT_OUT, usb.util.ENDPOINT_IN)
@@ -34,8 +31,7 @@ _TIMEOUT_MS = 1000
 _CLOSING_TIMEOUT_MS = 200
 
 
-@dataclass(frozen=True, slots=True)
-class Endpoints:
+class Endpoints(NamedTuple):
     """Addresses of the three bulk endpoints."""
 
     control_in: int
@@ -43,7 +39,7 @@ class Endpoints:
     data_in: int
 
 
-def endpoints_of(device: usb.core.Device) -> Endpoints | None:
+def _endpoints(device: usb.core.Device) -> Endpoints | None:
     """Return a camera's endpoints, ``None`` when the device has other descriptors."""
     try:
         interface = device[0][(_INTERFACE, 0)]
@@ -65,12 +61,12 @@ def endpoints_of(device: usb.core.Device) -> Endpoints | None:
     return Endpoints(*addresses)
 
 
-def is_camera(device: usb.core.Device) -> bool:
+def _is_camera(device: usb.core.Device) -> bool:
     """Return whether the descriptors are those of an EVK4."""
     return (
-        device.idVendor == VENDOR
-        and device.idProduct == PRODUCT
-        and endpoints_of(device) is not None
+        device.idVendor == _VENDOR
+        and device.idProduct == _PRODUCT
+        and _endpoints(device) is not None
     )
 
 
@@ -86,7 +82,7 @@ class CameraUsb:
     """
 
     def __init__(self, device: usb.core.Device) -> None:
-        endpoints = endpoints_of(device)
+        endpoints = _endpoints(device)
         if endpoints is None:
             raise DeviceError(f"{NAME}: the device has other endpoints than an EVK4; unplug it")
         self.device = device
@@ -111,7 +107,8 @@ class CameraUsb:
         try:
             self.device.write(self.endpoints.control_out, frame, self._timeout_ms)
         except usb.core.USBError as error:
-            raise bus.translate(error, f"{NAME}: request {_name(frame)}") from error
+            request = int.from_bytes(frame[:4], "little")
+            raise bus.translate(error, f"{NAME}: request {request:X}") from error
 
     def receive(self) -> bytes:
         """Read an answer."""
@@ -135,7 +132,7 @@ class CameraUsb:
         self._timeout_ms = _CLOSING_TIMEOUT_MS
 
     def close(self) -> None:
-        """Give the interface back; never raises."""
+        """Release the interface; never raises."""
         bus.release(self.device, _INTERFACE, reattach=self._reattach)
 
 
@@ -152,24 +149,28 @@ def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
         When several are there and no serial is given, or it cannot be opened.
     """
     if not serial:
-        return CameraUsb(bus.find_device(backend, name=NAME, matches=is_camera))
+        return CameraUsb(bus.find_device(backend, name=NAME, matches=_is_camera))
     seen: list[str] = []
-    for place in _places(backend):
+    try:
+        found = list(usb.core.find(find_all=True, backend=backend, custom_match=_is_camera))
+    except usb.core.USBError as error:
+        raise bus.translate(error, f"{NAME}: looking for it on the bus") from error
+    for place in [(device.bus, device.address) for device in found]:
         try:
-            camera = CameraUsb(_at(backend, place))
+            camera = CameraUsb(_find(backend, place))
         except DeviceError as error:
             seen.append(str(error))
             continue
         try:
-            found = read_serial(treuzell.Treuzell(camera))
+            its_serial = read_serial(treuzell.Treuzell(camera))
         except EschortyError as error:
             camera.close()
             seen.append(str(error))
             continue
-        if _same_serial(found, serial):
+        if _same_serial(its_serial, serial):
             return camera
         camera.close()
-        seen.append(found)
+        seen.append(its_serial)
     if not seen:
         raise DeviceGoneError(
             f"{NAME}: none with serial {serial} on the bus; check cable, power and serial"
@@ -190,16 +191,6 @@ def read_serial(control: treuzell.Treuzell) -> str:
     return f"{int.from_bytes(payload, 'little'):08x}"
 
 
-def read_firmware(control: treuzell.Treuzell) -> int:
-    """Read the firmware version, 0xMMmmpp."""
-    payload = control.request(treuzell.FIRMWARE)
-    if len(payload) < 4:
-        raise DeviceError(
-            f"{NAME}: its firmware version has {len(payload)} bytes, not 4; update the camera"
-        )
-    return int(struct.unpack_from("<I", payload)[0])
-
-
 def _same_serial(one: str, other: str) -> bool:
     """Return whether two serials are equal; openeb prints up to 16 digits, labels the last 8."""
     with suppress(ValueError):
@@ -207,21 +198,9 @@ def _same_serial(one: str, other: str) -> bool:
     return one.lower() == other.lower()
 
 
-def _places(backend: usb.backend.IBackend) -> Iterator[tuple[int, int]]:
-    try:
-        found = list(usb.core.find(find_all=True, backend=backend, custom_match=is_camera))
-    except usb.core.USBError as error:
-        raise bus.translate(error, f"{NAME}: looking for it on the bus") from error
-    return iter([(device.bus, device.address) for device in found])
-
-
-def _at(backend: usb.backend.IBackend, place: tuple[int, int]) -> usb.core.Device:
+def _find(backend: usb.backend.IBackend, place: tuple[int, int]) -> usb.core.Device:
     return bus.find_device(
         backend,
         name=NAME,
-        matches=lambda device: is_camera(device) and (device.bus, device.address) == place,
+        matches=lambda device: _is_camera(device) and (device.bus, device.address) == place,
     )
-
-
-def _name(frame: bytes) -> str:
-    return f"{int.from_bytes(frame[:4], 'little'):X}"

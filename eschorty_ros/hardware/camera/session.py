@@ -16,16 +16,11 @@ from eschorty_ros.hardware.base.protocols import DeviceIdentity
 from eschorty_ros.hardware.camera import event_rate, imx636, monitors, treuzell
 from eschorty_ros.hardware.camera.biases import BiasBank
 from eschorty_ros.hardware.camera.bulk_reader import BulkReader, ClockNs, make_reader
-from eschorty_ros.hardware.camera.camera_usb import (
-    NAME,
-    open_camera,
-    read_firmware,
-    read_serial,
-)
+from eschorty_ros.hardware.camera.camera_usb import NAME, open_camera, read_serial
 from eschorty_ros.hardware.camera.registers import Sleep, run_sequence
 from eschorty_ros.hardware.camera.settings import CameraSettings, apply_settings
 
-FIRMWARE_OLDEST = 0x030800
+_FIRMWARE_OLDEST = 0x030800
 
 
 class Session:
@@ -150,12 +145,18 @@ class Session:
 
     def _identify(self) -> DeviceIdentity:
         serial = read_serial(self.control)
-        version = read_firmware(self.control)
-        text = _version_text(version)
-        if version < FIRMWARE_OLDEST:
+        payload = self.control.request(treuzell.FIRMWARE)
+        if len(payload) < 4:
             raise DeviceError(
-                f"{NAME} {serial}: its firmware is {text}, {_version_text(FIRMWARE_OLDEST)} is the "
-                "oldest supported; update it with the maker's tool"
+                f"{NAME} {serial}: its firmware version has {len(payload)} bytes, not 4; "
+                "update the camera"
+            )
+        version = struct.unpack_from("<I", payload)[0]
+        text = _version_text(version)
+        if version < _FIRMWARE_OLDEST:
+            raise DeviceError(
+                f"{NAME} {serial}: its firmware is {text}, {_version_text(_FIRMWARE_OLDEST)} is "
+                "the oldest supported; update it with the maker's tool"
             )
         devices = self.control.request(treuzell.DEVICE_COUNT)
         if len(devices) < 4 or struct.unpack_from("<I", devices)[0] < 1:
