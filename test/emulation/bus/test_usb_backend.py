@@ -1,16 +1,20 @@
-"""The emulated bus keeps pyusb's and libusb's rules, so that drivers meet them in tests."""
+"""The emulated bus follows pyusb's and libusb's rules, in this process and over a socket."""
 
 import array
+import contextlib
 import errno
+import functools
 import threading
 
 import pytest
 import usb.core
 import usb.util
+from short_folder import short_folder
 from usb_loop import IN, OUT, PACKET, Loop
-from waiting import DEADLINE_S
+from waiting import DEADLINE_S, wait_until
 
-from eschorty_ros.emulation.bus import EmulatedBackend
+from eschorty_ros.emulation.bus import EmulatedBackend, UsbServer
+from eschorty_ros.hardware.base.usb import open_backend
 
 
 @pytest.fixture
@@ -18,11 +22,30 @@ def loop():
     return Loop()
 
 
-def opened(model, backend=None):
-    return usb.core.find(backend=backend or EmulatedBackend(lambda: [model]), idVendor=0x1234)
+@pytest.fixture(params=["in this process", "over a socket"])
+def opened(request):
+    """A function that opens a model on a bus in this process or on one behind a socket."""
+    devices = []
+    with contextlib.ExitStack() as stack:
+
+        @functools.cache
+        def bus(model):
+            if request.param == "in this process":
+                return EmulatedBackend(lambda: [model])
+            path = stack.enter_context(short_folder()) / "usb.sock"
+            stack.enter_context(UsbServer(path, lambda: [model]))
+            return open_backend(f"eschorty_ros.emulation.bus.usb_remote:backend?{path}")
+
+        def open_on(model):
+            devices.append(usb.core.find(backend=bus(model), idVendor=0x1234))
+            return devices[-1]
+
+        yield open_on
+        for device in filter(None, devices):
+            usb.util.dispose_resources(device)
 
 
-def test_pyusb_reads_the_descriptors_and_strings(loop):
+def test_pyusb_reads_the_descriptors_and_strings(loop, opened):
     device = opened(loop)
     assert (device.idVendor, device.idProduct, device.serial_number) == (0x1234, 0x5678, "LOOP1")
     interface = device.get_active_configuration()[(0, 0)]
@@ -30,7 +53,7 @@ def test_pyusb_reads_the_descriptors_and_strings(loop):
     assert [(e.bEndpointAddress, e.wMaxPacketSize) for e in interface] == [(OUT, 64), (IN, 64)]
 
 
-def test_what_is_written_comes_back_in_both_ways_of_reading(loop):
+def test_what_is_written_comes_back_in_both_ways_of_reading(loop, opened):
     device = opened(loop)
     device.write(OUT, b"abc")
     assert device.read(IN, 512).tobytes() == b"abc"
@@ -40,7 +63,7 @@ def test_what_is_written_comes_back_in_both_ways_of_reading(loop):
     assert buffer[:4].tobytes() == b"defg"
 
 
-def test_a_transfer_longer_than_the_buffer_goes_on_in_the_next_read(loop):
+def test_a_transfer_longer_than_the_buffer_goes_on_in_the_next_read(loop, opened):
     device = opened(loop)
     data = bytes(range(200))
     device.write(OUT, data)
@@ -49,7 +72,7 @@ def test_a_transfer_longer_than_the_buffer_goes_on_in_the_next_read(loop):
     assert len(first) == 2 * PACKET
 
 
-def test_an_exact_multiple_without_an_empty_packet_blocks_a_larger_read_and_is_lost(loop):
+def test_an_exact_multiple_without_an_empty_packet_blocks_a_larger_read_and_is_lost(loop, opened):
     loop.zero_length = False
     device = opened(loop)
     device.write(OUT, bytes(2 * PACKET))
@@ -60,14 +83,16 @@ def test_an_exact_multiple_without_an_empty_packet_blocks_a_larger_read_and_is_l
     assert device.read(IN, 4 * PACKET).tobytes() == b"next"
 
 
-def test_an_exact_multiple_fills_the_buffer_and_leaves_its_empty_packet_for_the_next_read(loop):
+def test_an_exact_multiple_fills_the_buffer_and_leaves_its_empty_packet_for_the_next_read(
+    loop, opened
+):
     device = opened(loop)
     device.write(OUT, bytes(2 * PACKET))
     assert len(device.read(IN, 2 * PACKET)) == 2 * PACKET
     assert len(device.read(IN, 2 * PACKET)) == 0
 
 
-def test_a_packet_larger_than_the_rest_of_the_buffer_overflows_and_is_lost(loop):
+def test_a_packet_larger_than_the_rest_of_the_buffer_overflows_and_is_lost(loop, opened):
     device = opened(loop)
     device.write(OUT, bytes(PACKET) + b"tail")
     with pytest.raises(usb.core.USBError) as caught:
@@ -76,7 +101,7 @@ def test_a_packet_larger_than_the_rest_of_the_buffer_overflows_and_is_lost(loop)
     assert device.read(IN, PACKET).tobytes() == b"tail"
 
 
-def test_a_stalled_endpoint_refuses_until_its_halt_is_cleared(loop):
+def test_a_stalled_endpoint_refuses_until_its_halt_is_cleared(loop, opened):
     device = opened(loop)
     loop.stalled.add(OUT)
     for _ in range(2):
@@ -87,7 +112,7 @@ def test_a_stalled_endpoint_refuses_until_its_halt_is_cleared(loop):
     assert device.write(OUT, b"x") == 1
 
 
-def test_a_mute_device_times_out_in_both_directions(loop):
+def test_a_mute_device_times_out_in_both_directions(loop, opened):
     device = opened(loop)
     loop.mute = True
     with pytest.raises(usb.core.USBTimeoutError):
@@ -96,7 +121,7 @@ def test_a_mute_device_times_out_in_both_directions(loop):
         device.read(IN, 64)
 
 
-def test_after_replug_the_old_handle_stays_dead_and_a_new_search_finds_the_device(loop):
+def test_after_replug_the_old_handle_stays_dead_and_a_new_search_finds_the_device(loop, opened):
     device = opened(loop)
     device.write(OUT, b"x")
     loop.gone = True
@@ -112,7 +137,7 @@ def test_after_replug_the_old_handle_stays_dead_and_a_new_search_finds_the_devic
 
 
 @pytest.mark.parametrize("mute", [False, True])
-def test_unplugging_wakes_a_waiting_read(mute):
+def test_unplugging_wakes_a_waiting_read(mute, opened):
     loop = Loop(wait=threading.Condition.wait)
     device = opened(loop)
     codes = []
@@ -133,15 +158,16 @@ def test_unplugging_wakes_a_waiting_read(mute):
     assert codes == [errno.ENODEV]
 
 
-def test_two_handles_cannot_claim_one_interface_until_the_first_closes(loop):
-    backend = EmulatedBackend(lambda: [loop])
-    first, second = opened(loop, backend), opened(loop, backend)
+def test_two_handles_cannot_claim_one_interface_until_the_first_closes(loop, opened):
+    first, second = opened(loop), opened(loop)
     usb.util.claim_interface(first, 0)
     for attempt in (lambda: usb.util.claim_interface(second, 0), lambda: second.write(OUT, b"x")):
         with pytest.raises(usb.core.USBError) as caught:
             attempt()
         assert (caught.value.errno, caught.value.backend_error_code) == (errno.EBUSY, -6)
     usb.util.dispose_resources(first)
+    # Over a socket, the server frees the claim when it notices the end of the link.
+    wait_until(lambda: not loop.claims, "the claim freed")
     usb.util.claim_interface(second, 0)
 
 
@@ -157,7 +183,7 @@ def test_a_read_about_to_wait_when_its_handle_closes_takes_nothing(loop):
     assert loop.pending(IN)
 
 
-def test_a_kernel_driver_holds_the_interface_until_detached(loop):
+def test_a_kernel_driver_holds_the_interface_until_detached(loop, opened):
     loop.kernel_driver = "usbtmc"
     device = opened(loop)
     with pytest.raises(usb.core.USBError, match=r"busy"):
@@ -170,7 +196,7 @@ def test_a_kernel_driver_holds_the_interface_until_detached(loop):
     assert loop.kernel_driver == "usbtmc"
 
 
-def test_an_unknown_control_request_stalls(loop):
+def test_an_unknown_control_request_stalls(loop, opened):
     with pytest.raises(usb.core.USBError) as caught:
         opened(loop).ctrl_transfer(0xA1, 7, 0, 0, 24)
     assert caught.value.errno == errno.EPIPE
