@@ -1,6 +1,6 @@
-"""How fast the emulated bus delivers, in this process and from another: one table.
+"""Throughput of the emulated bus in this process and from another, as a table.
 
-The last rows are the EVK4 model's events as it hands them out, one packet of the sensor a read.
+The last rows are events of the EVK4 model, one packet of the sensor per read.
 
 Usage: python benchmark/usb_emulation.py [--megabytes 512]
 """
@@ -49,7 +49,7 @@ class Spring:
 
 
 class Firehose(Evk4Model):
-    """A camera that always has as much data as is asked for."""
+    """A camera that always fills the read."""
 
     _data = memoryview(b"\x2a" * (1 << 20))
 

@@ -1,4 +1,4 @@
-"""What the EVK4 driver sets on the emulated camera, seen in the events that come out of it."""
+"""Settings that the EVK4 driver makes on the emulated camera, and their effect on the events."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def stepped(setup: CameraOnBench, name: str, offsets: tuple[int, ...], ms: int) 
     return counts
 
 
-def test_a_camera_left_alone_is_simulated_as_the_factory_made_it(tmp_path: Path) -> None:
+def test_default_settings_simulate_the_factory_s_sensor(tmp_path: Path) -> None:
     with CameraOnBench(tmp_path) as setup:
         assert sensor_control(setup.bench.camera.settings) == SensorControl()
 
@@ -51,7 +51,7 @@ def test_raising_a_threshold_lowers_its_events_step_by_step(
         assert again == pytest.approx(counts[offsets.index(0)], rel=0.03)
 
 
-def test_a_narrow_follower_takes_events_at_10_khz(tmp_path: Path) -> None:
+def test_a_narrow_follower_removes_events_at_10_khz(tmp_path: Path) -> None:
     with CameraOnBench(tmp_path) as setup:
         setup.light(10_000.0)
         setup.counts(10)
@@ -77,7 +77,7 @@ def test_a_shorter_dead_time_gives_more_events_at_2_khz(tmp_path: Path) -> None:
         assert counts[-1] > 1.5 * counts[0]
 
 
-def test_biases_set_before_the_start_hold_from_its_first_event_on(tmp_path: Path) -> None:
+def test_biases_set_before_the_start_act_on_the_first_event(tmp_path: Path) -> None:
     settings = CameraSettings(biases={"bias_diff_on": 120})
     counts = []
     for given in (CameraSettings(), settings):
@@ -89,7 +89,7 @@ def test_biases_set_before_the_start_hold_from_its_first_event_on(tmp_path: Path
 
 
 def test_offsets_beyond_the_normal_range_act_as_its_end() -> None:
-    class Silent:
+    class Empty:
         def start(self) -> None: ...
 
         def stop(self) -> None: ...
@@ -98,7 +98,7 @@ def test_offsets_beyond_the_normal_range_act_as_its_end() -> None:
             return b""
 
     seen = []
-    model = Evk4Model(Silent())
+    model = Evk4Model(Empty())
     model.configure = lambda settings: seen.append(sensor_control(settings))
     fo = BIASES["bias_fo"]
     model.write(fo.address, 0x11A10000 | model.registers.factory_dacs["bias_fo"] + 90)
@@ -107,7 +107,7 @@ def test_offsets_beyond_the_normal_range_act_as_its_end() -> None:
     assert seen[-1] == SensorControl()
 
 
-def test_the_rate_control_keeps_its_rate_and_tells_what_it_drops(tmp_path: Path) -> None:
+def test_the_rate_control_keeps_its_rate_and_counts_dropped_events(tmp_path: Path) -> None:
     with CameraOnBench(tmp_path, CameraSettings(erc_rate=300_000)) as setup:
         setup.light(500.0)
         setup.counts(100)
@@ -117,11 +117,11 @@ def test_the_rate_control_keeps_its_rate_and_tells_what_it_drops(tmp_path: Path)
         print(f"{delivered} delivered, {dropped} dropped, {counters}")
         assert np.bincount(times_us // 200).max() == 60
         assert dropped > 0.5 * delivered
-        # What has not been told yet is the period under way.
-        untold = np.count_nonzero(times_us >= times_us[-1] // 200 * 200)
-        assert 0 <= delivered - counters.erc_events_out <= untold
-        told = counters.erc_events_in - counters.erc_events_out
-        assert 0 <= dropped - told < 0.02 * dropped
+        # The period in progress is not reported yet.
+        unreported = np.count_nonzero(times_us >= times_us[-1] // 200 * 200)
+        assert 0 <= delivered - counters.erc_events_out <= unreported
+        reported = counters.erc_events_in - counters.erc_events_out
+        assert 0 <= dropped - reported < 0.02 * dropped
         assert counters.sensor_drop_words == 0
 
 

@@ -1,4 +1,4 @@
-"""The bench's physics: laser, stage and sensor, each with its clock, joined without a device."""
+"""The bench's physics: laser, stage and sensor, each with its clock, without device models."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CALIBRATION = load_calibration("config_3").model_copy(
 
 
 class Clock:
-    """A clock that stands still until told."""
+    """A clock that a test sets."""
 
     def __init__(self, now_ns: int = 1_700_000_000_123_456_789) -> None:
         self.now_ns = now_ns
@@ -45,7 +45,7 @@ def drained(physics: Physics, max_bytes: int = 1 << 20) -> bytes:
 
 
 def history(zero_ns: int, physics: Physics) -> list[tuple[int, object]]:
-    """What laser and stage do, in a run of 400 ms."""
+    """Changes of laser and stage in a run of 400 ms."""
     move = plan_move(zero_ns + 60 * MS + 500_001, 0.0, 20.0, 200.0, 2000.0)
     return [
         (31 * MS + 77, lambda t: physics.set_laser(t, True, Modulation(100.0))),
@@ -57,7 +57,7 @@ def history(zero_ns: int, physics: Physics) -> list[tuple[int, object]]:
 
 
 def run(read_every_ns: int, max_bytes: int) -> tuple[bytes, Physics]:
-    """The bytes of the run when the camera is read so often."""
+    """The bytes of the run, read every ``read_every_ns``."""
     clock = Clock()
     physics = Physics(world, clock)
     physics.start()
@@ -73,7 +73,7 @@ def run(read_every_ns: int, max_bytes: int) -> tuple[bytes, Physics]:
     return b"".join(out), physics
 
 
-def test_bytes_do_not_depend_on_when_they_are_read() -> None:
+def test_bytes_do_not_depend_on_the_times_of_the_reads() -> None:
     streams = [run(*how) for how in ((MS, 1 << 20), (7 * MS, 1000), (90 * MS, 1 << 17))]
     shortest = min(len(data) for data, _ in streams)
     reference, physics = streams[0]
@@ -115,7 +115,7 @@ def test_clocks_drift_apart(sensor_ppm: float, generator_ppm: float) -> None:
     assert np.abs(edges - expected * np.arange(len(edges))).max() <= 1.0
 
 
-def test_stage_pulses_arrive_as_triggers_though_a_new_command_came_before_they_were_read() -> None:
+def test_stage_pulses_before_a_new_command_arrive_as_triggers() -> None:
     clock = Clock()
     zero_ns = clock.now_ns
     pulses = [(zero_ns + k * 20 * MS + j * MS, not j) for k in range(1, 10) for j in (0, 1)]
@@ -128,7 +128,7 @@ def test_stage_pulses_arrive_as_triggers_though_a_new_command_came_before_they_w
     physics.start()
     clock.now_ns += 110 * MS
     physics.collect_pulses()
-    stopped_ns[0] = 0  # the new command forgets the old one's pulses
+    stopped_ns[0] = 0  # a new command drops the old one's pulses
     clock.now_ns += 90 * MS
     triggers = Decoder(64, 720).decode(drained(physics)).triggers
     seen = [((t_ns - zero_ns) * 10001 // 10_000_000, rising) for t_ns, rising in pulses[:10]]
@@ -136,7 +136,7 @@ def test_stage_pulses_arrive_as_triggers_though_a_new_command_came_before_they_w
     assert physics.statistics()["trigger_edges"] == 10
 
 
-def test_some_edges_go_missing_and_are_counted() -> None:
+def test_missing_edges_are_counted() -> None:
     print(f"seed {SEED}")
     clock = Clock()
     physics = Physics(world, clock, Imperfections(missing_edges=0.1, seed=SEED), "laser")
@@ -152,7 +152,7 @@ def test_some_edges_go_missing_and_are_counted() -> None:
     assert 0.06 < counted["trigger_edges_missed"] / counted["trigger_edges"] < 0.14
 
 
-def test_jitter_delays_bytes_and_changes_none() -> None:
+def test_jitter_delays_bytes_and_changes_no_byte() -> None:
     def stream(jitter_ms: float) -> tuple[bytes, list[int]]:
         clock = Clock()
         physics = Physics(world, clock, Imperfections(usb_jitter_ms=jitter_ms, seed=SEED))
@@ -199,7 +199,7 @@ def test_a_new_start_begins_at_zero_with_laser_and_stage_as_they_are() -> None:
     assert physics.late_changes == 0
 
 
-def test_changes_told_too_late_are_counted() -> None:
+def test_late_changes_are_counted() -> None:
     clock = Clock()
     physics = Physics(world, clock)
     physics.start()

@@ -59,19 +59,19 @@ def test_it_serves_all_devices_and_cleans_up(folder: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_it_without_a_word(folder: Path, number: int) -> None:
+def test_a_signal_ends_it_without_output(folder: Path, number: int) -> None:
     process = subprocess.Popen(
         bench_command(folder, {}), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
     try:
         wait_until((folder / READY_FILE).exists, "the bench ready")
         process.send_signal(number)
-        _, said = process.communicate(timeout=DEADLINE_S)
+        _, errors = process.communicate(timeout=DEADLINE_S)
     finally:
         process.kill()
         process.communicate()
     assert process.returncode == 0
-    assert said == ""
+    assert errors == ""
     assert not (folder / READY_FILE).exists()
 
 
@@ -104,7 +104,7 @@ time.sleep(600)
     [({"scene": "teapot"}, "teapot"), ({"calibration": "config_9"}, "config_9"),
      ({"sensor-ppm": "2000"}, "sensor_ppm is 2000")],
 )  # fmt: skip
-def test_what_cannot_be_is_one_line(folder: Path, options: dict[str, str], named: str) -> None:
+def test_refused_options_are_one_line(folder: Path, options: dict[str, str], named: str) -> None:
     with pytest.raises(DeviceError, match=named) as refused, bench_process(folder, options):
         pass
     assert "\n" not in str(refused.value)
@@ -121,7 +121,7 @@ def test_the_default_folder_is_the_users_and_the_domains(monkeypatch: pytest.Mon
     assert bench_folder("/tmp/b") == Path("/tmp/b")
 
 
-def test_help_teaches() -> None:
+def test_help_names_files_options_and_examples() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "eschorty_ros.emulation.bench.server", "--help"],
         capture_output=True,

@@ -4,8 +4,10 @@ import fault_table
 
 
 def test_every_fault_test_says_what_the_driver_does_and_what_the_user_reads():
-    silent = [test.name for test in fault_table.fault_tests() if not (test.driver and test.user)]
-    assert silent == [], "docstring: 'driver: ...; user reads: ...'"
+    incomplete = [
+        test.name for test in fault_table.fault_tests() if not (test.driver and test.user)
+    ]
+    assert incomplete == [], "docstring: 'driver: ...; user reads: ...'"
 
 
 def test_every_fault_has_a_test():

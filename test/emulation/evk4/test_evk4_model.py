@@ -1,4 +1,4 @@
-"""The emulated EVK4 against the reference, with requests written out by hand."""
+"""The emulated EVK4 against the protocol, with requests written as bytes."""
 
 import errno
 import struct
@@ -23,7 +23,7 @@ READ, WRITE = 0x10102, 0x40010102
 
 
 class Words:
-    """A source that gives prepared words, one piece per read."""
+    """A source of prepared words, one piece per read."""
 
     def __init__(self, *pieces):
         self.pieces = [np.asarray(piece, "<u2").tobytes() for piece in pieces]
@@ -40,14 +40,14 @@ class Words:
 
 
 class Host:
-    """Speaks to the model over pyusb as the reference describes it."""
+    """Uses the model over pyusb, without the driver."""
 
     def __init__(self, source=None, **options):
         self.source = source or Words()
         self.model = Evk4Model(self.source, wait=lambda *_: False, **options)
         self.device = usb.core.find(backend=EmulatedBackend(lambda: [self.model]))
 
-    def ask(self, property_, *words):
+    def request(self, property_, *words):
         self.device.write(
             CONTROL_OUT, struct.pack(f"<{2 + len(words)}I", property_, 4 * len(words), *words)
         )
@@ -57,14 +57,14 @@ class Host:
         return head[0], answer[8:]
 
     def read(self, address):
-        kind, payload = self.ask(READ, 0, address, 1)
+        kind, payload = self.request(READ, 0, address, 1)
         assert kind == READ
         device, echoed, value = struct.unpack("<3I", payload)
         assert (device, echoed) == (0, address)
         return value
 
     def write(self, address, value):
-        kind, payload = self.ask(WRITE, 0, address, value)
+        kind, payload = self.request(WRITE, 0, address, value)
         assert (kind, struct.unpack("<3I", payload)) == (WRITE, (0, address, value))
 
     def run(self, *names, pause=lambda ns: None):
@@ -82,17 +82,17 @@ def words(data):
     return [f"{word:04X}" for word in np.frombuffer(data, "<u2")]
 
 
-def test_the_board_says_who_it_is():
+def test_the_board_reports_its_identity():
     host = Host(board=BoardIdentity(serial=0x1_0005_1234))
     device = host.device
     assert (device.idVendor, device.idProduct, device.speed) == (0x04B4, 0x00F5, 4)
     interface = device.get_active_configuration()[(0, 0)]
     assert (interface.bInterfaceClass, interface.bInterfaceSubClass) == (0xFF, 0x19)
     assert [e.bEndpointAddress for e in interface] == [0x82, 0x02, 0x81]
-    assert host.ask(0x72) == (0x72, struct.pack("<Q", 0x1_0005_1234))
-    assert host.ask(0x79) == (0x79, struct.pack("<I", 0x030900))
-    assert host.ask(0x10000) == (0x10000, struct.pack("<I", 1))
-    assert host.ask(0x10003, 0)[1][4:].split(b"\0")[0] == b"psee,ccam5_imx636"
+    assert host.request(0x72) == (0x72, struct.pack("<Q", 0x1_0005_1234))
+    assert host.request(0x79) == (0x79, struct.pack("<I", 0x030900))
+    assert host.request(0x10000) == (0x10000, struct.pack("<I", 1))
+    assert host.request(0x10003, 0)[1][4:].split(b"\0")[0] == b"psee,ccam5_imx636"
     assert (host.read(0x14), host.read(0xF128) & 3) == (0xA0401806, 0)
 
 
@@ -108,7 +108,7 @@ def test_the_board_says_who_it_is():
     ],
 )
 def test_refused_requests_answer_with_the_errno(request_words, expected):
-    kind, payload = Host().ask(*request_words)
+    kind, payload = Host().request(*request_words)
     assert (kind, *struct.unpack(f"<{len(payload) // 4}I", payload)) == expected
 
 
@@ -121,8 +121,8 @@ def test_a_request_whose_size_is_wrong_is_refused():
 
 def test_bursts_cover_consecutive_registers():
     host = Host()
-    host.ask(WRITE, 0, 0x6800, 1, 2, 3)
-    assert struct.unpack("<5I", host.ask(READ, 0, 0x6800, 3)[1]) == (0, 0x6800, 1, 2, 3)
+    host.request(WRITE, 0, 0x6800, 1, 2, 3)
+    assert struct.unpack("<5I", host.request(READ, 0, 0x6800, 3)[1]) == (0, 0x6800, 1, 2, 3)
 
 
 def test_it_streams_only_after_init_and_start_in_order():
@@ -153,14 +153,14 @@ def test_a_sequence_out_of_order_is_named_and_has_no_effect():
     assert host.model.watch.violations[0] == "init step 6: B004=A expected, B040=0 came"
 
 
-def test_destroy_while_streaming_ends_the_stream_and_is_noted():
+def test_destroy_while_streaming_ends_the_stream_and_is_a_violation():
     host = Host()
     host.run("init", "start", "destroy")
     assert host.source.calls == ["start", "stop"]
     assert host.model.watch.violations == ["destroy while streaming"]
 
 
-def test_short_waits_are_noted_with_a_clock():
+def test_short_waits_are_violations():
     now = [0]
     host = Host(clock_ns=lambda: now[0])
 
@@ -252,7 +252,7 @@ def test_stale_data_stays_until_it_is_read_and_time_restarts_with_a_start():
     assert words(host.data()) == ["8000", "6002", "2002"]
 
 
-def test_a_full_buffer_drops_and_says_how_much():
+def test_a_full_buffer_drops_words_and_marks_their_number():
     host = Host(Words([0x8000, 0x6064, 0x0001, 0x2001], [0x6065, 0x2002, 0x6066, 0x2003]))
     host.model.buffer_bytes = 12
     host.run("init", "start")

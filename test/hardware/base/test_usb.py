@@ -1,4 +1,4 @@
-"""Finding and opening USB devices: one device, or one line that says why not and what to do."""
+"""Finding and opening USB devices: one device, or an error in one line with its remedy."""
 
 import errno
 from dataclasses import replace
@@ -48,7 +48,7 @@ def test_serials_are_compared_without_case_and_others_are_named():
     assert "00aB, 00ac" in line(caught)
 
 
-def test_none_and_several_say_what_to_do():
+def test_no_device_and_several_are_errors_with_a_remedy():
     with pytest.raises(DeviceGoneError, match="check cable"):
         find()
     with pytest.raises(DeviceError, match=r"2 devices match .* give the serial"):
@@ -92,7 +92,7 @@ def test_second_client_of_a_usb_device():
     usb_access.claim(second, 0, "loop")
 
 
-def test_release_of_a_device_that_is_gone_is_quiet():
+def test_release_of_an_unplugged_device_does_not_raise():
     loop = Loop()
     device = find(loop)
     usb_access.claim(device, 0, "loop")
@@ -111,7 +111,7 @@ def test_release_of_a_device_that_is_gone_is_quiet():
         (None, DeviceError),
     ],
 )
-def test_errors_are_told_apart_by_number(code, kind):
+def test_errors_are_distinguished_by_number(code, kind):
     error = usb_access.translate(usb.core.USBError("text", None, code), "EVK4: reading")
     assert type(error) is kind
     assert str(error).startswith("EVK4: reading: ")

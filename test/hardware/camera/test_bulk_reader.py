@@ -1,4 +1,4 @@
-"""Queued transfers at libusb's C interface: its structures are real, the bus is not."""
+"""Queued transfers at libusb's C interface, with its real structures and a fake bus."""
 
 # ruff: noqa: E402 - without the packages the file skips before it imports what needs them
 
@@ -33,7 +33,7 @@ def address(transfer: Any) -> int:
 
 
 class Bus:
-    """libusb whose transfers complete as a test says; the rest of its interface is the real one."""
+    """libusb whose transfers complete as a test sets; the rest of its interface is real."""
 
     def __init__(self) -> None:
         self.queued: list[Any] = []
@@ -74,7 +74,7 @@ class Bus:
         return 0
 
 
-class Silent:
+class Empty:
     """A device whose endpoint is empty."""
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ def bus() -> Bus:
 def reader_on(bus: Bus) -> AsyncReader:
     handle, context = ctypes.c_void_p(8), ctypes.c_void_p(16)
     clock = iter(range(10_000))
-    synchronous = SyncReader(Silent(), 0x81, lambda: 0)
+    synchronous = SyncReader(Empty(), 0x81, lambda: 0)
     return AsyncReader(bus, handle, context, synchronous, 0x81, lambda: next(clock))
 
 
@@ -133,7 +133,7 @@ def test_failed_transfer_comes_after_what_was_received(
 ) -> None:
     reader = reader_on(bus)
     reader.start()
-    # What completes after the failure lies behind the gap and must not come before it is told.
+    # Data after the failure lies behind a gap and must not come before the error.
     bus.events = [(COMPLETED, b"abcd"), (status, b""), (COMPLETED, b"late")]
     assert reader.read(0.1)[0] == b"abcd"
     with pytest.raises(kind) as caught:
@@ -160,7 +160,7 @@ def test_transfer_that_cannot_be_queued_is_an_error(bus: Bus) -> None:
 def test_emulated_backend_is_read_synchronously() -> None:
     class Backend: ...
 
-    assert isinstance(make_reader(Backend(), Silent(), 0x81, lambda: 0), SyncReader)  # type: ignore[arg-type]
+    assert isinstance(make_reader(Backend(), Empty(), 0x81, lambda: 0), SyncReader)  # type: ignore[arg-type]
 
 
 def test_real_libusb_is_read_with_queued_transfers() -> None:
@@ -170,7 +170,7 @@ def test_real_libusb_is_read_with_queued_transfers() -> None:
     class Context:
         handle = Handle()
 
-    class Opened(Silent):
+    class Opened(Empty):
         _ctx = Context()
 
     reader = make_reader(BACKEND, Opened(), 0x81, lambda: 0)  # type: ignore[arg-type]

@@ -164,8 +164,8 @@ def test_a_scene_without_events_is_no_failure() -> None:
     with CameraBench() as bench:
         bench.streaming()
         bench.exchange()
-        asked = bench.count("control_requests")
-        wait_until(lambda: bench.count("control_requests") > asked + 3, "requests to the camera")
+        before = bench.count("control_requests")
+        wait_until(lambda: bench.count("control_requests") > before + 3, "requests to the camera")
         wait_until(lambda: bench.camera.healthy, "health")
         bench.exchange()
         assert (bench.count("losses"), bench.count("gaps")) == (0, 0)

@@ -55,24 +55,24 @@ def test_a_refused_request_is_an_error_at_once() -> None:
     assert link.recoveries == 0
 
 
-ASKED = (treuzell.SERIAL, treuzell.REGISTERS, treuzell.REGISTERS | treuzell.WRITE)
+REQUESTS = (treuzell.SERIAL, treuzell.REGISTERS, treuzell.REGISTERS | treuzell.WRITE)
 FRAMES = st.builds(
     treuzell.request_frame,
-    st.sampled_from([*ASKED, *(a | treuzell.FAILED for a in ASKED), treuzell.FAILED]),
+    st.sampled_from([*REQUESTS, *(a | treuzell.FAILED for a in REQUESTS), treuzell.FAILED]),
     st.binary(max_size=40),
 )
 
 
 @settings(deadline=None)
-@given(st.binary(max_size=64) | FRAMES, st.sampled_from(ASKED))
-def test_any_bytes_are_an_answer_or_one_line(frame: bytes, asked: int) -> None:
-    if frame[:4] == asked.to_bytes(4, "little") and frame[4:8] == (len(frame) - 8).to_bytes(
+@given(st.binary(max_size=64) | FRAMES, st.sampled_from(REQUESTS))
+def test_any_bytes_are_an_answer_or_one_line(frame: bytes, request: int) -> None:
+    if frame[:4] == request.to_bytes(4, "little") and frame[4:8] == (len(frame) - 8).to_bytes(
         4, "little", signed=True
     ):
-        assert treuzell.answer_payload(asked, frame) == frame[8:]
+        assert treuzell.answer_payload(request, frame) == frame[8:]
         return
     with pytest.raises(DeviceError) as caught:
-        treuzell.answer_payload(asked, frame)
+        treuzell.answer_payload(request, frame)
     assert "\n" not in str(caught.value)
 
 

@@ -1,4 +1,4 @@
-"""The camera node at an emulated bench: what it publishes is what the sensor gave."""
+"""The camera node at an emulated bench publishes the sensor's bytes."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ CAMERA = {
 }
 
 
-class Witness:
-    """Notes every byte that the pixels give, and when they begin anew."""
+class Recorder:
+    """Records every byte of the sensor, by start of its stream."""
 
     def __init__(self, bench: Bench) -> None:
         self.runs: list[list[bytes]] = []
@@ -57,7 +57,7 @@ class Capture:
     def __init__(self, observer: Observer, bench: Bench) -> None:
         profile = qos.events()
         profile.reliability = ReliabilityPolicy.RELIABLE
-        self.witness = Witness(bench)
+        self.recorder = Recorder(bench)
         self.packets = observer.collect(EventPacket, "camera/events", profile)
         wait_until(lambda: observer.node.count_publishers("camera/events"), "camera/events")
         observer.wait_for_state("camera", "unconfigured")
@@ -119,7 +119,7 @@ def test_packets_are_numbered_and_bounded(capture: Capture) -> None:
 
 
 def test_every_byte_of_the_sensor_is_published_in_order(capture: Capture) -> None:
-    for run, given in zip(runs(capture), capture.witness.runs, strict=True):
+    for run, given in zip(runs(capture), capture.recorder.runs, strict=True):
         published = b"".join(bytes(packet.events) for packet in run)
         sensor = b"".join(given)
         assert sensor.startswith(published)
@@ -127,7 +127,7 @@ def test_every_byte_of_the_sensor_is_published_in_order(capture: Capture) -> Non
         assert len(published) > 0.9 * len(sensor)
 
 
-def test_sensor_time_begins_anew_with_every_start(capture: Capture) -> None:
+def test_sensor_time_restarts_with_every_start(capture: Capture) -> None:
     for run in runs(capture):
         assert decoded(bytes(run[0].events))["t"][0] < 20_000
 

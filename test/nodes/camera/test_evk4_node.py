@@ -35,7 +35,7 @@ BUS = "camera_node"
 
 
 class Run:
-    """One camera node, what it says, and the camera model it drives."""
+    """A camera node, its messages, and the emulated camera."""
 
     def __init__(self, observer: Observer, node: CameraNode, source: OnDemand, model: Any) -> None:
         self.observer, self.node, self.source, self.model = observer, node, source, model
@@ -61,7 +61,7 @@ class Run:
         return self
 
     def packets_from(self, count: int) -> list[Any]:
-        """Let events come about until ``count`` more packets are here."""
+        """Give events until ``count`` more packets arrived; returns these packets."""
         before = len(self.packets)
 
         def enough() -> bool:
@@ -77,7 +77,7 @@ Start = Callable[..., Run]
 
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
-    # The initialisation's waits are the sensor's; tested in the driver's own tests.
+    # Shorter waits of the initialisation; the driver's own tests check them.
     monkeypatch.setattr(evk4.Evk4, "_wait", lambda self, seconds: time.sleep(seconds / 100.0))
     context = rclpy.Context()
     with Observer(free_domain(), "evk4_observer") as observer:
@@ -123,8 +123,10 @@ def test_events_stream_with_arrival_stamps(start: Start) -> None:
     wait_until(lambda: run.beats, "a beat")
 
 
-def test_unplugged_camera_is_told_at_once_and_the_stream_restarts_at_zero(start: Start) -> None:
-    # Looked for until it is back, however late that is.
+def test_an_unplugged_camera_is_reported_at_once_and_the_stream_restarts_at_zero(
+    start: Start,
+) -> None:
+    # Attempts enough for any delay of the test.
     run = start(reconnect_attempts=1000).active()
     run.packets_from(4)
     run.model.gone = True
@@ -141,19 +143,19 @@ def test_unplugged_camera_is_told_at_once_and_the_stream_restarts_at_zero(start:
     run.model.replug()
     wait_until(lambda: run.node.healthy, "the camera back")
 
-    def anew() -> list[int]:
-        """Numbers since the stream's second beginning; packets of the first may come late."""
+    def restarted() -> list[int]:
+        """Return the numbers since the second start; packets of the first may arrive late."""
         run.source.give(5)
         seqs = [packet.seq for packet in list(run.packets)]
         begins = [k for k, seq in enumerate(seqs) if seq == 0]
         return seqs[begins[1] :] if len(begins) > 1 else []
 
-    wait_until(lambda: len(anew()) > 3, "packets of the new stream")
-    seqs = anew()
+    wait_until(lambda: len(restarted()) > 3, "packets of the new stream")
+    seqs = restarted()
     assert seqs == list(range(len(seqs)))
 
 
-def test_camera_that_stays_away_ends_the_node_s_activity(start: Start) -> None:
+def test_a_camera_that_stays_unplugged_deactivates_the_node(start: Start) -> None:
     run = start(reconnect_attempts=1).active()
     run.model.gone = True
     wait_until(lambda: run.node.state_label == "unconfigured", "the node unconfigured")
@@ -169,7 +171,7 @@ def test_absent_camera_is_waited_for(start: Start) -> None:
     run.active()
 
 
-def test_biases_are_parameters_kept_by_the_camera(start: Start, tmp_path: Path) -> None:
+def test_biases_are_parameters_that_the_camera_holds(start: Start, tmp_path: Path) -> None:
     path = tmp_path / "kept.bias"
     path.write_text("12 % bias_hpf\n-4 % bias_fo\n")
     run = start(bias_diff_on=30, bias_fo=6, bias_file=str(path)).active()
@@ -220,7 +222,7 @@ def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
     assert "erases the laser's 70 Hz; switch it off" in status.message
 
 
-def test_what_the_rate_control_drops_is_told(start: Start, tmp_path: Path) -> None:
+def test_events_dropped_by_the_rate_control_are_reported(start: Start, tmp_path: Path) -> None:
     still = StillBench(tmp_path)
     run = start(model=still.bench.camera, erc_mode="enabled", erc_rate=300_000).active()
     words = run.node.words
@@ -230,8 +232,8 @@ def test_what_the_rate_control_drops_is_told(start: Start, tmp_path: Path) -> No
     assert dropped > still.statistic("events")
     status = run.status(lambda s: "erc_events_dropped" in s.message, "the loss in the diagnostics")
     assert status.level == DiagnosticStatus.WARN
-    told = {value.key: value.value for value in status.values}
-    assert 0 < int(told["erc_events_dropped"]) <= dropped
+    values = {value.key: value.value for value in status.values}
+    assert 0 < int(values["erc_events_dropped"]) <= dropped
     statistics = run.observer.call(Trigger, "camera/dump_statistics")
     assert "erc_events_dropped" in statistics.message
     assert "erc_rate_hz 300000" in statistics.message

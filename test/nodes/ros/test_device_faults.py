@@ -1,4 +1,4 @@
-"""What the nodes do when a device fails while active: said once, safe, unconfigured, reported."""
+"""A device that fails while its node is active: reported, closed, unconfigured."""
 
 # ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
 from __future__ import annotations
@@ -65,7 +65,7 @@ def run(observer: Observer, emulated: tuple[Bench, Path]) -> Iterator[Run]:
 
 
 @pytest.mark.parametrize(("kind", "name"), [(LaserNode, "laser"), (StageNode, "stage")])
-def test_lost_device_is_closed_reported_and_left_alone(
+def test_a_lost_device_is_reported_closed_and_not_opened_again(
     kind: type[DeviceNode],
     name: str,
     run: Run,
@@ -80,10 +80,10 @@ def test_lost_device_is_closed_reported_and_left_alone(
     print(node.failure)
     assert node.failure
     assert "\n" not in node.failure
-    told = node.failure.split(": ")[-1]
+    reason = node.failure.split(": ")[-1]
     wait_until(
         lambda: any(
-            status.level == DiagnosticStatus.ERROR and told in status.message
+            status.level == DiagnosticStatus.ERROR and reason in status.message
             for array in reports
             for status in array.status
         ),
@@ -95,7 +95,7 @@ def test_lost_device_is_closed_reported_and_left_alone(
         device.gone = False
     time.sleep(3.0)
     assert node.state_label == "unconfigured", "nothing starts by itself after a failure"
-    # The laser's old guard may still hold the generator, to switch it off.
+    # The laser's old guard may still hold the generator while it switches it off.
     wait_until(lambda: observer.change_state(name, "configure"), "the device open again")
     assert observer.change_state(name, "activate")
     assert node.active

@@ -1,4 +1,4 @@
-"""What a node does whose device is not there when it starts: named, retried, never a traceback."""
+"""A node whose device is missing at the start: reason logged once, retried, no traceback."""
 
 # ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
 from __future__ import annotations
@@ -82,7 +82,7 @@ def run(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     context.try_shutdown()
 
 
-def test_an_absent_device_is_waited_for_and_told_once_per_reason(run, observer, capfd) -> None:
+def test_an_absent_device_is_retried_and_logged_once_per_reason(run, observer, capfd) -> None:
     reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
     absent, held = DeviceError("no camera found; plug it in"), DeviceError("camera is held")
     node = run(*[absent] * 5, held)
@@ -99,11 +99,11 @@ def test_an_absent_device_is_waited_for_and_told_once_per_reason(run, observer, 
     assert node.closed == node.device.attempts - 1
     assert (node.waiting, node.failure) == ("", "")
 
-    told = [line.split("]: ")[-1] for line in capfd.readouterr().err.splitlines()]
-    assert [line for line in told if "waiting" in line] == expected
+    lines = [line.split("]: ")[-1] for line in capfd.readouterr().err.splitlines()]
+    assert [line for line in lines if "waiting" in line] == expected
 
 
-def test_after_a_failure_in_operation_nothing_starts_by_itself(run) -> None:
+def test_after_a_failure_in_operation_nothing_restarts(run) -> None:
     node = run(None)
     wait_until(lambda: node.active, "the node active")
     node.fault("device lost: unplugged")
@@ -114,7 +114,7 @@ def test_after_a_failure_in_operation_nothing_starts_by_itself(run) -> None:
     assert (node.waiting, node.failure) == ("", "device lost: unplugged")
 
 
-def test_a_wrong_setting_is_no_reason_to_wait(run) -> None:
+def test_a_wrong_setting_is_not_retried(run) -> None:
     node = run(ArgumentError("driver 'magic' is unknown"))
     wait_until(lambda: node.failure, "the failure")
     assert not threading.Event().wait(1.0)

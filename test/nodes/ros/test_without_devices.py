@@ -1,4 +1,4 @@
-"""Real drivers without devices: each node says what it waits for, and nothing breaks."""
+"""Real drivers without devices: each node reports what it waits for, and ends normally."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.lifecycle import RETRY_S
 
 NODES = "eschorty_ros.nodes.{}.node"
-# An empty bus for this host's real one, which may hold a camera or a generator.
+# An empty bus instead of this host's, which may have a camera or a generator.
 EMPTY = "eschorty_ros.emulation.bus.usb_remote:backend?/nonexistent/usb.sock"
 DEVICES = {
     NODES.format("camera"): {"driver": "evk4", "backend": EMPTY},
@@ -39,33 +39,33 @@ def running(observer: Observer) -> Iterator[dict[str, NodeProcess]]:
         yield running
 
 
-def test_every_node_names_what_it_waits_for(
+def test_every_node_reports_what_it_waits_for(
     observer: Observer, running: dict[str, NodeProcess]
 ) -> None:
     reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
     waiting = ("camera", "laser", "stage", "scanner")
 
-    def told() -> dict[str, DiagnosticStatus]:
+    def reported() -> dict[str, DiagnosticStatus]:
         newest = {s.name.rsplit("/", 1)[-1]: s for array in reports for s in array.status}
         return {name: newest[name] for name in waiting if name in newest}
 
     wait_until(
         lambda: (
-            len(told()) == len(waiting)
-            and all(status.message.startswith("waiting: ") for status in told().values())
+            len(reported()) == len(waiting)
+            and all(status.message.startswith("waiting: ") for status in reported().values())
         ),
         "every node waiting",
     )
-    for name, status in told().items():
+    for name, status in reported().items():
         print(f"{name}: {status.message}")
         assert status.level == DiagnosticStatus.WARN
         assert "\n" not in status.message
     for name in ("camera", "laser", "stage"):
-        assert f"trying again every {RETRY_S:g} s" in told()[name].message
+        assert f"trying again every {RETRY_S:g} s" in reported()[name].message
         assert observer.lifecycle_state(name) == "unconfigured"
 
 
-def test_it_is_logged_once_and_tried_on(running: dict[str, NodeProcess]) -> None:
+def test_the_reason_is_logged_once(running: dict[str, NodeProcess]) -> None:
     time.sleep(2.5 * RETRY_S)
     for name in ("camera", "laser", "stage"):
         lines = [line for line in running[name].output.splitlines() if "waiting: " in line]
