@@ -73,3 +73,21 @@ def test_every_command_it_shows_exists():
     shown = set(re.findall(r"^    eschorty (\w+)", README, re.MULTILINE))
     assert shown
     assert shown <= set(COMMANDS)
+
+
+def test_the_architecture_names_files_and_functions_that_exist():
+    """A list item's functions stand in a file of that item or, without one, of those before."""
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    sources = ""
+    for item in re.findall(r"^(?:\d+\.|- ) .*", page, re.MULTILINE):
+        names = re.findall(r"`([\w./]+)`", item)
+        files = [ROOT / "eschorty_ros" / name for name in names if name.endswith(".py")]
+        for file in files:
+            assert file.is_file(), file
+        sources = "\n".join(file.read_text() for file in files) or sources
+        for name in names:
+            if re.fullmatch(r"(?!_)[A-Z]\w+(\.\w+)?|[a-z]\w+_\w+", name.strip()):
+                for part in name.split("."):
+                    assert re.search(rf"\b{part}\b", sources), f"{name} is not in {files}"
+    for folder in re.findall(r"^\| `(\w+)/`", page, re.MULTILINE):
+        assert (ROOT / "eschorty_ros" / folder).is_dir()
