@@ -66,11 +66,19 @@ faults: $(SETUP)
 reference: $(SETUP)
 	@$(ENTER) python test/support/interface_tables.py
 
+# Pure parts share the cores; what starts processes and devices runs alone.
+PURE := $(addprefix test/,core live control simulation stability report experiments)
+ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
+else
+test: $(SETUP) $(BUILD)/test.stamp
+	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
+	@$(ENTER) pytest test $(addprefix --ignore=,$(PURE))
+endif
 
 quick: $(SETUP) $(BUILD)/test.stamp
-	@$(ENTER) pytest test/core test/live test/control
+	@$(ENTER) pytest --numprocesses $(JOBS) test/core test/live test/control
 
 picture: $(BUILD)/test.stamp
 	@$(VENV)/bin/python docs/architecture.py
