@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -35,10 +34,6 @@ class BoardIdentity:
 
     serial: int = 0x00051234
     firmware: int = 0x030900
-    build_date_s: int = 1_700_000_000
-    name: str = "EVK4"
-    compatible: tuple[str, ...] = ("psee,ccam5_imx636", "psee,ccam5_gen42")
-    interface_hz: int = 100_000_000
 
 
 def frame(property_: int, payload: bytes = b"") -> bytes:
@@ -48,10 +43,6 @@ def frame(property_: int, payload: bytes = b"") -> bytes:
 
 def _words(*values: int) -> bytes:
     return struct.pack(f"<{len(values)}I", *values)
-
-
-def _strings(device: int, *texts: str) -> bytes:
-    return _words(device) + b"".join(text.encode() + b"\0" for text in texts)
 
 
 class TreuzellBoard:
@@ -64,22 +55,11 @@ class TreuzellBoard:
     """
 
     def __init__(self, identity: BoardIdentity, registers: RegisterAccess):
-        self._identity = identity
         self._registers = registers
-        self._properties: dict[int, Callable[[], bytes]] = {
-            0x71: lambda: _words(1),
-            0x72: lambda: struct.pack("<Q", identity.serial),
-            0x79: lambda: _words(identity.firmware),
-            0x7A: lambda: struct.pack("<Q", identity.build_date_s),
-            0x10000: lambda: _words(1),
-        }
-        self._of_device: dict[int, Callable[[], bytes]] = {
-            0x10001: lambda: _strings(0, identity.name),
-            0x10002: lambda: _words(0, identity.interface_hz),
-            0x10003: lambda: _strings(0, *identity.compatible),
-            0x10010: lambda: _words(0),
-            0x10200: lambda: _words(0),
-            0x10201: lambda: _strings(0, "EVT3"),
+        self._properties = {
+            0x72: struct.pack("<Q", identity.serial),
+            0x79: _words(identity.firmware),
+            0x10000: _words(1),
         }
 
     def answer(self, request: bytes) -> bytes:
@@ -90,15 +70,10 @@ class TreuzellBoard:
         payload = request[8:]
         if size != len(payload) or size % 4:
             return frame(property_ | FAILED, _words(0, 0, errno.EINVAL))
-        base = property_ & ~WRITE
-        if base == REGISTERS:
+        if property_ & ~WRITE == REGISTERS:
             return self._register_request(property_, payload)
-        if base in self._of_device:
-            if len(payload) < 4 or payload[:4] != _words(0):
-                return frame(property_ | FAILED, _words(0, 0, errno.ENODEV))
-            return frame(property_, self._of_device[base]())
         if property_ in self._properties:
-            return frame(property_, self._properties[property_]())
+            return frame(property_, self._properties[property_])
         return frame(FAILED)
 
     def _register_request(self, property_: int, payload: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""The queue between receiving and publishing: nothing lost silently."""
+"""Words, gaps, restarts and failures in the queue between receiving and publishing."""
 
 from __future__ import annotations
 
@@ -8,22 +8,10 @@ from eschorty_ros.core.base.errors import DeviceGoneError
 from eschorty_ros.hardware.camera.chunk_queue import ChunkQueue
 
 
-def opened(bytes_max: int = 1000) -> ChunkQueue:
-    queue = ChunkQueue(bytes_max)
+def opened() -> ChunkQueue:
+    queue = ChunkQueue()
     queue.open()
     return queue
-
-
-def test_first_chunk_begins_the_stream() -> None:
-    queue = opened()
-    queue.put(b"abcd", 7)
-    queue.put(b"efgh", 8)
-    first, second = queue.get(0.0), queue.get(0.0)
-    assert first is not None
-    assert second is not None
-    assert (first.data, first.arrival_ns, first.restarted, first.gap) == (b"abcd", 7, True, False)
-    assert (second.data, second.restarted) == (b"efgh", False)
-    assert queue.get(0.0) is None
 
 
 def test_words_cut_by_a_transfer_are_joined() -> None:
@@ -36,22 +24,7 @@ def test_words_cut_by_a_transfer_are_joined() -> None:
     assert [chunk.data for chunk in got if chunk] == [b"ab", b"cd", b"ef"]
 
 
-def test_overflow_drops_counts_and_marks_the_gap() -> None:
-    queue = opened(bytes_max=8)
-    queue.put(b"aaaa", 1)
-    queue.put(b"bbbb", 2)
-    queue.put(b"cccc", 3)
-    queue.put(b"dddd", 4)
-    assert (queue.drops, queue.dropped_bytes, queue.gaps) == (2, 8, 1)
-    assert [queue.get(0.0).gap for _ in range(2)] == [False, False]  # type: ignore[union-attr]
-    queue.put(b"eeee", 5)
-    late = queue.get(0.0)
-    assert late is not None
-    assert (late.data, late.gap) == (b"eeee", True)
-    assert queue.received_bytes == 20
-
-
-def test_gap_forgets_half_a_word() -> None:
+def test_a_gap_discards_half_a_word() -> None:
     queue = opened()
     queue.put(b"abc", 1)
     queue.mark_gap()
@@ -60,7 +33,7 @@ def test_gap_forgets_half_a_word() -> None:
     assert [(chunk.data, chunk.gap) for chunk in got if chunk] == [(b"ab", False), (b"xy", True)]
 
 
-def test_restart_is_marked_once_and_swallows_the_gap_before_it() -> None:
+def test_a_restart_is_marked_once_and_replaces_the_gap_before_it() -> None:
     queue = opened()
     queue.put(b"ab", 1)
     queue.mark_gap()
@@ -85,9 +58,3 @@ def test_failure_comes_after_the_last_chunk() -> None:
         queue.get(10.0)
     queue.open()
     assert queue.get(0.0) is None
-
-
-def test_close_wakes_the_reader() -> None:
-    queue = opened()
-    queue.close()
-    assert queue.get(10.0) is None

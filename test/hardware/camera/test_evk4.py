@@ -133,6 +133,7 @@ def test_default_settings_leave_the_pixels_alone() -> None:
         assert {offset for _, offset in seen.biases} == {0}
         assert (seen.event_rate, seen.flicker_band_hz, seen.noise_filter) == (None,) * 3
         assert not seen.trigger_in
+        assert seen.columns_off | seen.rows_off | seen.pixels_off == frozenset()
         assert seen.packet_period_us == 1008
 
 

@@ -176,14 +176,6 @@ def test_roi_masks_are_the_product_of_columns_and_rows() -> None:
     assert registers.values[0x4058] >> 16 == 0xFFFF
 
 
-def test_no_roi_is_the_full_frame() -> None:
-    registers = RegisterFile()
-    set_windows(registers, ())
-    assert all(registers.values[0x2000 + 4 * k] == 0 for k in range(40))
-    assert all(registers.values[0x4000 + 4 * k] == 0 for k in range(23))
-    assert registers.values[0x4] & 0b10 == 0
-
-
 @pytest.mark.parametrize(
     "flat", [[0, 0, 10], [0, 0, 1281, 10], [-1, 0, 10, 10], [0, 710, 10, 11], [5, 5, 0, 5]]
 )
