@@ -56,7 +56,7 @@ class RemoteBench:
             self.close()
             raise
 
-    def look_at(self, scene: str) -> None:
+    def set_scene(self, scene: str) -> None:
         """Set the scene from the next start of the stream on."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{scene}\n")
@@ -90,7 +90,7 @@ def serve(folder: str, settings: str) -> None:
     with serving(bench, Path(folder)):
         print("done", flush=True)
         for line in sys.stdin:
-            bench.look_at(line.strip())
+            bench.set_scene(line.strip())
             print("done", flush=True)
 
 

@@ -13,7 +13,7 @@ from waiting import DEADLINE_S
 from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.emulation.evk4 import BoardIdentity, Evk4Model
 from eschorty_ros.hardware.base.protocols import EventChunk
-from eschorty_ros.hardware.camera import Evk4, Reconnection
+from eschorty_ros.hardware.camera import Evk4
 
 SERIAL = 0x00051234
 
@@ -79,13 +79,6 @@ def plug(name: str, *models: Evk4Model) -> None:
     _BUSES[name] = list(models)
 
 
-class _Endless(Reconnection):
-    """Searches for the camera without end."""
-
-    def wait_s(self, attempt: int) -> float:
-        return self.longest_s
-
-
 class CameraBench:
     """A model with a driver; ``attempts`` None searches for a lost camera without end."""
 
@@ -103,8 +96,8 @@ class CameraBench:
 
     def driver(self, *, attempts: int | None = 5, **options: Any) -> Evk4:
         options.setdefault("sleep", self._sleep)
-        reconnection = _Endless(sys.maxsize) if attempts is None else Reconnection(attempts)
-        camera = Evk4(self.backend, time.monotonic_ns, reconnection=reconnection, **options)
+        attempts = sys.maxsize if attempts is None else attempts
+        camera = Evk4(self.backend, time.monotonic_ns, reconnect_attempts=attempts, **options)
         camera.on_loss = self.losses.append
         return camera
 

@@ -91,7 +91,7 @@ class Bench:
         self.camera = Evk4Model(self.physics)
         self.camera.configure = lambda settings: self.physics.set_sensor(sensor_control(settings))
 
-    def look_at(self, scene: str) -> None:
+    def set_scene(self, scene: str) -> None:
         """Set the scene from the next start of the stream on."""
         self._scene = named(scene)
 

@@ -8,7 +8,6 @@ from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
 from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACKET_PERIOD_US
 from eschorty_ros.hardware.camera.pixel_selection import windows_of
-from eschorty_ros.hardware.camera.reconnection import Reconnection
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
 
 __all__ = [
@@ -25,7 +24,6 @@ __all__ = [
     "AntiFlicker",
     "CameraSettings",
     "Evk4",
-    "Reconnection",
     "load_bias_file",
     "save_bias_file",
     "windows_of",

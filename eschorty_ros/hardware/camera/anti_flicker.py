@@ -19,6 +19,8 @@ _BYPASS, _ON = 0b101, 0b001
 _READY = 1 << 2
 _TRIES = 3
 _STOP_COUNT, _START_COUNT = 4, 6
+_HALF_DUTY = 8
+"""Duty cycle of the light in sixteenths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,19 +33,16 @@ class AntiFlicker:
         Band edges, 50 to 520 Hz.
     band_pass : bool
         Keep only light that flickers in the band.
-    duty_percent : float
-        Duty cycle of the light, above 0 to 100 %; resolved to sixteenths.
 
     Raises
     ------
     ArgumentError
-        For values outside their ranges.
+        For band edges outside the range.
     """
 
     low_hz: int = 50
     high_hz: int = 520
     band_pass: bool = False
-    duty_percent: float = 50.0
 
     def __post_init__(self) -> None:
         low, high = ANTI_FLICKER_HZ
@@ -51,10 +50,6 @@ class AntiFlicker:
             raise ArgumentError(
                 f"anti-flicker band is {self.low_hz} to {self.high_hz} Hz; "
                 f"choose {low} <= low <= high <= {high}"
-            )
-        if not 0.0 < self.duty_percent <= 100.0:
-            raise ArgumentError(
-                f"anti-flicker duty is {self.duty_percent:g} %; choose above 0 to 100"
             )
 
     def erases(self, frequency_hz: float) -> bool:
@@ -76,8 +71,7 @@ def set_anti_flicker(registers: Registers, band: AntiFlicker | None) -> None:
         return
     await_bits(registers, _INITIALISATION, _READY, _TRIES, "the anti-flicker filter")
     update(registers, _INVALIDATION, 0xFFF, 1630)
-    inverted_duty = min(round(16.0 * (100.0 - band.duty_percent) / 100.0), 15)
-    period = _period(band.high_hz) | _period(band.low_hz) << 8 | inverted_duty << 16
+    period = _period(band.high_hz) | _period(band.low_hz) << 8 | _HALF_DUTY << 16
     update(registers, _PERIOD, 0xF_FFFF, period)
     counts = _STOP_COUNT | _START_COUNT << 3 | int(band.band_pass) << 6
     update(registers, _PARAMETERS, 0x7F, counts)

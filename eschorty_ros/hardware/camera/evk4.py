@@ -17,9 +17,9 @@ from eschorty_ros.hardware.base.protocols import DeviceIdentity, EventChunk
 from eschorty_ros.hardware.camera.bulk_reader import ClockNs
 from eschorty_ros.hardware.camera.camera_usb import NAME
 from eschorty_ros.hardware.camera.chunk_queue import BYTES_MAX, ChunkQueue
+from eschorty_ros.hardware.camera.connection import Connection, EndedError
 from eschorty_ros.hardware.camera.health import HealthMonitor
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
-from eschorty_ros.hardware.camera.reconnection import Connection, EndedError, Reconnection
 from eschorty_ros.hardware.camera.registers import Sleep
 from eschorty_ros.hardware.camera.session import Session
 from eschorty_ros.hardware.camera.settings import CameraSettings
@@ -45,7 +45,8 @@ class Evk4:
     serial : str
         Hex serial; ``""`` takes the only camera there is; only that one is opened again.
     settings : CameraSettings, optional
-    reconnection : Reconnection, optional
+    reconnect_attempts : int
+        How often a lost camera is searched for: after 0.5 s, then with waits doubling up to 8 s.
     queue_bytes : int
         Bytes that may wait to be read; more is dropped, counted and reported as a gap.
     sleep : callable, optional
@@ -61,7 +62,7 @@ class Evk4:
         clock_ns: ClockNs,
         serial: str = "",
         settings: CameraSettings | None = None,
-        reconnection: Reconnection | None = None,
+        reconnect_attempts: int = 6,
         queue_bytes: int = BYTES_MAX,
         sleep: Sleep | None = None,
     ) -> None:
@@ -71,7 +72,7 @@ class Evk4:
             clock_ns,
             serial,
             settings or CameraSettings(),
-            reconnection or Reconnection(),
+            reconnect_attempts,
             self._wait,
             sleep or time.sleep,
         )

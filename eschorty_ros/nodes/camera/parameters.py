@@ -23,7 +23,6 @@ from eschorty_ros.hardware.camera import (
     AntiFlicker,
     CameraSettings,
     Evk4,
-    Reconnection,
     load_bias_file,
     windows_of,
 )
@@ -163,5 +162,5 @@ def make_camera(parameters: Mapping[str, Any], clock_ns: ClockNs) -> EventSource
         clock_ns,
         parameters["serial"],
         camera_settings(parameters),
-        Reconnection(parameters["reconnect_attempts"]),
+        parameters["reconnect_attempts"],
     )

@@ -27,7 +27,7 @@ class Instrument:
     def point_camera_at(self, scene):
         self.running["camera"].interrupt()
         self.running["camera"].kill()
-        self._emulated.look_at(scene)
+        self._emulated.set_scene(scene)
         parameters = scenarios.device_parameters(self._emulated.folder)[CAMERA]
         self.running["camera"] = NodeProcess(CAMERA, parameters, domain=self.bench.domain)
         self.bench.observer.wait_for_state("camera", "active")

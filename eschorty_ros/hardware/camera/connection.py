@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import usb.backend
 
@@ -16,30 +15,12 @@ from eschorty_ros.hardware.camera.registers import Sleep
 from eschorty_ros.hardware.camera.session import Session
 from eschorty_ros.hardware.camera.settings import CameraSettings
 
+_FIRST_WAIT_S = 0.5
+_LONGEST_WAIT_S = 8.0
+
 
 class EndedError(DeviceError):
     """A wait that the end of the stream cut short."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reconnection:
-    """How often a lost camera is searched for, and how long to wait before.
-
-    Parameters
-    ----------
-    attempts : int
-        0 gives up at once.
-    first_s, longest_s : float
-        Wait before the first attempt; it doubles up to the longest.
-    """
-
-    attempts: int = 6
-    first_s: float = 0.5
-    longest_s: float = 8.0
-
-    def wait_s(self, attempt: int) -> float:
-        """Return the wait before that attempt, counted from 0."""
-        return min(self.first_s * 2.0**attempt, self.longest_s)
 
 
 class Connection:
@@ -53,7 +34,8 @@ class Connection:
         ``""`` takes the only camera there is; after the first opening only that one is taken.
     settings : CameraSettings
         Written in every new session.
-    reconnection : Reconnection
+    attempts_max : int
+        How often a lost camera is searched for.
     sleep : callable
         Waits some seconds; raises :class:`EndedError` when the stream ends.
     settle : callable
@@ -76,7 +58,7 @@ class Connection:
         clock_ns: ClockNs,
         serial: str,
         settings: CameraSettings,
-        reconnection: Reconnection,
+        attempts_max: int,
         sleep: Sleep,
         settle: Sleep,
     ) -> None:
@@ -87,7 +69,7 @@ class Connection:
         self.losses = self.reconnects = self.attempts = 0
         self._backend = backend
         self._clock_ns = clock_ns
-        self._reconnection = reconnection
+        self._attempts_max = attempts_max
         self._sleep = sleep
         self._settle = settle
         self._lock = threading.Lock()
@@ -138,8 +120,10 @@ class Connection:
             After the last attempt.
         """
         last = self.loss
-        for attempt in range(self._reconnection.attempts):
-            self._sleep(self._reconnection.wait_s(attempt))
+        wait_s = _FIRST_WAIT_S
+        for _ in range(self._attempts_max):
+            self._sleep(wait_s)
+            wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
             self.attempts += 1
             try:
                 self.open()
@@ -154,7 +138,7 @@ class Connection:
             return
         raise DeviceGoneError(
             f"{NAME} {self.identity.serial}: lost, and not back after "
-            f"{self._reconnection.attempts} attempts ({last}); check cable and power, then "
+            f"{self._attempts_max} attempts ({last}); check cable and power, then "
             "configure it again"
         )
 
