@@ -1,12 +1,19 @@
-"""EVT3, the camera's wire format: bytes to events and back, and the activity filter."""
+"""EVT3, the camera's wire format: bytes to events and back, and the activity filter.
+
+Time is int64 microseconds of the sensor's clock, first 24-bit wrap = 0.
+"""
 
 from eschorty_ros.core.evt3._decode import EventArrays
 from eschorty_ros.core.evt3.activity_filter import ActivityFilter
-from eschorty_ros.core.evt3.decoder import Decoder, Encoder, Events, Triggers, sort_readout
+from eschorty_ros.core.evt3.decoder import Counters, Decoder
+from eschorty_ros.core.evt3.encoder import Encoder, sort_readout
+from eschorty_ros.core.evt3.events import EVENT_DTYPE, EventArrays, Events, Triggers
 from eschorty_ros.core.evt3.word_count import WordCounter
 
 __all__ = [
+    "EVENT_DTYPE",
     "ActivityFilter",
+    "Counters",
     "Decoder",
     "Encoder",
     "EventArrays",

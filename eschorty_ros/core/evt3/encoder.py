@@ -1,34 +1,41 @@
-"""EVT3 encoding: the mirror image of the decoder, for simulation and tests."""
+"""Streaming EVT3 encoder, the inverse of the decoder, for simulation and tests."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import whole
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import words as w3
-from eschorty_ros.core.evt3._encode import NONE, T_US, _encode, _first_fall, _put_time
+from eschorty_ros.core.evt3.events import EventArrays, first_fall
 
 _TRIGGER = np.uint16(w3.EXT_TRIGGER << 12)
 _DROP = np.uint16(w3.OTHERS << 12 | w3.DROPPED_EVENTS)
 _COUNT_MAX = (1 << 28) - 1
 _IDLE_MAX_US = 3_600_000_000
-"""Longest silence filled with TIME_HIGH words: one hour, 1.8 MB."""
+"""Longest time without events that is filled with TIME_HIGH words: one hour, 1.8 MB."""
+_STATE = ("high", "low", "t_us", "row", "base", "polarity", "width")
+_NONE = -1
+
+_SINGLES_MAX = 3
+"""A vector group costs three words after another one, four otherwise: more events must share it."""
 
 
 class Encoder:
     """Streaming EVT3 encoder.
 
-    Events keep the order they are given in: the decoder returns exactly what went in. Runs of
-    rising x with equal time, row and polarity become vector triples where that is shorter, so
-    give events in readout order (``sort_readout``) for a compact stream. TIME_HIGH is written
-    for every 4096 us that pass, also while nothing happens (``advance``).
+    Events keep their order: the decoder returns exactly what went in. Runs of rising x with equal
+    time, row and polarity become vector triples where that is shorter, so give events in readout
+    order (``sort_readout``) for a compact stream. TIME_HIGH is written for every 4096 us that
+    pass, also without events (``advance``).
 
-    The stream carries 24 bits of time: a decoder that starts with this stream finds the same
-    times when the first one lies below 2**24 us, otherwise modulo that.
+    The stream carries 24 bits of time: a decoder that starts with it finds the same times when the
+    first lies below 2**24 us, otherwise modulo 2**24.
 
     Parameters
     ----------
@@ -46,13 +53,14 @@ class Encoder:
             whole(name, size, 1, w3.ADDRESSES)
         self.width = int(width)
         self.height = int(height)
-        self._state = np.full(6, NONE, dtype=np.int64)
+        self._state = record(*_STATE, value=_NONE)
+        self._state.width = self.width
         self._words = np.empty(0, dtype="<u2")
 
     @property
     def time_us(self) -> int | None:
-        """Time the stream has reached; ``None`` before the first word."""
-        return None if self._state[T_US] == NONE else int(self._state[T_US])
+        """Time the stream has reached (us); ``None`` before the first word."""
+        return None if self._state.t_us == _NONE else int(self._state.t_us)
 
     def encode(
         self,
@@ -65,7 +73,7 @@ class Encoder:
         drop_t: ArrayLike | None = None,
         rate_counts: ArrayLike | None = None,
     ) -> bytes:
-        """Bytes of the next events, triggers and notes of dropped events.
+        """Return the bytes of the next events, triggers and notes of dropped events.
 
         Parameters
         ----------
@@ -77,7 +85,7 @@ class Encoder:
             Trigger times (not falling) and edges (1 = rising), channel 0; at equal times a
             trigger comes before the events.
         drop_t : array_like of int, shape (k,), optional
-            Times (not falling) at which the stream says that the sensor dropped events.
+            Times (not falling) at which the stream notes that the sensor dropped events.
         rate_counts : array_like of int, shape (j, 3), optional
             Reports of the event-rate control: time (not falling), events before and after it in
             the period that ends there, below 2**28.
@@ -85,8 +93,8 @@ class Encoder:
         Raises
         ------
         ArgumentError
-            For falling times, values outside the sensor, unequal lengths, or a silence of more
-            than an hour. Nothing is encoded then.
+            For falling times, values outside the sensor, unequal lengths, or more than an hour
+            without events. Nothing is encoded then.
         """
         times = _checked("t", t, np.int64, 1 << 62)
         columns = _checked("x", x, np.uint16, self.width)
@@ -127,21 +135,11 @@ class Encoder:
         bound = 3 * times.size + 2 * marks.size + steps
         if self._words.size < bound:
             self._words = np.empty(bound, dtype="<u2")
-        n = _encode(
-            times,
-            columns,
-            rows,
-            polarities,
-            mark_times,
-            marks,
-            self.width,
-            self._state,
-            self._words,
-        )
+        n = _encode(times, columns, rows, polarities, mark_times, marks, self._state, self._words)
         return self._words[:n].tobytes()
 
     def advance(self, t_us: int) -> bytes:
-        """Time words that bring a silent stream to ``t_us``.
+        """Return the time words that bring a stream without events to ``t_us``.
 
         Raises
         ------
@@ -155,16 +153,16 @@ class Encoder:
         return words[:n].tobytes()
 
     def _refuse_fall(self, name: str, times: NDArray[np.int64]) -> None:
-        fall = _first_fall(times, self._state[T_US])
+        fall = first_fall(times, self._state.t_us)
         if fall >= 0:
-            before = times[fall - 1] if fall else self._state[T_US]
+            before = times[fall - 1] if fall else self._state.t_us
             raise ArgumentError(
                 f"{name}[{fall}] is {times[fall]} us, after {before} us; sort the events by time"
             )
 
     def _high_words(self, start_us: int, end_us: int) -> int:
         """Return number of TIME_HIGH words up to ``end_us``."""
-        begun_us = start_us if self._state[T_US] == NONE else int(self._state[T_US])
+        begun_us = start_us if self._state.t_us == _NONE else int(self._state.t_us)
         if end_us - begun_us > _IDLE_MAX_US:
             raise ArgumentError(
                 f"time runs from {begun_us} to {end_us} us in one call; "
@@ -190,7 +188,7 @@ def _reports(rate_counts: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _report_words(counts: NDArray[np.int64]) -> NDArray[np.uint16]:
-    """Eight words per report: two OTHERS with 28 bits of payload each."""
+    """Return eight words per report: two OTHERS with 28 bits of payload each."""
     words = np.empty((len(counts), 2, 4), dtype=np.uint16)
     words[:, :, 0] = w3.OTHERS << 12 | np.array((w3.ERC_EVENTS_IN, w3.ERC_EVENTS_OUT))
     words[:, :, 1] = w3.CONTINUED_12 << 12 | counts & 0xFFF
@@ -202,7 +200,7 @@ def _report_words(counts: NDArray[np.int64]) -> NDArray[np.uint16]:
 def _merged_marks(
     *series: tuple[NDArray[np.int64], NDArray[np.uint16]],
 ) -> tuple[NDArray[np.int64], NDArray[np.uint16]]:
-    """Words that are no events by time; at equal times in the order given."""
+    """Return times and words of all series by time; at equal times in the order given."""
     filled = [one for one in series if one[0].size]
     if len(filled) == 1:
         return filled[0]
@@ -217,7 +215,7 @@ def _or_none(values: ArrayLike | None) -> ArrayLike:
 
 
 def _checked(name: str, values: ArrayLike, dtype: Any, limit: int) -> NDArray[Any]:
-    """``values`` as a contiguous vector of ``dtype``, each in 0..limit-1."""
+    """Return ``values`` as a contiguous vector of ``dtype``, each in 0..limit-1."""
     array = np.asarray(values)
     if array.size == 0 and array.ndim == 1:
         return np.empty(0, dtype=dtype)
@@ -234,8 +232,8 @@ def _checked(name: str, values: ArrayLike, dtype: Any, limit: int) -> NDArray[An
 
 def sort_readout(
     t: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], p: NDArray[np.uint8]
-) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]:
-    """Events in the order a sensor reads them out: by time, row, polarity, column.
+) -> EventArrays:
+    """Return events in the order a sensor reads them out: by time, row, polarity, column.
 
     Parameters
     ----------
@@ -244,8 +242,8 @@ def sort_readout(
 
     Returns
     -------
-    tuple of arrays
-        Sorted copies: int64, uint16, uint16, uint8.
+    EventArrays
+        Sorted copies.
 
     Raises
     ------
@@ -257,16 +255,139 @@ def sort_readout(
     rows = _checked("y", y, np.uint16, w3.ADDRESSES)
     polarities = _checked("p", p, np.uint8, 2)
     if times.size == 0:
-        return times, columns, rows, polarities
+        return EventArrays(times, columns, rows, polarities)
     origin = times.min()
     if int(times.max()) - int(origin) >= 1 << 40:
         raise ArgumentError("t spans more than 2**40 us; sort shorter pieces")
     key = (times - origin) << 23 | rows.astype(np.int64) << 12
     key |= polarities.astype(np.int64) << 11 | columns
     key.sort()
-    return (
+    return EventArrays(
         (key >> 23) + origin,
         (key & 0x7FF).astype(np.uint16),
         (key >> 12 & 0x7FF).astype(np.uint16),
         (key >> 11 & 1).astype(np.uint8),
     )
+
+
+_STREAM = typeof(record(*_STATE))
+_I8 = types.Array(int64, 1, "C", readonly=True)
+_U2 = types.Array(uint16, 1, "C", readonly=True)
+_U1 = types.Array(uint8, 1, "C", readonly=True)
+
+
+@kernel(uint64(int64, types.boolean, _STREAM, uint16[::1], uint64))
+def _put_time(t, idle, s, words, n):
+    """Bring the stream's time to ``t``: write every TIME_HIGH on the way, then TIME_LOW.
+
+    Before an event TIME_LOW is written even when it is 0: not every decoder zeroes the low bits by
+    itself. An ``idle`` stream that stops at a multiple of TIME_HIGH leaves it out.
+    """
+    high = t >> 12
+    if s.high == _NONE:
+        s.high = high - 1
+    while s.high < high:
+        s.high += 1
+        words[n] = np.uint16(w3.TIME_HIGH << 12 | (s.high & 0xFFF))
+        n += np.uint64(1)
+        s.low = _NONE
+    low = t & 0xFFF
+    if low != s.low and not (idle and low == 0):
+        s.low = low
+        words[n] = np.uint16(w3.TIME_LOW << 12 | low)
+        n += np.uint64(1)
+    if t != s.t_us:
+        # A readout begins: the row is written again, as the sensor does.
+        s.t_us = t
+        s.row = _NONE
+    return n
+
+
+@kernel
+def _group(x, k, end, base):
+    """Return count and mask of the events from ``k`` on that fit a 32-pixel group, x rising."""
+    mask = np.uint32(0)
+    count = np.uint64(0)
+    last = np.int64(-1)
+    while k < end:
+        column = np.int64(x[k])
+        if column <= last or column < base or column >= base + 32:
+            break
+        mask |= np.uint32(1) << np.uint32(column - base)
+        last = column
+        count += np.uint64(1)
+        k += np.uint64(1)
+    return count, mask
+
+
+@kernel
+def _put_row(k, end, x, y, p, s, words, n):
+    """Write events ``k`` to ``end``, of one time, row, polarity; as vectors where shorter."""
+    if s.row != y:
+        words[n] = np.uint16(w3.ADDR_Y << 12 | y)
+        n += np.uint64(1)
+        s.row = y
+        s.base = _NONE
+    while k < end:
+        first = np.int64(x[k])
+        chained = s.base != _NONE and s.polarity == p and s.base <= first < s.base + 32
+        # A group never reaches past the sensor: other decoders refuse it.
+        base = s.base if chained else min(first, s.width - 32)
+        count = np.uint64(0)
+        if base >= 0 and base + 32 <= s.width:
+            count, mask = _group(x, k, end, base)
+        if count <= np.uint64(_SINGLES_MAX if chained else _SINGLES_MAX + 1):
+            words[n] = np.uint16(w3.ADDR_X << 12 | (p << 11) | first)
+            n += np.uint64(1)
+            k += np.uint64(1)
+            continue
+        if not chained:
+            words[n] = np.uint16(w3.VECT_BASE_X << 12 | (p << 11) | base)
+            n += np.uint64(1)
+            s.polarity = p
+        words[n] = np.uint16(w3.VECT_12 << 12 | (mask & np.uint32(0xFFF)))
+        words[n + np.uint64(1)] = np.uint16(
+            w3.VECT_12 << 12 | (mask >> np.uint32(12) & np.uint32(0xFFF))
+        )
+        words[n + np.uint64(2)] = np.uint16(w3.VECT_8 << 12 | mask >> np.uint32(24))
+        n += np.uint64(3)
+        s.base = base + 32
+        k += count
+    return n
+
+
+@kernel(uint64(_I8, _U2, _U2, _U1, _I8, _U2, _STREAM, uint16[::1]))
+def _encode(t, x, y, p, mark_t, marks, s, words):
+    """Merge events and marks by time, marks first; return the number of words."""
+    n = np.uint64(0)
+    k = np.uint64(0)
+    j = np.uint64(0)
+    end = np.uint64(t.size)
+    count = np.uint64(mark_t.size)
+    while k < end or j < count:
+        if j < count and (k >= end or mark_t[j] <= t[k]):
+            n = _put_time(mark_t[j], False, s, words, n)
+            words[n] = marks[j]
+            n += np.uint64(1)
+            j += np.uint64(1)
+            continue
+        last = k + np.uint64(1)
+        while last < end and t[last] == t[k] and y[last] == y[k] and p[last] == p[k]:
+            last += np.uint64(1)
+        if t[k] != s.t_us or s.low == _NONE:
+            n = _put_time(t[k], False, s, words, n)
+        if last - k > np.uint64(_SINGLES_MAX):
+            n = _put_row(k, last, x, np.int64(y[k]), np.int64(p[k]), s, words, n)
+            k = last
+            continue
+        # Too few for a vector; no call, since each costs more than the words themselves.
+        if s.row != np.int64(y[k]):
+            s.row = np.int64(y[k])
+            s.base = _NONE
+            words[n] = np.uint16(w3.ADDR_Y << 12 | y[k])
+            n += np.uint64(1)
+        while k < last:
+            words[n] = np.uint16(w3.ADDR_X << 12 | np.int64(p[k]) << 11 | np.int64(x[k]))
+            n += np.uint64(1)
+            k += np.uint64(1)
+    return n

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 from streams import line_row_events, sparse_events
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.evt3 import decoder as evt3
+from eschorty_ros.core import evt3
 
 
 def hex_words(data: bytes) -> str:

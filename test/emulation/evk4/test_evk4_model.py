@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import usb.core
 
-from eschorty_ros.core.evt3 import decoder as evt3
+from eschorty_ros.core import evt3
 from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.emulation.evk4 import (
     CONTROL_IN,

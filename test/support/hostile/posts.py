@@ -8,7 +8,7 @@ import numpy as np
 from line_events import blank_profiles
 
 from eschorty_ros.core import calibration
-from eschorty_ros.core.evt3 import decoder as evt3
+from eschorty_ros.core import evt3
 from hostile.kinds import Call, Kind, exactly, number, number_or_nan, vector, whole
 from hostile.subjects import COLUMNS, MODEL, ROWS, N, method
 

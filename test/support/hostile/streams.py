@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from eschorty_ros.core.evt3 import activity_filter as noise
-from eschorty_ros.core.evt3 import decoder as evt3
+from eschorty_ros.core import evt3
 from eschorty_ros.core.evt3 import word_count as evt3_count
 from eschorty_ros.core.modulation import modulation
 from eschorty_ros.core.reconstruction import reconstructor, settings
