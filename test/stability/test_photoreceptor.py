@@ -6,7 +6,15 @@ import mpmath
 import numpy as np
 import pytest
 
-from eschorty_ros.simulation.pixels._response import NOTHING, OFF, ON, _advanced, _noiseless
+from eschorty_ros.simulation.pixels._response import (
+    NOTHING,
+    OFF,
+    ON,
+    Levels,
+    Signal,
+    _advanced,
+    _noiseless,
+)
 
 SEED = 25
 TAU_US = 159.0
@@ -38,7 +46,7 @@ def test_case_25_step_of_the_photoreceptor(u, settled, steps, follower_us, measu
         for x in steps:
             t_us = float(x) * TAU_US
             exact_u, exact_y = exact_levels(u, u, settled, follower_us, t_us)
-            ours_u, ours_y = _advanced(u, u, settled, TAU_US, follower_us, t_us)
+            ours_u, ours_y = _advanced(Signal(u, u, settled, TAU_US, follower_us), t_us)
             receptor = max(receptor, relative(ours_u, exact_u))
             follower = max(follower, relative(ours_y, exact_y))
     measured("photoreceptor after a step, relative", receptor, 1e-13)
@@ -58,28 +66,29 @@ def test_case_25_nearly_equal_time_constants(apart, measured):
                 exact = mpmath.mpf(0.2) + mpmath.mpf(0.8) * mpmath.exp(-turns) * (1 + turns)
             else:
                 _, exact = exact_levels(1.0, 1.0, 0.2, follower_us, t_us)
-            _, ours = _advanced(1.0, 1.0, 0.2, TAU_US, follower_us, t_us)
+            _, ours = _advanced(Signal(1.0, 1.0, 0.2, TAU_US, follower_us), t_us)
             worst = max(worst, relative(ours, exact))
     measured("follower nearly as slow as the photoreceptor, relative", worst, 1e-13)
 
 
 @pytest.mark.parametrize("t_us", [1e5, 1e9, 1e300])
 def test_case_25_endless_step_settles_exactly(t_us):
-    assert _advanced(1.0, 0.9, 0.125, TAU_US, 8.0, t_us) == (0.125, 0.125)
-    assert _advanced(0.125, 0.2, 1.0, TAU_US, 8.0, t_us) == (1.0, 1.0)
+    assert _advanced(Signal(1.0, 0.9, 0.125, TAU_US, 8.0), t_us) == (0.125, 0.125)
+    assert _advanced(Signal(0.125, 0.2, 1.0, TAU_US, 8.0), t_us) == (1.0, 1.0)
 
 
 def test_case_25_many_short_steps_are_one_long_step(measured):
     u = y = 1.0
     for _ in range(100_000):
-        u, y = _advanced(u, y, 0.2, TAU_US, 8.0, 1e-5 * TAU_US)
-    once = _advanced(1.0, 1.0, 0.2, TAU_US, 8.0, TAU_US)
+        u, y = _advanced(Signal(u, y, 0.2, TAU_US, 8.0), 1e-5 * TAU_US)
+    once = _advanced(Signal(1.0, 1.0, 0.2, TAU_US, 8.0), TAU_US)
     error = max(relative(a, b) for a, b in zip((u, y), once, strict=True))
     measured("100 000 steps against one, relative", error, 1e-11)
 
 
+@pytest.mark.parametrize("follower_us", [1e-6, 8.0, 60.0])
 @pytest.mark.parametrize("rising", [True, False])
-def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, measured):
+def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, follower_us, measured):
     """Levels from one part in 1e12 of the swing to all but one part in 1e12 of it."""
     rng = np.random.default_rng(SEED)
     shares = np.concatenate([np.geomspace(1e-12, 0.5, 40), 1.0 - np.geomspace(1e-12, 0.5, 40)])
@@ -89,13 +98,15 @@ def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, measured):
             u, settled = (1.0, rng.uniform(0.01, 0.9)) if rising else (rng.uniform(0.01, 0.9), 1.0)
             level = u + share * (settled - u)
             band = (level, 10.0) if rising else (0.0, level)
-            ours_us, polarity = _noiseless(u, u, settled, TAU_US, 8.0, *band)
+            ours_us, polarity = _noiseless(
+                Signal(u, u, settled, TAU_US, follower_us), Levels(*band)
+            )
             assert polarity == (ON if rising else OFF)
-            _, there = exact_levels(u, u, settled, 8.0, ours_us)
+            _, there = exact_levels(u, u, settled, follower_us, ours_us)
             worst = max(worst, relative(there, mpmath.mpf(level)))
     measured("level at the crossing found, relative", worst, 1e-13)
 
 
 def test_case_25_level_out_of_reach_is_no_event():
-    assert _noiseless(1.0, 1.0, 0.5, TAU_US, 8.0, 0.4, 2.0) == (np.inf, NOTHING)
-    assert _noiseless(1.0, 1.0, 1.0, TAU_US, 8.0, 0.4, 2.0) == (np.inf, NOTHING)
+    assert _noiseless(Signal(1.0, 1.0, 0.5, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)
+    assert _noiseless(Signal(1.0, 1.0, 1.0, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)

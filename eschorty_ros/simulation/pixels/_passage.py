@@ -2,19 +2,24 @@
 
 Noise at the follower's output is a Gaussian process of correlation time ``tau_f``. It is never
 drawn: a pixel whose signal is ``g`` standard deviations from a level passes it at the rate
-``r(g)``, and while the gap shrinks from ``g1`` to ``g2`` also with the probability that the noise
-at hand reaches across; both come from a table (``_noise_table``). The event is where the rates
-summed up reach an exponential number drawn once per pixel and piece of signal.
+``r(g)``, and while the gap shrinks from ``g1`` to ``g2`` also with the probability that the present
+noise reaches across; both come from a table (``noise_table``). The event is where the rates summed
+up reach an exponential number drawn once per pixel and piece of signal.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.simulation.pixels._response import NOTHING, OFF, ON, UNKNOWN, _shares
+
+DECISION_US = 1.0
+"""The comparator decides once in so long: it does not see what noise does in between."""
 
 GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 4.5, 64.0
 """Span of the noise table in standard deviations, and its entries per standard deviation."""
@@ -30,9 +35,55 @@ _DECAY_STEPS, _DECAY_MAX = 32.0, 40.0
 _DECAY = np.exp(-np.arange(int(_DECAY_STEPS * _DECAY_MAX) + 1) / _DECAY_STEPS)
 
 
+@cache
+def noise_table(correlation_us: float) -> NDArray[np.float64]:
+    """Return the risk of a passage against the gap between signal and level.
+
+    The noise is an Ornstein-Uhlenbeck process looked at every ``DECISION_US``. Its rate of
+    first passages out of equilibrium is one over the mean first-passage time
+    ``sqrt(2 pi) integral_0^g exp(z^2/2) Phi(z) dz`` (in correlation times); discrete looks act
+    like a level higher by ``0.5826 sqrt(2 dt / tau)`` (Siegmund's correction). Below a gap of 1
+    the rate joins on to ``1 - g``, exact at 0 and -1 (zeros of the Hermite polynomials).
+
+    Parameters
+    ----------
+    correlation_us : float
+        Time constant of the noise, positive.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 3)
+        Per gap from ``GAP_MIN`` to ``GAP_MAX`` in steps of ``1 / GAP_STEPS``: passages per us,
+        their integral from the gap to ``GAP_MAX``, and minus the log of the probability that
+        the noise is below the gap.
+    """
+    gap = GAP_MIN + np.arange(round((GAP_MAX - GAP_MIN) * GAP_STEPS) + 1) / GAP_STEPS
+    shifted = gap + 0.5826 * math.sqrt(2.0 * DECISION_US / correlation_us)
+    fine = np.linspace(0.0, 12.0, 12_001)
+    below = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in fine])
+    integrand = math.sqrt(2.0 * math.pi) * np.exp(0.5 * fine**2) * below
+    passage = np.concatenate(
+        ([0.0], np.cumsum(0.5 * (integrand[1:] + integrand[:-1]) * np.diff(fine)))
+    )
+    at_one = 1.0 / float(np.interp(1.0, fine, passage))
+    rate = np.where(
+        shifted > 1.0,
+        1.0 / np.interp(np.maximum(shifted, 1.0), fine, passage),
+        np.where(shifted > 0.0, at_one ** np.clip(shifted, 0.0, 1.0), 1.0 - shifted),
+    )
+    share = np.array([-math.log(0.5 * math.erfc(-g / math.sqrt(2.0))) for g in gap])
+    rate[-1] = 0.0
+    share[-1] = 0.0
+    rate /= correlation_us
+    above = np.concatenate((np.cumsum((0.5 * (rate[1:] + rate[:-1]))[::-1])[::-1], [0.0]))
+    table = np.ascontiguousarray(np.column_stack((rate, above / GAP_STEPS, share)))
+    table.setflags(write=False)
+    return table
+
+
 @kernel
 def _decay(x):
-    """``exp(-x)`` of a positive number to 1e-6: enough where risks are summed up, and quicker."""
+    """Return ``exp(-x)`` of a positive number to 1e-6: enough for a sum of risks, and quicker."""
     x = min(x, _DECAY_MAX)
     entry = np.int64(x * _DECAY_STEPS + 0.5)
     rest = x - entry * (1.0 / _DECAY_STEPS)
@@ -41,14 +92,14 @@ def _decay(x):
 
 @kernel
 def _entry(gap):
-    """Row of the noise table for a gap."""
+    """Return the row of the noise table for a gap."""
     # By way of a signed integer: converting to an unsigned one is slow.
     return np.uintp(np.int64((min(max(gap, GAP_MIN), GAP_MAX) - GAP_MIN) * GAP_STEPS))
 
 
 @kernel
 def _cost(old, new, per_gap_us, step_us, table):
-    """Risk spent while the gap went from entry ``old`` to ``new`` at a steady pace."""
+    """Return the risk spent while the gap went from entry ``old`` to ``new`` at a steady pace."""
     frozen = max(0.0, table[new, _SHARE] - table[old, _SHARE])
     moved = (table[new, _SUM] - table[old, _SUM]) * per_gap_us
     rested = table[new, _RATE] * step_us
@@ -58,7 +109,7 @@ def _cost(old, new, per_gap_us, step_us, table):
 
 @kernel
 def _part(first, last, rest, cost):
-    """Part of a step in which ``rest`` of its ``cost`` is spent, the rate growing evenly."""
+    """Return the part of a step in which ``rest`` of its ``cost`` is spent, at an even growth."""
     first, last = first + 1e-300, last + 1e-300
     root = math.sqrt(cost * (cost * first * first + rest * (last * last - first * first)))
     return rest * (first + last) / (cost * first + root)
@@ -66,22 +117,23 @@ def _part(first, last, rest, cost):
 
 @kernel
 def _gap(value, per_level, noise, per_noise, sign):
-    """Distance of y from a level in standard deviations, positive inside the band.
+    """Return the distance of y from a level in standard deviations, positive inside the band.
 
-    ``log(1 + x) / noise`` by its series: near the level it counts, far off it only has to rise.
+    ``log(1 + x) / noise`` by its series: near the level it counts, far off it only has to grow.
     """
     x = sign * (value * per_level - 1.0)
     return x * (1.0 + x * (x * (1 / 3) - sign * 0.5)) * per_noise
 
 
 @kernel(inline="always")
-def _start(u, y, settled, tau_us, follower_us, noise, from_us):
-    """Where the summation begins and in which steps.
+def _start(signal, noise, from_us):
+    """Return where the summation begins and in which steps.
 
-    Returns the two exponentials at ``from_us``, the first step and what is left of the
+    These are the two exponentials at ``from_us``, the first step and what is left of the
     exponentials after it, and their second derivatives relative to themselves.
     """
-    a, b, follower_us = _shares(u, y, settled, tau_us, follower_us)
+    settled, tau_us = signal.settled, signal.tau_us
+    a, b, follower_us = _shares(signal)
     rate_a, rate_b = 1.0 / tau_us, 1.0 / follower_us
     fade_a, fade_b = _decay(from_us * rate_a), _decay(from_us * rate_b)
     a *= fade_a
@@ -100,21 +152,17 @@ def _start(u, y, settled, tau_us, follower_us, noise, from_us):
 
 
 @kernel(inline="always")
-def _noisy(
-    u, y, settled, tau_us, follower_us, on_level, off_level, middle, noise, table, from_us,
-    until_us, budget,
-):  # fmt: skip
-    """Time from now and polarity of the first passage of y with noise.
+def _noisy(signal, levels, middle, noise, table, from_us, until_us, budget):
+    """Return time from now and polarity of the first passage of y with noise.
 
     Sums up the risk from ``from_us`` on until it reaches ``budget``, in steps over which the gaps
-    change at a nearly steady pace. A moving signal risks to pass the nearer level only, on its
-    side of ``middle``. Returns UNKNOWN when nothing happened up to ``until_us`` and the signal
+    change at a nearly steady pace. A moving signal can pass the nearer level only, the one on
+    its side of ``middle``. Returns UNKNOWN when nothing happened up to ``until_us`` and the signal
     still moves: ask again later. The steps do not depend on ``until_us``.
     """
-    a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(
-        u, y, settled, tau_us, follower_us, noise, from_us
-    )
-    per_noise, per_on, per_off = 1.0 / noise, 1.0 / on_level, 1.0 / off_level
+    a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(signal, noise, from_us)
+    settled = signal.settled
+    per_noise, per_on, per_off = 1.0 / noise, 1.0 / levels.on, 1.0 / levels.off
     value = settled + a + b
     t, spent = from_us, 0.0
     old_sign, old_gap, old = 0.0, 0.0, np.uintp(0)

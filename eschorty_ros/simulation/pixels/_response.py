@@ -10,6 +10,7 @@ differs from acting on ``v`` in second order of the swing and leaves a sum of tw
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,9 +22,27 @@ _SETTLED = 38.0
 ON, OFF, NOTHING, UNKNOWN = 1, 0, -1, -2
 
 
+class Signal(NamedTuple):
+    """Photoreceptor and follower of a pixel now, where both are heading, and how fast."""
+
+    u: float
+    y: float
+    settled: float
+    tau_us: float
+    follower_us: float
+
+
+class Levels(NamedTuple):
+    """Values of y at which the comparator fires."""
+
+    on: float
+    off: float
+
+
 @kernel
-def _shares(u, y, settled, tau_us, follower_us):
+def _shares(signal):
     """Return ``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
+    u, y, settled, tau_us, follower_us = signal
     apart = 1.0 - follower_us / tau_us
     # Equal time constants have no such form; a part in a million apart they have, to 1e-6.
     if abs(apart) < 1e-6:
@@ -33,8 +52,9 @@ def _shares(u, y, settled, tau_us, follower_us):
 
 
 @kernel
-def _advanced(u, y, settled, tau_us, follower_us, t_us):
-    """Photoreceptor and follower after ``t_us`` of constant light."""
+def _advanced(signal, t_us):
+    """Return photoreceptor and follower after ``t_us`` of constant light."""
+    u, y, settled, tau_us, follower_us = signal
     if t_us > _SETTLED * tau_us and t_us > _SETTLED * follower_us:
         return settled, settled
     x, z = t_us / tau_us, t_us / follower_us
@@ -46,7 +66,7 @@ def _advanced(u, y, settled, tau_us, follower_us, t_us):
     if abs(w) > 0.1:
         share = (fade - lag) / apart
     else:
-        # expm1(w) / w: both exponentials fall nearly or wholly into one.
+        # expm1(w) / w: the two exponentials are nearly or exactly one.
         share = lag * (t_us / follower_us) * (math.expm1(w) / w if w != 0.0 else 1.0)
     if x < 0.01 and z < 0.01:
         return u + way * math.expm1(-x), y + (y - settled) * math.expm1(-z) + way * share
@@ -55,7 +75,7 @@ def _advanced(u, y, settled, tau_us, follower_us, t_us):
 
 @kernel
 def _fade(x):
-    """``exp(-x)`` to 2e-6: enough where risks are summed up, and quicker."""
+    """Return ``exp(-x)`` to 2e-6: enough where risks are summed up, and quicker."""
     if not -0.5 < x < 0.5:
         return math.exp(-x)
     x = -x
@@ -67,7 +87,10 @@ def _fade(x):
 
 @kernel
 def _solve(settled, a, b, tau_us, follower_us, level, lo_us, hi_us):
-    """Time in [lo, hi] at which the monotone y passes ``level``: Newton kept inside a bracket."""
+    """Return the time in [lo, hi] at which the monotone y passes ``level``.
+
+    Newton's steps, kept inside a bracket.
+    """
     sign = 1.0 if settled + a * math.exp(-lo_us / tau_us) + b * math.exp(
         -lo_us / follower_us
     ) > level else -1.0  # fmt: skip
@@ -90,13 +113,14 @@ def _solve(settled, a, b, tau_us, follower_us, level, lo_us, hi_us):
 
 
 @kernel
-def _noiseless(u, y, settled, tau_us, follower_us, on_level, off_level):
-    """Time from now and polarity of the first passage of y; NOTHING when there is none."""
-    if y <= on_level:
+def _noiseless(signal, levels):
+    """Return time from now and polarity of the first passage of y; NOTHING when there is none."""
+    settled, tau_us = signal.settled, signal.tau_us
+    if signal.y <= levels.on:
         return 0.0, ON
-    if y >= off_level:
+    if signal.y >= levels.off:
         return 0.0, OFF
-    a, b, follower_us = _shares(u, y, settled, tau_us, follower_us)
+    a, b, follower_us = _shares(signal)
     begin_us = 0.0
     # y turns round at most once, soon after the light has changed.
     if a * b < 0.0:
@@ -106,29 +130,30 @@ def _noiseless(u, y, settled, tau_us, follower_us, on_level, off_level):
             at_turn = (
                 settled + a * math.exp(-turn_us / tau_us) + b * math.exp(-turn_us / follower_us)
             )
-            if at_turn <= on_level:
-                return _solve(settled, a, b, tau_us, follower_us, on_level, 0.0, turn_us), ON
-            if at_turn >= off_level:
-                return _solve(settled, a, b, tau_us, follower_us, off_level, 0.0, turn_us), OFF
+            if at_turn <= levels.on:
+                return _solve(settled, a, b, tau_us, follower_us, levels.on, 0.0, turn_us), ON
+            if at_turn >= levels.off:
+                return _solve(settled, a, b, tau_us, follower_us, levels.off, 0.0, turn_us), OFF
             begin_us = turn_us
     end_us = begin_us + 60.0 * (tau_us + follower_us)
-    if settled < on_level:
-        return _solve(settled, a, b, tau_us, follower_us, on_level, begin_us, end_us), ON
-    if settled > off_level:
-        return _solve(settled, a, b, tau_us, follower_us, off_level, begin_us, end_us), OFF
+    if settled < levels.on:
+        return _solve(settled, a, b, tau_us, follower_us, levels.on, begin_us, end_us), ON
+    if settled > levels.off:
+        return _solve(settled, a, b, tau_us, follower_us, levels.off, begin_us, end_us), OFF
     return np.inf, NOTHING
 
 
 @kernel
-def _earliest_us(u, y, settled, t_us, tau_us, follower_us, on_level, off_level, reach):
+def _earliest_us(signal, t_us, levels, reach):
     """Return a time before which nothing can happen: where y comes within ``reach`` of a level.
 
-    ``inf`` when no level is near. ``reach`` is the largest gap the noise table knows, as a factor.
+    ``inf`` when no level is near. ``reach`` is the largest gap of the noise table, as a factor.
     """
-    on_near, off_near = on_level * reach, off_level / reach
+    u, y, settled, tau_us, follower_us = signal
+    on_near, off_near = levels.on * reach, levels.off / reach
     if min(u, y) <= on_near or max(u, y) >= off_near:
         return t_us
-    # Where y is ahead of u, what it is ahead by only fades: it may set out from y as well.
+    # Where y is ahead of u its lead only fades: the signal may as well start from y.
     if settled < on_near:
         way = min(u, y) - on_near
     elif settled > off_near:

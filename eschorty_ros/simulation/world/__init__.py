@@ -3,8 +3,7 @@
 from eschorty_ros.simulation.world.footprint import footprint
 from eschorty_ros.simulation.world.line_bench import LineEvents, simulate_line
 from eschorty_ros.simulation.world.recorder import simulate_recording
-from eschorty_ros.simulation.world.sensor_control import SensorControl
-from eschorty_ros.simulation.world.timeline import Gate, LaserTimeline, StageTimeline
+from eschorty_ros.simulation.world.timeline import Gate, LaserTimeline, SensorControl, StageTimeline
 from eschorty_ros.simulation.world.warm_up import warm_up
 from eschorty_ros.simulation.world.world import BACKGROUND_HZ, STEP_MM, World
 

@@ -1,4 +1,4 @@
-"""The laser line on the pixels: drawn anew only in the columns where it has changed."""
+"""The laser line on the pixels, drawn again only in the columns where it has changed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _REFLECTANCE_STEP = 0.01
 
 
 class DrawnLine:
-    """What of the line the pixels have been told.
+    """The line as it lies on the pixels.
 
     Parameters
     ----------
@@ -34,22 +34,22 @@ class DrawnLine:
         self._reflectance = np.full(model.columns, np.nan)
         self._was_split = np.zeros(model.columns, dtype=bool)
 
-    def forget(self) -> None:
-        """Draw every column anew the next time, as pixels that see more of the line need it."""
+    def redraw(self) -> None:
+        """Draw every column the next time, as pixels with other thresholds need it."""
         self._row[:] = np.nan
         self._position_mm = np.nan
 
     def draw(self, t_us: int, position_mm: float, level: float) -> None:
-        """Light the line as the scene has it at a stage position, with the laser at ``level``."""
+        """Draw the line where it falls at a stage position, with the laser at ``level``."""
         if level != self._level:
-            self.forget()
+            self.redraw()
             self._level = level
         if position_mm != self._position_mm:
             self._draw_at(t_us, position_mm)
             self._position_mm = position_mm
 
-    def darken(self, t_us: int) -> None:
-        """Take the line away."""
+    def remove(self, t_us: int) -> None:
+        """Remove the line."""
         dark = np.zeros(self._model.columns)
         self._pixels.relight(t_us, self._every_column, self._row, dark)
         self._level = 0.0

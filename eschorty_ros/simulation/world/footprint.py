@@ -11,11 +11,11 @@ from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes import Scene
 
-_LOOKS = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-"""Where the scene is looked at across the line, in half widths of the footprint."""
+_SAMPLES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+"""Where the scene is sampled across the line, in half widths of the footprint."""
 _CENTRE = 2
 _FINE = 32
-"""Parts into which the stretch between two looks is cut to find an edge."""
+"""Parts into which the stretch between two samples is cut to find an edge."""
 _ROW_JUMP = 0.25
 _REFLECTANCE_JUMP = 0.02
 
@@ -27,7 +27,7 @@ class Footprint:
     Attributes
     ----------
     row, reflectance : float64, shape (columns,)
-        Where the middle of the line appears, and how bright; NaN where it hits nothing.
+        Row of the middle of the line and reflectance there; NaN where it hits nothing.
     split : int64, shape (n,)
         Columns across whose footprint an edge runs.
     patch_row, patch_reflectance, low_row, high_row : float64, shape (n, 2)
@@ -44,11 +44,11 @@ class Footprint:
 
 
 def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float) -> Footprint:
-    """Look at the scene across the line's thickness.
+    """Return the line on the scene across its thickness.
 
     Rows ``d`` above the line's centre see the scene ``d / rows_per_mm_off_sheet`` behind the
-    sheet (PHYSICS section 3). Only a jump of range or reflectance makes a second patch; a smooth
-    surface counts by what its middle shows.
+    sheet. Only a jump of range or reflectance makes a second patch; of a smooth surface the range
+    in the middle of the line counts.
 
     Parameters
     ----------
@@ -61,21 +61,21 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     columns = np.arange(model.columns)
     at_middle = scene.range_mm(np.array([stage_mm]), columns, model)
     seen = at_middle[np.isfinite(at_middle)]
-    # Where the middle hits nothing the scene may begin beside it, at a range nobody knows yet.
+    # Where the middle hits nothing the scene may begin beside it, at an unknown range.
     nearest_mm = float(seen.max()) if seen.size else float(model.range_mm(model.rows / 2))
     half_mm = half_rows / float(model.rows_per_mm_off_sheet(nearest_mm))
-    stages = stage_mm + _LOOKS * half_mm
+    stages = stage_mm + _SAMPLES * half_mm
     range_mm = scene.range_mm(stages, columns, model)
     reflectance = scene.reflectance(stages, columns, model)
     row = np.where(np.isfinite(range_mm), model.row(range_mm, columns), np.nan)
     step = _jumps(row, reflectance)
-    # The edge next to the middle, of the looks' four stretches.
+    # The edge next to the middle, of the four stretches between samples.
     order = np.array([1, 2, 0, 3])
     first = order[np.argmax(step[order], axis=0)]
     suspects = np.flatnonzero(step.any(axis=0))
     parts = [
         _edges(scene, model, stage_mm, stages[k : k + 2], suspects[first[suspects] == k])
-        for k in range(_LOOKS.size - 1)
+        for k in range(_SAMPLES.size - 1)
         if (first[suspects] == k).any()
     ]
     edge_mm, there_row, there_reflectance, split = (
@@ -105,7 +105,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
 
 
 def _jumps(row: Array, reflectance: Array) -> NDArray[np.bool_]:
-    """Where neighbouring looks (first axis) differ, shape one shorter."""
+    """Return where neighbouring samples (first axis) differ, shape one shorter."""
     lit = np.isfinite(row)
     with np.errstate(invalid="ignore"):
         far = np.abs(np.diff(row, axis=0)) > _ROW_JUMP
@@ -117,7 +117,7 @@ def _jumps(row: Array, reflectance: Array) -> NDArray[np.bool_]:
 def _edges(
     scene: Scene, model: RangeModel, stage_mm: float, stretch: Array, columns: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Edges between two looks: mm ahead of the middle, row and reflectance beyond; columns.
+    """Return edges between two samples: mm ahead of the middle, row, reflectance, column.
 
     Columns whose surface only slopes are left out.
     """

@@ -55,7 +55,7 @@ def simulate_line(
     rows: int = 720,
     readout: ReadoutParameters | None = None,
 ) -> LineEvents:
-    """Events of a resting line; no two columns share noise or thresholds.
+    """Return the events of a resting line; no two columns share noise or thresholds.
 
     Parameters
     ----------
@@ -72,8 +72,7 @@ def simulate_line(
         0 to 1.
     edge_offset_rows : float or array_like, shape (columns,), optional
         Puts a reflectance step into the footprint: rows more than this above ``line_row`` (at
-        higher row numbers) see ``reflectance_above`` (PHYSICS section 9). The row an edge lies
-        in sees a mixture.
+        higher row numbers) see ``reflectance_above``. The row an edge lies in sees a mixture.
     reflectance_above : float or array_like, shape (columns,), optional
         0 to 1; given if and only if ``edge_offset_rows`` is.
     background_hz : float
@@ -83,7 +82,7 @@ def simulate_line(
     rows : int
         Height of the sensor, at most 1024.
     readout : ReadoutParameters, optional
-        Left out, every event leaves the sensor as soon as its pixel asks.
+        Left out, every event leaves the sensor at its request.
 
     Raises
     ------
@@ -124,7 +123,7 @@ def simulate_line(
 
 
 def _per_column(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
-    """``values`` as one finite number per column."""
+    """Return ``values`` as one finite number per column."""
     array = np.asarray(values, dtype=np.float64)
     if array.shape not in ((), (columns,)) or not np.isfinite(array).all():
         raise ArgumentError(

@@ -100,7 +100,7 @@ def simulate_recording(
     world.set_stage(move, 0)
     folder = _folder(out_dir)
     writer = RawWriter(folder / EVENTS_FILE, width=world.columns, height=world.rows)
-    with _whole_or_absent(folder):
+    with _complete_or_absent(folder):
         with writer as raw:
             while world.now_us < end_us:
                 raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
@@ -117,7 +117,7 @@ def simulate_recording(
 
 
 @contextmanager
-def _whole_or_absent(folder: Path) -> Iterator[None]:
+def _complete_or_absent(folder: Path) -> Iterator[None]:
     """Remove a recording, and its folder when nothing else is in it, if the block is left early."""
     try:
         yield

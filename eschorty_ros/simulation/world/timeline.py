@@ -1,15 +1,20 @@
-"""What the laser and the stage do, over sensor time."""
+"""What the laser, the stage and the sensor are set to, over sensor time."""
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from fractions import Fraction
+from typing import Generic, TypeVar
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import MotionPlan
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.simulation.pixels import Biases
+from eschorty_ros.simulation.readout import EventRate
+
+Setting = TypeVar("Setting")
 
 SINE_STEPS = 12
 """Steps of constant light in which a sine rises, and in which it falls."""
@@ -42,19 +47,19 @@ class Gate:
     def __post_init__(self) -> None:
         if self.modulation.on_edge_us is None:
             raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")
-        # Integers throughout: edges are asked for in the inner loop, Fraction objects are slow.
+        # Integers throughout: edges are computed in the inner loop, where Fraction is slow.
         period = 1_000_000 * self.clock_rate / Fraction(self.modulation.frequency_hz)
         object.__setattr__(self, "_period", period.as_integer_ratio())
         object.__setattr__(self, "_duty", Fraction(self.modulation.duty).as_integer_ratio())
         object.__setattr__(self, "_origin_us", self.modulation.on_edge_us)
 
     def rise_us(self, index: int) -> int:
-        """Rising edge ``index``, us."""
+        """Return rising edge ``index``, us."""
         numerator, denominator = self._period
         return self._origin_us + _round_ratio(index * numerator, denominator)
 
     def fall_us(self, index: int) -> int:
-        """Falling edge of period ``index``, us; at least 1 us from both rising edges."""
+        """Return the falling edge of period ``index``, us; at least 1 us from both rising edges."""
         numerator, denominator = self._period
         share, whole = self._duty
         fall = self._origin_us + _round_ratio(
@@ -63,7 +68,7 @@ class Gate:
         return max(self.rise_us(index) + 1, min(fall, self.rise_us(index + 1) - 1))
 
     def index(self, t_us: int) -> int:
-        """Index of the period that holds ``t_us``."""
+        """Return the index of the period that holds ``t_us``."""
         numerator, denominator = self._period
         index = (t_us - self._origin_us) * denominator // numerator
         while self.rise_us(index) > t_us:
@@ -73,15 +78,15 @@ class Gate:
         return index
 
     def high(self, t_us: int) -> bool:
-        """Whether the gate's signal is high at ``t_us``: from a rising to a falling edge."""
+        """Return whether the gate's signal is high at ``t_us``: from a rising to a falling edge."""
         return self._flank(t_us)[2]
 
     def flank_us(self, t_us: int) -> int:
-        """First edge of the gate's signal after ``t_us``."""
+        """Return the first edge of the gate's signal after ``t_us``."""
         return self._flank(t_us)[1]
 
     def level(self, t_us: int) -> float:
-        """Light at ``t_us``, 0 to 1."""
+        """Return the light at ``t_us``, 0 to 1."""
         begin_us, end_us, rising = self._flank(t_us)
         if self.modulation.waveform != "sine":
             return float(rising)
@@ -91,7 +96,7 @@ class Gate:
         return share if rising else 1.0 - share
 
     def next_us(self, t_us: int) -> int:
-        """First time after ``t_us`` at which the light changes."""
+        """Return the first time after ``t_us`` at which the light changes."""
         begin_us, end_us, _ = self._flank(t_us)
         if self.modulation.waveform != "sine":
             return end_us
@@ -101,7 +106,7 @@ class Gate:
         return begin_us - (-(step + 1) * length_us) // steps
 
     def _flank(self, t_us: int) -> tuple[int, int, bool]:
-        """Begin and end of the part of the period that holds ``t_us``; whether it is the first."""
+        """Return begin and end of the half-period that holds ``t_us``, and whether it is lit."""
         index = self.index(t_us)
         fall = self.fall_us(index)
         if t_us < fall:
@@ -116,12 +121,41 @@ def _round_ratio(numerator: int, denominator: int) -> int:
     return whole + up
 
 
-class LaserTimeline:
-    """When the laser is lit: a list of settings, each from its time on; dark before the first."""
+class Timeline(Generic[Setting]):
+    """Settings, each from its time on; none before the first."""
 
     def __init__(self) -> None:
         self._times: list[int] = []
-        self._gates: list[Gate | None] = []
+        self._settings: list[Setting] = []
+
+    def add(self, t_us: int, setting: Setting) -> None:
+        """Hold ``setting`` from ``t_us`` on; replaces what was set for later times."""
+        keep = bisect_left(self._times, t_us)
+        self._times[keep:] = [t_us]
+        self._settings[keep:] = [setting]
+
+    def at(self, t_us: int) -> Setting | None:
+        """Return the setting that holds at ``t_us``."""
+        k = bisect_right(self._times, t_us)
+        return self._settings[k - 1] if k else None
+
+    def next_us(self, t_us: int) -> int | None:
+        """Return the time of the first change after ``t_us``, ``None`` for none."""
+        k = bisect_right(self._times, t_us)
+        return self._times[k] if k < len(self._times) else None
+
+    def forget_before(self, t_us: int) -> None:
+        """Drop settings that no time from ``t_us`` on needs."""
+        k = max(bisect_right(self._times, t_us) - 1, 0)
+        del self._times[:k], self._settings[:k]
+
+
+class LaserTimeline:
+    """When the laser is lit; dark before the first setting."""
+
+    def __init__(self) -> None:
+        self._gates: Timeline[Gate | None] = Timeline()
+        self.forget_before = self._gates.forget_before
 
     def set(
         self,
@@ -139,32 +173,29 @@ class LaserTimeline:
         """
         if on and modulation is None:
             raise ArgumentError("the laser is on without a modulation; give one")
-        gate = Gate(modulation, clock_rate) if on and modulation is not None else None
-        keep = len([t for t in self._times if t < t_us])
-        self._times[keep:] = [t_us]
-        self._gates[keep:] = [gate]
+        self._gates.add(t_us, Gate(modulation, clock_rate) if on and modulation else None)
 
     def level(self, t_us: int) -> float:
-        """Light of the laser at ``t_us``, 0 to 1."""
-        gate = self._gate(t_us)
+        """Return the light of the laser at ``t_us``, 0 to 1."""
+        gate = self._gates.at(t_us)
         return 0.0 if gate is None else gate.level(t_us)
 
     def rises(self, t_us: int) -> bool:
-        """Whether ``t_us`` is a rising edge."""
-        gate = self._gate(t_us)
+        """Return whether ``t_us`` is a rising edge."""
+        gate = self._gates.at(t_us)
         return gate is not None and gate.rise_us(gate.index(t_us)) == t_us
 
     def edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
-        """Edges of the gate's signal from ``begin_us`` to before ``end_us``: time, rising."""
+        """Return the edges of the gate's signal from ``begin_us`` to before ``end_us``.
+
+        Each is its time and whether it rises.
+        """
         found: list[tuple[int, bool]] = []
         t_us, high = begin_us - 1, self._high(begin_us - 1)
         while True:
-            gate = self._gate(t_us)
-            k = bisect_right(self._times, t_us)
-            ends = self._times[k : k + 1]
-            if gate is not None:
-                ends.append(gate.flank_us(t_us))
-            t_us = min(ends, default=end_us)
+            gate = self._gates.at(t_us)
+            ends = [self._gates.next_us(t_us), gate.flank_us(t_us) if gate else None]
+            t_us = min((end for end in ends if end is not None), default=end_us)
             if t_us >= end_us:
                 return found
             if self._high(t_us) != high:
@@ -172,34 +203,22 @@ class LaserTimeline:
                 found.append((t_us, high))
 
     def next_us(self, t_us: int) -> int | None:
-        """First time after ``t_us`` at which the laser may change, ``None`` for never."""
-        k = bisect_right(self._times, t_us)
-        candidates = self._times[k : k + 1]
-        gate = self._gate(t_us)
-        if gate is not None:
-            candidates.append(gate.next_us(t_us))
-        return min(candidates, default=None)
-
-    def forget_before(self, t_us: int) -> None:
-        """Drop settings that no time from ``t_us`` on needs."""
-        k = max(bisect_right(self._times, t_us) - 1, 0)
-        del self._times[:k], self._gates[:k]
+        """Return the first time after ``t_us`` at which the light may change, or ``None``."""
+        gate = self._gates.at(t_us)
+        ends = [self._gates.next_us(t_us), gate.next_us(t_us) if gate else None]
+        return min((end for end in ends if end is not None), default=None)
 
     def _high(self, t_us: int) -> bool:
-        gate = self._gate(t_us)
+        gate = self._gates.at(t_us)
         return gate is not None and gate.high(t_us)
-
-    def _gate(self, t_us: int) -> Gate | None:
-        k = bisect_right(self._times, t_us) - 1
-        return self._gates[k] if k >= 0 else None
 
 
 class StageTimeline:
-    """Where the stage is: a list of motion plans, each from its time on; at 0 before the first."""
+    """Where the stage is; at 0 before the first plan."""
 
     def __init__(self) -> None:
-        self._times: list[int] = []
-        self._plans: list[tuple[MotionPlan, int, Fraction]] = []
+        self._plans: Timeline[tuple[MotionPlan, int, Fraction]] = Timeline()
+        self.forget_before = self._plans.forget_before
 
     def set(
         self, t_us: int, plan: MotionPlan, zero_ns: int, clock_rate: Fraction = Fraction(1)
@@ -209,20 +228,28 @@ class StageTimeline:
         The plan's clock read ``zero_ns`` at sensor time 0; ``clock_rate`` is the sensor time that
         passes per unit of the plan's.
         """
-        keep = len([t for t in self._times if t < t_us])
-        self._times[keep:] = [t_us]
-        self._plans[keep:] = [(plan, zero_ns, clock_rate)]
+        self._plans.add(t_us, (plan, zero_ns, clock_rate))
 
     def state(self, t_us: int) -> tuple[float, float]:
-        """Position (mm) and velocity (mm/s) at ``t_us``."""
-        k = bisect_right(self._times, t_us) - 1
-        if k < 0:
+        """Return position (mm) and velocity (mm/s) at ``t_us``."""
+        found = self._plans.at(t_us)
+        if found is None:
             return 0.0, 0.0
-        plan, zero_ns, rate = self._plans[k]
+        plan, zero_ns, rate = found
         position, velocity = plan.state(zero_ns + t_us * 1000 * rate.denominator // rate.numerator)
         return float(position), float(velocity)
 
-    def forget_before(self, t_us: int) -> None:
-        """Drop plans that no time from ``t_us`` on needs."""
-        k = max(bisect_right(self._times, t_us) - 1, 0)
-        del self._times[:k], self._plans[:k]
+
+@dataclass(frozen=True, slots=True)
+class SensorControl:
+    """Settings of the sensor; the defaults are its factory's.
+
+    Parameters
+    ----------
+    biases : Biases
+    event_rate : EventRate or None
+        Limit of the event-rate control, ``None`` when it is off.
+    """
+
+    biases: Biases = field(default_factory=Biases)
+    event_rate: EventRate | None = None

@@ -1,4 +1,4 @@
-"""When the line was lit and where the stage stood then: what the truth is made of."""
+"""The true ranges: when the line was lit and where the stage stood then."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class TruthLog:
         self._phases.append((middle_us, stage_mm))
 
     def table(self) -> NDArray[np.void]:
-        """Give the true range per phase and column whose line falls on the sensor, TRUTH_DTYPE."""
+        """Return the true range per phase and column with its line on the sensor, TRUTH_DTYPE."""
         every = np.arange(self._model.columns)
         parts = [np.empty(0, dtype=TRUTH_DTYPE)]
         phases = list(self._phases)

@@ -23,15 +23,19 @@ from eschorty_ros.simulation.pixels import (
 from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.drawn_line import DrawnLine
-from eschorty_ros.simulation.world.sensor_control import ControlTimeline, SensorControl
-from eschorty_ros.simulation.world.timeline import LaserTimeline, StageTimeline
+from eschorty_ros.simulation.world.timeline import (
+    LaserTimeline,
+    SensorControl,
+    StageTimeline,
+    Timeline,
+)
 from eschorty_ros.simulation.world.truth_log import TruthLog
 
 BACKGROUND_HZ = 0.22
 """Background activity per pixel: 5 % of all events at 70 Hz with every column lit."""
 
 STEP_MM = 0.25
-"""Stage travel after which a moving line is drawn anew."""
+"""Stage travel after which a moving line is drawn again."""
 
 _STEP_MAX_US = 5_000
 _STEP_MIN_US = 50
@@ -43,7 +47,7 @@ _TIME_HIGH_US = 4_096
 
 
 class World:
-    """What the camera would see.
+    """A camera in front of a scene, with laser and stage.
 
     The bytes depend on scene, calibration, parameters, seed and on what laser and stage do, never
     on how calls to :meth:`advance` are spaced.
@@ -63,7 +67,7 @@ class World:
     Attributes
     ----------
     trigger_input : EdgeSource or None
-        What is wired to the camera's trigger input; asked once for every stretch of time.
+        What is wired to the camera's trigger input; called once for every stretch of time.
     """
 
     def __init__(
@@ -88,7 +92,7 @@ class World:
         self._laser = LaserTimeline()
         self._stage = StageTimeline()
         self._control = SensorControl()
-        self._controls = ControlTimeline()
+        self._controls: Timeline[SensorControl] = Timeline()
         self._truth = TruthLog(scene, self.model)
         self._line = DrawnLine(scene, self.model, self._pixels)
         self._now_us = 0
@@ -103,12 +107,12 @@ class World:
 
     @property
     def dropped(self) -> int:
-        """Events lost so far because the readout was full; the stream says when, not how many."""
+        """Events lost so far because the readout was full; the stream has only their times."""
         return self._readout.dropped
 
     @property
     def rate_dropped(self) -> int:
-        """Events the event-rate control has dropped so far; the stream tells them."""
+        """Events the event-rate control has dropped so far; the stream reports them."""
         return self._readout.rate_dropped
 
     def set_laser(
@@ -162,18 +166,18 @@ class World:
             When ``t_us`` has been simulated already.
         """
         self._refuse_past("t_us", t_us)
-        self._controls.set(t_us, control)
+        self._controls.add(t_us, control)
 
     def laser_edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
-        """Edges of the laser's gate signal, an ``EdgeSource``."""
+        """Return the edges of the laser's gate signal, an ``EdgeSource``."""
         return self._laser.edges(begin_us, end_us)
 
     def stage_mm(self, t_us: int) -> float:
-        """Stage position at sensor time ``t_us``, as far as it is known now."""
+        """Return the stage position at sensor time ``t_us`` as planned now."""
         return self._stage.state(t_us)[0]
 
     def advance(self, until_us: int) -> bytes:
-        """EVT3 bytes of all events read out before ``until_us`` and not handed out yet.
+        """Return the EVT3 bytes of all events read out up to ``until_us`` since the last call.
 
         Raises
         ------
@@ -183,11 +187,12 @@ class World:
         self._refuse_past("until_us", until_us)
         parts = []
         while self._now_us < until_us:
-            control = self._controls.due(self._now_us)
-            if control is not None:
-                self._obey(control)
-            end_us = self._controls.next_us(min(until_us, self._now_us + _PIECE_US))
-            self._follow(end_us)
+            self._use(self._controls.at(self._now_us) or self._control)
+            end_us = min(until_us, self._now_us + _PIECE_US)
+            change_us = self._controls.next_us(self._now_us)
+            if change_us is not None:
+                end_us = min(end_us, change_us)
+            self._apply_light(end_us)
             self._pixels.run_until(end_us)
             keys, drops_us, periods = self._readout.read_out(self._pixels.take(end_us), end_us)
             if self._encoder.time_us is None:
@@ -203,13 +208,14 @@ class World:
                     rate_counts=periods,
                 )
             )
-            # Only whole TIME_HIGH steps: other idle words would tell how calls were spaced.
+            # Only multiples of TIME_HIGH: the bytes must not depend on how calls are spaced.
             step_us = end_us - end_us % _TIME_HIGH_US
             if step_us > (self._encoder.time_us or 0):
                 parts.append(self._encoder.advance(step_us))
             self._now_us = end_us
             self._laser.forget_before(self._handled_us)
             self._stage.forget_before(self._handled_us)
+            self._controls.forget_before(self._now_us)
         return b"".join(parts)
 
     @property
@@ -227,19 +233,18 @@ class World:
                 f"{name} is {t_us} us and {self._now_us} us are simulated; give a later time"
             )
 
-    def _obey(self, control: SensorControl) -> None:
-        """Set the sensor as ``control`` wants it from now on."""
+    def _use(self, control: SensorControl) -> None:
         before, self._control = self._control, control
         if control.event_rate != before.event_rate:
             self._readout.limit(self._now_us, control.event_rate)
         if control.biases != before.biases:
             pixels = parameters_from_biases(self._factory, control.biases)
             self._pixels.change(self._now_us, pixels)
-            self._line.forget()
+            self._line.redraw()
             if self._lit_since_us is not None:
                 self._step_us = self._now_us
 
-    def _follow(self, end_us: int) -> None:
+    def _apply_light(self, end_us: int) -> None:
         """Apply every change of light before ``end_us``."""
         while True:
             candidates = [self._laser.next_us(self._handled_us), self._step_us]
@@ -249,15 +254,15 @@ class World:
             self._handled_us = t_us
             level = self._laser.level(t_us)
             if self._lit_since_us is not None and self._laser.rises(t_us):
-                # Light that never goes out: the next period begins.
+                # Light that stays on: the next period begins.
                 self._close_phase(t_us)
             if level > 0.0:
                 self._draw(t_us, level)
             elif self._lit_since_us is not None:
-                self._darken(t_us)
+                self._remove(t_us)
 
     def _draw(self, t_us: int, level: float) -> None:
-        """Put the line where the scene has it now."""
+        """Draw the line where it falls on the scene now."""
         position_mm, velocity_mm_s = self._stage.state(t_us)
         if self._lit_since_us is None:
             self._lit_since_us = t_us
@@ -265,15 +270,15 @@ class World:
         pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
         self._step_us = t_us + int(min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US))
 
-    def _darken(self, t_us: int) -> None:
-        """Take the line away and note the phase that ends here."""
-        self._line.darken(t_us)
+    def _remove(self, t_us: int) -> None:
+        """Remove the line and note the phase that ends here."""
+        self._line.remove(t_us)
         self._close_phase(t_us)
         self._lit_since_us = None
         self._step_us = None
 
     def _close_phase(self, t_us: int) -> None:
-        """Note the lit phase that ends here; light goes on into the next unless it is dark."""
+        """Note the lit phase that ends here."""
         middle_us = ((self._lit_since_us or 0) + t_us) // 2
         self._truth.add(middle_us, self._stage.state(middle_us)[0])
         self._lit_since_us = t_us

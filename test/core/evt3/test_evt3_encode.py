@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 
 from streams import line_row_events, sparse_events
 
-from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core import evt3
+from eschorty_ros.core.base.errors import ArgumentError
 
 
 def hex_words(data: bytes) -> str:

@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from eschorty_ros.simulation.pixels._noise_table import noise_table, passage_gaps, way_times
-from eschorty_ros.simulation.pixels._passage import GAP_MAX, GAP_MIN, GAP_STEPS
-from eschorty_ros.simulation.pixels._prompt import _prompt
-from eschorty_ros.simulation.pixels._response import OFF, ON, UNKNOWN
+from eschorty_ros.simulation.pixels._passage import GAP_MAX, GAP_MIN, GAP_STEPS, noise_table
+from eschorty_ros.simulation.pixels._prompt import _prompt, passage_gaps, way_times
+from eschorty_ros.simulation.pixels._response import OFF, ON, UNKNOWN, Levels, Signal
 
 TAU_DARK_US, THRESHOLD = 159.15, 0.25
 DRAWS = (np.arange(400) + 0.5) / 400
@@ -39,13 +38,9 @@ def test_time_of_the_passage_agrees_with_the_summed_risk(
 ) -> None:
     u, settled = (1.0, 1.0 / light) if rising else (1.0 / light, 1.0)
     gaps = passage_gaps(noise_table(follower_us), follower_us)
-    levels = u * math.exp(-THRESHOLD), u * math.exp(THRESHOLD)
-    found = [
-        _prompt(
-            u, settled, TAU_DARK_US * settled, follower_us, *levels, noise, way_times(), gaps, draw
-        )
-        for draw in DRAWS
-    ]
+    levels = Levels(u * math.exp(-THRESHOLD), u * math.exp(THRESHOLD))
+    signal = Signal(u, u, settled, TAU_DARK_US * settled, follower_us)
+    found = [_prompt(signal, levels, noise, way_times(), gaps, draw) for draw in DRAWS]
     assert {what for _, what in found} == {ON if rising else OFF}
     t_us = np.array([after_us for after_us, _ in found])
     wanted = summed(u, settled, follower_us, noise, 0.02)
@@ -57,7 +52,6 @@ def test_time_of_the_passage_agrees_with_the_summed_risk(
 def test_levels_the_signal_hardly_reaches_are_not_looked_up() -> None:
     gaps = passage_gaps(noise_table(8.0), 8.0)
     for light in (1.0, 1.05, 1.29):
-        after_us, what = _prompt(
-            1.0, 1.0 / light, TAU_DARK_US / light, 8.0, 0.78, 1.28, 0.04, way_times(), gaps, 0.5
-        )
+        signal = Signal(1.0, 1.0, 1.0 / light, TAU_DARK_US / light, 8.0)
+        after_us, what = _prompt(signal, Levels(0.78, 1.28), 0.04, way_times(), gaps, 0.5)
         assert (after_us, what) == (math.inf, UNKNOWN)

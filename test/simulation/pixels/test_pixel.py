@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.simulation.pixels import PixelArray, PixelParameters, unpack
-from eschorty_ros.simulation.pixels._response import OFF, ON, _advanced, _noiseless
+from eschorty_ros.simulation.pixels._response import OFF, ON
 
 SEED = 7
 CENTRE = 40.0
@@ -72,54 +71,11 @@ def test_photoreceptor_swings_as_the_closed_form_says(frequency_hz: float) -> No
     pixels.relight((edges + 1) * half_us, column, line, np.array([0.0]))
     bright_u = pixels._pixels["u"][0, rows]
     bright, dark = closed_form(actual_hz, rows, blind)
-    lit = pixels._spans[0, 2:]
-    inside = (rows >= lit[0]) & (rows < lit[1])
+    state = pixels._columns[0]
+    inside = (rows >= state["due_begin"]) & (rows < state["due_end"])
     assert inside.sum() >= 15
     assert np.max(np.abs(bright_u / bright - 1.0)[inside]) < 1e-12
     assert np.max(np.abs(dark_u / dark - 1.0)[inside]) < 1e-12
-
-
-def test_step_response_keeps_13_digits_from_tiny_to_huge_steps() -> None:
-    mpmath.mp.dps = 50
-    rng = np.random.default_rng(SEED)
-    tau_us = mpmath.mpf(24.5)
-    for x in 10.0 ** np.linspace(-14, 3, 400):
-        u, settled = rng.uniform(0.1, 1.0, 2)
-        t_us = x * 24.5
-        change = (mpmath.mpf(u) - settled) * mpmath.expm1(-mpmath.mpf(t_us) / tau_us)
-        for k, follower_us in enumerate((1e-6, 8.0, 300.0)):
-            got_u, got_y = _advanced(u, u, settled, 24.5, follower_us, t_us)
-            assert abs(got_u - (u + change)) < 1e-13 * abs(u + change)
-            # u itself is rounded to 1e-16: the change is as good as that allows.
-            assert abs(got_u - u - change) < 1e-13 * abs(change) + 2.3e-16
-            share = tau_us / (tau_us - mpmath.mpf(follower_us))
-            a = (mpmath.mpf(u) - settled) * share
-            b = mpmath.mpf(u) - settled - a
-            exact = settled + a * mpmath.exp(-mpmath.mpf(t_us) / tau_us)
-            exact += b * mpmath.exp(-mpmath.mpf(t_us) / mpmath.mpf(follower_us))
-            assert abs(got_y - exact) < 1e-13 * abs(exact) * max(1.0, abs(float(share))), k
-
-
-def test_equal_time_constants_are_no_exception() -> None:
-    near = _advanced(1.0, 0.8, 0.2, 8.0 * (1.0 + 1e-4), 8.0, 5.0)
-    assert _advanced(1.0, 0.8, 0.2, 8.0, 8.0, 5.0) == pytest.approx(near, rel=1e-4)
-
-
-@pytest.mark.parametrize("follower_us", [1e-6, 8.0, 60.0])
-def test_crossing_times_are_exact(follower_us: float) -> None:
-    mpmath.mp.dps = 30
-    settled, tau_us = 0.15, 24.5
-    for share in 10.0 ** np.linspace(-9, -1e-3, 60):
-        level = 1.0 - share * (1.0 - settled)
-        after_us, what = _noiseless(1.0, 1.0, settled, tau_us, follower_us, level, 2.0)
-        assert what == ON
-        fast, slow = mpmath.mpf(follower_us), mpmath.mpf(tau_us)
-        a = (1 - mpmath.mpf(settled)) * slow / (slow - fast)
-        b = 1 - mpmath.mpf(settled) - a
-        there = settled + a * mpmath.exp(-after_us / slow) + b * mpmath.exp(-after_us / fast)
-        assert abs(there - level) < 1e-12
-    assert _noiseless(1.0, 1.0, 0.6, 1.0, follower_us, 0.5, 2.0) == (np.inf, -1)
-    assert _noiseless(0.2, 0.2, 1.0, 159.0, follower_us, 0.1, 0.3)[1] == OFF
 
 
 def test_first_events_come_at_the_crossing_times() -> None:
@@ -298,7 +254,7 @@ def test_a_jumping_line_leaves_the_old_rows_and_lights_the_new() -> None:
     assert set(p[late & (y < 100)]) == {0}
     assert set(p[late & (y > 100)]) == {1}
     assert set(p[(t > 15_000) & (y < 100)]) == {0}
-    assert np.isinf(pixels._due).all()
+    assert np.isinf(pixels._columns["due_us"]).all()
 
 
 def test_output_grows_when_it_must() -> None:

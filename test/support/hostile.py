@@ -1,7 +1,8 @@
-"""Hostile values by kind of argument."""
+"""Hostile values by kind of argument, and calls that take them."""
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -14,11 +15,22 @@ HUGE = 10**400
 
 @dataclass(frozen=True)
 class Kind:
-    """Values an argument must refuse, and values it may take or refuse but not choke on."""
+    """Values an argument must refuse, and values it may take or refuse."""
 
     refused: Sequence[Any]
     borderline: Sequence[Any] = ()
     nan_gives_nan: bool = False
+
+
+@dataclass(frozen=True)
+class Call:
+    """One public callable: how to call it, valid arguments, and what else each may be."""
+
+    make: Callable[..., Any]
+    good: dict[str, Any]
+    kinds: dict[str, Kind] = field(default_factory=dict)
+    named: dict[str, str] = field(default_factory=dict)
+    """Arguments that messages call by another name."""
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, optional: bool = False) -> Kind:
@@ -34,7 +46,7 @@ def number_or_nan(*outside: float) -> Kind:
     return Kind(wrong, [math.nan, 1e300, 5e-324])
 
 
-def whole(low: int | None = None, high: int | None = None, *, optional: bool = False) -> Kind:
+def integer(low: int | None = None, high: int | None = None, *, optional: bool = False) -> Kind:
     """An integer; ``low`` and ``high`` are the first values outside or absent."""
     wrong: list[Any] = [math.nan, math.inf, 1.5, "3", [1, 2], HUGE]
     wrong += [bound for bound in (low, high) if bound is not None]
@@ -67,12 +79,10 @@ def reals(*, optional: bool = False) -> Kind:
     )
 
 
-def vector(*outside: float, finite: bool = True, size: int = 0, any_shape: bool = False) -> Kind:
-    """One axis of real numbers; with ``size`` a wrong length is refused."""
-    wrong: list[Any] = [*_NO_REALS, *outside_of(size, outside)]
-    wrong += [] if any_shape else [np.zeros((2, 2))]
-    if finite:
-        wrong += outside_of(size, (math.nan, math.inf, -math.inf))
+def vector(*outside: float, finite: bool = True, size: int = 0) -> Kind:
+    """One axis of real numbers, of ``size`` entries where that is given."""
+    infinite = (math.nan, math.inf, -math.inf) if finite else ()
+    wrong = [*_NO_REALS, np.zeros((2, 2)), *_full(size, (*outside, *infinite))]
     return Kind(wrong, [np.arange(float(2 * size))[::2]] if size else [[]])
 
 
@@ -80,24 +90,22 @@ def integers(*outside: int, size: int = 0, any_shape: bool = False) -> Kind:
     """One axis of integers."""
     wrong: list[Any] = [[1.5] * max(size, 1), [math.nan], "abc", ["a"], None]
     wrong += [] if any_shape else [np.zeros((2, 2), int)]
-    wrong += [np.array([HUGE]), [1 + 1j], *outside_of(size, outside)]
+    wrong += [np.array([HUGE]), [1 + 1j], *_full(size, outside)]
     return Kind(wrong, [np.arange(2 * size)[::2]] if size else [[]])
 
 
-def outside_of(size: int, values: Sequence[Any]) -> list[Any]:
+def _full(size: int, values: Sequence[Any]) -> list[Any]:
     return [np.full(max(size, 1), value) for value in values]
 
 
-def exactly(dtype: str, size: int, *, alone: bool = False) -> Kind:
+def exactly(dtype: str, size: int) -> Kind:
     """An array that compiled code takes as it is: dtype and shape must be right."""
-    other = "f8" if dtype != "f8" else "f4"
     good = np.zeros(size, dtype)
-    wrong: list[Any] = [good.astype(other), np.zeros((2, 2), dtype), None, "abc", 3]
-    wrong += [] if alone else [good[:-1]]
+    wrong: list[Any] = [good.astype("f4"), np.zeros((2, 2), dtype), good[:-1], None, "abc", 3]
     return Kind(wrong, [np.zeros(2 * size, dtype)[::2]])
 
 
-def octets() -> Kind:
+def stream() -> Kind:
     """Bytes of a stream."""
     rng = np.random.default_rng(26)
     noise = [rng.integers(0, 256, n, np.uint8).tobytes() for n in (1, 7, 5000)]
@@ -109,11 +117,8 @@ def path() -> Kind:
     return Kind([None, 3, "no/such/folder/file.pcd", "a\0b.pcd", "/"])
 
 
-@dataclass(frozen=True)
-class Call:
-    """One public callable: how to call it, valid arguments, and what else each may be."""
-
-    make: Callable[..., Any]
-    good: dict[str, Any]
-    kinds: dict[str, Kind] = field(default_factory=dict)
-    says: dict[str, str] = field(default_factory=dict)
+def parameters(item: Any) -> set[str]:
+    """Names of the arguments a caller gives."""
+    variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    found = inspect.signature(item).parameters.values()
+    return {p.name for p in found if p.name != "self" and p.kind not in variable}
