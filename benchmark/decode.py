@@ -27,8 +27,8 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / 
 
 from streams import line_row_events, sparse_events  # noqa: E402
 
-from eschorty_ros.core.evt3 import ActivityFilter  # noqa: E402
 from eschorty_ros.core import evt3  # noqa: E402
+from eschorty_ros.core.evt3 import ActivityFilter  # noqa: E402
 from eschorty_ros.core.storage.raw_file import RawReader, RawWriter  # noqa: E402
 
 PIECE_BYTES = 128 * 1024

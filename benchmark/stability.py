@@ -9,7 +9,6 @@ limit. With --write the table replaces the one between the markers in that file.
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -21,19 +20,25 @@ BEGIN, END = "<!-- measured: begin -->\n", "<!-- measured: end -->\n"
 
 
 class Collector:
-    """Gathers what the fixture ``measured`` left with each test."""
+    """Collects the errors that the fixture ``measured`` recorded with each test."""
 
     def __init__(self) -> None:
+        self.cases: dict[str, int] = {}
         self.tests: dict[int, int] = defaultdict(int)
         self.bounds: dict[tuple[int, str, float], float] = {}
         self.failed = 0
 
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        for item in items:
+            marker = item.get_closest_marker("hard_case")
+            if marker is not None:
+                self.cases[item.nodeid] = marker.args[0]
+
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        found = re.search(r"::test_case_(\d\d)_", report.nodeid)
+        case = self.cases.get(report.nodeid)
         self.failed += report.failed
-        if report.when != "call" or found is None:
+        if report.when != "call" or case is None:
             return
-        case = int(found.group(1))
         self.tests[case] += 1
         for kind, value in report.user_properties:
             if kind == "measured":

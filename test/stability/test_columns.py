@@ -38,7 +38,8 @@ def one_column(rows, method="mode_mean", **options):
 @pytest.mark.parametrize("method", AVERAGES)
 @pytest.mark.parametrize("sigma_px", [0.3, 0.05])
 @pytest.mark.parametrize("row", [700.0, 40.0])
-def test_case_04_variance_of_a_narrow_line_far_from_row_0(method, sigma_px, row, measured):
+@pytest.mark.hard_case(4)
+def test_variance_of_a_narrow_line_far_from_row_0(method, sigma_px, row, measured):
     """In float32 E[x^2] - E[x]^2 would be wrong 12-fold and 740-fold here."""
     rng = np.random.default_rng(SEED)
     rows = np.rint(rng.normal(row + 0.45, sigma_px, 400)).astype(np.int64)
@@ -56,7 +57,8 @@ def test_case_04_variance_of_a_narrow_line_far_from_row_0(method, sigma_px, row,
 @every_method
 @pytest.mark.parametrize("row", [0, 300, 719])
 @pytest.mark.parametrize("events", [1, 7])
-def test_case_05_one_event_or_one_row_has_a_floor_in_sigma(method, row, events, measured):
+@pytest.mark.hard_case(5)
+def test_one_event_or_one_row_has_a_floor_in_sigma(method, row, events, measured):
     found = one_column([row] * events, method)
     assert found.row[0] == pytest.approx(row, abs=1e-9)
     shortfall = lone_sigma_px(method) - float(found.sigma_row[0])
@@ -64,7 +66,8 @@ def test_case_05_one_event_or_one_row_has_a_floor_in_sigma(method, row, events, 
 
 
 @every_method
-def test_case_05_no_event_is_nan_without_warning(method):
+@pytest.mark.hard_case(5)
+def test_no_event_is_nan_without_warning(method):
     found = estimate(np.empty(0, np.uint16), np.zeros(4, int), method)
     for values in (found.row, found.sigma_row, found.width):
         assert np.isnan(values).all()
@@ -74,14 +77,16 @@ def test_case_05_no_event_is_nan_without_warning(method):
 @every_method
 @pytest.mark.parametrize("events", [2, 50, 4000])
 @pytest.mark.parametrize("row", [1, 699, 718])
-def test_case_06_constant_column_has_exactly_no_spread(method, events, row):
+@pytest.mark.hard_case(6)
+def test_constant_column_has_exactly_no_spread(method, events, row):
     found = one_column([row] * events, method)
     assert found.width[0] == 0.0
     assert found.row[0] == pytest.approx(row, abs=1e-9)
 
 
 @every_method
-def test_case_11_seventy_thousand_events_on_one_pixel(method):
+@pytest.mark.hard_case(11)
+def test_seventy_thousand_events_on_one_pixel(method):
     rows = np.concatenate([np.full(70_000, 719), np.full(10, 0)])
     found = one_column(rows, method)
     if method == "mean":
@@ -92,7 +97,8 @@ def test_case_11_seventy_thousand_events_on_one_pixel(method):
         assert found.events[0] >= 70_000
 
 
-def test_case_11_hot_pixel_in_a_stream_is_counted_not_wrapped():
+@pytest.mark.hard_case(11)
+def test_hot_pixel_in_a_stream_is_counted_not_wrapped():
     """Twice more events than 16 bits hold, on one pixel, within one period."""
     n = 140_000
     t = np.sort(np.random.default_rng(SEED).integers(1000, 60_000, n))
@@ -110,7 +116,8 @@ def test_case_11_hot_pixel_in_a_stream_is_counted_not_wrapped():
 
 
 @every_method
-def test_case_22_rows_without_events_inside_a_footprint(method):
+@pytest.mark.hard_case(22)
+def test_rows_without_events_inside_a_footprint(method):
     """A log fit of the histogram would take log 0; no estimator here takes logs of counts."""
     rng = np.random.default_rng(SEED)
     sparse = 2 * np.rint(rng.normal(150.0, 2.0, (200, 12))).astype(np.int64)
@@ -120,7 +127,8 @@ def test_case_22_rows_without_events_inside_a_footprint(method):
     assert np.abs(found.row - 300.0).max() < 8.0
 
 
-def test_case_22_gauss_ml_without_background_is_the_mean(measured):
+@pytest.mark.hard_case(22)
+def test_gauss_ml_without_background_is_the_mean(measured):
     """Closed form: without noise events the likelihood of a Gaussian peaks at their mean."""
     rng = np.random.default_rng(SEED)
     rows = np.rint(rng.normal(350.0, 4.0, (300, 40))).astype(np.int64)
@@ -143,7 +151,8 @@ TIED = {
 @every_method
 @pytest.mark.parametrize("rows", TIED.values(), ids=TIED)
 @pytest.mark.parametrize("width", [2.0, 7.0, 20.0])
-def test_case_23_ties_reverse_with_the_rows(method, rows, width, measured):
+@pytest.mark.hard_case(23)
+def test_ties_reverse_with_the_rows(method, rows, width, measured):
     values = np.array(rows)
     a = one_column(values, method, line_width_px=width)
     b = one_column(719 - values[::-1], method, line_width_px=width)
@@ -160,7 +169,8 @@ def test_case_23_ties_reverse_with_the_rows(method, rows, width, measured):
     st.sampled_from([2.0, 5.0, 9.0]),
     st.randoms(use_true_random=False),
 )
-def test_case_23_neither_order_nor_direction_decides(rows, method, width, random):
+@pytest.mark.hard_case(23)
+def test_neither_order_nor_direction_decides(rows, method, width, random):
     values = np.array(rows)
     shuffled = list(rows)
     random.shuffle(shuffled)
@@ -172,7 +182,8 @@ def test_case_23_neither_order_nor_direction_decides(rows, method, width, random
 
 @pytest.mark.parametrize("edge", [0, 719])
 @pytest.mark.parametrize("sigma_px", [4.0, 8.0])
-def test_case_24_footprint_cut_in_half_is_off_by_the_truncated_normal(edge, sigma_px, measured):
+@pytest.mark.hard_case(24)
+def test_footprint_cut_in_half_is_off_by_the_truncated_normal(edge, sigma_px, measured):
     """Half a Gaussian has its mean at sqrt(2/pi) sigma; the flag and the wider sigma say so."""
     rng = np.random.default_rng(SEED)
     away = np.abs(rng.normal(0.0, sigma_px, (200, 400)))
@@ -187,7 +198,8 @@ def test_case_24_footprint_cut_in_half_is_off_by_the_truncated_normal(edge, sigm
 
 
 @pytest.mark.parametrize("sigma_px", [0.8, 4.0, 25.0])
-def test_case_24_truncated_normal_is_inverted(sigma_px, measured):
+@pytest.mark.hard_case(24)
+def test_truncated_normal_is_inverted(sigma_px, measured):
     """Mean and variance of the visible part, with 50 digits, give the centre back."""
     worst = 0.0
     with mpmath.workdps(50):
@@ -204,7 +216,8 @@ def test_case_24_truncated_normal_is_inverted(sigma_px, measured):
 
 @pytest.mark.parametrize("method", ["mode_mean", "gauss_ml", "edge_mid"])
 @pytest.mark.parametrize(("row", "bias_px"), [(704.0, 0.3), (707.0, 0.6), (712.0, 1.5)])
-def test_case_24_flat_line_narrower_than_its_window(method, row, bias_px):
+@pytest.mark.hard_case(24)
+def test_flat_line_narrower_than_its_window(method, row, bias_px):
     """Rows as bright pixels fire: as often in the whole line, which ends 10 rows off its middle.
 
     From row 710 on the sensor cuts it. As a Gaussian of the window's width it would be 0.7, 1.6 and
@@ -226,7 +239,8 @@ def test_case_24_flat_line_narrower_than_its_window(method, row, bias_px):
 
 
 @every_method
-def test_case_24_flag_is_for_cut_footprints_only(method):
+@pytest.mark.hard_case(24)
+def test_flag_is_for_cut_footprints_only(method):
     rng = np.random.default_rng(SEED)
     middle = np.rint(rng.normal(350.0, 5.0, 60)).astype(int)
     cut = np.abs(np.rint(rng.normal(0.0, 5.0, 60))).astype(int)

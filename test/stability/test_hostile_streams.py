@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -65,7 +66,8 @@ modulations = st.builds(
     st.integers(0, 2**32), st.integers(0, 2 * WORDS), hostile_settings, modulations,
     st.sampled_from(["flush", "gap", "new modulation"]),
 )  # fmt: skip
-def test_case_26_any_words_are_survived_and_counted(seed, cut, chosen, modulation, between):
+@pytest.mark.hard_case(26)
+def test_any_words_are_survived_and_counted(seed, cut, chosen, modulation, between):
     data = scrambled(seed)
     reconstructor = Reconstructor(CALIBRATION, modulation, chosen)
     parts = [reconstructor.push(data[:cut])]

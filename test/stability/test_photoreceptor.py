@@ -39,7 +39,8 @@ def exact_levels(u, y, settled, follower_us, t_us):
 @swings
 @pytest.mark.parametrize("steps", [SHORT, LONG], ids=["short", "long"])
 @pytest.mark.parametrize("follower_us", [8.0, 1e-3, 600.0])
-def test_case_25_step_of_the_photoreceptor(u, settled, steps, follower_us, measured):
+@pytest.mark.hard_case(25)
+def test_step_of_the_photoreceptor(u, settled, steps, follower_us, measured):
     """``u <- 1/I + (u - 1/I) exp(-x)``, the exponential near 1 or gone; the follower behind it."""
     receptor = follower = 0.0
     with mpmath.workdps(50):
@@ -54,7 +55,8 @@ def test_case_25_step_of_the_photoreceptor(u, settled, steps, follower_us, measu
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-15, 1e-12, 1e-9, -1e-9, 1e-6, -1e-6, 1e-3, 0.01, -0.1])
-def test_case_25_nearly_equal_time_constants(apart, measured):
+@pytest.mark.hard_case(25)
+def test_nearly_equal_time_constants(apart, measured):
     """The two exponentials of the follower fall into one, their factors grow without limit."""
     follower_us = TAU_US * (1.0 - apart)
     worst = 0.0
@@ -72,12 +74,14 @@ def test_case_25_nearly_equal_time_constants(apart, measured):
 
 
 @pytest.mark.parametrize("t_us", [1e5, 1e9, 1e300])
-def test_case_25_endless_step_settles_exactly(t_us):
+@pytest.mark.hard_case(25)
+def test_endless_step_settles_exactly(t_us):
     assert _advanced(Signal(1.0, 0.9, 0.125, TAU_US, 8.0), t_us) == (0.125, 0.125)
     assert _advanced(Signal(0.125, 0.2, 1.0, TAU_US, 8.0), t_us) == (1.0, 1.0)
 
 
-def test_case_25_many_short_steps_are_one_long_step(measured):
+@pytest.mark.hard_case(25)
+def test_many_short_steps_are_one_long_step(measured):
     u = y = 1.0
     for _ in range(100_000):
         u, y = _advanced(Signal(u, y, 0.2, TAU_US, 8.0), 1e-5 * TAU_US)
@@ -88,7 +92,8 @@ def test_case_25_many_short_steps_are_one_long_step(measured):
 
 @pytest.mark.parametrize("follower_us", [1e-6, 8.0, 60.0])
 @pytest.mark.parametrize("rising", [True, False])
-def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, follower_us, measured):
+@pytest.mark.hard_case(25)
+def test_crossing_is_where_the_step_is_at_the_level(rising, follower_us, measured):
     """Levels from one part in 1e12 of the swing to all but one part in 1e12 of it."""
     rng = np.random.default_rng(SEED)
     shares = np.concatenate([np.geomspace(1e-12, 0.5, 40), 1.0 - np.geomspace(1e-12, 0.5, 40)])
@@ -107,6 +112,7 @@ def test_case_25_crossing_is_where_the_step_is_at_the_level(rising, follower_us,
     measured("level at the crossing found, relative", worst, 1e-13)
 
 
-def test_case_25_level_out_of_reach_is_no_event():
+@pytest.mark.hard_case(25)
+def test_level_out_of_reach_is_no_event():
     assert _noiseless(Signal(1.0, 1.0, 0.5, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)
     assert _noiseless(Signal(1.0, 1.0, 1.0, TAU_US, 8.0), Levels(0.4, 2.0)) == (np.inf, NOTHING)

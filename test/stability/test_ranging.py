@@ -29,7 +29,8 @@ def model(build: str) -> RangeModel:
 
 
 @pytest.mark.parametrize("build", BUILDS)
-def test_case_01_range_evaluation(build, measured):
+@pytest.mark.hard_case(1)
+def test_range_evaluation(build, measured):
     """Every row against 50 digits from the decimal numbers of the file."""
     with mpmath.workdps(50):
         k_prime, b_prime = (mpmath.mpf(text) for text in TABLE_1[build])
@@ -42,7 +43,8 @@ def test_case_01_range_evaluation(build, measured):
 
 
 @pytest.mark.parametrize("build", BUILDS)
-def test_case_02_pole_is_invalid_and_never_a_sign_flip(build):
+@pytest.mark.hard_case(2)
+def test_pole_is_invalid_and_never_a_sign_flip(build):
     m = model(build)
     pole = -m.b_prime_px
     beyond = pole + np.concatenate([-POLE_DISTANCES_PX, POLE_DISTANCES_PX, [0.0, 1.0, 50.0, 1e9]])
@@ -53,7 +55,8 @@ def test_case_02_pole_is_invalid_and_never_a_sign_flip(build):
 
 
 @pytest.mark.parametrize("build", BUILDS)
-def test_case_02_last_valid_row_keeps_all_digits(build, measured):
+@pytest.mark.hard_case(2)
+def test_last_valid_row_keeps_all_digits(build, measured):
     m = model(build)
     row = -m.b_prime_px - np.array([1.0, 1.5, 10.0])
     with mpmath.workdps(50):
@@ -66,13 +69,15 @@ def test_case_02_last_valid_row_keeps_all_digits(build, measured):
 
 
 @pytest.mark.parametrize("build", BUILDS)
-def test_case_03_row_to_range_and_back(build, measured):
+@pytest.mark.hard_case(3)
+def test_row_to_range_and_back(build, measured):
     rows = np.linspace(0.0, 719.0, 20_001)
     back = model(build).row(model(build).range_mm(rows))
     measured("row to range and back, px", np.abs(back - rows).max(), 1e-12)
 
 
-def test_case_17_forward_map_at_and_behind_the_front_focal_line_is_nan():
+@pytest.mark.hard_case(17)
+def test_forward_map_at_and_behind_the_front_focal_line_is_nan():
     m = RangeModel(24.06, -37000.0, 5.0, -1140.0)
     bad = np.array([-5.0, -5.0000001, -1000.0, np.nan, -np.inf])
     for result in (m.row(bad), m.range_per_row_mm(bad), m.lateral_mm(0, bad)):
@@ -82,7 +87,8 @@ def test_case_17_forward_map_at_and_behind_the_front_focal_line_is_nan():
 
 @settings(derandomize=True, max_examples=300, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(-100.0, 100.0))
-def test_case_17_forward_map_is_finite_or_flagged(range_mm, b_mm):
+@pytest.mark.hard_case(17)
+def test_forward_map_is_finite_or_flagged(range_mm, b_mm):
     m = RangeModel(24.06, -37000.0, b_mm, -1140.0)
     row = float(m.row(range_mm))
     assert np.isnan(row) == (range_mm + b_mm <= 1e-300)
@@ -90,7 +96,8 @@ def test_case_17_forward_map_is_finite_or_flagged(range_mm, b_mm):
     assert not row > -m.b_prime_px
 
 
-def test_case_18_limits_at_the_pole_are_infinite_without_complaint():
+@pytest.mark.hard_case(18)
+def test_limits_at_the_pole_are_infinite_without_complaint():
     m = model("config_3")
     assert float(m.magnification(-m.b_prime_px)) == 0.0
     assert float(depth_of_field_mm(0.0, 2.0, 85.87, -7.62)) == np.inf
@@ -103,7 +110,8 @@ def test_case_18_limits_at_the_pole_are_infinite_without_complaint():
 @pytest.mark.parametrize(
     ("range_mm", "limit_um"), [(2400.0, 0.24), (100_000.0, 7.7)], ids=["2.4 m", "100 m"]
 )
-def test_case_19_points_are_rounded_to_float32_once(range_mm, limit_um, measured):
+@pytest.mark.hard_case(19)
+def test_points_are_rounded_to_float32_once(range_mm, limit_um, measured):
     """Half a spacing of float32, wherever in a millimetre the range falls; t stays float64."""
     ranges = range_mm - np.linspace(0.0, 1.0, 4001)
     n = ranges.size

@@ -58,7 +58,8 @@ class LateDecoder(Decoder):
         return replace(events, t=events.t + self.shift_us)
 
 
-def test_case_07_decades_of_microseconds_give_the_same_profiles(monkeypatch):
+@pytest.mark.hard_case(7)
+def test_decades_of_microseconds_give_the_same_profiles(monkeypatch):
     rng = np.random.default_rng(SEED)
     data = encoded(line_events(rng, flat, frequency_hz=FREQUENCY_HZ, periods=6, columns=200))
     near = reconstructed(data, Modulation(FREQUENCY_HZ, on_edge_us=1000))
@@ -72,7 +73,8 @@ def test_case_07_decades_of_microseconds_give_the_same_profiles(monkeypatch):
     assert (old_edge.t_us >= old_edge.edge_us).all()
 
 
-def test_case_07_conversion_to_ros_time_is_exact_at_1e18_ns(measured):
+@pytest.mark.hard_case(7)
+def test_conversion_to_ros_time_is_exact_at_1e18_ns(measured):
     """Floats would round to 256 ns here."""
     t_us = EPOCH_US + np.random.default_rng(SEED).integers(0, 10**12, 2000)
     clock = SensorClock(zero_ns=123_456_789)
@@ -85,7 +87,8 @@ def test_case_07_conversion_to_ros_time_is_exact_at_1e18_ns(measured):
 
 
 @pytest.mark.parametrize("uptime_us", [WRAP_EVT3_US, WRAP_INT32_US, WRAP_EVT2_US, EPOCH_US])
-def test_case_07_a_clock_from_edges_is_the_same_after_any_uptime(uptime_us, measured):
+@pytest.mark.hard_case(7)
+def test_a_clock_from_edges_is_the_same_after_any_uptime(uptime_us, measured):
     """ROS time of 54 years, sensor time up to as much: floats would round both."""
     bench = StagePulses((10.0, 210.0, 10.0))
     near = fit_edges(bench.edges, bench.track, PULSES, bench.arrivals(3.0))
@@ -98,7 +101,8 @@ def test_case_07_a_clock_from_edges_is_the_same_after_any_uptime(uptime_us, meas
     measured("position by that clock at 300 mm/s, um", bench.error_um(near), 10.0)
 
 
-def test_case_07_points_count_time_from_their_origin(measured):
+@pytest.mark.hard_case(7)
+def test_points_count_time_from_their_origin(measured):
     n = 2000
     t_us = EPOCH_US + np.arange(n) * 997
     points = place(blank_profiles(n, t_us=t_us), MODEL, 0.0, (0.0, 1.0, 0.0), EPOCH_US)
@@ -106,7 +110,8 @@ def test_case_07_points_count_time_from_their_origin(measured):
     measured("time of points since the origin, s", error, 1e-15)
 
 
-def test_case_07_phase_of_events_is_that_of_the_same_events_at_zero(measured):
+@pytest.mark.hard_case(7)
+def test_phase_of_events_is_that_of_the_same_events_at_zero(measured):
     rng = np.random.default_rng(SEED)
     t, _, _, p = line_events(rng, flat, frequency_hz=FREQUENCY_HZ, columns=60)
     near = estimate_phase(t, p, Modulation(FREQUENCY_HZ))
@@ -116,7 +121,8 @@ def test_case_07_phase_of_events_is_that_of_the_same_events_at_zero(measured):
 
 
 @pytest.mark.parametrize("origin_us", [0, EPOCH_US])
-def test_case_08_phase_against_50_digits(origin_us, measured):
+@pytest.mark.hard_case(8)
+def test_phase_against_50_digits(origin_us, measured):
     """Vector strength over a minute, which every phase enters; float f t is off by 1.6e-6."""
     n = 2000
     t = origin_us + np.sort(np.random.default_rng(SEED).integers(0, 60_000_000, n))
@@ -129,7 +135,8 @@ def test_case_08_phase_against_50_digits(origin_us, measured):
 
 
 @pytest.mark.parametrize("origin_us", [0, EPOCH_US])
-def test_case_08_edges_are_the_exact_quotient(origin_us, measured):
+@pytest.mark.hard_case(8)
+def test_edges_are_the_exact_quotient(origin_us, measured):
     """One hour after the last sync edge each edge is the nearest microsecond, exactly."""
     schedule = EdgeSchedule(Modulation(FREQUENCY_HZ))
     schedule.anchor(origin_us, origin_us)
@@ -163,7 +170,8 @@ def stream_across(wrap_us: int, disorder_us: int) -> tuple[np.ndarray, bytes]:
 
 @pytest.mark.parametrize("chunk", [1 << 20, 4096, 6, 1])
 @pytest.mark.parametrize("disorder_us", [0, 10])
-def test_case_09_time_never_steps_back_across_the_24_bit_wrap(chunk, disorder_us, measured):
+@pytest.mark.hard_case(9)
+def test_time_never_steps_back_across_the_24_bit_wrap(chunk, disorder_us, measured):
     sent, data = stream_across(WRAP_EVT3_US, disorder_us)
     decoder = Decoder()
     pieces = [decoder.decode(data[at : at + chunk]).t.copy() for at in range(0, len(data), chunk)]
@@ -176,7 +184,8 @@ def test_case_09_time_never_steps_back_across_the_24_bit_wrap(chunk, disorder_us
 
 
 @pytest.mark.parametrize("wrap_us", [WRAP_INT32_US, WRAP_EVT2_US])
-def test_case_09_time_goes_on_beyond_31_and_34_bits(wrap_us, measured):
+@pytest.mark.hard_case(9)
+def test_time_goes_on_beyond_31_and_34_bits(wrap_us, measured):
     rng = np.random.default_rng(SEED)
     t = wrap_us - 50_000 + np.sort(rng.integers(0, 100_000, 3000))
     x, y, p = rng.integers(0, 1280, 3000), rng.integers(0, 720, 3000), np.ones(3000, np.uint8)
@@ -192,7 +201,8 @@ def test_case_09_time_goes_on_beyond_31_and_34_bits(wrap_us, measured):
     np.testing.assert_allclose(track.position_mm(events.t), expected, rtol=1e-12)
 
 
-def test_case_09_profiles_across_the_wrap_are_those_before_it():
+@pytest.mark.hard_case(9)
+def test_profiles_across_the_wrap_are_those_before_it():
     rng = np.random.default_rng(SEED)
     modulation = Modulation(70.0, on_edge_us=1000)
     t, x, y, p = line_events(rng, flat, periods=6, columns=100)
@@ -206,7 +216,8 @@ def test_case_09_profiles_across_the_wrap_are_those_before_it():
         np.testing.assert_array_equal(getattr(far, name), getattr(near, name), name)
 
 
-def test_case_10_shuffled_events_give_the_same_points():
+@pytest.mark.hard_case(10)
+def test_shuffled_events_give_the_same_points():
     rng = np.random.default_rng(SEED)
     t, x, y, p = line_events(rng, flat, periods=5, columns=80)
     order = np.argsort(t + rng.uniform(0.0, 50.0, t.size), kind="stable")
@@ -222,7 +233,8 @@ def test_case_10_shuffled_events_give_the_same_points():
             np.testing.assert_array_equal(ours, expected, name)
 
 
-def test_case_10_unsorted_events_are_refused_where_order_counts():
+@pytest.mark.hard_case(10)
+def test_unsorted_events_are_refused_where_order_counts():
     t = np.array([100, 150, 120])
     with pytest.raises(ArgumentError, match=r"t\[2\] is 120"):
         Encoder().encode(t, t, t, [1, 1, 1])
@@ -242,7 +254,8 @@ def test_case_10_unsorted_events_are_refused_where_order_counts():
 
 @pytest.mark.parametrize("origin_us", [0, EPOCH_US, -(2**40)])
 @pytest.mark.parametrize("speed_mm_s", [50.0, -300.0])
-def test_case_20_linear_motion(origin_us, speed_mm_s, measured):
+@pytest.mark.hard_case(20)
+def test_linear_motion(origin_us, speed_mm_s, measured):
     """Samples every 20 ms lie on whole nanometres, so what is left is interpolation error."""
     t_us = np.arange(0, 2_000_001, 20_000)
     start_mm = 300.0
@@ -255,13 +268,15 @@ def test_case_20_linear_motion(origin_us, speed_mm_s, measured):
     measured("interpolated position, share of 300 mm", worst / 300, 1e-12)
 
 
-def test_case_20_reversal_of_the_motion():
+@pytest.mark.hard_case(20)
+def test_reversal_of_the_motion():
     stage = StageTrack()
     stage.append([0, 10, 20], [0.0, 1.0, 0.0])
     np.testing.assert_allclose(stage.position_mm([5, 10, 15]), [0.5, 1.0, 0.5], rtol=1e-15)
 
 
-def test_case_20_nothing_is_extrapolated():
+@pytest.mark.hard_case(20)
+def test_nothing_is_extrapolated():
     assert np.isnan(StageTrack().position_mm([0, 5])).all()
     single = StageTrack()
     single.append(7, 1.5)
@@ -272,7 +287,8 @@ def test_case_20_nothing_is_extrapolated():
     np.testing.assert_array_equal(two.position_mm([6, 7, 8, 9, 10]), [np.nan, 1, 2, 3, np.nan])
 
 
-def test_case_20_gaps_are_not_bridged_beyond_the_limit():
+@pytest.mark.hard_case(20)
+def test_gaps_are_not_bridged_beyond_the_limit():
     query = [0, 50, 100, 101, 299, 300, 350]
     for limit_us, bridged in ((199, False), (200, True), (None, True)):
         stage = StageTrack(limit_us)
@@ -282,14 +298,16 @@ def test_case_20_gaps_are_not_bridged_beyond_the_limit():
         np.testing.assert_allclose(position, [0.0, 0.5, 1.0, *inside, 3.0, 3.5], rtol=1e-15)
 
 
-def test_case_20_times_at_both_ends_of_int64():
+@pytest.mark.hard_case(20)
+def test_times_at_both_ends_of_int64():
     limits = np.iinfo(np.int64)
     stage = StageTrack()
     stage.append([-100, 100], [0.0, 1.0])
     assert np.isnan(stage.position_mm([limits.min, limits.max])).all()
 
 
-def test_case_21_point_lies_where_the_stage_was_at_its_events(measured):
+@pytest.mark.hard_case(21)
+def test_point_lies_where_the_stage_was_at_its_events(measured):
     """Mean time of the events used: 1 ms would be 0.3 mm, a batch of 4 ms 1.2 mm."""
     rng = np.random.default_rng(SEED)
     t, x, y, p = line_events(rng, flat, periods=8, columns=64)

@@ -1,4 +1,4 @@
-"""Where configuration lies; files that are whole or absent: written beside, then renamed."""
+"""Folders of configuration; files that are complete or absent: written beside, then renamed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Find out before long work whether ``atomic_write`` can write ``path``; leaves no trace.
+    """Check before long work that ``atomic_write`` can write ``path``; leaves nothing behind.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def _partial(target: Path) -> Path:
 
 @contextmanager
 def _named(target: Path) -> Iterator[None]:
-    """Turn the system's refusal into one that names the file meant."""
+    """Raise the system's errors as an ``ArgumentError`` that names the file."""
     try:
         yield
     except OSError as error:
@@ -74,7 +74,7 @@ def _named(target: Path) -> Iterator[None]:
 
 
 def config_folders() -> list[Path]:
-    """List where ``config/`` may lie: source tree, pip-installed package, colcon's share."""
+    """Return where ``config/`` may lie: source tree, pip-installed package, colcon's share."""
     here = Path(__file__).absolute()
     return [
         here.parents[3] / "config",

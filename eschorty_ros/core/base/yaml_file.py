@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from eschorty_ros.core.base.errors import EschortyError
-from eschorty_ros.core.base.numbers import file_path
+from eschorty_ros.core.base.numbers import file_path, short
 
 
 class Schema(BaseModel):
@@ -23,7 +23,7 @@ Model = TypeVar("Model", bound=Schema)
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses a key given twice, of which plain YAML keeps the last without a word."""
+    """Refuses a key given twice, of which plain YAML silently keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -74,8 +74,7 @@ def validate(
     """
     if not isinstance(data, dict):
         raise error(
-            f"{where}: it holds {_short(data)} instead of keys; "
-            f"write {', '.join(_required(schema))}"
+            f"{where}: it holds {short(data)} instead of keys; write {', '.join(_required(schema))}"
         )
     try:
         return schema.model_validate(data)
@@ -92,13 +91,8 @@ def _required(schema: type[Schema]) -> list[str]:
     return [name for name, field in schema.model_fields.items() if field.is_required()]
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def _line(schema: type[Schema], fault: Any) -> str:
-    kind, value = fault["type"], _short(fault["input"])
+    kind, value = fault["type"], short(fault["input"])
     key = ".".join(str(part) for part in fault["loc"])
     if kind == "missing":
         return f"{key} is missing; add it"

@@ -3,7 +3,6 @@
 Time is int64 microseconds of the sensor's clock, first 24-bit wrap = 0.
 """
 
-from eschorty_ros.core.evt3._decode import EventArrays
 from eschorty_ros.core.evt3.activity_filter import ActivityFilter
 from eschorty_ros.core.evt3.decoder import Counters, Decoder
 from eschorty_ros.core.evt3.encoder import Encoder, sort_readout

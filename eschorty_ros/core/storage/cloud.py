@@ -41,7 +41,7 @@ _HEADER_LIMIT = 4096
 
 
 def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
-    """Write ``points`` as ``.pcd`` or ``.ply``; the file appears whole or not at all.
+    """Write ``points`` as ``.pcd`` or ``.ply``; the file appears complete or not at all.
 
     Parameters
     ----------
@@ -53,6 +53,16 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
     ------
     ArgumentError
         For another extension, another dtype or shape, or a path that cannot be written.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> points = np.zeros(2, POINT_DTYPE)
+    >>> points["x"] = 1.0, 1.1
+    >>> with TemporaryDirectory() as folder:
+    ...     write_cloud(f"{folder}/cloud.pcd", points)
+    ...     read_cloud(f"{folder}/cloud.pcd")["x"].tolist()
+    [1.0, 1.100000023841858]
     """
     header = _header_writer(file_path("path", path))
     if not isinstance(points, np.ndarray):
@@ -106,7 +116,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
 
 
 def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """All points of ``parts``; a field that some of them lack is NaN in theirs.
+    """Return all points of ``parts``; a field that some of them lack is NaN in theirs.
 
     Parameters
     ----------
@@ -172,7 +182,7 @@ def _ply_header(dtype: np.dtype[Any], count: int) -> bytes:
 
 
 def _parse_header(source: Path, data: bytes) -> tuple[int, int]:
-    """Find the number of points and the offset of the first one."""
+    """Return the number of points and the offset of the first one."""
     pcd = source.suffix.lower() == ".pcd"
     end, key = (b"DATA binary\n", b"POINTS ") if pcd else (b"end_header\n", b"element vertex ")
     stop = data.find(end, 0, _HEADER_LIMIT)

@@ -24,7 +24,7 @@ _REMEDY = "convert it to EVT3 or record again with format EVT3"
 
 
 class Header(Mapping[str, str]):
-    """The header's keys and values as written, plus what they mean.
+    """The header's keys and values as written, plus their meaning.
 
     ``width``, ``height`` : sensor size in pixels (1280 x 720 when the file does not say).
     ``format`` : always ``"EVT3"``. ``size_bytes`` : offset of the first word.
@@ -59,8 +59,8 @@ class RawReader:
     ----------
     header : Header
     warnings : list of str
-        One line per oddity that was read over: no ``% end``, no geometry, no events, an odd last
-        byte. The last is known when ``chunks`` has reached the end.
+        One line per fault that does not stop the reading: no ``% end``, no geometry, no events,
+        an odd last byte. The last appears when ``chunks`` has reached the end.
 
     Raises
     ------
@@ -144,8 +144,8 @@ class RawReader:
 
     @staticmethod
     def _looks_like_evt3(head: bytes) -> bool:
-        """Whether a file without header begins with a stream: types known, TIME_HIGH among them."""
-        kinds = [octet >> 4 for octet in head[1:4096:2]]
+        """Return whether a file without header begins with EVT3 words, TIME_HIGH among them."""
+        kinds = [byte >> 4 for byte in head[1:4096:2]]
         return w3.TIME_HIGH in kinds and not any(kind in w3.UNUSED for kind in kinds)
 
     def _meaning(self, values: dict[str, str]) -> tuple[int, int]:
@@ -187,7 +187,7 @@ class RawReader:
 
 
 class RawWriter:
-    """Writes an EVT3 RAW file with the header keys that older and newer readers ask for.
+    """Writes an EVT3 RAW file with the header keys that older and newer readers need.
 
     Parameters
     ----------
@@ -226,10 +226,10 @@ class RawWriter:
             whole(name, size, 1, _SIZE_MAX)
         self.path = file_path("path", path)
         self.bytes_written = 0
-        moment = date or datetime.datetime.now(datetime.UTC)
+        recorded = date or datetime.datetime.now(datetime.UTC)
         header = {
             "camera_integrator_name": "Prophesee",
-            "date": moment.strftime("%Y-%m-%d %H:%M:%S"),
+            "date": recorded.strftime("%Y-%m-%d %H:%M:%S"),
             "evt": "3.0",
             "format": f"EVT3;height={height};width={width}",
             "generation": "4.2",

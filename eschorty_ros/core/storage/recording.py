@@ -48,7 +48,7 @@ class _LaserFile(Schema):
 
 @dataclass(frozen=True)
 class Recording:
-    """What a recording folder holds.
+    """The content of a recording folder.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Recording:
     stage : StageTrack
         Stage position over sensor time; bridges any gap.
     stage_samples : ndarray of STAGE_DTYPE, shape (n,)
-        The samples behind ``stage``, positions on whole nanometres.
+        The samples of ``stage``, positions rounded to nanometres.
     modulation : Modulation
     calibration : Calibration
     """
@@ -154,6 +154,17 @@ def write_stage_csv(path: str | os.PathLike[str], t_us: ArrayLike, position_mm: 
     ------
     ArgumentError
         When the times do not increase, a position is not finite or the path cannot be written.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     write_stage_csv(f"{folder}/stage.csv", [0, 10_000], [10.0, 10.5])
+    ...     print(Path(f"{folder}/stage.csv").read_text())
+    t_us,position_mm
+    0,10.000000
+    10000,10.500000
+    <BLANKLINE>
     """
     samples = _columns(STAGE_DTYPE, t_us=t_us, position_mm=position_mm)
     back = np.flatnonzero(np.diff(samples["t_us"]) <= 0)
@@ -191,11 +202,11 @@ def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
         if dtype[name].kind == "f":
             table[name] = quantise_nm(array, name) / NM_PER_MM
         else:
-            table[name] = _whole(array, name, np.iinfo(dtype[name]))
+            table[name] = _integers(array, name, np.iinfo(dtype[name]))
     return table
 
 
-def _whole(array: NDArray[Any], name: str, limits: np.iinfo[Any]) -> NDArray[Any]:
+def _integers(array: NDArray[Any], name: str, limits: np.iinfo[Any]) -> NDArray[Any]:
     if array.size and array.dtype.kind not in "iu":
         raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
     wrong = (array < limits.min) | (array > limits.max)
@@ -262,20 +273,20 @@ def _check_lengths(path: Path, name: str, values: NDArray[np.float64]) -> None:
 
 def _parse_table(stream: Any, dtype: np.dtype[Any]) -> NDArray[np.void]:
     with warnings.catch_warnings():
-        # An empty table is for the caller to judge.
+        # The caller checks for an empty table.
         warnings.filterwarnings("ignore", "loadtxt: input contained no data", UserWarning)
         return np.atleast_1d(np.loadtxt(stream, dtype, delimiter=",", comments=None))
 
 
 def _line_number(path: Path, index: int) -> int:
-    """Line of table row ``index``, blank lines counted as an editor does."""
+    """Return the line of table row ``index``, blank lines counted as an editor does."""
     lines = path.read_text(encoding="utf-8-sig").splitlines()
     filled = [number for number, line in enumerate(lines, 1) if line.strip()]
     return filled[index + 1]
 
 
 def _first_fault(path: Path, dtype: np.dtype[Any]) -> str:
-    """Say which line is the first that does not fit."""
+    """Return the message about the first line that does not fit."""
     names = dtype.names or ()
     for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
         cells = line.split(",")

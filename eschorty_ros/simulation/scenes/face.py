@@ -1,7 +1,6 @@
 """A face: smooth, with nose bridge, eye sockets, lips and ears, as a height field.
 
-Every ray ends at the first surface it meets. That the nose may hide a cheek from the camera
-(occlusion) is not modelled, here or in any other scene.
+Every ray ends at the first surface it meets. Occlusion is not modelled, as in every scene.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _EAR_LINE_MM = 2.0
 _SKIN, _LIPS, _EYES = 0.75, 0.5, 0.9
 _SOLVE_STEPS = 4
 _BELL_END = 1e-9
-"""Bumps this far down their slope change nothing by more than a millionth of a micrometre."""
+"""Parts of a bump below this share of its height are left out: less than 20 pm."""
 
 # Bumps: across and up from the middle of the face, their half widths, and the height; mm. Those off
 # the middle come in pairs. Up is +z.
@@ -73,11 +72,11 @@ class Face:
             raise ArgumentError(f"centre_mm is {self.centre_mm!r}; choose a positive range")
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`eschorty_ros.simulation.scenes.scene.Scene`; NaN beside the face."""
+        """Return ranges as a :class:`Scene`; NaN beside the face."""
         return self._recent.get(self._meet, stage_mm, columns, model)[0]
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Skin, darker lips and lighter eyes, changing gradually; 0 beside the face."""
+        """Return the reflectance of skin, darker lips and lighter eyes; 0 beside the face."""
         x, z = self._recent.get(self._meet, stage_mm, columns, model)
         y, _ = sheet(stage_mm, columns, model)
         across = y - self.centre_stage_mm
@@ -90,7 +89,7 @@ class Face:
     def _meet(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
     ) -> tuple[Array, Array]:
-        """Range and height above the nose at which each ray meets head or ear; NaN for neither."""
+        """Return range and height at which each ray meets head or ear; NaN for neither."""
         y, slope = sheet(stage_mm, columns, model)
         across, depth_mm = y - self.centre_stage_mm, self.centre_mm + model.b_mm
         x = np.full((y.size, slope.size), np.nan)
@@ -118,7 +117,7 @@ def _bell(at: Array, centre: float, half_width: float) -> Array:
 
 
 def _head_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Height of the head towards the sensor, and whether there is any; goes on beyond the rim."""
+    """Return the height of the head towards the sensor, and where there is a head."""
     jaw = 1.0 - 0.22 / (1.0 + np.exp((up + 55.0) / 14.0))
     squared = (across / (HEAD_HALF_WIDTH_MM * jaw)) ** 2 + (up / HEAD_HALF_HEIGHT_MM) ** 2
     height = -HEAD_DEPTH_MM * np.minimum(squared, 1.5) ** 1.3
@@ -132,7 +131,7 @@ def _head_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _ear_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Height of the ears, flat shells with a rim behind the head, and whether there are any."""
+    """Return the height of the ears, flat shells with a rim, and where there are ears."""
     aside = np.abs(across) - EAR_OFF_MM
     squared = (aside / _EAR_HALF_MM[0]) ** 2 + ((up - _EAR_LINE_MM) / _EAR_HALF_MM[1]) ** 2
     rim = 4.0 * np.exp(-(((squared - 0.75) / 0.25) ** 2))
@@ -145,7 +144,7 @@ def _solve(
     depth_mm: float,
     height: Callable[[Array, Array], tuple[Array, NDArray[np.bool_]]],
 ) -> tuple[Array, Array]:
-    """Depth and height along the line where ``x = depth - height(across, slope x)``, by secants.
+    """Return depth and height where ``x = depth - height(across, slope x)``, by secants.
 
     Rays lie within 7 degrees of the x axis, so that ``x -> depth - height`` shrinks every error
     about fivefold even at the head's rim, and the secants leave less than 1 um.

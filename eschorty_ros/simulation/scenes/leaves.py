@@ -1,7 +1,6 @@
 """A collage of leaves: three layers that overlap, with leaves 2.2 mm apart within a layer.
 
-Every ray ends at the first leaf it meets. That the camera may look past a leaf's rim differently
-from the laser (occlusion) is not modelled, here or in any other scene.
+Every ray ends at the first leaf it meets. Occlusion is not modelled, as in every scene.
 """
 
 from __future__ import annotations
@@ -70,28 +69,28 @@ class Leaf:
 
     @property
     def half_extent_mm(self) -> tuple[Array, Array]:
-        """Half of the box around blade and petiole: along the stage and along the line."""
+        """Return half of the box around blade and petiole: along the stage and along the line."""
         along = self.length_mm * (0.5 + _PETIOLE_SHARE)
         s, c = np.abs(self.heading_stage), np.abs(self.heading_line)
         return along * s + self.half_width_mm * c, along * c + self.half_width_mm * s
 
     def take(self, index: NDArray[Any]) -> Leaf:
-        """Leaf of every entry of ``index`` (numbers or a mask), from leaves as arrays."""
+        """Return the leaf of every entry of ``index``, from leaves as arrays."""
         return Leaf(*(np.asarray(getattr(self, name))[index] for name in self.__slots__))
 
     def place(self, y: Array, z: Array) -> tuple[Array, Array]:
-        """Coordinates in the leaf, mm: from the blade's beginning to its tip, and across."""
+        """Return coordinates in the leaf, mm: from its stalk to its tip, and across."""
         dy, dz = y - self.stage_mm, z - self.line_mm
         along = dz * self.heading_line + dy * self.heading_stage + 0.5 * self.length_mm
         return along, dy * self.heading_line - dz * self.heading_stage
 
     def near(self, along: Array, across: Array) -> NDArray[np.bool_]:
-        """Whether a point is within the box around blade and petiole, or 1 mm beside it."""
+        """Return whether a point is within the box around blade and petiole, or 1 mm beside it."""
         within = (along > -_PETIOLE_SHARE * self.length_mm - 1.0) & (along < self.length_mm + 1.0)
         return np.asarray(within & (np.abs(across) < self.half_width_mm + 1.0))
 
     def covers(self, along: Array, across: Array) -> NDArray[np.bool_]:
-        """Whether blade or petiole is there."""
+        """Return whether blade or petiole is there."""
         distance = np.abs(across)
         u = np.clip(along / self.length_mm, 0.0, 1.0)
         # Lobes lean towards the tip as the side veins do.
@@ -102,7 +101,7 @@ class Leaf:
         return np.asarray((distance < half) | (petiole & (distance < _PETIOLE_HALF_MM)))
 
     def vein_mm(self, along: Array, across: Array) -> Array:
-        """Height of midrib and side veins above the blade."""
+        """Return the height of midrib and side veins above the blade."""
         distance = np.abs(across)
         midrib = np.maximum(1.0 - distance / _MIDRIB_HALF_MM, 0.0)
         phase = (along - _VEIN_LEAN * distance) / _VEIN_EVERY_MM
@@ -160,7 +159,7 @@ class Leaves:
         object.__setattr__(self, "_arrays", arrays)
 
     def _layer(self, depth_mm: float, stage_mm: float, rng: np.random.Generator) -> list[Leaf]:
-        """Leaves along a wavy row, each overlapping the one before, level after level."""
+        """Return leaves along a wavy row, each overlapping the one before, level after level."""
         count = self.leaves_per_layer
         line = np.linspace(-_LINE_TRAVEL_MM, _LINE_TRAVEL_MM, count) + rng.uniform(-8, 8, count)
         wave = np.sin(rng.uniform(0.0, 2.0 * np.pi) + 2.4 * np.arange(count))
@@ -184,22 +183,22 @@ class Leaves:
         ]
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`eschorty_ros.simulation.scenes.scene.Scene`; NaN between the leaves."""
+        """Return ranges as a :class:`Scene`; NaN between the leaves."""
         return self._hits(stage_mm, columns, model)[0]
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Each leaf's own, 0 between the leaves."""
+        """Return each leaf's reflectance, 0 between the leaves."""
         leaf = self._hits(stage_mm, columns, model)[1]
         return np.append(self._arrays.albedo, 0.0)[leaf]
 
     def leaf_index(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
     ) -> NDArray[np.intp]:
-        """Index into ``leaves`` of what every ray hits, -1 for nothing; shape (n, m)."""
+        """Return the index into ``leaves`` of what every ray hits, -1 for nothing; shape (n, m)."""
         return self._hits(stage_mm, columns, model)[1]
 
     def curvature_mm(self, stage_mm: ArrayLike, line_mm: ArrayLike) -> Array:
-        """How far leaves bend away from their level there; the arguments broadcast."""
+        """Return how far leaves bend away from their level; the arguments broadcast."""
         y = (np.asarray(stage_mm, dtype=np.float64) - _CENTRE_STAGE_MM) / 100.0
         z = np.asarray(line_mm, dtype=np.float64) / 165.0
         return np.asarray(1.5 * y * y + 1.5 * z * z + 1.5 * y * z - 1.0)
@@ -212,7 +211,7 @@ class Leaves:
     def _cast(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
     ) -> tuple[Array, NDArray[np.intp]]:
-        """Range and leaf of the first hit of every ray: NaN and -1 for none."""
+        """Return range and leaf of the first hit of every ray: NaN and -1 for none."""
         y, slope = sheet(stage_mm, columns, model)
         every = self._arrays
         tall, wide = every.half_extent_mm
@@ -237,7 +236,7 @@ class Leaves:
     def _meet(
         self, leaf: Leaf, y: Array, z: Array, slope: Array, b_mm: float
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Where each ray meets its leaf's surface, and whether the leaf reaches that far.
+        """Return where each ray meets its leaf's surface, and whether the leaf extends to there.
 
         The surface is nearly flat: a step of ``x = surface(y, slope (x + b))`` leaves less than a
         twentieth of the error, and two of them less than 2 um.

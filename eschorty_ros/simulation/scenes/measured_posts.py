@@ -1,4 +1,4 @@
-"""Posts at known ranges as a finder would measure them, with noise and without events."""
+"""Measurements of posts at known ranges, with noise and without events."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ def measured_posts(
     bloom_px: float = 0.0,
     noise: float = 1.0,
 ) -> Targets:
-    """Measure posts that stand where the ranges say, give or take their errors.
+    """Return measurements of posts at these ranges, with their errors.
 
     Parameters
     ----------
     truth : RangeModel
-        The instrument as it is.
+        The true instrument.
     range_mm : ndarray of float64, shape (n,)
-        Ranges as somebody measured them; the posts stand `SIGMA_RANGE_MM` away from there.
+        Measured ranges; the true ones differ by `SIGMA_RANGE_MM`.
     rng : Generator
     size_mm, spacing_mm : array_like, scalar or shape (n,)
         Sizes of the posts, distances of two marks on them; NaN for none.
     bloom_px : float
         Columns by which light widens every post.
     noise : float
-        Share of the errors that is drawn; the stated ones stay.
+        Share of the errors that is drawn; the stated sigmas stay.
 
     Returns
     -------

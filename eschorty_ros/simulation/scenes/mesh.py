@@ -47,7 +47,7 @@ class Mesh(UniformReflectance):
 
     @classmethod
     def from_file(cls, path: str | Path) -> Mesh:
-        """Mesh from any file Open3D reads (.ply, .stl, .obj, .off, .gltf)."""
+        """Return the mesh of any file Open3D reads (.ply, .stl, .obj, .off, .gltf)."""
         o3d = load_open3d("a mesh scene")
         if not Path(path).is_file():
             raise FormatError(f"mesh {str(path)!r} does not exist; give the path of a mesh file")
@@ -56,7 +56,7 @@ class Mesh(UniformReflectance):
         return cls(np.asarray(mesh.vertices), np.asarray(mesh.triangles), f"mesh {str(path)!r}")
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`eschorty_ros.simulation.scenes.scene.Scene`."""
+        """Return ranges as a :class:`Scene`."""
         y, slope = sheet(stage_mm, columns, model)
         rays = np.zeros((y.size, slope.size, 6), dtype=np.float32)
         rays[..., 0] = -model.b_mm * 1e-3

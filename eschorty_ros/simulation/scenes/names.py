@@ -33,7 +33,7 @@ NAMES = tuple(_BUILDERS)
 
 
 def named(name_or_mesh_path: str | Path) -> Scene:
-    """Scene by name (one of ``NAMES``) or from a mesh file.
+    """Return the scene of a name (one of ``NAMES``) or from a mesh file.
 
     A mesh is in metres in ``eschorty_base`` (x = range); any format Open3D reads.
 

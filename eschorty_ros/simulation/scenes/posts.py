@@ -1,4 +1,4 @@
-"""Posts at known ranges side by side along the laser line: what a build is calibrated with."""
+"""Posts at known ranges side by side along the laser line, targets of a calibration."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Post:
             raise ArgumentError(f"a post's line_mm is {self.line_mm!r}; choose a finite number")
 
     def front_mm(self, slope: Array, model: RangeModel) -> Array:
-        """Range of the first hit of rays with these slopes; NaN beside the post."""
+        """Return the range of the first hit of rays with these slopes; NaN beside the post."""
         depth = self.range_mm + model.b_mm
         if not self.round:
             beside = np.abs(slope * depth - self.line_mm) > 0.5 * self.size_mm
@@ -66,7 +66,7 @@ class Post:
         return np.asarray(constant / (half_linear + root) - model.b_mm)
 
     def columns(self, model: RangeModel) -> tuple[float, float]:
-        """Columns, in pixels and fractions, between which the post is seen."""
+        """Return the columns (fractional) between which the post is seen."""
         depth = self.range_mm + model.b_mm
         if self.round:
             radius = 0.5 * self.size_mm
@@ -83,10 +83,10 @@ class Post:
 
 
 def bench(ranges_mm: Sequence[float] = RANGES_MM) -> tuple[Post, ...]:
-    """Flat posts at these ranges, each in the middle of its share of the fan.
+    """Return flat posts at these ranges, each in the middle of its share of the fan.
 
-    Slim and wide ones by turns, so that a blooming of the image does not pass for a size; the
-    nearest are slim, because a wide one would fill its share.
+    Slim and wide posts alternate, so that blooming is not taken for a size; the nearest are slim,
+    because a wide one would fill its share.
 
     Raises
     ------
@@ -130,7 +130,7 @@ class Posts(UniformReflectance):
         return np.array([post.range_mm for post in self.posts])
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`~eschorty_ros.simulation.scenes.scene.Scene`; NaN between the posts."""
+        """Return ranges as a :class:`Scene`; NaN between the posts."""
         stage, slope = sheet(stage_mm, columns, model)
         nearest = np.full(slope.shape, np.nan if self.backdrop_mm is None else self.backdrop_mm)
         for post in self.posts:

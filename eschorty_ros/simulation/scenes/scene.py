@@ -1,4 +1,4 @@
-"""What a scene is, and what every scene needs.
+"""The interface of a scene, and what scenes share.
 
 All scenes live in ``eschorty_base``: x is the range, y the stage direction, z the laser line.
 At stage position ``s`` the sheet is a fan of rays from ``(-b, s, 0)`` with the direction
@@ -22,7 +22,7 @@ class Scene(Protocol):
     """A surface the laser sheet can hit."""
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Range of the first hit of every ray.
+        """Return the range of the first hit of every ray.
 
         Parameters
         ----------
@@ -40,17 +40,17 @@ class Scene(Protocol):
         """
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Reflectance (0 to 1) where the rays of :meth:`range_mm` hit, same shape."""
+        """Return the reflectance (0 to 1) where the rays of :meth:`range_mm` hit, same shape."""
 
 
 def sheet(stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> tuple[Array, Array]:
-    """Stage positions as (n, 1) and ray slopes (mm of z per mm of depth) as (1, m)."""
+    """Return stage positions as (n, 1) and ray slopes (mm of z per mm of depth) as (1, m)."""
     stage = np.atleast_1d(np.asarray(stage_mm, dtype=np.float64))
     return stage[:, np.newaxis], model.column_slope(np.atleast_1d(columns))[np.newaxis, :]
 
 
 class RecentRays:
-    """Result of the last query, so that range and reflectance of the same rays cost one cast."""
+    """The result of the last query: range and reflectance of the same rays need one cast."""
 
     def __init__(self) -> None:
         self._last: tuple[Any, tuple[Array, NDArray[Any]]] | None = None
@@ -62,7 +62,7 @@ class RecentRays:
         columns: ArrayLike,
         model: RangeModel,
     ) -> tuple[Array, NDArray[Any]]:
-        """``cast(stage_mm, columns, model)``, its arrays made read-only."""
+        """Return ``cast(stage_mm, columns, model)``, its arrays made read-only."""
         rays = (np.asarray(values, dtype=np.float64).tobytes() for values in (stage_mm, columns))
         key = (*rays, model)
         if self._last is None or self._last[0] != key:
@@ -74,10 +74,10 @@ class RecentRays:
 
 
 class UniformReflectance:
-    """A surface of one reflectance all over."""
+    """A surface of uniform reflectance."""
 
     albedo: float = 1.0
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Give the same value to every ray, shape (n, m)."""
+        """Return the same value for every ray, shape (n, m)."""
         return np.full((np.size(stage_mm), np.size(columns)), self.albedo)

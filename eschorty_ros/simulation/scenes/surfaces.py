@@ -25,7 +25,7 @@ class Plane(UniformReflectance):
     pivot_mm: float = 0.0
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`Scene`; NaN for rays that run away from the plane."""
+        """Return ranges as a :class:`Scene`; NaN for rays that run away from the plane."""
         y, slope = sheet(stage_mm, columns, model)
         facing = 1.0 - self.slope_column * slope
         at_axis = self.centre_mm + model.b_mm + self.slope_stage * (y - self.pivot_mm)
@@ -39,7 +39,7 @@ class Steps(UniformReflectance):
     """Flat levels on a grid of equal column bands and stage bands.
 
     A tile lies at ``base_mm + column_levels_mm[i] + stage_levels_mm[j]``; the first and last
-    stage band go on for ever. Walls between column bands run along the rays, so that no tile
+    stage band have no end. Walls between column bands run along the rays, so that no tile
     hides another. The default spans 207 mm around 1.32 m with steps from 2 to 102 mm. Between
     10 and 110 mm the stage crosses one large step: the laser line is 7 mm thick there, to
     where it fades, and lies on both levels for as long.
@@ -57,7 +57,7 @@ class Steps(UniformReflectance):
             raise ArgumentError(f"stage_band_mm is {self.stage_band_mm!r}; choose a positive width")
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`Scene`."""
+        """Return ranges as a :class:`Scene`."""
         stage = np.atleast_1d(np.asarray(stage_mm, dtype=np.float64))
         column = np.atleast_1d(np.asarray(columns, dtype=np.int64))
         across = np.array(self.column_levels_mm)
@@ -70,7 +70,7 @@ class Steps(UniformReflectance):
 
 @dataclass(frozen=True)
 class Sphere(UniformReflectance):
-    """Sphere at ``(range_mm, stage_mm, line_mm)``, with a flat backdrop or with nothing behind."""
+    """Sphere at ``(range_mm, stage_mm, line_mm)``, with a flat backdrop or without one."""
 
     centre_range_mm: float = 1320.0
     centre_stage_mm: float = 50.0
@@ -83,7 +83,7 @@ class Sphere(UniformReflectance):
             raise ArgumentError(f"radius_mm is {self.radius_mm!r}; choose a positive radius")
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """See :class:`Scene`; NaN beside the sphere when there is no backdrop."""
+        """Return ranges as a :class:`Scene`; NaN beside the sphere without a backdrop."""
         y, slope = sheet(stage_mm, columns, model)
         depth = self.centre_range_mm + model.b_mm
         half_linear = depth + slope * self.centre_line_mm

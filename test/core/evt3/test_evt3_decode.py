@@ -18,8 +18,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 from evt3_oracle import SlowDecoder
 from streams import RECORDING_SHARES, recording_like_words, words_of
 
-from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core import evt3
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage.raw_file import RawReader
 
 RECORDING = Path(__file__).parents[4] / "shared/data/evt3_gen41_sample.raw"
