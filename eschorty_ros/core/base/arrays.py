@@ -1,4 +1,4 @@
-"""Checks at the boundary: what compiled code would wrap around, numpy would cast silently."""
+"""Checks of arrays at the boundary: compiled code would wrap bad values, numpy cast them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from eschorty_ros.core.base.numbers import (
     SMALLEST,
     TIME_LIMIT,
     file_path,
+    integer,
     number,
     number_or_nan,
     positive,
     short,
-    whole,
 )
 
 __all__ = [
@@ -25,19 +25,19 @@ __all__ = [
     "Array",
     "as_array",
     "broadcast",
+    "byte_view",
     "exact",
     "file_path",
+    "integer",
+    "integer_vector",
     "number",
     "number_or_nan",
-    "octets",
     "positive",
     "reals",
     "selection",
     "short",
     "times",
     "vector",
-    "whole",
-    "whole_vector",
 ]
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 
 
 def reals(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """``values`` of any shape as float64; NaN and infinity pass, texts and objects do not."""
+    """Return ``values`` of any shape as float64; NaN and infinity pass, text and objects do not."""
     array = as_array(name, values)
     if array.dtype.kind not in "iuf":
         raise ArgumentError(f"{name} has dtype {array.dtype}; give real numbers")
@@ -53,7 +53,7 @@ def reals(name: str, values: ArrayLike) -> NDArray[np.float64]:
 
 
 def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """``values`` as one axis of finite float64."""
+    """Return ``values`` as one axis of finite float64."""
     array = reals(name, values)
     if array.ndim != 1:
         raise ArgumentError(f"{name} has shape {array.shape}; give one axis")
@@ -63,10 +63,10 @@ def vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def whole_vector(
+def integer_vector(
     name: str, values: ArrayLike, dtype: DTypeLike, low: int, high: int
 ) -> NDArray[Any]:
-    """``values`` as a contiguous vector of ``dtype``, each from ``low`` to ``high``."""
+    """Return ``values`` as a contiguous vector of ``dtype``, each from ``low`` to ``high``."""
     array = as_array(name, values)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise ArgumentError(
@@ -81,7 +81,7 @@ def whole_vector(
 
 
 def exact(name: str, values: Any, dtype: DTypeLike, size: int | None = None) -> NDArray[Any]:
-    """``values`` as compiled code takes them: one contiguous axis of just this dtype."""
+    """Return ``values`` for compiled code: one contiguous axis of exactly this dtype."""
     if not isinstance(values, np.ndarray) or values.dtype != dtype or values.ndim != 1:
         raise ArgumentError(f"{name} is {_form(values)}; give one axis of {np.dtype(dtype)}")
     if size is not None and values.size != size:
@@ -90,7 +90,7 @@ def exact(name: str, values: Any, dtype: DTypeLike, size: int | None = None) -> 
 
 
 def times(name: str, values: ArrayLike) -> NDArray[np.int64]:
-    """Integer times of any shape as int64; floats are refused, since they lose microseconds."""
+    """Return integer times of any shape as int64; floats, which lose digits, are refused."""
     array = as_array(name, values)
     if array.size and array.dtype.kind not in "iu":
         raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
@@ -100,7 +100,7 @@ def times(name: str, values: ArrayLike) -> NDArray[np.int64]:
 
 
 def selection(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
-    """``which`` as a mask of ``size`` entries or as indices below it."""
+    """Return ``which`` as a mask of ``size`` entries or as indices below it."""
     array = as_array(name, which)
     if array.size == 0:
         return np.empty(0, dtype=np.intp)
@@ -115,7 +115,7 @@ def selection(name: str, which: ArrayLike, size: int) -> NDArray[Any]:
     return array
 
 
-def octets(name: str, data: Any) -> memoryview:
+def byte_view(name: str, data: Any) -> memoryview:
     """Return ``data`` as bytes; arrays of anything wider are refused, not reinterpreted."""
     try:
         view = memoryview(data)
@@ -127,7 +127,7 @@ def octets(name: str, data: Any) -> memoryview:
 
 
 def broadcast(names: str, *arrays: NDArray[Any]) -> tuple[int, ...]:
-    """Return common shape of ``arrays``."""
+    """Return the common shape of ``arrays``."""
     try:
         return np.broadcast_shapes(*(array.shape for array in arrays))
     except ValueError:
@@ -142,7 +142,7 @@ def _form(values: Any) -> str:
 
 
 def as_array(name: str, values: ArrayLike) -> NDArray[Any]:
-    """``values`` as an array of whatever they are; ragged nests are refused."""
+    """Return ``values`` as an array of their own dtype; ragged nests are refused."""
     try:
         return np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:

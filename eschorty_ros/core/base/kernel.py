@@ -74,7 +74,7 @@ def record(*names: str, value: int = 0) -> Any:
 
     >>> state = record("row", "column")
     >>> state.row += 3
-    >>> (state.row, state.column)
+    >>> print(state)
     (3, 0)
     """
     dtype = np.dtype([(name, np.int64) for name in names])

@@ -1,4 +1,4 @@
-"""Checks of single values at the boundary, without numpy: small processes start fast."""
+"""Checks of single values at the boundary, without numpy, so that small processes start fast."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TIME_LIMIT = 1 << 62
 
 
 def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-    """``value`` as a finite float from ``low`` to ``high``."""
+    """Return ``value`` as a finite float from ``low`` to ``high``."""
     real = _float(value)
     if not (math.isfinite(real) and low <= real <= high):
         raise ArgumentError(f"{name} is {short(value)}; {_span('a finite number', low, high)}")
@@ -25,22 +25,22 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
 
 
 def number_or_nan(name: str, value: Any, low: float = -math.inf) -> float:
-    """``value`` as a float from ``low`` on, NaN where it is unknown."""
+    """Return ``value`` as a float from ``low`` on, NaN where it is unknown."""
     if isinstance(value, Real) and value != value:
         return math.nan
     return number(name, value, low)
 
 
 def positive(name: str, value: Any) -> float:
-    """``value`` as a finite float above 0, with a finite reciprocal."""
+    """Return ``value`` as a finite float above 0, with a finite reciprocal."""
     real = _float(value)
     if not SMALLEST < real < math.inf:
         raise ArgumentError(f"{name} is {short(value)}; choose a positive number")
     return real
 
 
-def whole(name: str, value: Any, low: int, high: int) -> int:
-    """``value`` as an int from ``low`` to ``high``; no floats, not even whole ones."""
+def integer(name: str, value: Any, low: int, high: int) -> int:
+    """Return ``value`` as an int from ``low`` to ``high``; floats are refused."""
     wrong = isinstance(value, bool) or not isinstance(value, Integral)
     if wrong or not low <= value <= high:
         raise ArgumentError(f"{name} is {short(value)}; {_span('a whole number', low, high)}")
@@ -48,20 +48,20 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
 
 
 def file_path(name: str, value: Any) -> Path:
-    """``value`` as a path that an operating system can be asked for."""
+    """Return ``value`` as a path that the operating system accepts."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fsdecode(value):
         raise ArgumentError(f"{name} is {short(value)}; give the name of a file")
     return Path(value)
 
 
 def short(value: Any) -> str:
-    """``repr`` on one line of bounded length."""
+    """Return the ``repr`` on one line of bounded length."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _float(value: Any) -> float:
-    """``value`` as a float; NaN for what is no real number."""
+    """Return ``value`` as a float; NaN for what is no real number."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return math.nan
     try:

@@ -8,7 +8,7 @@ import numpy as np
 from numba import int64, types, uint16, uint32
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import exact, whole
+from eschorty_ros.core.base.arrays import exact, integer
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.optics import PIXELS_MAX
 
@@ -43,8 +43,8 @@ class AggregateFrame:
     """
 
     def __init__(self, columns: int, rows: int) -> None:
-        whole("columns", columns, 1, PIXELS_MAX)
-        whole("rows", rows, 1, PIXELS_MAX)
+        integer("columns", columns, 1, PIXELS_MAX)
+        integer("rows", rows, 1, PIXELS_MAX)
         self.counts = np.zeros((rows, columns), np.uint32)
         self.events = 0
 

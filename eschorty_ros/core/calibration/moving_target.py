@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import number, reals, whole
+from eschorty_ros.core.base.arrays import integer, number, reals
 from eschorty_ros.core.base.errors import ArgumentError, FitError
 from eschorty_ros.core.calibration.post_finder import COLUMNS_MIN, GRID_SIGMA_PX
 from eschorty_ros.core.calibration.targets import Targets
@@ -76,7 +76,7 @@ def moving_target(
     number("range_at_zero_mm", range_at_zero_mm)
     if number("range_per_stage", range_per_stage, -1.0, 1.0) == 0.0:
         raise ArgumentError("range_per_stage is 0; the stage must change the target's range")
-    whole("blocks", blocks, 1, 64)
+    integer("blocks", blocks, 1, 64)
     used = np.isfinite(position) & np.isfinite(profiles.row) & (profiles.return_index == 0)
     profiles, position = profiles.select(used), position[used]
     low, high = _seen_columns(profiles)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, times, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, times
 from eschorty_ros.core.base.errors import ArgumentError
 
 NS_PER_US = 1_000
@@ -45,9 +45,9 @@ class ClockLine:
     drift_ppb: int = 0
 
     def __post_init__(self) -> None:
-        whole("origin_us", self.origin_us, -T_US_LIMIT, T_US_LIMIT)
-        whole("origin_ns", self.origin_ns, -TIME_LIMIT, TIME_LIMIT)
-        whole("drift_ppb", self.drift_ppb, -DRIFT_MAX_PPB, DRIFT_MAX_PPB)
+        integer("origin_us", self.origin_us, -T_US_LIMIT, T_US_LIMIT)
+        integer("origin_ns", self.origin_ns, -TIME_LIMIT, TIME_LIMIT)
+        integer("drift_ppb", self.drift_ppb, -DRIFT_MAX_PPB, DRIFT_MAX_PPB)
 
     def to_ns(self, t_us: Time) -> Time:
         """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
@@ -55,18 +55,18 @@ class ClockLine:
             since = _within("t_us", t_us, T_US_LIMIT) - self.origin_us
             # Half the range where the drift adds to it.
             return self._elapsed_ns(_within("t_us", since, self._reach_us)) + self.origin_ns
-        since_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT) - self.origin_us
+        since_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT) - self.origin_us
         return int(self._elapsed_ns(since_us)) + self.origin_ns
 
     def to_us(self, t_ns: Time) -> Time:
         """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
         if isinstance(t_ns, np.ndarray):
             return self._since_us(_within("t_ns", t_ns, TIME_LIMIT) - self.origin_ns)
-        return int(self._since_us(whole("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT) - self.origin_ns))
+        return int(self._since_us(integer("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT) - self.origin_ns))
 
     def shifted(self, by_ns: int) -> ClockLine:
         """Return the line that lies ``by_ns`` later."""
-        by_ns = whole("by_ns", by_ns, -2 * TIME_LIMIT, 2 * TIME_LIMIT)
+        by_ns = integer("by_ns", by_ns, -2 * TIME_LIMIT, 2 * TIME_LIMIT)
         return ClockLine(self.origin_us, self.origin_ns + by_ns, self.drift_ppb)
 
     @property

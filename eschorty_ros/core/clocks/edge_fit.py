@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, whole_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, ClockLine
 from eschorty_ros.core.clocks.pulses import PulseTrain
 from eschorty_ros.core.clocks.stage_track import StageTrack
@@ -92,7 +92,7 @@ def fit_edges(
         ``None`` when fewer than 8 edges have a position, too many fit no pulse, or the drift
         leaves its bounds: the edges are then not those of this stage.
     """
-    t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     if t_us.size < EDGES_MIN or pulses.count == 0:
         return None
     match = _Match(t_us, track, pulses, arrivals)

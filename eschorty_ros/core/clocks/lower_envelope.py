@@ -13,7 +13,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, T_US_LIMIT, ClockLine
 
 _BINS = 600
@@ -45,7 +45,7 @@ class LowerEnvelope:
     """
 
     def __init__(self, window_ns: int) -> None:
-        self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
+        self._window_ns = integer("window_ns", window_ns, 1, TIME_LIMIT)
         self._bin_us = max(window_ns // (NS_PER_US * _BINS), 1)
         # Each: number of its bin, sensor time, arrival.
         self._points: deque[tuple[int, int, int]] = deque()
@@ -58,8 +58,8 @@ class LowerEnvelope:
 
     def observe(self, t_us: int, arrival_ns: int) -> ClockLine:
         """Add the arrival of the event of sensor time ``t_us``; times must not go back."""
-        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
-        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         points = self._points
         bin_ = t_us // self._bin_us
         if self.line is not None and points and points[-1][0] == bin_:

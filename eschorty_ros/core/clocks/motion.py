@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, number, positive, times, vector, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, number, positive, times, vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
 
@@ -34,7 +34,7 @@ class MotionPlan:
     accelerations_mm_s2: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        whole("start_ns", self.start_ns, -TIME_LIMIT, TIME_LIMIT)
+        integer("start_ns", self.start_ns, -TIME_LIMIT, TIME_LIMIT)
         for name in ("position_mm", "velocity_mm_s"):
             number(name, getattr(self, name))
         for name in ("durations_s", "accelerations_mm_s2"):
@@ -167,7 +167,7 @@ def plan_stop(plan: MotionPlan, at_ns: int, deceleration_mm_s2: float) -> Motion
         When the deceleration is not positive.
     """
     positive("deceleration_mm_s2", deceleration_mm_s2)
-    whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)
+    integer("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)
     position, velocity = plan.state(at_ns)
     speed = float(velocity)
     if speed == 0.0:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, number, positive, times, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, integer, number, positive, times
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks.motion import MotionPlan, plan_move, plan_stop
 from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
@@ -101,9 +101,9 @@ class MotionFit:
             When a value is not finite or the earliest lies after the latest.
         """
         number("position_mm", position_mm, -POSITION_LIMIT_MM, POSITION_LIMIT_MM)
-        latest_ns = whole("latest_ns", latest_ns, -TIME_LIMIT, TIME_LIMIT)
+        latest_ns = integer("latest_ns", latest_ns, -TIME_LIMIT, TIME_LIMIT)
         if earliest_ns is not None:
-            earliest_ns = whole("earliest_ns", earliest_ns, -TIME_LIMIT, TIME_LIMIT)
+            earliest_ns = integer("earliest_ns", earliest_ns, -TIME_LIMIT, TIME_LIMIT)
             if earliest_ns > latest_ns:
                 raise ArgumentError(
                     f"earliest_ns is {earliest_ns}, after latest_ns {latest_ns}; swap them"
@@ -125,7 +125,7 @@ class MotionFit:
     def expect_stop(self, at_ns: int, deceleration_mm_s2: float) -> None:
         """Expect the motion under way to end in a ramp that begins at ``at_ns`` or soon after."""
         positive("deceleration_mm_s2", deceleration_mm_s2)
-        whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)
+        integer("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)
         before = self._legs[-1].plan()
         if before is None:
             self.expect_unknown(at_ns)
@@ -134,7 +134,7 @@ class MotionFit:
 
     def expect_unknown(self, at_ns: int) -> None:
         """Use readings alone from ``at_ns`` on."""
-        self._begin(_Leg(whole("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)))
+        self._begin(_Leg(integer("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)))
 
     def discard_motion(self) -> None:
         """Use readings alone for the motion under way."""
@@ -143,7 +143,7 @@ class MotionFit:
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
         """Return the lowest and highest position between two times; ``None`` if unknown."""
         for name, value in (("earliest_ns", earliest_ns), ("latest_ns", latest_ns)):
-            whole(name, value, -TIME_LIMIT, TIME_LIMIT)
+            integer(name, value, -TIME_LIMIT, TIME_LIMIT)
         return self._legs[-1].expected_mm(earliest_ns, latest_ns)
 
     def state(self, t_ns: ArrayLike) -> tuple[Array, Array]:

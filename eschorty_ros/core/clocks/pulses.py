@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, number, positive, reals, whole, whole_vector
+from eschorty_ros.core.base.arrays import (
+    TIME_LIMIT,
+    integer,
+    integer_vector,
+    number,
+    positive,
+    reals,
+)
 from eschorty_ros.core.base.errors import ArgumentError
 
 
@@ -28,7 +35,7 @@ class PulseTrain:
     def __post_init__(self) -> None:
         number("first_mm", self.first_mm, -1e6, 1e6)
         positive("interval_mm", self.interval_mm)
-        whole("count", self.count, 0, 1 << 31)
+        integer("count", self.count, 0, 1 << 31)
 
     def nearest(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the number of the pulse nearest to each position; NaN stays."""
@@ -55,8 +62,8 @@ def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArr
     polarity : ndarray of uint8, shape (n,)
         1 for rising.
     """
-    t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
-    polarity = whole_vector("polarity", polarity, np.uint8, 0, 1)
+    t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)
     if t_us.shape != polarity.shape:
         raise ArgumentError(
             f"t_us has {t_us.size} edges and polarity {polarity.size}; give one for each"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks.clock_line import T_US_LIMIT, ClockLine, Time
 from eschorty_ros.core.clocks.lower_envelope import LowerEnvelope
@@ -36,10 +36,10 @@ class SensorClock:
     """
 
     def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
-        self._window_ns = whole("window_ns", window_ns, 1, TIME_LIMIT)
+        self._window_ns = integer("window_ns", window_ns, 1, TIME_LIMIT)
         self._fixed = None
         if zero_ns is not None:
-            self._fixed = ClockLine(0, whole("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT))
+            self._fixed = ClockLine(0, integer("zero_ns", zero_ns, -TIME_LIMIT, TIME_LIMIT))
         self._adopted: ClockLine | None = None
         self._envelope = LowerEnvelope(window_ns)
         self._last: tuple[int, int] | None = None
@@ -83,14 +83,14 @@ class SensorClock:
 
     def goes_on(self, t_us: int, arrival_ns: int) -> bool:
         """Return whether neither time lies before the last observed."""
-        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
-        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])
 
     def observe(self, t_us: int, arrival_ns: int) -> None:
         """Add one arrival: the event of sensor time ``t_us`` came at ROS time ``arrival_ns``."""
-        t_us = whole("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
-        arrival_ns = whole("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
+        t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
+        arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         if self._fixed is None:
             if not self.goes_on(t_us, arrival_ns):
                 self._envelope = LowerEnvelope(self._window_ns)

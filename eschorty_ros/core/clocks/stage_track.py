@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, reals, times, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, times
 from eschorty_ros.core.base.errors import ArgumentError
 
 NM_PER_MM = 1_000_000
@@ -49,7 +49,7 @@ class StageTrack:
 
     def __init__(self, max_gap_us: int | None = None) -> None:
         if max_gap_us is not None:
-            whole("max_gap_us", max_gap_us, 1, TIME_LIMIT)
+            integer("max_gap_us", max_gap_us, 1, TIME_LIMIT)
         self.max_gap_us = max_gap_us
         self.dropped = 0
         self._t_us = np.empty(256, np.int64)
@@ -129,7 +129,7 @@ class StageTrack:
 
     def forget_before(self, t_us: int) -> None:
         """Release samples that no query at ``t_us`` or later needs."""
-        whole("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
+        integer("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
         held = self._t_us[self._begin : self._end]
         self._begin += max(int(np.searchsorted(held, t_us, side="right")) - 1, 0)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import int32, int64, typeof, types, uint8, uint16, uint64
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, event_arrays, first_fall
@@ -65,8 +65,8 @@ class ActivityFilter:
 
     def __init__(self, width: int = 1280, height: int = 720, window_us: int = 500) -> None:
         for name, size in (("width", width), ("height", height)):
-            whole(name, size, 1, 2048)
-        whole("window_us", window_us, 1, _WINDOW_MAX_US)
+            integer(name, size, 1, 2048)
+        integer("window_us", window_us, 1, _WINDOW_MAX_US)
         self.width, self.height, self.window_us = int(width), int(height), int(window_us)
         # One cell of border on each side, so that no neighbour needs a check.
         self._pitch = ((self.width + 7) >> _COLUMN_BITS) + 2

@@ -13,7 +13,7 @@ import numpy as np
 from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import octets, whole
+from eschorty_ros.core.base.arrays import byte_view, integer
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import ctz64, popcount64
@@ -171,7 +171,7 @@ class Decoder:
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
         for name, size in (("width", width), ("height", height)):
-            whole(name, size, 1, w3.ADDRESSES)
+            integer(name, size, 1, w3.ADDRESSES)
         self.width = int(width)
         self.height = int(height)
         self._events = event_arrays(0)
@@ -258,7 +258,7 @@ class Decoder:
 
     def _words(self, data: Bytes) -> NDArray[np.uint16]:
         """Return the words of the carried byte and ``data``; an odd last byte is carried on."""
-        stream = np.frombuffer(octets("data", data), dtype=np.uint8)
+        stream = np.frombuffer(byte_view("data", data), dtype=np.uint8)
         if self._odd:
             stream = np.frombuffer(self._odd + stream.tobytes(), dtype=np.uint8)
         even = stream.size & ~1

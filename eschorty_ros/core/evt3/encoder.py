@@ -8,7 +8,7 @@ import numpy as np
 from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import whole
+from eschorty_ros.core.base.arrays import integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import words as w3
@@ -50,7 +50,7 @@ class Encoder:
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
         for name, size in (("width", width), ("height", height)):
-            whole(name, size, 1, w3.ADDRESSES)
+            integer(name, size, 1, w3.ADDRESSES)
         self.width = int(width)
         self.height = int(height)
         self._state = record(*_STATE, value=_NONE)
@@ -146,7 +146,7 @@ class Encoder:
         ArgumentError
             When ``t_us`` lies before the time the stream has reached, or more than an hour after.
         """
-        whole("t_us", t_us, 0, (1 << 62) - 1)
+        integer("t_us", t_us, 0, (1 << 62) - 1)
         self._refuse_fall("t_us", _checked("t_us", [t_us], np.int64, 1 << 62))
         words = np.empty(self._high_words(t_us, t_us) + 1, dtype="<u2")
         n = _put_time(t_us, True, self._state, words, 0)

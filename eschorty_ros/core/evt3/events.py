@@ -10,7 +10,7 @@ from numba import int64, types, uint8, uint16
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.base.numbers import whole
+from eschorty_ros.core.base.numbers import integer
 
 EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 """One event, packed: time (us), column, row, polarity (1 = brighter)."""
@@ -62,7 +62,7 @@ class Events:
 
 def event_arrays(size: int) -> EventArrays:
     """Return uninitialised arrays for ``size`` events."""
-    whole("size", size, 0, 1 << 32)
+    integer("size", size, 0, 1 << 32)
     return EventArrays(
         np.empty(size, dtype=np.int64),
         np.empty(size, dtype=np.uint16),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import int64, typeof, types, uint16
 
-from eschorty_ros.core.base.arrays import octets
+from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import popcount64
@@ -59,7 +59,7 @@ class WordCounter:
         ArgumentError
             For anything but bytes.
         """
-        view = octets("data", data)
+        view = byte_view("data", data)
         _count(np.frombuffer(view[: len(view) & ~1], "<u2"), self._counts)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import number, positive, whole
+from eschorty_ros.core.base.arrays import integer, number, positive
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.columns import grouped_columns
@@ -287,7 +287,7 @@ def estimate(
     offset_array = _checked_offsets(offsets, row_array.size)
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
-    whole("events_min", events_min, 1, 1 << 31)
+    integer("events_min", events_min, 1, 1 << 31)
     check_method(method, returns)
     estimator = make_estimator(
         method,
@@ -316,7 +316,7 @@ def estimate(
 
 
 def _checked_rows(rows: ArrayLike, height: int) -> NDArray[np.uint32]:
-    whole("height", height, 1, ROW_LAST + 1)
+    integer("height", height, 1, ROW_LAST + 1)
     array = np.asarray(rows)
     if array.ndim != 1 or (array.size and not np.issubdtype(array.dtype, np.integer)):
         raise ArgumentError(

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, number, vector, whole_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, Array, integer_vector, number, vector
 from eschorty_ros.core.base.errors import ArgumentError
 
 ROOT_12 = math.sqrt(12.0)
@@ -74,7 +74,7 @@ def relative_reflectance(
         When shapes differ, ``footprint_sigma_px`` lies outside 0.1 to 1000 px or
         ``white_width_px`` outside 0 to 1000 px.
     """
-    edge_us = whole_vector("edge_us", edge_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    edge_us = integer_vector("edge_us", edge_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     width_px, counts = _checked(width_px, events)
     if edge_us.shape != width_px.shape:
         raise ArgumentError(
@@ -109,7 +109,7 @@ def _checked(width_px: Array, events: NDArray[np.integer]) -> tuple[Array, NDArr
     widths = vector("width_px", width_px)
     if (widths < 0.0).any():
         raise ArgumentError(f"width_px is {widths.min()}; choose 0 or more")
-    counts = whole_vector("events", events, np.int64, 0, TIME_LIMIT)
+    counts = integer_vector("events", events, np.int64, 0, TIME_LIMIT)
     if counts.size != widths.size:
         raise ArgumentError(
             f"width_px has {widths.size} entries and events {counts.size}; give equal numbers"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import TIME_LIMIT, number, whole
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number
 
 WAVEFORMS = ("square", "sine", "pulse")
 FREQUENCY_MIN_HZ = 16.0
@@ -51,7 +51,7 @@ class Modulation:
         if not 0.0 < self.duty < 1.0:
             raise ArgumentError(f"duty is {self.duty!r}; choose a value between 0 and 1")
         if self.on_edge_us is not None:
-            whole("on_edge_us", self.on_edge_us, -TIME_LIMIT, TIME_LIMIT)
+            integer("on_edge_us", self.on_edge_us, -TIME_LIMIT, TIME_LIMIT)
         if self.waveform not in WAVEFORMS:
             raise ArgumentError(
                 f"waveform is {self.waveform!r}; choose one of {', '.join(WAVEFORMS)}"
@@ -69,5 +69,5 @@ class Modulation:
         """
         if self.on_edge_us is None:
             raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")
-        whole("index", index, -TIME_LIMIT, TIME_LIMIT)
+        integer("index", index, -TIME_LIMIT, TIME_LIMIT)
         return self.on_edge_us + round(index * 1_000_000 / Fraction(self.frequency_hz))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, whole_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation.modulation import Modulation
 
@@ -70,12 +70,12 @@ def estimate_phase(
     ArgumentError
         When there are no events, or they are not in time order.
     """
-    t_us = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     fall = np.flatnonzero(np.diff(t_us) < 0)
     if fall.size:
         before, after = t_us[fall[0]], t_us[fall[0] + 1]
         raise ArgumentError(f"t_us goes from {before} to {after}; sort the events by time")
-    polarity = whole_vector("polarity", polarity, np.uint8, 0, 1)
+    polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)
     if t_us.size == 0 or t_us.shape != polarity.shape:
         raise ArgumentError(
             f"t_us has {t_us.size} events and polarity {polarity.size}; give one polarity per event"

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.base.numbers import whole
+from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.core.modulation.modulation import Modulation
 
 LEAD_US = 200
@@ -61,7 +61,7 @@ def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
     ArgumentError
         When ``gate_us`` lies outside its range.
     """
-    whole("gate_us", gate_us, 0, GATE_MAX_US)
+    integer("gate_us", gate_us, 0, GATE_MAX_US)
     period_us, length_us = modulation.period_us, float(LEAD_US + gate_us)
     if gate_us == 0 or modulation.waveform == "sine" or length_us >= period_us:
         return PhaseGate()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from eschorty_ros.core.base.arrays import number, positive, whole
+from eschorty_ros.core.base.arrays import integer, number, positive
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics.optical_build import Design
 from eschorty_ros.core.optics.range_model import (
@@ -60,7 +60,7 @@ def design(
         When a value is out of its range or a choice is not made exactly once.
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
-    whole("columns", columns, 1, PIXELS_MAX)
+    integer("columns", columns, 1, PIXELS_MAX)
     tilt_deg = _sensor_tilt_deg(focal_length_mm, theta_deg, theta_prime_deg, baseline_mm)
     k_mm = object_scale_mm(focal_length_mm, theta_deg)
     k_prime_px = -focal_length_mm / (pixel_um * 1e-3 * math.sin(math.radians(abs(tilt_deg))))
@@ -107,7 +107,7 @@ def design_for_ranges(
         When ``0 < near + b < far + b`` does not hold or no sensor tilt reaches both ranges.
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
-    whole("rows", rows, 2, PIXELS_MAX)
+    integer("rows", rows, 2, PIXELS_MAX)
     near, far = _depth("near_mm", near_mm, b_mm), _depth("far_mm", far_mm, b_mm)
     if not near < far:
         raise ArgumentError(f"far_mm is {far_mm!r}; choose more than near_mm = {near_mm!r}")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import Array, broadcast, number, positive, reals, whole
+from eschorty_ros.core.base.arrays import Array, broadcast, integer, number, positive, reals
 from eschorty_ros.core.base.errors import ArgumentError
 
 POLE_MARGIN_PX = 1.0
@@ -134,7 +134,7 @@ class RangeModel:
         for name in ("k_mm", "pixel_um"):
             positive(name, getattr(self, name))
         for name in ("columns", "rows"):
-            whole(name, getattr(self, name), 1, PIXELS_MAX)
+            integer(name, getattr(self, name), 1, PIXELS_MAX)
         if not self.k_prime_px < 0.0:
             raise ArgumentError(f"k_prime_px is {self.k_prime_px!r}; choose a negative value")
         if not self.b_prime_px <= -POLE_MARGIN_PX:

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, octets, whole, whole_vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
@@ -29,7 +29,7 @@ def decode_all(
     Each word's time, row and vector base come from the latest word of the kind that sets them.
     No checks, no triggers: what is not well-formed belongs to ``evt3.Decoder``.
     """
-    view = octets("data", data)
+    view = byte_view("data", data)
     words = np.frombuffer(view, dtype="<u2", count=len(view) // 2)
     kind, payload = words >> 12, (words & 0xFFF).astype(np.int64)
     index = np.arange(words.size)
@@ -99,10 +99,10 @@ def reconstruct(
     ArgumentError
         When the three arrays differ in length, times fall or a pixel is off the sensor.
     """
-    t = whole_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
-    x = whole_vector("column", column, np.int64, 0, model.columns - 1)
-    y = whole_vector("row", row, np.int64, 0, model.rows - 1)
-    whole("events_min", events_min, 1, 1 << 31)
+    t = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
+    x = integer_vector("column", column, np.int64, 0, model.columns - 1)
+    y = integer_vector("row", row, np.int64, 0, model.rows - 1)
+    integer("events_min", events_min, 1, 1 << 31)
     if not t.shape == x.shape == y.shape:
         raise ArgumentError(
             f"t_us, column and row have {t.size}, {x.size} and {y.size} entries; give equal numbers"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import exact, whole
+from eschorty_ros.core.base.arrays import exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import EventArrays
@@ -174,7 +174,7 @@ class ProfileAssembler:
         )
         times = exact("edges", edges, np.int64)
         beginnings = _Edges(times, exact("indices", indices, np.int64, times.size))
-        progress = _Progress(0, whole("first_edge", first_edge, 0, times.size))
+        progress = _Progress(0, integer("first_edge", first_edge, 0, times.size))
         while True:
             progress = _merge(
                 events, beginnings, progress, drain, self._gate, self._memory, self._state,

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, reals, selection, vector, whole
+from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
@@ -155,7 +155,7 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
         the profiles know their reflectance.
     """
     known = profiles.reflectance is not None
-    whole("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
+    integer("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
     points = np.zeros(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
     points["x"] = profiles.range_mm * 1e-3
     points["z"] = model.lateral_mm(profiles.column, profiles.range_mm) * 1e-3

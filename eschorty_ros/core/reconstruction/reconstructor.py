@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, octets
+from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import TIME_LIMIT_US, relative_reflectance
@@ -105,7 +105,7 @@ class Reconstructor:
         data : bytes-like
             EVT3, cut anywhere.
         """
-        view = octets("data", data)
+        view = byte_view("data", data)
         for begin in range(0, len(view), _PIECE_BYTES):
             events = self._decoded(view[begin : begin + _PIECE_BYTES])
             if events is not None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from eschorty_ros.core.base.arrays import file_path, octets, whole
+from eschorty_ros.core.base.arrays import byte_view, file_path, integer
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.evt3 import words as w3
 
@@ -93,7 +93,7 @@ class RawReader:
         ArgumentError
             When ``size`` is not positive.
         """
-        whole("size", size, 1, 1 << 40)
+        integer("size", size, 1, 1 << 40)
         return self._chunks(size)
 
     def __iter__(self) -> Iterator[bytes]:
@@ -223,7 +223,7 @@ class RawWriter:
         if not (isinstance(sensor_name, str) and re.fullmatch(r"[!-~]+", sensor_name)):
             raise ArgumentError(f"sensor_name is {sensor_name!r}; give one ASCII word")
         for name, size in (("width", width), ("height", height)):
-            whole(name, size, 1, _SIZE_MAX)
+            integer(name, size, 1, _SIZE_MAX)
         self.path = file_path("path", path)
         self.bytes_written = 0
         recorded = date or datetime.datetime.now(datetime.UTC)
@@ -251,7 +251,7 @@ class RawWriter:
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Append bytes of the stream; raises ``FormatError`` when the disk refuses."""
-        view = octets("data", data)
+        view = byte_view("data", data)
         try:
             self._file.write(view)
         except OSError as error:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import number, whole
+from eschorty_ros.core.base.numbers import integer, number
 
 READBACK_POLICIES = ("required", "best_effort", "off")
 HIGH_LIMIT_V = 10.0
@@ -83,6 +83,6 @@ class AwgSettings:
         if choices and value not in choices:
             raise ArgumentError(f"{name} is {value!r}; choose one of {', '.join(choices)}")
         if "range" in metadata:
-            (whole if isinstance(default, int) else number)(name, value, *metadata["range"])
+            (integer if isinstance(default, int) else number)(name, value, *metadata["range"])
         elif not isinstance(value, str):
             raise ArgumentError(f"{name} is {value!r}; give a text")
