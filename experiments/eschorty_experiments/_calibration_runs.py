@@ -36,7 +36,7 @@ _WITHIN = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What stands in front of the instrument."""
+    """The scene in front of the instrument."""
 
     name: str
     range_mm: Array
@@ -45,7 +45,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """What is fitted, and whether under the priors of `calibrate`."""
+    """The parameters that are fitted, with or without the priors of `calibrate`."""
 
     name: str
     free: tuple[str, ...]

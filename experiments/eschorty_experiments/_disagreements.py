@@ -1,4 +1,4 @@
-"""Where the paper disagrees with itself or with its equations, and what is right."""
+"""Contradictions of the paper with itself or with its equations, and the right values."""
 
 from __future__ import annotations
 

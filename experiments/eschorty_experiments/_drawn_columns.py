@@ -37,7 +37,7 @@ class Drawn:
         return float(np.sqrt((self.fwhm_px / FWHM_PER_SIGMA) ** 2 + 1 / 12) / np.sqrt(self.signal))
 
     def estimate(self, method: str, returns: str = "strongest") -> Centroids:
-        """Rows by the package's estimator, told the line's width."""
+        """Rows by the package's estimator, given the line's width."""
         offsets = np.arange(len(self.rows) + 1) * self.rows.shape[1]
         return estimate(
             self.rows.ravel(), offsets, method, returns=returns, line_width_px=self.fwhm_px

@@ -1,4 +1,4 @@
-"""What the estimators' experiment measures, and its pictures."""
+"""Measurements and pictures of the estimators' experiment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Case(NamedTuple):
 
 
 class Second(NamedTuple):
-    """What a method makes of a column with a second line: the strongest return, then all."""
+    """Return a method's rows of a column with a second line: the strongest return, then all."""
 
     method: str
     strength: float

@@ -1,4 +1,4 @@
-"""How far nose and ears of the scanned face stand out, over how far they truly do."""
+"""Relief of the scanned face: how far nose and ears come out over their true height."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether leaves 2.2 mm apart are resolved: the levels of the collage's middle layer."""
+"""Resolution of leaves 2.2 mm apart: the levels of the collage's middle layer."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def level_residuals(
 
 
 def _inside(leaf: NDArray[np.intp], lines: int) -> NDArray[np.bool_]:
-    """Where the same leaf is hit all around, ``lines`` up and down and a few columns aside."""
+    """Return where the same leaf is hit all around, ``lines`` lines and a few columns each way."""
     inside = leaf >= 0
     for axis, reach in ((0, lines), (1, EDGE_COLUMNS)):
         for shift in range(1, reach + 1):

@@ -1,4 +1,4 @@
-"""What the trade-off compares, on what, and how time, memory and errors are taken."""
+"""The settings and scenes of the trade-off, and the measures of time, memory and error."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Variant:
 
     @property
     def is_default(self) -> bool:
-        """Whether these are the settings a user gets."""
+        """Return whether these are the settings a user gets."""
         return self.settings == DEFAULT
 
     def run(self, data: bytes, recording: Recording) -> Profiles:

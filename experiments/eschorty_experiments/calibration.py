@@ -20,12 +20,12 @@ from eschorty_experiments._calibration_runs import (
     OUTLIERS,
     PAPER,
     SIZES,
-    Array,
     Score,
     compare,
     coverage,
     outliers,
 )
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.report.experiment import (
     DataTable,

@@ -1,4 +1,4 @@
-"""Is the reported sigma honest? Share of errors within one and two sigma, for every estimator."""
+"""Coverage of the reported sigma: share of errors within one and two sigma, by estimator."""
 
 from __future__ import annotations
 
@@ -235,4 +235,4 @@ _REMARKS = (
     "knows: the share within two sigma is then above 98 %.",
 )
 
-EXPERIMENT = Experiment("sigma", "Is the reported sigma honest?", run)
+EXPERIMENT = Experiment("sigma", "Coverage of the reported sigma", run)
