@@ -4,8 +4,6 @@ import math
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.control.calibration_sequence import check_request, run_capture
 from eschorty_ros.control.scan_sequence import End, ScanCanceled, ScanFailure
 from eschorty_ros.core.base.errors import ArgumentError

@@ -1,14 +1,9 @@
 """The order of a scan: whatever fails, light off, stage at rest, points kept."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
-from eschorty_ros.control.instrument_monitor import InstrumentMonitor
-from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import (
     End,
     ScanCanceled,
@@ -22,7 +17,6 @@ from eschorty_ros.control.scan_sequence import (
     sweep_ends_mm,
 )
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.nodes.ros.instrument_client import ScanClient
 
 LIMITS = ScanLimits((0.0, 220.0), 250.0, 2000.0, 100.0, 10.0)
 REQUEST = ScanRequest("s", 20.0, 40.0, 50.0, 70.0)
@@ -93,43 +87,6 @@ def test_the_first_reason_stays():
 
     instrument.end_scan = end_scan
     assert run_scan(instrument, REQUEST, LIMITS).message == "camera: gone"
-
-
-class Answered:
-    """A future that is done after some looks."""
-
-    def __init__(self, answer, looks):
-        self._answer, self._looks = answer, looks
-
-    def done(self):
-        self._looks -= 1
-        return self._looks < 0
-
-    def result(self):
-        return self._answer
-
-
-class CanceledClient(ScanClient):
-    """The client of a goal that is canceled while the reconstruction's answer is on its way."""
-
-    def __init__(self):
-        monitor = InstrumentMonitor(lambda: True)
-        PacedWaiting.__init__(self, "scanner", monitor, lambda: 0, lambda: True, 3.0)
-        self._service_timeout_s = 5.0
-        answer = SimpleNamespace(success=True, message="")
-        self._clients = {
-            "reconstruction/begin_scan": SimpleNamespace(
-                call_async=lambda request: Answered(answer, 3)
-            )
-        }
-        PacedWaiting.prepare(self, lambda: True, lambda phase: None)
-
-
-def test_a_cancel_waits_until_the_reconstruction_has_confirmed_that_it_collects():
-    client = CanceledClient()
-    client.begin_scan(REQUEST)
-    with pytest.raises(ScanCanceled):
-        client.tick()
 
 
 def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():

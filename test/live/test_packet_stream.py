@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from line_events import encoded, line_events
 
 from eschorty_ros.core.clocks import PulseTrain

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from line_events import blank_profiles
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.live.pipeline import ScanReport

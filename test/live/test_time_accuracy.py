@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from line_events import line_events
 from stage_pulses import EPOCH_NS, PULSES, StagePulses
 
