@@ -55,7 +55,7 @@ def test_order_of_a_capture(request_, steps):
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("begin", 1),
                                   ("laser_on", 1), *(("move", k) for k in (1, 2, 3))])  # fmt: skip
 @pytest.mark.parametrize("error", [ScanFailure("camera: gone"), ScanCanceled()])
-def test_every_interruption_ends_dark_and_at_rest(step, error):
+def test_every_interruption_ends_with_the_laser_off_and_at_rest(step, error):
     instrument = RecordingInstrument(step, error)
     outcome = instrument.capture(MOVING)
     canceled = isinstance(error, ScanCanceled)

@@ -53,7 +53,7 @@ def test_order_of_a_scan():
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("move", 1),
                                   ("begin_scan", 1), ("laser_on", 1), ("move", 2)])  # fmt: skip
 @pytest.mark.parametrize("error", [ScanFailure("stage: stuck"), ScanCanceled()])
-def test_every_interruption_ends_dark_and_at_rest(step, error):
+def test_every_interruption_ends_with_the_laser_off_and_at_rest(step, error):
     instrument = RecordingInstrument(step, error)
     outcome = run_scan(instrument, REQUEST, LIMITS)
     canceled = isinstance(error, ScanCanceled)

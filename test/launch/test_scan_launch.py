@@ -23,9 +23,9 @@ TESTS = Path(__file__).resolve().parents[1]
 @pytest.mark.parametrize("name", ["scan", "calibration"])
 def test_scenarios_under_launch(name, tmp_path):
     search = [str(TESTS / "support"), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
-    said = tmp_path / "said.log"
+    log_path = tmp_path / "launch.log"
     with (
-        said.open("w") as log,
+        log_path.open("w") as log,
         subprocess.Popen(
             [
                 sys.executable,
@@ -43,9 +43,9 @@ def test_scenarios_under_launch(name, tmp_path):
             process.wait(540.0)
         finally:
             end_group(process)
-            print(said.read_text(errors="replace")[-16_000:])
+            print(log_path.read_text(errors="replace")[-16_000:])
     assert process.returncode == 0
-    assert "Ran 5 tests" in said.read_text(errors="replace")
+    assert "Ran 5 tests" in log_path.read_text(errors="replace")
 
 
 def end_group(process):

@@ -62,7 +62,7 @@ def test_points_outside_the_limits_are_counted():
 
 
 @pytest.mark.parametrize(
-    ("points", "events", "without", "outside", "says"),
+    ("points", "events", "without", "outside", "begins"),
     [
         (5, 100, 0, 3, ""),
         (0, 0, 0, 0, "no points: no events came"),
@@ -71,13 +71,13 @@ def test_points_outside_the_limits_are_counted():
         (0, 100, 7, 3, "7 points had no stage position"),
     ],
 )
-def test_a_scan_without_points_says_why(points, events, without, outside, says):
+def test_a_scan_without_points_has_the_reason(points, events, without, outside, begins):
     buffer = ScanBuffer("a", 0.0, 1.0)
     if points:
         buffer.add(placed([0.5] * points, [T0_NS] * points, range(points)))
     report = ScanReport(buffer.assemble(), events, 0, 0, without, outside, 0)
-    assert report.message.startswith(says)
-    assert bool(report.message) == bool(says)
+    assert report.message.startswith(begins)
+    assert bool(report.message) == bool(begins)
 
 
 def test_points_over_the_limit_are_counted():

@@ -1,4 +1,4 @@
-"""What a calibration must do, asserted once: process tests and launch tests run these functions."""
+"""Scenarios of a calibration with their assertions, for the process and the launch tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eschorty_ros.action import Calibrate
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
 from rclpy.action import ActionClient
-from ros_process import Observer, told_after, wait_until
+from ros_process import Observer, stamped_after, wait_until
 from scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
 from std_msgs.msg import Bool
 
@@ -27,13 +27,13 @@ from eschorty_ros.simulation.scenes import bench as bench_of_posts
 CALIBRATION, AS_BUILT = "config_3", "config_3_as_built"
 KNOWN_SCENE = "steps"
 POSTS = bench_of_posts()
-# A capture that something happens in: few events.
+# A capture that is interrupted: few events.
 LONG = {"capture_time": 60.0, "frequency": SLOW_HZ}
 TRUE_MM = np.linspace(800.0, 2100.0, 131)
 
 
 def bench_settings(laser_log: Path, scene: str) -> dict[str, Any]:
-    """A bench that is not built as the calibration says."""
+    """A bench whose build is not that of the calibration."""
     return {"scene": scene, "calibration": AS_BUILT, "seed": 7, "laser_log": str(laser_log)}
 
 
@@ -66,10 +66,10 @@ class CalibrationBench(Bench):
 
     def begin(self, **goal: Any) -> Any:
         """Send a goal with the posts of the bench unless others are given; the handle."""
-        # First, as in ``start``.
+        # As in ``start``.
         self.observer.wait_for_answers("reconstruction", SCAN_DEADLINE_S)
         wait_until(self._calibrate.server_is_ready, "the calibrate action", SCAN_DEADLINE_S)
-        # A list of its own: feedback of the goal before may still come.
+        # A new list, because feedback of the goal before may still come.
         seen = self.seen = []
         values = {
             "targets": [
@@ -109,12 +109,12 @@ class CalibrationBench(Bench):
 
     @property
     def newest(self) -> Any:
-        """The active calibration as told last."""
+        """The newest message of the active calibration."""
         wait_until(lambda: self.active, "a latched calibration", SCAN_DEADLINE_S)
         return self.active[-1]
 
     def wait_for_active(self, calibration_id: str) -> None:
-        """Wait until this calibration is the one told; "" is the design."""
+        """Wait until this calibration is the active one; "" is the design."""
         wait_until(
             lambda: self.newest.id == calibration_id, f"calibration {calibration_id!r} on its topic"
         )
@@ -122,11 +122,11 @@ class CalibrationBench(Bench):
     @contextlib.contextmanager
     def nothing_changes(self) -> Iterator[None]:
         """Within it the active calibration and the folder stay as they are."""
-        told, count = self.newest, len(self.active)
+        active, count = self.newest, len(self.active)
         files = sorted(self.folder.iterdir()) if self.folder.exists() else []
         yield
         assert len(self.active) == count
-        assert self.newest is told
+        assert self.newest is active
         assert (sorted(self.folder.iterdir()) if self.folder.exists() else []) == files
 
 
@@ -204,7 +204,7 @@ def nine_posts(bench: CalibrationBench, method: str) -> None:
         ),
         "feedback of every post",
     )
-    bench.assert_dark_and_at_rest()
+    bench.assert_off_and_at_rest()
 
 
 def moving_target(bench: CalibrationBench) -> None:
@@ -226,7 +226,7 @@ def moving_target(bench: CalibrationBench) -> None:
         print(f"moved by the stage: range RMS {rms_mm:.3f} mm from {near_mm:g} to {far_mm:g} mm")
         assert rms_mm < bound_mm
     bench.wait_for_active(result.calibration_id)
-    bench.assert_dark_and_at_rest()
+    bench.assert_off_and_at_rest()
 
 
 def bad_goals(bench: CalibrationBench) -> None:
@@ -260,13 +260,13 @@ def useless_captures(bench: CalibrationBench) -> None:
         assert "0 of 3 targets found among 9 posts" in result.message, result.message
         assert len(result.rejected) == 12
         assert result.frame.data
-        bench.assert_dark_and_at_rest()
-        # The same range twice: which is which cannot be told.
+        bench.assert_off_and_at_rest()
+        # The same range twice, which is ambiguous.
         twice = [CalibrationTarget(range=1.0, label=label) for label in ("left", "right")]
         status, result = bench.calibrate(targets=twice)
         assert status == GoalStatus.STATUS_ABORTED
         assert "left and right have the same range" in result.message, result.message
-        bench.assert_dark_and_at_rest()
+        bench.assert_off_and_at_rest()
         # Canceled.
         handle = bench.begin(**LONG)
         bench.wait_for_capture()
@@ -274,7 +274,7 @@ def useless_captures(bench: CalibrationBench) -> None:
         wait_until(canceled.done, "an answer to the cancel request")
         status, result = bench.end()
         assert status == GoalStatus.STATUS_CANCELED, result.message
-        bench.assert_dark_and_at_rest()
+        bench.assert_off_and_at_rest()
         # The laser goes off.
         interlock = bench.observer.publisher(Bool, "laser/interlock", qos.stream(10))
         bench.begin(**LONG)
@@ -282,14 +282,14 @@ def useless_captures(bench: CalibrationBench) -> None:
         interlock.publish(Bool(data=True))
         status, result = bench.end()
         interlock.publish(Bool(data=False))
-        said_ns = time.time_ns()
+        closed_ns = time.time_ns()
         wait_until(
-            lambda: told_after(bench.laser, said_ns) and not bench.laser[-1].interlock_open,
+            lambda: stamped_after(bench.laser, closed_ns) and not bench.laser[-1].interlock_open,
             "the interlock closed",
         )
         assert status == GoalStatus.STATUS_ABORTED
         assert "laser: went off: interlock open" in result.message, result.message
-        bench.assert_dark_and_at_rest()
+        bench.assert_off_and_at_rest()
 
 
 def one_thing_at_a_time(bench: CalibrationBench) -> None:
@@ -315,7 +315,7 @@ def one_thing_at_a_time(bench: CalibrationBench) -> None:
         wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
         status, result = bench.result()
         assert status == GoalStatus.STATUS_CANCELED, result.message
-    bench.assert_dark_and_at_rest()
+    bench.assert_off_and_at_rest()
 
 
 def load(bench: CalibrationBench, name: str | Path) -> Any:
@@ -331,7 +331,7 @@ def save(bench: CalibrationBench, path: str | Path = "") -> Any:
 
 
 def load_and_save(bench: CalibrationBench, folder: Path) -> None:
-    """Only calibrations of this instrument are loaded; files come whole or not at all."""
+    """Only calibrations of this instrument are loaded; files are written completely or not."""
     own = load_calibration(CALIBRATION)
     with bench.nothing_changes():
         for change, words in (
@@ -355,7 +355,7 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
         answer = save(bench, folder / "missing" / "c.yaml")
         assert not answer.success
         assert answer.message
-    told = bench.newest.id
+    active = bench.newest.id
     answer = save(bench, folder / "kept.yaml")
     assert answer.success, answer.message
     answer = load(bench, CALIBRATION)
@@ -363,8 +363,8 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
     bench.wait_for_active("")
     answer = load(bench, folder / "kept.yaml")
     assert answer.success, answer.message
-    assert answer.id == told
-    bench.wait_for_active(told)
+    assert answer.id == active
+    bench.wait_for_active(active)
 
 
 def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
@@ -376,7 +376,7 @@ def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
         status, result = bench.end()
         assert status == GoalStatus.STATUS_ABORTED
         assert "camera" in result.message, result.message
-        bench.assert_dark_and_at_rest()
+        bench.assert_off_and_at_rest()
 
 
 def reconstruction_interrupted(bench: CalibrationBench, interrupt: Callable[[], Any]) -> None:

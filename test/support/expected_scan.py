@@ -1,4 +1,4 @@
-"""What every scan of a simulated scene must reach, whoever runs it."""
+"""The accuracy that every scan of a simulated scene must reach."""
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.report import accuracy

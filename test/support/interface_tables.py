@@ -80,7 +80,7 @@ class Topic:
 
     @property
     def qos(self) -> str:
-        """What the publishers offer; without any, what is asked for."""
+        """The publishers' quality of service; the subscribers' without a publisher."""
         first, *others = (self.publishers or self.subscribers).items()
         differing = [f"{node}: {offered}" for node, offered in others if offered != first[1]]
         return "; ".join([first[1], *differing])
@@ -216,7 +216,7 @@ def _short(name: str) -> str:
 
 
 def _common(name: str) -> bool:
-    """Whether every node, or every lifecycle node, has it."""
+    """Return whether every node, or every lifecycle node, has it."""
     parameters = ("_parameters", "_parameters_atomically", "_parameter_types")
     lifecycle = ("_state", "_states", "_transitions", "_graph", "transition_event")
     others = ("/rosout", "/parameter_events", "_type_description")

@@ -32,7 +32,7 @@ from eschorty_ros.nodes.ros.dds import use_profile
 
 NAMESPACE = "/eschorty"
 _RESEND_S = 2.0
-# However the tests end, the kernel then ends the nodes, too; where util-linux is.
+# With util-linux the kernel ends the nodes however the tests end.
 _ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
 
 
@@ -45,8 +45,8 @@ def ros_minus_steady_ns() -> int:
     return min(pairs)[1]
 
 
-def told_after(messages: list[Any], t_ns: int) -> bool:
-    """Whether the newest message is about a later time: what is on its way may be older news."""
+def stamped_after(messages: list[Any], t_ns: int) -> bool:
+    """Return whether the newest message is stamped later than ``t_ns``."""
     return bool(messages) and ns_from_stamp(messages[-1].header.stamp) > t_ns
 
 
@@ -135,16 +135,13 @@ class NodeProcess:
         fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-    def kill(self, patience_s: float = 20.0) -> None:
-        """SIGTERM, then SIGKILL if it still runs; always leaves nothing behind.
-
-        A killed process would leave its shared memory.
-        """
+    def kill(self, timeout_s: float = 20.0) -> None:
+        """End the process: SIGTERM first, as a killed process leaves its shared memory."""
         if self.running():
             self._process.send_signal(signal.SIGCONT)
             self._process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(patience_s)
+                self._process.wait(timeout_s)
         if self.running():
             self._process.kill()
         self._process.wait()
@@ -211,7 +208,7 @@ class Observer:
     ) -> Any:
         """The service's response; the service's name begins with that of its node."""
         with self._client(service_type, name, deadline_s) as client:
-            # A server that does not know the client yet would answer nobody.
+            # A server that has not discovered the client yet would not answer it.
             self.wait_for_answers(name.split("/")[0], deadline_s)
             future = client.call_async(request if request is not None else service_type.Request())
             wait_until(future.done, f"answer of {name}", deadline_s)

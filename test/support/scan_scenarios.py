@@ -1,4 +1,4 @@
-"""What a scan must do, asserted once: process tests and launch tests run these same functions."""
+"""Scenarios of a scan with their assertions, for the process tests and the launch tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
 from rclpy.action import ActionClient
-from ros_process import Observer, ros_minus_steady_ns, told_after, wait_until
+from ros_process import Observer, ros_minus_steady_ns, stamped_after, wait_until
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
@@ -33,7 +33,7 @@ EDGE_MM = 4.0
 CALIBRATION = "config_3"
 START_M, STOP_M, SPEED_M_S, FREQUENCY_HZ = 0.020, 0.040, 0.050, 70.0
 SLOW_HZ, SLOW_M_S, FAR_M = 20.0, 0.010, 0.200
-"""Of sweeps that something happens in: few events, and far from their end when it happens."""
+"""Of sweeps that are interrupted: few events, and interrupted far from their end."""
 SLOW = {"stop": FAR_M, "speed": SLOW_M_S, "frequency": SLOW_HZ}
 SWEPT_POINTS = 30_000
 CLOCK_S = 0.01
@@ -87,10 +87,10 @@ class Bench:
 
     def start(self, **goal: float) -> Any:
         """Send a goal; the accepted handle."""
-        # First: the action of a scanner that has just ended may still be there.
+        # First, because the action of a scanner that has just ended may still be discovered.
         self.observer.wait_for_answers("scanner", SCAN_DEADLINE_S)
         wait_until(self._action.server_is_ready, "the scan action", SCAN_DEADLINE_S)
-        # A list of its own: feedback of the goal before may still come.
+        # A new list, because feedback of the goal before may still come.
         feedback = self.feedback = []
         values = {"start": START_M, "stop": STOP_M, "speed": SPEED_M_S, "frequency": FREQUENCY_HZ}
         sent = self._action.send_goal_async(
@@ -125,7 +125,7 @@ class Bench:
     def cloud_after(self, count: int, points: int) -> np.ndarray:
         """Cloud of so many points, published after ``count`` clouds were there.
 
-        The one of a scan that nobody ended may come before it.
+        The cloud of a scan that was left open may come before it.
         """
         wait_until(
             lambda: len(self.clouds) > count and self.clouds[-1].width == points,
@@ -141,7 +141,7 @@ class Bench:
     def lit_part(self, points: np.ndarray) -> tuple[np.ndarray, float]:
         """Points of the newest cloud made in the last light, and how long it lasted after them (s).
 
-        A scan also keeps what background makes of the dark, wherever the stage was then.
+        A scan also holds points that the background makes without light, at any stage position.
         """
         on_ns, off_ns = (t_ns for t_ns, _ in truth(self._laser_log)[-2:])
         begun_ns = ns_from_stamp(self.clouds[-1].header.stamp) - ros_minus_steady_ns()
@@ -154,13 +154,13 @@ class Bench:
         """ON and OFF in the order of the emulator's own log."""
         return [output for _, output in truth(self._laser_log)]
 
-    def assert_dark_and_at_rest(self) -> None:
+    def assert_off_and_at_rest(self) -> None:
         """Laser off by the emulator's own log and by the node; stage not moving."""
         wait_until(lambda: self.output_lines()[-1] == "OFF", "OFF in the emulator's log")
         now_ns = time.time_ns()
-        wait_until(lambda: told_after(self.laser, now_ns), "a new laser/state")
+        wait_until(lambda: stamped_after(self.laser, now_ns), "a new laser/state")
         assert self.laser[-1].output == LaserState.OUTPUT_OFF
-        wait_until(lambda: told_after(self.odometry, now_ns), "new odometry")
+        wait_until(lambda: stamped_after(self.odometry, now_ns), "new odometry")
         assert self.odometry[-1].twist.twist.linear.y == 0.0
 
 
@@ -174,8 +174,8 @@ def bench(domain: int, laser_log: Path) -> Iterator[Bench]:
 def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: float) -> None:
     """At least ``completeness`` of the lit columns, and the project's bounds on their errors.
 
-    The errors are those of points whose whole footprint, 7 mm along the stage, lies on one level:
-    how many others a scan holds that ends somewhere depends on where.
+    The errors are those of points whose beam, 7 mm along the stage, lies on one level: the number
+    of other points depends on where the scan ends.
     """
     model, scene = load_calibration(CALIBRATION).model(), Steps()
     error_mm = range_error_mm(points, scene, model)
@@ -183,8 +183,8 @@ def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: 
     share = np.count_nonzero(known) / int(lit_columns(scene, model, positions_mm).sum())
     band_mm = scene.stage_band_mm
     y_mm = 1e3 * points["y"]
-    whole = known & (np.abs((y_mm + 0.5 * band_mm) % band_mm - 0.5 * band_mm) > EDGE_MM)
-    signed_mm, where_mm = error_mm[whole], y_mm[whole]
+    inside = known & (np.abs((y_mm + 0.5 * band_mm) % band_mm - 0.5 * band_mm) > EDGE_MM)
+    signed_mm, where_mm = error_mm[inside], y_mm[inside]
     median_mm, p95_mm = np.median(np.abs(signed_mm)), np.percentile(np.abs(signed_mm), 95.0)
     found = f"{share:.4f} of the lit points, error median {median_mm:.3f}, p95 {p95_mm:.3f} mm"
     print(found)
@@ -218,7 +218,7 @@ def full_scan(bench: Bench) -> None:
     assert math.isclose(sweep_s, (STOP_M - START_M) / SPEED_M_S, rel_tol=0.25)
     assert [f.phase for f in bench.feedback if f.phase == "sweeping"]
     assert 0.0 < result.sigma_median < 2e-3
-    bench.assert_dark_and_at_rest()
+    bench.assert_off_and_at_rest()
 
 
 def cancel_scan(bench: Bench) -> None:
@@ -231,7 +231,7 @@ def cancel_scan(bench: Bench) -> None:
     status, result = bench.result()
     assert status == GoalStatus.STATUS_CANCELED, result.message
     assert not result.success
-    bench.assert_dark_and_at_rest()
+    bench.assert_off_and_at_rest()
     assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
     _assert_partial(bench, before, result, to_the_end=True)
 
@@ -289,7 +289,7 @@ def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
 def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     """The camera's process dies mid-scan: aborted, the camera named, light off, points kept."""
     before = len(bench.clouds)
-    # Slow: DDS holds everybody's messages for some seconds after a process was killed.
+    # Slow: DDS holds all messages for some seconds after a process was killed.
     bench.start(**SLOW)
     bench.wait_for_sweep()
     kill()
@@ -298,13 +298,13 @@ def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     print(f"goal ended {time.monotonic() - killed_s:.1f} s after the camera: {result.message}")
     assert status == GoalStatus.STATUS_ABORTED
     assert "camera" in result.message, result.message
-    bench.assert_dark_and_at_rest()
+    bench.assert_off_and_at_rest()
     assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
     _assert_partial(bench, before, result, to_the_end=False)
 
 
 def _assert_partial(bench: Bench, before: int, result: Any, *, to_the_end: bool) -> None:
-    """What was swept is there, ``to_the_end`` of the light or of what a camera had sent."""
+    """The cloud reaches ``to_the_end`` of the light, or of the events that a camera had sent."""
     points, light_after_s = bench.lit_part(bench.cloud_after(before, result.points))
     assert len(points) > SWEPT_POINTS
     begin_m, reached_m = float(points["y"].min()), float(points["y"].max())

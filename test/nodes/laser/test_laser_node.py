@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from awg_process import AwgProcess
 from eschorty_ros.msg import LaserState
-from ros_process import NodeProcess, Observer, ros_minus_steady_ns, told_after, wait_until
+from ros_process import NodeProcess, Observer, ros_minus_steady_ns, stamped_after, wait_until
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 
@@ -106,7 +106,7 @@ class Bench:
         self.interlock.publish(Bool(data=False))
         said_ns = time.time_ns()
         wait_until(
-            lambda: told_after(self.states, said_ns) and not self.states[-1].interlock_open,
+            lambda: stamped_after(self.states, said_ns) and not self.states[-1].interlock_open,
             "the interlock closed",
         )
 
@@ -222,7 +222,7 @@ def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
     bench.switch_on()
     assert bench.enable(False).success
     now_ns = time.time_ns()
-    wait_until(lambda: told_after(bench.states, now_ns), "a new laser/state")
+    wait_until(lambda: stamped_after(bench.states, now_ns), "a new laser/state")
     assert bench.states[-1].output == LaserState.OUTPUT_OFF
     to_ros_ns = ros_minus_steady_ns()
     switched_ns = [t_ns + to_ros_ns for t_ns in bench.switched_ns()]

@@ -21,7 +21,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from awg_process import AwgProcess
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
-from ros_process import NodeProcess, Observer, told_after, wait_until
+from ros_process import NodeProcess, Observer, stamped_after, wait_until
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -120,7 +120,7 @@ class Bench:
 
         def told() -> bool:
             newest = self.states[-1:]
-            return told_after(newest, now_ns) and (
+            return stamped_after(newest, now_ns) and (
                 newest[0].requested == newest[0].output == output and not newest[0].interlock_open
             )
 

@@ -26,7 +26,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_real_drivers_unless_told(tmp_path):
+def test_drivers_are_real_by_default(tmp_path):
     text = ros_file(laser={"driver": "fake"}, stage={"port": "/dev/ttyUSB0"})
     tables = read_hardware(written(tmp_path, text))
     assert {name: table["driver"] for name, table in tables.items()} == {
