@@ -35,7 +35,7 @@ class BenchSettings:
         Background events of one pixel.
     trigger : {"none", "laser", "stage"}
         What is wired to the camera's trigger input.
-    flaws : Imperfections
+    imperfections : Imperfections
     laser_log : str
         File with one line per change of the generator's output; empty for none.
     """
@@ -46,7 +46,7 @@ class BenchSettings:
     seed: int = 1
     background_hz: float = BACKGROUND_HZ
     trigger: str = "stage"
-    flaws: Imperfections = field(default_factory=Imperfections)
+    imperfections: Imperfections = field(default_factory=Imperfections)
     laser_log: str = ""
 
 
@@ -79,7 +79,7 @@ class Bench:
         self.physics = Physics(
             world,
             clock_ns,
-            settings.flaws,
+            settings.imperfections,
             settings.trigger,
             lambda from_ns, until_ns: self.stage.trigger_pulses(from_ns, until_ns),
         )

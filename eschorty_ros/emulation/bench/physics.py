@@ -145,11 +145,11 @@ class Physics:
         self.edges = 0
         self.edges_missed = 0
         self._make_world = make_world
-        self._flaws = imperfections or Imperfections()
+        self._imperfections = imperfections or Imperfections()
         self._trigger = trigger
         self._pulses = pulses
-        self._edge_chance = random.Random(self._flaws.seed)
-        self._usb_chance = random.Random(self._flaws.seed + 1)
+        self._edge_chance = random.Random(self._imperfections.seed)
+        self._usb_chance = random.Random(self._imperfections.seed + 1)
         self._simulating = threading.Lock()
         self._world: World | None = None
         self._zero_ns = 0
@@ -270,7 +270,7 @@ class Physics:
             return False
         data = world.advance(world.now_us + min(packets, _PACKETS_AT_ONCE) * PACKET_US)
         if data:
-            late_ns = round(self._usb_chance.uniform(0.0, self._flaws.usb_jitter_ms) * 1e6)
+            late_ns = round(self._usb_chance.uniform(0.0, self._imperfections.usb_jitter_ms) * 1e6)
             self._in_transit.append((horizon_ns + late_ns, data))
         return True
 
@@ -285,12 +285,12 @@ class Physics:
             world.set_laser(since_us, False)
             return
         wave = replace(light.modulation, on_edge_us=self._sensor_us(light.since_ns))
-        rate = self._flaws.sensor_rate / self._flaws.generator_rate
+        rate = self._imperfections.sensor_rate / self._imperfections.generator_rate
         world.set_laser(since_us, True, wave, rate)
 
     def _apply_plan(self, world: World, plan: MotionPlan) -> None:
         since_us = self._from_us(world, plan.start_ns)
-        world.set_stage(plan, self._zero_ns, since_us, self._flaws.sensor_rate)
+        world.set_stage(plan, self._zero_ns, since_us, self._imperfections.sensor_rate)
 
     def _stage_trigger(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
         edges = []
@@ -301,13 +301,15 @@ class Physics:
 
     def _seen(self, edges: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
         """Return the edges without those that the camera misses."""
-        seen = [edge for edge in edges if self._chance_of_edge() >= self._flaws.missing_edges]
+        seen = [
+            edge for edge in edges if self._chance_of_edge() >= self._imperfections.missing_edges
+        ]
         self.edges += len(edges)
         self.edges_missed += len(edges) - len(seen)
         return seen
 
     def _chance_of_edge(self) -> float:
-        return self._edge_chance.random() if self._flaws.missing_edges else 1.0
+        return self._edge_chance.random() if self._imperfections.missing_edges else 1.0
 
     def _from_us(self, world: World, t_ns: int) -> int:
         """Return the sensor time of ``t_ns``, not before the world's; counts late changes."""
@@ -317,9 +319,9 @@ class Physics:
         return max(t_us, world.now_us)
 
     def _sensor_us(self, t_ns: int) -> int:
-        rate = self._flaws.sensor_rate
+        rate = self._imperfections.sensor_rate
         return (t_ns - self._zero_ns) * rate.numerator // (rate.denominator * 1000)
 
     def _bench_ns(self, t_us: int) -> int:
-        rate = self._flaws.sensor_rate
+        rate = self._imperfections.sensor_rate
         return t_us * 1000 * rate.denominator // rate.numerator

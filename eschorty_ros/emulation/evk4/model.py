@@ -11,7 +11,6 @@ from __future__ import annotations
 import errno
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 
 from eschorty_ros.emulation.bus import (
@@ -59,8 +58,6 @@ class Evk4Model(EmulatedUsbDevice):
     registers : Registers
     watch : SequenceWatch
         Phase and violations.
-    writes : deque of (address, value)
-        The latest register writes.
     board : TreuzellBoard
         Answers requests.
     buffer_bytes : int or None
@@ -101,14 +98,13 @@ class Evk4Model(EmulatedUsbDevice):
         )
         self.registers = Registers(factory_dacs)
         self.watch = SequenceWatch(clock_ns)
-        self.writes: deque[tuple[int, int]] = deque(maxlen=4096)
         self.buffer_bytes: int | None = None
         self.configure: Callable[[SensorSettings], None] | None = None
         self._source = source
         self.board = TreuzellBoard(board, self)
         self._packets = Packetiser()
         self._mask = PixelMask((), (), ())
-        # Between the reader's thread and the one that starts and stops.
+        # Held by the reading thread and by the one that starts and stops.
         self._stream_lock = threading.Lock()
         self._run = 0
         self._settings = read_settings(self.registers)
@@ -139,7 +135,6 @@ class Evk4Model(EmulatedUsbDevice):
         """Write a register, as the control protocol does."""
         before = self.registers[address]
         self.registers.write(address, value)
-        self.writes.append((address, value))
         was = self.watch.phase
         if address == SENSOR_RESET and before and not value:
             self.watch.sensor_reset()

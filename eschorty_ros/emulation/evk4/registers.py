@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-CHIP_ID = 0xA0401806
-FACTORY_DACS = {
+_CHIP_ID = 0xA0401806
+_FACTORY_DACS = {
     "bias_fo": 0x53,
     "bias_hpf": 0x00,
     "bias_diff_on": 0x66,
@@ -29,7 +29,7 @@ _BIAS_WORD = 0x11A10000
 
 _RESET = {
     0x0004: 0xF0005042,
-    0x0014: CHIP_ID,
+    0x0014: _CHIP_ID,
     0x002C: 0x0022C324,
     0x003C: 0x02CF04FF,
     0x6000: 0x00155400,
@@ -44,9 +44,8 @@ _RESET = {
     0xD000: 0x5,
 }
 
-ADC_CONTROL, ADC_STATUS, ADC_MISC, TEMPERATURE_CONTROL = 0x4C, 0x50, 0x54, 0x5C
-WINDOW_CONTROL = 0x34
-AFK_FLAGS, STC_FLAGS = 0xC0C4, 0xD0C4
+_ADC_CONTROL, _ADC_STATUS, _ADC_MISC, _TEMPERATURE_CONTROL = 0x4C, 0x50, 0x54, 0x5C
+_ANTI_FLICKER_FLAGS, _TRAIL_FLAGS = 0xC0C4, 0xD0C4
 SENSOR_RESET = 0x400004
 
 
@@ -65,7 +64,7 @@ class Registers:
     """
 
     def __init__(self, factory_dacs: Mapping[str, int] | None = None):
-        self.factory_dacs = {**FACTORY_DACS, **(factory_dacs or {})}
+        self.factory_dacs = {**_FACTORY_DACS, **(factory_dacs or {})}
         self.temperature_c = 35.0
         self._values: dict[int, int] = {}
         self._temperature_ready = False
@@ -82,18 +81,15 @@ class Registers:
 
     def read(self, address: int) -> int:
         """Read over the bus: the temperature is polled by reading."""
-        return self._temperature() if address == ADC_STATUS else self[address]
+        return self._temperature() if address == _ADC_STATUS else self[address]
 
     def write(self, address: int, value: int) -> None:
         """Write over the bus."""
         if address == SENSOR_RESET and self[address] and not value:
             self.reset()
-        elif address == WINDOW_CONTROL:
-            # The window takes effect at once: bit 0 requests it, bit 1 confirms.
-            value = (value & ~1) | 2 if value & 1 else value
-        elif address in (AFK_FLAGS, STC_FLAGS):
+        elif address in (_ANTI_FLICKER_FLAGS, _TRAIL_FLAGS):
             value = self._flags(address, value)
-        elif address == ADC_CONTROL:
+        elif address == _ADC_CONTROL:
             self._temperature_ready = False
         self._values[address] = value
 
@@ -102,8 +98,8 @@ class Registers:
         return (value & ~4) | (4 if value & 1 else self[address] & 4 & ~value)
 
     def _temperature(self) -> int:
-        running = self[ADC_CONTROL] & 0b110 == 0b110 and self[TEMPERATURE_CONTROL] & 0b11 == 0b11
-        if not (running and self[ADC_MISC] & 1 << 12):
+        running = self[_ADC_CONTROL] & 0b110 == 0b110 and self[_TEMPERATURE_CONTROL] & 0b11 == 0b11
+        if not (running and self[_ADC_MISC] & 1 << 12):
             return 0
         if not self._temperature_ready:
             # The conversion takes longer than the first poll.

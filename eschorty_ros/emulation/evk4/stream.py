@@ -68,8 +68,8 @@ class PixelMask:
         """Return the words without the events of masked pixels."""
         words = np.frombuffer(data, np.dtype("<u2")).copy()
         kinds, payload = words >> 12, words & 0x7FF
-        rows = self._filled(kinds == w3.ADDR_Y, payload, self._row)
-        bases = self._vector_bases(kinds, payload)
+        rows = self._rows_at(kinds == w3.ADDR_Y, payload, self._row)
+        bases = self._bases_at(kinds, payload)
         vectors = (kinds == w3.VECT_12) | (kinds == w3.VECT_8)
         singles = kinds == w3.ADDR_X
         off = self._rows[rows]
@@ -84,7 +84,7 @@ class PixelMask:
             words[hit] &= ~(np.uint16(1) << bit[hit].astype(np.uint16))
         return words[~lost].tobytes()
 
-    def _filled(
+    def _rows_at(
         self, given: NDArray[np.bool_], payload: NDArray[np.integer], before: int
     ) -> NDArray[np.int64]:
         """Return the row in force at each word."""
@@ -94,7 +94,7 @@ class PixelMask:
             self._row = int(rows[-1])
         return rows
 
-    def _vector_bases(
+    def _bases_at(
         self, kinds: NDArray[np.integer], payload: NDArray[np.integer]
     ) -> NDArray[np.int64]:
         """Return the column of bit 0 at each word; a vector advances it by its width."""
@@ -115,7 +115,7 @@ class Packetiser:
     def __init__(self) -> None:
         self._pending: list[Words] = []
         self._high = 0
-        self._frame = -1
+        self._period_index = -1
 
     def push(self, data: bytes, period_us: int) -> list[bytes]:
         """Add words; returns the packets that they complete."""
@@ -148,11 +148,11 @@ class Packetiser:
         high = np.where(last_high >= 0, payload[last_high], self._high)
         self._high = int(high[-1])
         # A TIME_HIGH alone gives no time: it is repeated within its 4096 us.
-        frames = ((high << 12) | payload)[~is_high] // period_us
-        if not len(frames):
+        periods = ((high << 12) | payload)[~is_high] // period_us
+        if not len(periods):
             return []
-        changed = np.flatnonzero(np.diff(frames, prepend=self._frame))
-        self._frame = int(frames[-1])
+        changed = np.flatnonzero(np.diff(periods, prepend=self._period_index))
+        self._period_index = int(periods[-1])
         return [int(cut) for cut in self._before_high(kinds, at[~is_high][changed])]
 
     @staticmethod
