@@ -6,11 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from short_folder import short_folder
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError
@@ -28,9 +28,8 @@ from eschorty_ros.hardware.base.usb import open_backend
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """Short, because a Unix socket's path is limited."""
-    with tempfile.TemporaryDirectory(prefix="bench_") as name:
-        yield Path(name) / "bench"
+    with short_folder() as parent:
+        yield parent / "bench"
 
 
 def devices(folder: Path) -> list[tuple[int, int]]:

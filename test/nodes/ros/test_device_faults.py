@@ -20,7 +20,7 @@ from spinning import spinning
 
 from eschorty_ros.emulation.bench.devices import Bench
 from eschorty_ros.nodes.laser.node import LaserNode
-from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros import lifecycle, qos
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.stage.node import StageNode
@@ -41,7 +41,10 @@ def observer() -> Iterator[Observer]:
 
 
 @pytest.fixture
-def run(observer: Observer, emulated: tuple[Bench, Path]) -> Iterator[Run]:
+def run(
+    observer: Observer, emulated: tuple[Bench, Path], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Run]:
+    monkeypatch.setattr(lifecycle, "RETRY_S", 0.2)
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=observer.domain)
     executor = MultiThreadedExecutor(4, context=context)
@@ -93,7 +96,7 @@ def test_a_lost_device_is_reported_closed_and_not_opened_again(
         device.replug()
     else:
         device.gone = False
-    time.sleep(3.0)
+    time.sleep(1.0)
     assert node.state_label == "unconfigured", "nothing starts by itself after a failure"
     # The laser's old guard may still hold the generator while it switches it off.
     wait_until(lambda: observer.change_state(name, "configure"), "the device open again")
