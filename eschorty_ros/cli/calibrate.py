@@ -179,7 +179,7 @@ def command(
 
     design = load_calibration(nominal)
     made_with = {"targets from": ", ".join(map(str, sources)), "design": nominal}
-    # What varies across the columns shows in several targets side by side.
+    # Roll and smile need several targets side by side.
     blocks = _BLOCKS if set(COLUMN_TERMS) & set(free) else 1
     targets = Targets.concatenate(
         [
@@ -265,8 +265,7 @@ def _recorded(
         click.echo(f"left out: {line}")
     if match.targets is None:
         raise FitError(
-            f"--distances is {distances}; no post lies where they say, check the ranges and "
-            "--nominal"
+            f"--distances is {distances}; no post lies there; check the ranges and --nominal"
         )
     return match.targets
 

@@ -70,7 +70,7 @@ class CalibrationReport:
     Attributes
     ----------
     calibration : Calibration
-        What the file holds.
+        Content of the file.
     nominal : Calibration
         The design it started from.
     method : str
@@ -235,7 +235,7 @@ def _priors(
 ) -> dict[str, float]:
     if method == "paper":
         if prior_sigma:
-            raise ArgumentError("method paper knows no prior_sigma; choose joint or leave it out")
+            raise ArgumentError("method paper has no prior_sigma; choose joint or leave it out")
         return {}
     known = {"k_mm": K_PRIOR_SHARE * design.k_mm, **PRIOR_SIGMA}
     priors = {name: known[name] for name in names} | checked_priors(prior_sigma, names)

@@ -170,8 +170,8 @@ def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[
     if away <= _RESIDUAL_SIGMA:
         return []
     return [
-        f"sizes contradict k_mm: they say {k_mm:.3f} with a sigma of {sigma:.3f}, {away:.1f} sigma "
-        f"from the {design.k_mm:.3f} it was held at; method joint fits it"
+        f"sizes contradict k_mm: they give {k_mm:.3f} with a sigma of {sigma:.3f}, "
+        f"{away:.1f} sigma from the {design.k_mm:.3f} it was held at; method joint fits it"
     ]
 
 

@@ -34,7 +34,7 @@ from eschorty_ros.core.optics import RangeModel
 
 CONDITION_WARNING = 1e3
 PAPER_FREE = ("k_prime_px", "b_prime_px")
-"""What the paper fits: k and b stay at their design values."""
+"""Parameters that the paper fits; k and b stay at their design values."""
 PRIOR_SIGMA = {
     "k_prime_px": 3000.0,
     "b_mm": 3.0,
@@ -201,7 +201,7 @@ def fit(
             "spread the targets over the range or fix b_mm"
         )
     if dof == 0:
-        verdicts.append("no degrees of freedom: residuals say nothing; add targets")
+        verdicts.append("no degrees of freedom: the residuals carry no information; add targets")
     residual, white = problem.observed.residual(values), problem.residual(at)
     if residual is None or white is None:
         raise FitError("the targets lead to no possible build; check them")
@@ -256,7 +256,7 @@ def _straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Valu
     u, v = (x - x_mean) / sigma, (rows - row_mean) / sigma
     length = math.sqrt(math.fsum(u * u))
     product = math.fsum((u / length) * v) / length
-    # What rounding left in the means comes back through the mean residual.
+    # The mean residual corrects the rounding of the means.
     rest = math.fsum(weight * (rows - row_mean - product * (x - x_mean))) / total
     return values_of(design) | {
         "k_prime_px": product / design.k_mm,

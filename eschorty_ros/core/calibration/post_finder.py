@@ -83,11 +83,11 @@ def find_posts(frame: AggregateFrame, line_width_px: float = 20.0) -> list[Post]
         For a width outside the sensor.
     """
     width = number("line_width_px", line_width_px, 0.5, len(frame.counts))
-    columns_image = _Columns(frame.counts, max(HALF_WIDTH_PER_FWHM * width, 3.0))
+    image = _Columns(frame.counts, max(HALF_WIDTH_PER_FWHM * width, 3.0))
     posts = []
-    for first, last in columns_image.runs():
+    for first, last in image.runs():
         if last - first + 1 >= COLUMNS_MIN:
-            posts.append(columns_image.post(first, last, 0.5 * HALF_WIDTH_PER_FWHM * width))
+            posts.append(image.post(first, last, 0.5 * HALF_WIDTH_PER_FWHM * width))
     return [post for post in posts if post.width_px >= COLUMNS_MIN]
 
 
@@ -101,7 +101,7 @@ class _Columns:
         place = np.arange(self.rows)[:, np.newaxis]
         zero = np.zeros((1, self.columns))
         self._mass = np.concatenate((zero, np.cumsum(value, axis=0)))
-        self._moment = np.concatenate((zero, np.cumsum(value * place, axis=0)))
+        self._weighted = np.concatenate((zero, np.cumsum(value * place, axis=0)))
         self.row = self._densest()
         for _ in range(_CENTRING_STEPS):
             self.row = self._centroid(self.row)
@@ -133,7 +133,7 @@ class _Columns:
 
     def _centroid(self, row: Array) -> Array:
         mass = self._sum(self._mass, row)
-        centre = np.divide(self._sum(self._moment, row), mass, out=row.copy(), where=mass > 0.0)
+        centre = np.divide(self._sum(self._weighted, row), mass, out=row.copy(), where=mass > 0.0)
         return np.clip(centre, 0.0, self.rows - 1.0)
 
     def runs(self) -> list[tuple[int, int]]:
@@ -189,21 +189,21 @@ class _Columns:
         near = near[self.lit[near]]
         row = self.row[near]
         kept = np.abs(row - np.median(row)) <= _ROW_JUMP_PX
+        offset = (near - column) / max(reach, 1.0)
         for _ in range(3):
-            at, seen = (near[kept] - column) / max(reach, 1.0), row[kept]
-            powers = (0, 1, 2) if seen.size >= _CURVED_MIN else (0,)
-            design = np.stack([at**power for power in powers], axis=1)
-            weights, *_ = np.linalg.lstsq(design, seen, rcond=None)
-            all_at = (near - column) / max(reach, 1.0)
-            model = sum(w * all_at**p for w, p in zip(weights, powers, strict=True))
-            freedom = max(seen.size - len(powers), 1)
-            scatter = float(np.sqrt(np.sum((seen - design @ weights) ** 2) / freedom))
+            count = int(kept.sum())
+            design = np.vander(offset, 3 if count >= _CURVED_MIN else 1, increasing=True)
+            used = design[kept]
+            weights, *_ = np.linalg.lstsq(used, row[kept], rcond=None)
+            residual = row - design @ weights
+            freedom = max(count - len(weights), 1)
+            scatter = float(np.sqrt(np.sum(residual[kept] ** 2) / freedom))
             scatter = max(scatter, SIGMA_FLOOR_PX)
-            again = np.abs(row - model) <= 4.0 * scatter
+            again = np.abs(residual) <= 4.0 * scatter
             if np.array_equal(again, kept):
                 break
             kept = again
-        spread = float(np.linalg.inv(design.T @ design)[0, 0])
+        spread = float(np.linalg.inv(used.T @ used)[0, 0])
         return float(weights[0]), float(np.hypot(scatter * np.sqrt(spread), GRID_SIGMA_PX))
 
 
@@ -222,7 +222,7 @@ def _inner(first: int, last: int) -> slice:
 
 
 def _edge(along: Array, half: float) -> tuple[float, bool]:
-    """Return how far from its start ``along`` stays below ``half``, and whether it never does."""
+    """Return where ``along`` falls below ``half`` for good, and whether it does not."""
     low = np.flatnonzero(along < half)
     for index in low.tolist():
         beyond = along[index : index + _GAP_COLUMNS + 1]

@@ -69,7 +69,7 @@ class KnownTarget:
 
     @property
     def hinted(self) -> bool:
-        """Whether the column or row where it should be seen is known."""
+        """True when the column or row where it should be seen is known."""
         return not (math.isnan(self.column) and math.isnan(self.row))
 
 
@@ -98,7 +98,7 @@ def match_posts(
     """Find the post that every known target is.
 
     A target with a pixel hint is the post nearest to the hint. The others follow from what the
-    range equation demands whatever its constants: rows are a straight line in ``1 / (R + b)``.
+    range equation demands for any constants: rows are a straight line in ``1 / (R + b)``.
     Of all lines through two posts whose ``kk'`` and ``b'`` lie near the nominal ones, the one that
     most posts agree with wins. Sizes, where known, rule out posts of another width.
 
@@ -292,7 +292,7 @@ def _left_over(
             continue
         row = search.row_of(target)
         if target.hinted:
-            reason = "no whole post near its pixel hint"
+            reason = "no uncut post near its pixel hint"
         elif math.isnan(row):
             reason = "no two posts agree with the known ranges and the nominal build"
         else:

@@ -85,7 +85,7 @@ def recorded_moving_target(
     recording, nominal, progress
         As in `recorded_posts`.
     range_at_zero_mm, range_per_stage, blocks
-        As in `moving_target`, which also says what is raised.
+        As in `moving_target`, which also lists the errors.
 
     Returns
     -------

@@ -273,7 +273,7 @@ def test_sizes_that_contradict_the_k_of_the_papers_method_are_reported():
     other = replace(TRUTH, k_mm=25.0)
     targets = see(np.random.default_rng(SEED), truth=other, size_mm=TWO_SIZES_MM, bloom_px=4.0)
     line = next(v for v in calibrate(targets, NOMINAL, "paper").verdicts if "sizes" in v)
-    stated = float(line.split("they say ")[1].split()[0])
+    stated = float(line.split("they give ")[1].split()[0])
     assert stated == pytest.approx(25.0, rel=0.006)
     assert "method joint fits it" in line
     good = see(np.random.default_rng(SEED), truth=DESIGN, size_mm=TWO_SIZES_MM, bloom_px=4.0)

@@ -61,9 +61,9 @@ def test_sweeps_forth_and_back_give_the_geometry(sweeps):
 
 def test_blocks_lie_side_by_side(sweeps):
     zero, profiles, stage = sweeps[0]
-    whole = moving_target(profiles, stage, zero)
+    one = moving_target(profiles, stage, zero)
     parts = moving_target(profiles, stage, zero, blocks=4)
-    assert len(parts) == pytest.approx(4 * len(whole), rel=0.02)
+    assert len(parts) == pytest.approx(4 * len(one), rel=0.02)
     assert set(np.round(parts.column / 12.0 - 0.48).astype(int)) == {0, 1, 2, 3}
 
 

@@ -174,7 +174,7 @@ def test_hints_come_before_ranges():
     )
     result = match_posts(posts, [KnownTarget(1200.0, column=300.0)], NOMINAL)
     assert result.targets is None
-    assert "target 1200 mm: no whole post near its pixel hint" in result.rejected
+    assert "target 1200 mm: no uncut post near its pixel hint" in result.rejected
 
 
 def test_cut_lines_are_rejected_with_the_reason():
