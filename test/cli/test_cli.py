@@ -177,7 +177,7 @@ def test_simulate_then_reconstruct_without_ros(recording):
     assert 1e-4 < facts["sigma_median_m"] < 2e-3
 
 
-@pytest.mark.parametrize("step", ["world.World.advance", "recorder.write_truth_csv"])
+@pytest.mark.parametrize("step", ["world.World.advance", "world.recorder.write_truth_csv"])
 def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step):
     def interrupted(*_):
         assert (tmp_path / "rec" / "events.raw").is_file()
