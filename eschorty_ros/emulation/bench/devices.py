@@ -101,7 +101,7 @@ class Bench:
 
 
 def sensor_control(settings: SensorSettings) -> SensorControl:
-    """Biases and event rate of ``settings``; a bias beyond its normal range acts as at its end."""
+    """Return the simulation's biases and event rate; biases are clipped to their normal range."""
     offsets = dict(settings.biases)
     biases = {
         name: min(max(offsets[f"bias_{name}"], low), high) for name, (low, high) in LIMITS.items()

@@ -61,7 +61,7 @@ def serving(bench: Bench, folder: Path) -> Iterator[UsbServer]:
 
 @contextlib.contextmanager
 def _short_switch_interval() -> Iterator[None]:
-    """Let threads switch often inside the context: answers must not wait for the simulation."""
+    """Switch threads often inside the context, so that answers do not wait for the simulation."""
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
     try:

@@ -180,14 +180,14 @@ class EmulatedBackend(DescriptorBackend):
         return bool(self._run(dev_handle.live).kernel_driver)
 
     def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
-        """Take the interface from the kernel driver."""
+        """Detach the kernel driver from the interface."""
         device = self._run(dev_handle.live)
         if not device.kernel_driver:
             raise_usb_error(errno.ENOENT)
         device.detached_driver, device.kernel_driver = device.kernel_driver, None
 
     def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
-        """Give the interface back to the kernel driver it was taken from."""
+        """Attach the detached kernel driver again."""
         device = self._run(dev_handle.live)
         if not device.detached_driver:
             raise_usb_error(errno.ENOENT)

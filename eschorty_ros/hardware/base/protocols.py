@@ -61,19 +61,19 @@ class EventSource(Protocol):
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Model, serial and firmware; complete after ``open``."""
+        """Return model, serial and firmware; complete after ``open``."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line for each oddity that ``open`` found."""
+        """Return one line for each oddity that ``open`` found."""
 
     @property
     def healthy(self) -> bool:
-        """Whether the camera streams and answers; never waits."""
+        """Return whether the camera streams and answers; never waits."""
 
     @property
     def loss(self) -> str:
-        """Why a streaming camera is being searched for, one line; empty while it is there."""
+        """Return why a streaming camera is searched for, one line; empty while it is there."""
 
     def open(self) -> None:
         """Find, probe and initialise the camera; may take seconds, ``close`` interrupts it."""

@@ -45,7 +45,7 @@ class ChunkQueue:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes in the queue."""
+        """Return the bytes in the queue."""
         return self._waiting_bytes
 
     def open(self) -> None:

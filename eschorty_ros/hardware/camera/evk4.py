@@ -88,23 +88,23 @@ class Evk4:
 
     @property
     def identity(self) -> DeviceIdentity:
-        """Model, serial and firmware; complete after ``open``."""
+        """Return model, serial and firmware; complete after ``open``."""
         return self._connection.identity
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line for each oddity that ``open`` found."""
+        """Return one line for each oddity that ``open`` found."""
         session = self._connection.session
         return session.warnings if session is not None else ()
 
     @property
     def loss(self) -> str:
-        """Why a streaming camera is being searched for, one line; empty while it is there."""
+        """Return why a streaming camera is searched for, one line; empty while it is there."""
         return self._connection.loss if self._thread is not None else ""
 
     @property
     def healthy(self) -> bool:
-        """Whether the receiving thread runs and the camera answers."""
+        """Return whether the receiving thread runs and the camera answers."""
         thread = self._thread
         return (
             thread is not None

@@ -59,7 +59,7 @@ class HealthMonitor:
 
     @property
     def answering(self) -> bool:
-        """Whether no request has waited for its answer for 0.5 s.
+        """Return whether no request has waited for its answer for 0.5 s.
 
         A request that a busy host sends late does not count against the camera.
         """

@@ -140,14 +140,14 @@ class CameraNode(DeviceNode):
 
     @property
     def healthy(self) -> bool:
-        """Whether the stream runs and the camera answers."""
+        """Return whether the stream runs and the camera answers."""
         thread, source = self._thread, self._source
         alive = thread is not None and thread.is_alive() and not self._ending.is_set()
         return alive and source is not None and source.healthy
 
     @property
     def words(self) -> WordCounter:
-        """Counts of the words in the stream, published or not."""
+        """Return counts of the words in the stream, published or not."""
         return self._packets.words
 
     def _stream(self, source: EventSource, ending: threading.Event) -> None:

@@ -51,7 +51,7 @@ class PacketPublisher:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Events that the sensor reports as dropped, by name."""
+        """Return the events that the sensor reports as dropped, by name."""
         words = self.words
         return {
             "sensor_drop_words": words.drop_words,
