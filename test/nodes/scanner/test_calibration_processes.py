@@ -50,9 +50,20 @@ def instrument(tmp_path_factory):
             print(f"--- {name}\n{process.output[-3000:]}")
 
 
-def test_calibration_takes_a_known_target_from_tens_of_mm_to_one(instrument):
+def test_an_uncalibrated_scan_is_off_by_tens_of_mm(instrument):
     scenarios.uncalibrated_scan_is_off(instrument.bench)
+
+
+def test_useless_captures_change_nothing(instrument):
     instrument.point_camera_at("posts")
+    scenarios.useless_captures(instrument.bench)
+
+
+def test_one_thing_at_a_time(instrument):
+    scenarios.one_thing_at_a_time(instrument.bench)
+
+
+def test_nine_posts_calibrate_the_same_scan_to_one_mm(instrument):
     scenarios.nine_posts(instrument.bench, "paper")
     scenarios.nine_posts(instrument.bench, "joint")
     instrument.point_camera_at(scenarios.KNOWN_SCENE)
@@ -70,15 +81,6 @@ def test_bad_goals_are_refused(instrument):
 def test_killed_camera_ends_the_calibration(instrument):
     camera = instrument.running["camera"]
     scenarios.camera_killed(instrument.bench, lambda: camera.send(signal.SIGKILL))
-
-
-def test_useless_captures_change_nothing(instrument):
-    instrument.point_camera_at("posts")
-    scenarios.useless_captures(instrument.bench)
-
-
-def test_one_thing_at_a_time(instrument):
-    scenarios.one_thing_at_a_time(instrument.bench)
 
 
 def test_a_target_moved_by_the_stage_calibrates_too(instrument):
