@@ -380,7 +380,7 @@ def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
 
 
 def reconstruction_interrupted(bench: CalibrationBench, interrupt: Callable[[], Any]) -> None:
-    """The reconstruction ends during a capture: its way out, or the end of its heartbeat, switches the laser off."""
+    """The reconstruction ends in a capture: its way out or its lost heartbeat ends the light."""
     bench.begin(**LONG)
     bench.wait_for_capture()
     assert bench.output_lines()[-1] == "ON"
