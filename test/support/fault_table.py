@@ -30,7 +30,7 @@ FAULTS = (
     "bit flips",
     "encoder jumps",
     "carriage stalls",
-    "serial unplugged, silent",
+    "serial line unplugged, no answer",
     "limit switch",
     "completion message missing",
     "keep-alive missing",

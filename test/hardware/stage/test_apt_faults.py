@@ -128,7 +128,7 @@ def test_a_position_error_counts_as_a_stall() -> None:
     assert at_rest(bench)
 
 
-@pytest.mark.fault("serial unplugged, silent")
+@pytest.mark.fault("serial line unplugged, no answer")
 def test_an_unplugged_port_fails_at_once() -> None:
     """driver: fails at once, as does every later order; user reads: the stage's port failed: ..."""
     bench = moving()
@@ -140,7 +140,7 @@ def test_an_unplugged_port_fails_at_once() -> None:
     bench.stage.close()
 
 
-@pytest.mark.fault("serial unplugged, silent")
+@pytest.mark.fault("serial line unplugged, no answer")
 def test_a_controller_that_sends_nothing_fails() -> None:
     """driver: warns after 0.5 s, fails after 1.5 s; user reads: sent no status for 1.5 s."""
     bench = AptBench()

@@ -77,7 +77,7 @@ def test_a_second_client_is_refused(port: str) -> None:
         stage.close()
 
 
-@pytest.mark.fault("serial unplugged, silent")
+@pytest.mark.fault("serial line unplugged, no answer")
 def test_an_unplugged_port_ends_the_threads(port: str, model: AptModel) -> None:
     """driver: its threads end, orders fail; user reads: the stage's port failed; check cable."""
     stage = opened(port)

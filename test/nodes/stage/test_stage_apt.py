@@ -38,7 +38,7 @@ def observer() -> Iterator[Observer]:
         yield observer
 
 
-@pytest.mark.fault("serial unplugged, silent")
+@pytest.mark.fault("serial line unplugged, no answer")
 def test_an_unplugged_stage_makes_the_node_leave_active(
     port: str, model: AptModel, observer: Observer
 ) -> None:
