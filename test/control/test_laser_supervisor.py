@@ -73,7 +73,7 @@ def test_enabled_twice_it_stays_on(supervisor: LaserSupervisor, laser: HeldLaser
     supervisor.enable()
     supervisor.enable()
     assert laser.lit
-    assert laser.lightings == 1
+    assert laser.enablings == 1
 
 
 def test_arming_does_not_outlive_disabling(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
@@ -87,7 +87,7 @@ def test_arming_does_not_outlive_disabling(supervisor: LaserSupervisor, laser: H
     assert failures == ["laser refused: interlock open"]
     with pytest.raises(DeviceError, match="not armed"):
         supervisor.enable()
-    assert laser.lightings == 0
+    assert laser.enablings == 0
 
 
 def test_commands_that_waited_while_it_was_disabled_are_void(
@@ -107,7 +107,7 @@ def test_commands_that_waited_while_it_was_disabled_are_void(
         thread.join()
     assert failures == ["laser refused: switched off by request"] * 2
     assert not supervisor.interlock.armed
-    assert laser.lightings == 0
+    assert laser.enablings == 0
 
 
 class Interrupted(HeldLaser):

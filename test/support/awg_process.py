@@ -1,4 +1,4 @@
-"""An emulated generator in a process of its own, with its log as the witness of light.
+"""An emulated generator in a process of its own, with its log as the evidence of light.
 
 ``python awg_process.py SOCKET LOG`` serves it on an emulated bus and does what comes on standard
 input: ``gone``, ``back``, ``mute``, ``speak``, ``replug``, ``reboot``, ``touch PATH TEXT``.
@@ -58,11 +58,11 @@ class AwgProcess:
         """Whether the output is on now."""
         return self.outputs()[-1] == "ON"
 
-    def off_after_s(self, since_ns: int, patience_s: float = 60.0) -> float:
+    def off_after_s(self, since_ns: int, deadline_s: float = 60.0) -> float:
         """How long after ``since_ns`` (CLOCK_MONOTONIC) the output was switched off."""
-        end_s = time.monotonic() + patience_s
+        end_s = time.monotonic() + deadline_s
         while self.lit():
-            assert time.monotonic() < end_s, f"still on after {patience_s:g} s"
+            assert time.monotonic() < end_s, f"still on after {deadline_s:g} s"
             time.sleep(0.005)
         return (truth(self.log)[-1][0] - since_ns) * 1e-9
 

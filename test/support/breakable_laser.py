@@ -1,4 +1,4 @@
-"""The laser node with a way to break it from outside: ``test/break`` says how."""
+"""The laser node with the topic ``test/break``, which makes it fail."""
 
 from __future__ import annotations
 

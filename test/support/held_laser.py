@@ -1,4 +1,4 @@
-"""A laser in memory whose commands can be held up."""
+"""A laser in memory whose commands can be delayed."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput, La
 
 
 class HeldLaser:
-    """In memory; a command named in ``hold`` waits for ``go`` before it is carried out;
-    ``switched_off`` tells of a ``disable`` meanwhile."""
+    """The command named in ``hold`` waits for ``go``; ``disabled`` is set by a ``disable`` then."""
 
     def __init__(self) -> None:
         self.identity = DeviceIdentity("held", "1")
         self.hold = ""
         self.reached, self.go = threading.Event(), threading.Event()
-        self.switched_off = threading.Event()
+        self.disabled = threading.Event()
         self.lit = self.armed = False
         self.modulation = Modulation(70.0)
-        self.lightings = self.offs = 0
+        self.enablings = self.offs = 0
 
     def _wait(self, command: str) -> None:
         if self.hold == command:
@@ -42,13 +41,13 @@ class HeldLaser:
         if not self.armed:
             raise DeviceError("not armed")
         self.armed, self.lit = False, True
-        self.lightings += 1
+        self.enablings += 1
 
     def disable(self) -> None:
         self.armed = self.lit = False
         self.offs += 1
         if self.hold:
-            self.switched_off.set()
+            self.disabled.set()
 
     def readback(self) -> LaserReadback:
         self._wait("readback")

@@ -23,7 +23,7 @@ def log(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def bench(log: Path, monkeypatch: pytest.MonkeyPatch) -> AwgBench:
-    # No wait takes time here: a host that stands still must not keep a remedy from its turn.
+    # No wait takes time here: a stall of the host must not prevent a later try.
     monkeypatch.setattr(awg, "OFF_LIMIT_S", 600.0)
     return AwgBench(log)
 
@@ -87,7 +87,7 @@ def test_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None:
 
 @pytest.mark.fault("endpoint stalls")
 def test_second_stall_is_an_error(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """driver: no third try, off, confirmed after opening anew; user reads: ... the device stalled the transfer."""  # noqa: E501
+    """driver: no third try, off, confirmed after opening again; user reads: ... the device stalled the transfer."""  # noqa: E501
     laser = bench.lit_laser()
     stuck = [True]
     clear_halt = bench.model.clear_halt
@@ -126,8 +126,8 @@ def test_mute_generator(bench: AwgBench, log: Path) -> None:
 
 @pytest.mark.parametrize("fault", ["mute", "lost_replies"])
 @pytest.mark.fault("no answer, time-out")
-def test_switching_off_waits_two_seconds_at_most(fault: str) -> None:
-    """driver: the sum of all waits of a vain switching off is bounded; user reads: laser state unknown within 2 s."""  # noqa: E501
+def test_disabling_waits_two_seconds_at_most(fault: str) -> None:
+    """driver: the sum of all waits of a disabling that fails is bounded; user reads: laser state unknown within 2 s."""  # noqa: E501
     waits: list[float] = []
 
     def wait(_: threading.Condition, seconds: float | None) -> bool:
@@ -151,7 +151,7 @@ def test_switching_off_waits_two_seconds_at_most(fault: str) -> None:
 
 @pytest.mark.fault("no answer, time-out")
 def test_replies_lost(bench: AwgBench) -> None:
-    """driver: a setting asked for is not a setting made; dark when it cannot be read back; user reads: ... no answer in time."""  # noqa: E501
+    """driver: refuses a setting that cannot be read back, and switches off; user reads: ... no answer in time."""  # noqa: E501
     laser = bench.ready_laser()
     bench.model.faults.lost_replies = 2
     with pytest.raises(DeviceError, match="no answer in time"):
@@ -165,7 +165,7 @@ def test_replies_lost(bench: AwgBench) -> None:
 )
 @pytest.mark.fault("malformed transfer")
 def test_bad_reply_header(bench: AwgBench, fault: str) -> None:
-    """driver: drops the reply, clears, asks again; user reads: nothing, faults 1 in diagnostics."""
+    """driver: drops it, clears, reads again; user reads: nothing, faults 1 in diagnostics."""
     laser = bench.lit_laser()
     setattr(bench.model.faults, fault, 1)
     assert laser.readback().output is LaserOutput.ON
@@ -175,7 +175,7 @@ def test_bad_reply_header(bench: AwgBench, fault: str) -> None:
 
 @pytest.mark.fault("malformed transfer")
 def test_bad_reply_headers_without_end(bench: AwgBench) -> None:
-    """driver: never takes text that is out of step; dark; user reads: laser state unknown: ... a reply header has the wrong tag ..."""  # noqa: E501
+    """driver: accepts no reply to another request, and switches off; user reads: laser state unknown: ... a reply header has the wrong tag ..."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.faults.wrong_tags = 10**9
     with pytest.raises(DeviceError, match=r"laser state unknown.*a reply header has the wrong tag"):
@@ -198,7 +198,7 @@ def test_reply_in_pieces(bench: AwgBench, size: int, newline: bool) -> None:
 
 @pytest.mark.fault("stale reply")
 def test_stale_reply_after_a_time_out(bench: AwgBench) -> None:
-    """driver: flushes by CLEAR before it asks again, so no reply is taken for another; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
+    """driver: clears before it reads again, so no reply is taken for another; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.faults.late_replies = 1
     assert laser.readback().output is LaserOutput.ON
@@ -208,7 +208,7 @@ def test_stale_reply_after_a_time_out(bench: AwgBench) -> None:
 
 @pytest.mark.fault("stale reply")
 def test_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
-    """driver: the stale reply is no value of the kind asked for: asks again; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
+    """driver: refuses a stale reply of another kind, reads again; user reads: nothing, faults 1 in diagnostics."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model._replies.append(b"SQUARE")
     assert laser.readback().output is LaserOutput.ON
@@ -218,7 +218,7 @@ def test_stale_reply_that_survives_clearing(bench: AwgBench) -> None:
 @pytest.mark.parametrize("errors", [None, [], ['-222,"Data out of range"', '-113,"Undefined"']])
 @pytest.mark.fault("error queue")
 def test_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
-    """driver: asks once at opening, takes silence for absent, empties what is there; user reads: a warning per entry."""  # noqa: E501
+    """driver: reads it once at opening, no reply means none, empties it; user reads: a warning per entry."""  # noqa: E501
     bench.model.errors = None if errors is None else type(bench.model.commands)(errors)
     laser = bench.laser()
     warnings = laser.readback().warnings
@@ -231,16 +231,16 @@ def test_error_queue(bench: AwgBench, errors: list[str] | None) -> None:
 
 @pytest.mark.fault("error queue")
 def test_error_queue_without_end(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """driver: takes 32 entries, or none when they are garbage, and goes on; user reads: 32 warnings at most."""  # noqa: E501
+    """driver: reads 32 entries, or none when they are garbage, and goes on; user reads: 32 warnings at most."""  # noqa: E501
     queried = bench.model._queried
-    says = ['-350,"Queue overflow"']
+    reply = ['-350,"Queue overflow"']
     monkeypatch.setattr(
-        bench.model, "_queried", lambda path: says[0] if "ERR" in path else queried(path)
+        bench.model, "_queried", lambda path: reply[0] if "ERR" in path else queried(path)
     )
     bench.laser().close()
     assert sum("ERR" in c for c in bench.model.commands) == 32
     bench.model.commands.clear()
-    says[0] = "<?garbage"
+    reply[0] = "<?garbage"
     laser = bench.laser()
     assert sum("ERR" in c for c in bench.model.commands) == 1
     laser.configure(SQUARE)
@@ -289,7 +289,7 @@ def test_panel_touched_before_light(bench: AwgBench, path: str, value: str) -> N
 
 @pytest.mark.fault("setting clamped or ignored")
 def test_panel_touched_while_lit(bench: AwgBench) -> None:
-    """driver: sees it at the next read-back, goes dark; user reads: high is 3 instead of 5; check its display ..."""  # noqa: E501
+    """driver: notices it at the next read-back, switches off; user reads: high is 3 instead of 5; check its display ..."""  # noqa: E501
     laser = bench.lit_laser()
     assert bench.model.touch("BASE:HIGH", "3")
     with pytest.raises(DeviceError, match="high is 3 instead of 5"):
@@ -310,7 +310,7 @@ def test_switched_on_at_the_panel(bench: AwgBench) -> None:
 
 @pytest.mark.fault("generator rebooted")
 def test_rebooted_while_lit(bench: AwgBench) -> None:
-    """driver: output reads OFF, light is refused until configured anew; user reads: output found off; restarted, or switched off by hand."""  # noqa: E501
+    """driver: output reads OFF, light is refused until it is configured; user reads: output found off; restarted, or switched off by hand."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.reboot()
     assert laser.readback().output is LaserOutput.OFF
@@ -347,7 +347,7 @@ def test_kernel_driver_and_second_program(bench: AwgBench) -> None:
 
 @pytest.mark.fault("no permission, busy")
 def test_no_permission(bench: AwgBench) -> None:
-    """driver: waits for permission, named; user reads: permission denied; install the udev rules of docs/hardware.md ..."""  # noqa: E501
+    """driver: opens once permission is there; user reads: permission denied; install the udev rules of docs/hardware.md ..."""  # noqa: E501
     bench.model.denied = True
     with pytest.raises(DeviceError, match="permission denied; install the udev rules"):
         bench.laser()
@@ -357,7 +357,7 @@ def test_no_permission(bench: AwgBench) -> None:
 
 @pytest.mark.fault("no permission, busy")
 def test_no_generator_and_two(bench: AwgBench) -> None:
-    """driver: refuses to guess; user reads: no such device on the bus; check cable ... / 2 devices match ...; give the serial."""  # noqa: E501
+    """driver: refuses to choose; user reads: no such device on the bus; check cable ... / 2 devices match ...; give the serial."""  # noqa: E501
     bench.models = []
     with pytest.raises(DeviceGoneError, match="laser generator: no such device on the bus"):
         bench.laser()
@@ -368,8 +368,8 @@ def test_no_generator_and_two(bench: AwgBench) -> None:
     assert bench.laser(serial="AWG0000000002").identity.serial == "AWG0000000002"
 
 
-def test_faults_in_a_row_never_leave_light_behind(bench: AwgBench) -> None:
-    """Any single fault at any transfer up to light: lit as asked, or known to be unknown."""
+def test_any_single_fault_on_the_way_to_light_leaves_no_unknown_light(bench: AwgBench) -> None:
+    """Lit as requested, or reported as unknown."""
     outcomes = set()
     for at in range(60):
         for fault in ("stall_in", "stall_out", "wrong_tags", "lost_replies", "gone"):
@@ -402,16 +402,15 @@ def _struck(fault: str, at: int) -> str:
         laser.arm()
         laser.enable()
     except DeviceError as error:
-        told = "unknown" if "laser state unknown" in str(error) else "dark"
-        assert (laser.readback().output is LaserOutput.UNKNOWN) == (told == "unknown")
-        if told == "dark":
-            assert not bench.model.output
-        return told
+        unknown = "laser state unknown" in str(error)
+        assert (laser.readback().output is LaserOutput.UNKNOWN) == unknown
+        assert unknown or not bench.model.output
+        return "unknown" if unknown else "off"
     assert bench.model.lit
     return "lit"
 
 
-def test_off_from_many_threads_is_off(bench: AwgBench, log: Path) -> None:
+def test_disabled_from_many_threads_it_is_off(bench: AwgBench, log: Path) -> None:
     laser = bench.lit_laser()
     threads = [threading.Thread(target=laser.disable) for _ in range(8)]
     for thread in threads:

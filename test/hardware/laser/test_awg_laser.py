@@ -1,4 +1,4 @@
-"""The laser's generator: dark by default, lit only as configured and read back."""
+"""The laser's generator: off by default, enabled only as configured and read back."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def bench(tmp_path: Path) -> AwgBench:
     return AwgBench(tmp_path / "laser.log")
 
 
-def states(bench: AwgBench, tmp_path: Path) -> list[str]:
+def states(tmp_path: Path) -> list[str]:
     return [state for _, state in truth(tmp_path / "laser.log")]
 
 
@@ -41,10 +41,10 @@ def test_construction_switches_a_lit_generator_off(bench: AwgBench, tmp_path: Pa
     assert next(iter(bench.model.commands)) == ":CHANnel1:OUTPut OFF"
     assert [channel.output for channel in bench.model.channels] == [False, False]
     assert laser.readback().output is LaserOutput.OFF
-    assert states(bench, tmp_path) == ["OFF", "ON", "OFF"]
+    assert states(tmp_path) == ["OFF", "ON", "OFF"]
 
 
-def test_identity_is_what_the_generator_says(bench: AwgBench) -> None:
+def test_identity_is_read_from_the_generator(bench: AwgBench) -> None:
     identity = bench.laser().identity
     assert (identity.model, identity.serial) == ("UNI-T UTG962E", "AWG1234567890")
     assert identity.firmware == "V1.08"
@@ -114,17 +114,13 @@ def test_panel_is_free_after_every_call(bench: AwgBench) -> None:
         assert not bench.model.locked
 
 
-def test_levels_never_cross_and_never_exceed(bench: AwgBench) -> None:
-    seen: list[tuple[float, float]] = []
-    bench.model.on_change = lambda *_: None
-    laser = bench.laser()
+def test_levels_can_be_set_from_any_others(bench: AwgBench) -> None:
     for low, high in ((0.0, 5.0), (2.0, 3.0), (0.0, 1.0), (1.5, 4.0)):
-        laser.close()
         laser = bench.laser(low_v=low, high_v=high)
         laser.configure(SQUARE)
         state = bench.model.channels[0]
-        seen.append((state.low_v, state.high_v))
-    assert seen == [(0.0, 5.0), (2.0, 3.0), (0.0, 1.0), (1.5, 4.0)]
+        assert (state.low_v, state.high_v) == (low, high)
+        laser.close()
 
 
 def test_volts_stay_volts_whatever_the_load_was(bench: AwgBench) -> None:
@@ -134,26 +130,6 @@ def test_volts_stay_volts_whatever_the_load_was(bench: AwgBench) -> None:
     assert bench.model.channels[0].load_ohm == 10000.0
 
 
-def test_enable_needs_arming_each_time(bench: AwgBench) -> None:
-    laser = bench.lit_laser()
-    laser.disable()
-    with pytest.raises(DeviceError, match="not armed; arm it"):
-        laser.enable()
-    laser.arm()
-    laser.disable()
-    with pytest.raises(DeviceError, match="not armed"):
-        laser.enable()
-    assert not bench.model.output
-
-
-def test_enable_needs_a_configuration(bench: AwgBench) -> None:
-    laser = bench.laser()
-    laser.arm()
-    with pytest.raises(DeviceError, match="not configured"):
-        laser.enable()
-    assert not bench.model.output
-
-
 def test_off_again_and_again_is_off(bench: AwgBench, tmp_path: Path) -> None:
     laser = bench.lit_laser()
     for _ in range(3):
@@ -161,18 +137,18 @@ def test_off_again_and_again_is_off(bench: AwgBench, tmp_path: Path) -> None:
     laser.close()
     laser.close()
     laser.disable()
-    assert states(bench, tmp_path) == ["OFF", "ON", "OFF"]
+    assert states(tmp_path) == ["OFF", "ON", "OFF"]
     assert bench.model.channels[0].high_v == 0.01
     with pytest.raises(DeviceError, match="closed; open it again"):
         laser.configure(SQUARE)
 
 
-def test_changed_while_lit_is_dark_in_between_and_lit_again(
+def test_configured_while_on_it_is_off_in_between_and_on_again(
     bench: AwgBench, tmp_path: Path
 ) -> None:
     laser = bench.lit_laser()
     laser.configure(Modulation(1000.0))
-    assert states(bench, tmp_path) == ["OFF", "ON", "OFF", "ON"]
+    assert states(tmp_path) == ["OFF", "ON", "OFF", "ON"]
     assert bench.model.channels[0].frequency_hz == 1000.0
     assert laser.readback().modulation.frequency_hz == 1000.0
     with pytest.raises(ArgumentError, match="sine has none"):
@@ -180,27 +156,27 @@ def test_changed_while_lit_is_dark_in_between_and_lit_again(
     assert bench.model.lit
 
 
-def test_readback_tells_when_and_no_phase(bench: AwgBench) -> None:
+def test_readback_has_the_time_of_the_switch_and_no_phase(bench: AwgBench) -> None:
     laser = bench.laser()
     laser.configure(SQUARE)
     laser.arm()
     bench.clock.now_ns += 5_000
     laser.enable()
-    told = laser.readback()
-    assert (told.output, told.output_since_ns) == (LaserOutput.ON, bench.clock.now_ns)
-    assert told.phase_epoch_ns is None
-    assert told.modulation == SQUARE
+    readback = laser.readback()
+    assert (readback.output, readback.output_since_ns) == (LaserOutput.ON, bench.clock.now_ns)
+    assert readback.phase_epoch_ns is None
+    assert readback.modulation == SQUARE
 
 
-def test_world_hears_light_and_its_waveform(bench: AwgBench) -> None:
-    heard: list[tuple[int, bool, float]] = []
+def test_change_of_light_is_reported_with_its_waveform(bench: AwgBench) -> None:
+    changes: list[tuple[bool, float]] = []
     laser = bench.laser()
     laser.configure(SQUARE)
-    bench.model.on_change = lambda t, lit, wave: heard.append((t, lit, wave.frequency_hz))
+    bench.model.on_change = lambda _, lit, wave: changes.append((lit, wave.frequency_hz))
     laser.arm()
     laser.enable()
     laser.disable()
-    assert [(lit, hz) for _, lit, hz in heard] == [(True, 70.0), (False, 70.0)]
+    assert changes == [(True, 70.0), (False, 70.0)]
 
 
 def test_warns_of_another_model_and_goes_on(bench: AwgBench, tmp_path: Path) -> None:
@@ -236,36 +212,35 @@ def test_best_effort_still_refuses_what_contradicts(bench: AwgBench) -> None:
         laser.configure(Modulation(70.0, 0.3))
 
 
-class Meddler(threading.Thread):
-    """Switches off from another thread in the middle of something."""
-
-    def __init__(self, laser: AwgLaser) -> None:
-        super().__init__()
-        self._laser = laser
-
-    def run(self) -> None:
-        self._laser.disable()
-
-
-def test_off_interrupts_what_is_under_way(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    laser = bench.ready_laser()
-    meddler = Meddler(laser)
+def disable_at(
+    bench: AwgBench, laser: AwgLaser, command: str, monkeypatch: pytest.MonkeyPatch
+) -> tuple[threading.Thread, list[str]]:
+    """Disable from another thread once the generator gets ``command``; also what it gets then."""
+    disabling = threading.Thread(target=laser.disable)
     execute = bench.model._execute
     after: list[str] = []
 
-    def slow(text: str) -> None:
+    def executing(text: str) -> None:
         execute(text)
-        if "BASE:FREQuency 500" in text:
-            meddler.start()
+        if disabling.ident is not None:
+            after.append(text.strip())
+        elif command in text:
+            disabling.start()
             while not laser._in_flight.disabling_now:
                 pass
-        elif meddler.ident is not None:
-            after.append(text.strip())
 
-    monkeypatch.setattr(bench.model, "_execute", slow)
+    monkeypatch.setattr(bench.model, "_execute", executing)
+    return disabling, after
+
+
+def test_disabling_interrupts_the_command_in_progress(
+    bench: AwgBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laser = bench.ready_laser()
+    disabling, after = disable_at(bench, laser, "BASE:FREQuency 500", monkeypatch)
     with pytest.raises(DeviceError, match="switched off meanwhile"):
         laser.configure(Modulation(500.0))
-    meddler.join()
+    disabling.join()
     assert after[0] == ":CHANnel1:OUTPut OFF"
     assert not any(" 25" in text or "OUTPut ON" in text for text in after)
     with pytest.raises(DeviceError, match="not armed"):
@@ -279,20 +254,10 @@ def test_interrupted_light_can_be_switched_on_again(
     laser = bench.ready_laser()
     if operation == "readback":
         laser.enable()
-    meddler = Meddler(laser)
-    execute = bench.model._execute
-
-    def slow(text: str) -> None:
-        execute(text)
-        if "BASE:FREQuency?" in text and meddler.ident is None:
-            meddler.start()
-            while not laser._in_flight.disabling_now:
-                pass
-
-    monkeypatch.setattr(bench.model, "_execute", slow)
+    disabling, _ = disable_at(bench, laser, "BASE:FREQuency?", monkeypatch)
     with pytest.raises(DeviceError, match="switched off meanwhile"):
         getattr(laser, operation)()
-    meddler.join()
+    disabling.join()
     assert not bench.model.lit
     laser.arm()
     laser.enable()
@@ -339,7 +304,7 @@ def test_opened_by_keywords(bench: AwgBench) -> None:
         open_laser(colour="red")
 
 
-def test_stall_while_switching_on_ends_dark(bench: AwgBench, monkeypatch: Any) -> None:
+def test_stall_while_switching_on_leaves_the_output_off(bench: AwgBench, monkeypatch: Any) -> None:
     laser = bench.ready_laser()
     execute = bench.model._execute
 

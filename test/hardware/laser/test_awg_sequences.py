@@ -1,4 +1,4 @@
-"""Any sequence of calls and faults: what the driver says of the light is never too little."""
+"""Any sequence of calls and faults: an output that is on is never reported as off."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def call(laser: AwgLaser, name: str) -> None:
 
 
 def attempt(laser: AwgLaser, name: str) -> str:
-    """Make a call; what it was refused with, if it was."""
+    """Make a call; returns the error it was refused with, if it was."""
     try:
         call(laser, name)
     except DeviceError as error:
@@ -48,7 +48,7 @@ def attempt(laser: AwgLaser, name: str) -> str:
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.sampled_from(CALLS + tuple(FAULTS)), max_size=25))
-def test_light_is_never_denied(steps: list[str]) -> None:
+def test_output_that_is_on_is_never_reported_as_off(steps: list[str]) -> None:
     bench = AwgBench()
     laser = bench.laser()
     for step in steps:
@@ -63,7 +63,7 @@ def test_light_is_never_denied(steps: list[str]) -> None:
         if bench.model.output:
             assert laser._output is not LaserOutput.OFF
         assert not bench.model.locked or bench.model.mute
-    # All is well again.
+    # Without faults again.
     bench.model.mute = False
     bench.model.faults = AwgFaults()
     laser.disable()
@@ -75,7 +75,7 @@ def test_light_is_never_denied(steps: list[str]) -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.sampled_from(CALLS), max_size=25))
-def test_without_faults_only_arming_and_configuring_are_asked_for(steps: list[str]) -> None:
+def test_without_faults_only_arming_and_configuring_are_required(steps: list[str]) -> None:
     bench = AwgBench()
     laser = bench.laser()
     ready = armed = False

@@ -1,4 +1,4 @@
-"""SCPI layer: whatever comes as a reply is a value of the kind asked for, or a typed error."""
+"""SCPI layer: any reply is a value of the kind that was requested, or a typed error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROFILE = load_profile("utg900e")
 
 
 class Answering(UsbTmc):
-    """A link that gives prepared replies and remembers what it was asked to do."""
+    """A link that gives prepared replies and records what it is called with."""
 
     def __init__(self, *replies: bytes | DeviceError) -> None:
         self.replies = list(replies)
@@ -62,7 +62,7 @@ def test_replies_as_instruments_write_them(name: str, reply: bytes, value: objec
 
 
 @pytest.mark.parametrize("reply", [b"70 mHg", b"1,5", b"70 70", b"nan", b"", b"0x10"])
-def test_what_is_no_number_is_refused(reply: bytes) -> None:
+def test_reply_that_is_no_number_is_refused(reply: bytes) -> None:
     with pytest.raises(DeviceError, match="which is no number"):
         scpi(Answering(reply, reply)).get("frequency", 1)
 
@@ -82,7 +82,7 @@ def test_any_reply_is_a_value_or_a_typed_error(reply: bytes, name: str) -> None:
     assert link.clears == (2 if refusal else 0)
 
 
-def test_one_fault_is_retried_two_are_told() -> None:
+def test_one_fault_is_retried_two_are_raised() -> None:
     fault = DeviceTimeoutError("silence")
     link = Answering(fault, b"ON")
     layer = scpi(link)

@@ -1,4 +1,4 @@
-"""USBTMC client on the emulated bus: every header checked, never asked twice, always recovered."""
+"""USBTMC client on the emulated bus: checked headers, one request for a reply, recovery."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from eschorty_ros.hardware.laser.usbtmc import REPLY_LIMIT, UsbTmc, is_usbtmc
 
 
 class Echo(AwgModel):
-    """A generator that says what it is told to say."""
+    """A generator that replies with ``reply_text`` to any query."""
 
     def __init__(self) -> None:
         super().__init__(lambda: 0, wait=lambda *_: False)
-        self.says = "0"
+        self.reply_text = "0"
         self.requests = 0
 
     def _queried(self, path: str) -> str | None:
-        return self.says
+        return self.reply_text
 
     def _answer(self, tag: int, wanted: int) -> None:
         self.requests += 1
@@ -44,7 +44,7 @@ def model() -> Echo:
 @pytest.fixture
 def link(model: Echo) -> Iterator[UsbTmc]:
     device = usb.core.find(backend=EmulatedBackend(lambda: [model]), custom_match=is_usbtmc)
-    # Nothing is waited for here: every wait of the model is over at once.
+    # Every wait of the model ends at once.
     link = UsbTmc(device, name="generator", timeout_s=60.0)
     yield link
     link.close()
@@ -56,7 +56,7 @@ def ask(link: UsbTmc) -> bytes:
 
 
 def test_reply_without_newline_is_one_request(link: UsbTmc, model: Echo) -> None:
-    model.says = "70.5"
+    model.reply_text = "70.5"
     assert ask(link) == b"70.5"
     assert model.requests == 1
 
@@ -66,13 +66,13 @@ def test_reply_without_newline_is_one_request(link: UsbTmc, model: Echo) -> None
     length=st.one_of(st.integers(0, 400), st.integers(4080, 4200)),
     cut=st.sampled_from([0, 1, 5, 52, 64, 500]),
 )
-def test_replies_of_any_length_and_cut_come_whole(length: int, cut: int) -> None:
+def test_replies_of_any_length_and_cut_are_joined(length: int, cut: int) -> None:
     model = Echo()
     device = usb.core.find(backend=EmulatedBackend(lambda: [model]), custom_match=is_usbtmc)
     link = UsbTmc(device, name="generator", timeout_s=0.05)
-    model.says = "abcdefghij"[: length % 10] + "x" * (length - length % 10)
+    model.reply_text = "abcdefghij"[: length % 10] + "x" * (length - length % 10)
     model.faults.transfer_bytes = cut
-    assert ask(link) == model.says.encode()
+    assert ask(link) == model.reply_text.encode()
     link.close()
 
 
@@ -80,9 +80,9 @@ def test_replies_of_any_length_and_cut_come_whole(length: int, cut: int) -> None
 def test_reply_of_whole_packets_without_an_empty_one_does_not_block(
     link: UsbTmc, model: Echo, packets: int
 ) -> None:
-    model.says = "7" * (packets * PACKET - 12)
-    assert ask(link) == model.says.encode()
-    assert ask(link) == model.says.encode()
+    model.reply_text = "7" * (packets * PACKET - 12)
+    assert ask(link) == model.reply_text.encode()
+    assert ask(link) == model.reply_text.encode()
 
 
 def test_reply_tags_run_round_without_zero(link: UsbTmc) -> None:
@@ -91,11 +91,11 @@ def test_reply_tags_run_round_without_zero(link: UsbTmc) -> None:
 
 
 def test_endless_reply_is_refused(link: UsbTmc, model: Echo) -> None:
-    model.says = "x" * (REPLY_LIMIT + 5000)
+    model.reply_text = "x" * (REPLY_LIMIT + 5000)
     with pytest.raises(DeviceError, match="longer than 65536"):
         ask(link)
     link.clear()
-    model.says = "1"
+    model.reply_text = "1"
     assert ask(link) == b"1"
 
 
@@ -149,7 +149,7 @@ def test_empty_packet_before_a_reply_is_skipped(link: UsbTmc, model: Echo) -> No
     assert ask(link) == b"0"
 
 
-def test_unplugged_is_told_apart(link: UsbTmc, model: Echo) -> None:
+def test_unplugged_has_an_error_of_its_own(link: UsbTmc, model: Echo) -> None:
     model.gone = True
     with pytest.raises(DeviceGoneError, match="generator: sending a command"):
         ask(link)

@@ -1,4 +1,4 @@
-"""Whatever happens to the process that wants light, its guard makes it dark."""
+"""The guard disables the output whatever happens to the process that enabled it."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import generator_double
 import pytest
-from generator_double import MAKE, Generator
+from awg_process import AwgProcess
 from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
@@ -30,39 +29,51 @@ from eschorty_ros.hardware.laser_guard.opening import maker, open_again
 
 OFF_LIMIT_S = 0.25
 TIMEOUT_S = 0.5
-# Where silence is not the subject: a loaded machine may let the owner wait.
+# Where heartbeats are not the subject: a loaded machine may delay the owner.
 LONG_S = 30.0
-TEST_FOLDER = str(Path(__file__).parents[2] / "support")
+AWG = "eschorty_ros.hardware.laser.awg:open_laser"
+INTERRUPTIBLE = "interruptible_awg:open_laser"
+SQUARE = Modulation(70.0)
+SUPPORT_FOLDER = str(Path(__file__).parents[2] / "support")
 
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The guard imports the double."""
-    monkeypatch.setenv("PYTHONPATH", f"{TEST_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
+    """The guard imports drivers of the tests."""
+    monkeypatch.setenv("PYTHONPATH", f"{SUPPORT_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
 
 
-@pytest.fixture
-def device(tmp_path: Path) -> Iterator[Generator]:
-    with generator_double.generator(tmp_path) as made:
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AwgProcess]:
+    with AwgProcess(tmp_path_factory.mktemp("generator")) as made:
         yield made
 
 
+@pytest.fixture
+def awg(shared: AwgProcess) -> Iterator[AwgProcess]:
+    yield shared
+    assert not shared.lit()
+
+
 @contextlib.contextmanager
-def opened(device: Generator, timeout_s: float = LONG_S, **settings: str) -> Iterator[GuardedLaser]:
-    """A laser that is closed whatever the test comes to."""
-    made = GuardedLaser(MAKE, {**device.settings, **settings}, heartbeat_timeout_s=timeout_s)
+def opened(
+    awg: AwgProcess, timeout_s: float = LONG_S, make: str = AWG, **settings: str
+) -> Iterator[GuardedLaser]:
+    """A configured laser that is closed whatever the result of the test."""
+    made = GuardedLaser(make, {"backend": awg.backend, **settings}, heartbeat_timeout_s=timeout_s)
     try:
+        made.configure(SQUARE)
         yield made
     finally:
         with contextlib.suppress(DeviceError):
             made.close()
+        _wait_for_end(made.guard_pid)
 
 
 @pytest.fixture
-def laser(device: Generator) -> Iterator[GuardedLaser]:
-    with opened(device) as made:
+def laser(awg: AwgProcess) -> Iterator[GuardedLaser]:
+    with opened(awg) as made:
         yield made
-    assert not device.lit()
 
 
 def light(laser: GuardedLaser) -> None:
@@ -70,41 +81,42 @@ def light(laser: GuardedLaser) -> None:
     laser.enable()
 
 
-def test_output_follows_and_is_read_back(laser: GuardedLaser, device: Generator) -> None:
-    assert laser.identity.serial == "42"
+def test_output_follows_and_is_read_back(laser: GuardedLaser, awg: AwgProcess) -> None:
+    assert laser.identity.serial == "AWG1234567890"
     laser.configure(Modulation(100.0, 0.25, "pulse"))
     light(laser)
-    assert device.lit()
+    assert awg.lit()
     state = laser.readback()
     assert (state.output, state.modulation) == (LaserOutput.ON, Modulation(100.0, 0.25, "pulse"))
     laser.disable()
     laser.disable()
-    assert not device.lit()
+    assert not awg.lit()
     assert laser.readback().output is LaserOutput.OFF
 
 
-def test_enable_needs_arming_each_time(laser: GuardedLaser, device: Generator) -> None:
+def test_enable_needs_arming_each_time(laser: GuardedLaser, awg: AwgProcess) -> None:
+    before = len(awg.outputs())
     for _ in range(2):
         with pytest.raises(DeviceError, match="not armed"):
             laser.enable()
         light(laser)
         laser.disable()
-    assert [output for _, output in device.lines()] == ["OFF", "ON", "OFF", "ON", "OFF"]
+    assert awg.outputs()[before:] == ["ON", "OFF", "ON", "OFF"]
 
 
-def test_close_switches_off_and_releases(device: Generator) -> None:
-    with opened(device) as laser:
+def test_close_switches_off_and_releases(awg: AwgProcess) -> None:
+    with opened(awg) as laser:
         light(laser)
         laser.close()
         laser.close()
-        assert not device.lit()
-    with opened(device) as laser:
+        assert not awg.lit()
+    with opened(awg) as laser:
         laser.close()
 
 
-def test_generator_that_is_absent_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DeviceGoneError, match="no generator"):
-        GuardedLaser(MAKE, {"path": str(tmp_path / "nowhere")})
+def test_generator_that_is_absent_is_one_line(awg: AwgProcess) -> None:
+    with pytest.raises(DeviceGoneError, match="no such device with serial 1"):
+        GuardedLaser(AWG, {"backend": awg.backend, "serial": "1"})
 
 
 def test_driver_that_is_absent_is_one_line() -> None:
@@ -112,19 +124,20 @@ def test_driver_that_is_absent_is_one_line() -> None:
         GuardedLaser("nowhere:laser", {})
 
 
-def test_second_client_is_refused(laser: GuardedLaser, device: Generator) -> None:
-    with pytest.raises(DeviceError, match="busy"):
-        GuardedLaser(MAKE, device.settings)
+def test_second_client_is_refused(laser: GuardedLaser, awg: AwgProcess) -> None:
+    with pytest.raises(DeviceError, match="in use; close the other program"):
+        GuardedLaser(AWG, {"backend": awg.backend})
 
 
 OWNER = """
 import ctypes, faulthandler, os, signal, subprocess, sys, time
 for number in (signal.SIGHUP, signal.SIGTERM):
     signal.signal(number, signal.SIG_DFL)  # inherited as ignored under nohup
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
-laser = GuardedLaser(
-    "generator_double:GeneratorLaser", {"path": sys.argv[1]}, heartbeat_timeout_s=float(sys.argv[2])
-)
+driver, backend, timeout_s = sys.argv[1:]
+laser = GuardedLaser(driver, {"backend": backend}, heartbeat_timeout_s=float(timeout_s))
+laser.configure(Modulation(70.0))
 laser.arm()
 laser.enable()
 print(laser.guard_pid, flush=True)
@@ -143,7 +156,7 @@ elif way == "exit":
 elif way == "exception":
     raise RuntimeError("nobody catches this")
 elif way == "gil":
-    # A library that never comes back and keeps the interpreter to itself.
+    # A library that never returns and keeps the interpreter to itself.
     ctypes.PyDLL(None).sleep(3)
 elif way in ("child", "fork"):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -152,17 +165,14 @@ time.sleep(30.0)
 
 
 class Owner:
-    """A process that has switched the light on."""
+    """A process that has enabled the output."""
 
     def __init__(
-        self,
-        device: Generator,
-        stderr: int = subprocess.DEVNULL,
-        timeout_s: float = LONG_S,
+        self, awg: AwgProcess, stderr: int = subprocess.DEVNULL, timeout_s: float = LONG_S
     ) -> None:
-        self.device = device
+        self.awg = awg
         self.process = subprocess.Popen(
-            [sys.executable, "-c", OWNER, str(device.path), str(timeout_s)],
+            [sys.executable, "-c", OWNER, AWG, awg.backend, str(timeout_s)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -170,82 +180,90 @@ class Owner:
         )
         try:
             self.guard_pid = int(self._line())
-            assert "ON" in [output for _, output in device.lines()]
+            assert awg.lit()
         except BaseException:
-            self.close()
+            self._kill()
             raise
 
     def die(self, way: str) -> float:
-        """Seconds from the order to darkness."""
+        """Seconds from the order until the output is off."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{way}\n")
         self.process.stdin.flush()
-        return self.device.off_after_s(int(self._line()))
+        return self.awg.off_after_s(int(self._line()))
 
     def send(self, number: int) -> float:
-        """Seconds from the signal to darkness."""
+        """Seconds from the signal until the output is off."""
         sent_ns = time.monotonic_ns()
         self.process.send_signal(number)
-        return self.device.off_after_s(sent_ns)
+        return self.awg.off_after_s(sent_ns)
 
     def _line(self) -> str:
         assert self.process.stdout is not None
         return self.process.stdout.readline()
 
-    def close(self) -> None:
+    def _kill(self) -> None:
         self.process.kill()
-        self.process.communicate()
+        self.process.wait()
+        # A child of it may keep the other ends open.
+        for stream in (self.process.stdin, self.process.stdout):
+            assert stream is not None
+            stream.close()
+
+    def close(self) -> None:
+        self._kill()
+        _wait_for_end(self.guard_pid)
 
 
 @pytest.fixture
-def owner(device: Generator) -> Iterator[Owner]:
-    made = Owner(device)
+def owner(awg: AwgProcess) -> Iterator[Owner]:
+    made = Owner(awg)
     yield made
     made.close()
 
 
 @pytest.mark.parametrize("way", ["abort", "segfault", "exit", "exception", "child", "fork"])
-def test_dark_when_the_owner_ends(owner: Owner, way: str) -> None:
+def test_off_when_the_owner_ends(owner: Owner, way: str) -> None:
     took_s = owner.die(way)
-    print(f"{way}: dark after {took_s * 1e3:.1f} ms")
+    print(f"{way}: off after {took_s * 1e3:.1f} ms")
     assert took_s < OFF_LIMIT_S
     _wait_for_end(owner.guard_pid)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGSTOP])
-def test_dark_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
+def test_off_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
     took_s = owner.send(number)
-    print(f"signal {number}: dark after {took_s * 1e3:.1f} ms")
+    print(f"signal {number}: off after {took_s * 1e3:.1f} ms")
     assert took_s < OFF_LIMIT_S
 
 
-def test_dark_when_the_owner_hangs(device: Generator) -> None:
-    owner = Owner(device, timeout_s=TIMEOUT_S)
+def test_off_when_the_owner_hangs(awg: AwgProcess) -> None:
+    owner = Owner(awg, timeout_s=TIMEOUT_S)
     try:
         took_s = owner.die("gil")
     finally:
         owner.close()
-    print(f"silent: dark after {took_s * 1e3:.1f} ms")
+    print(f"no heartbeat: off after {took_s * 1e3:.1f} ms")
     assert took_s < TIMEOUT_S + OFF_LIMIT_S
 
 
-def test_guard_is_deaf_to_the_terminal(owner: Owner) -> None:
+def test_guard_ignores_the_terminals_signals(owner: Owner) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         os.kill(owner.guard_pid, number)
     time.sleep(0.2)
-    assert owner.device.lit()
+    assert owner.awg.lit()
     assert os.getsid(owner.guard_pid) == owner.guard_pid
     assert owner.send(signal.SIGKILL) < OFF_LIMIT_S
 
 
-def test_nobody_reading_what_the_guard_says_keeps_it_from_nothing(device: Generator) -> None:
+def test_full_standard_error_does_not_delay_the_guard(awg: AwgProcess) -> None:
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     with contextlib.suppress(BlockingIOError):
         while True:
             os.write(writing, b"x" * 4096)
     os.set_blocking(writing, True)
-    owner = Owner(device, stderr=writing)
+    owner = Owner(awg, stderr=writing)
     try:
         for number in (signal.SIGSTOP, signal.SIGKILL):
             assert owner.send(number) < OFF_LIMIT_S
@@ -257,28 +275,29 @@ def test_nobody_reading_what_the_guard_says_keeps_it_from_nothing(device: Genera
 
 
 def test_guard_imports_nothing_from_the_current_folder(
-    device: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    awg: AwgProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("json", "socket", "generator_double", "eschorty_ros"):
+    for module in ("json", "socket", "usb", "eschorty_ros"):
         (tmp_path / f"{module}.py").write_text("raise SystemExit('from the current folder')")
     monkeypatch.chdir(tmp_path)
-    test_close_switches_off_and_releases(device)
+    test_close_switches_off_and_releases(awg)
 
 
 def test_guard_runs_the_package_that_started_it(
-    device: Generator, monkeypatch: pytest.MonkeyPatch
+    awg: AwgProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also from a checkout that is no more than the current folder."""
-    monkeypatch.setenv("PYTHONPATH", TEST_FOLDER)
-    test_close_switches_off_and_releases(device)
+    monkeypatch.setenv("PYTHONPATH", SUPPORT_FOLDER)
+    test_close_switches_off_and_releases(awg)
 
 
-def test_silence_disarms_until_armed_again(device: Generator) -> None:
-    with opened(device, TIMEOUT_S) as laser:
+def test_missing_heartbeats_disarm_until_armed_again(awg: AwgProcess) -> None:
+    before = len(awg.outputs())
+    with opened(awg, TIMEOUT_S) as laser:
         light(laser)
         began_ns = time.monotonic_ns()
         ctypes.PyDLL(None).sleep(2)
-        assert device.off_after_s(began_ns) < TIMEOUT_S + OFF_LIMIT_S
+        assert awg.off_after_s(began_ns) < TIMEOUT_S + OFF_LIMIT_S
         state = laser.readback()
         assert state.output is LaserOutput.OFF
         assert "no heartbeat for 0.5 s" in state.reason
@@ -287,36 +306,36 @@ def test_silence_disarms_until_armed_again(device: Generator) -> None:
         light(laser)
         assert laser.readback().reason == ""
         laser.close()
-        assert [output for _, output in device.lines()] == ["OFF", "ON", "OFF", "ON", "OFF"]
+        assert awg.outputs()[before:] == ["ON", "OFF", "ON", "OFF"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])
-def test_dark_when_the_guard_dies(laser: GuardedLaser, device: Generator, number: int) -> None:
+def test_off_when_the_guard_dies(laser: GuardedLaser, awg: AwgProcess, number: int) -> None:
     light(laser)
     sent_ns = time.monotonic_ns()
     os.kill(laser.guard_pid, number)
-    took_s = device.off_after_s(sent_ns)
-    print(f"guard gets signal {number}: dark after {took_s * 1e3:.1f} ms")
+    took_s = awg.off_after_s(sent_ns)
+    print(f"guard gets signal {number}: off after {took_s * 1e3:.1f} ms")
     assert took_s < OFF_LIMIT_S
     for call in (laser.arm, laser.enable, laser.readback):
         with pytest.raises(DeviceGoneError, match="output switched off; configure"):
             call()
     laser.disable()
-    assert not device.lit()
+    assert not awg.lit()
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_closing_when_the_guard_has_just_died_is_dark(device: Generator, number: int) -> None:
-    with opened(device) as laser:
+def test_closing_when_the_guard_has_just_died_switches_off(awg: AwgProcess, number: int) -> None:
+    with opened(awg) as laser:
         light(laser)
         os.kill(laser.guard_pid, number)
         with contextlib.suppress(DeviceError):
             laser.close()
-        assert not device.lit()
+        assert not awg.lit()
 
 
-def test_a_guard_that_stood_still_itself_calls_nobody_silent(
-    device: Generator, monkeypatch: pytest.MonkeyPatch
+def test_stall_of_the_guard_is_no_missing_heartbeat(
+    awg: AwgProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = StallClock(monkeypatch)
     monkeypatch.setattr(guard, "time", clock)
@@ -325,115 +344,125 @@ def test_a_guard_that_stood_still_itself_calls_nobody_silent(
     serving = threading.Thread(target=guard.Guard(Wire(there), os.getpid()).run)
     serving.start()
     try:
-        wire.send({"id": 0, "do": "open", "make": MAKE, "settings": device.settings,
-                   "heartbeat_timeout_s": TIMEOUT_S})  # fmt: skip
-        for number, command in enumerate(("arm", "enable"), 1):
-            wire.send({"id": number, "do": command})
-        wait_until(device.lit, "light")
+        orders: list[dict[str, object]] = [
+            {
+                "do": "open",
+                "make": AWG,
+                "settings": {"backend": awg.backend},
+                "heartbeat_timeout_s": TIMEOUT_S,
+            },
+            {"do": "configure", "modulation": {"frequency_hz": 70.0}},
+            {"do": "arm"},
+            {"do": "enable"},
+        ]
+        for number, order in enumerate(orders):
+            wire.send({"id": number, **order})
+        wait_until(awg.lit, "light")
         clock.advance(60.0)
-        assert device.lit()
+        assert awg.lit()
         for _ in range(int(TIMEOUT_S / 0.05) + 2):
             clock.advance(0.05)
-        assert not device.lit()
+        wait_until(lambda: not awg.lit(), "the output off")
     finally:
         here.close()
         serving.join()
         there.close()
 
 
-def test_guard_whose_driver_crashes(device: Generator) -> None:
-    with opened(device, crash="readback") as laser:
+def test_guard_whose_driver_crashes(awg: AwgProcess) -> None:
+    with opened(awg, make=INTERRUPTIBLE) as laser:
         light(laser)
         with pytest.raises(DeviceGoneError, match="exit code 7"):
             laser.readback()
-        assert not device.lit()
+        assert not awg.lit()
         laser.close()
 
 
-def test_switching_off_overtakes(device: Generator, tmp_path: Path) -> None:
-    """Reading back does not end here; nobody waits for it in the light."""
-    held = tmp_path / "held"
-    with opened(device, held=str(held)) as laser:
+def test_disabling_interrupts_a_read_back(awg: AwgProcess, tmp_path: Path) -> None:
+    waits = tmp_path / "waits"
+    with opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser:
         light(laser)
         failures: list[Exception] = []
-        reader = _thread(lambda: laser.readback(), failures)
-        wait_until(held.exists, "the read-back under way")
+        join = _thread(laser.readback, failures)
+        wait_until(waits.exists, "the read-back in progress")
         asked_ns = time.monotonic_ns()
         laser.disable()
-        assert device.off_after_s(asked_ns) < OFF_LIMIT_S
-        reader()
+        assert awg.off_after_s(asked_ns) < OFF_LIMIT_S
+        join()
         assert "switched off meanwhile" in str(failures[0])
-        laser.close()
 
 
-def test_an_answer_that_comes_with_the_end_of_the_wait_counts(
-    device: Generator, monkeypatch: pytest.MonkeyPatch
+def test_an_answer_that_arrives_at_the_end_of_the_wait_counts(
+    awg: AwgProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(guarded, "_LATE_S", DEADLINE_S)
-    laser = GuardedLaser(MAKE, device.settings, heartbeat_timeout_s=LONG_S, answer_timeout_s=1e-9)
+    laser = GuardedLaser(
+        AWG, {"backend": awg.backend}, heartbeat_timeout_s=LONG_S, answer_timeout_s=1e-9
+    )
     with contextlib.closing(laser):
+        laser.configure(SQUARE)
         light(laser)
         assert laser.readback().output is LaserOutput.ON
 
 
-def test_what_was_asked_before_switching_off_is_void(
-    device: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_commands_requested_before_disabling_are_void(
+    awg: AwgProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = tmp_path / "held"
-    with opened(device, held=str(held)) as laser:
+    waits = tmp_path / "waits"
+    with opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser:
         light(laser)
-        asked: list[str] = []
+        sent: list[str] = []
         send = laser._wire.send
         monkeypatch.setattr(
-            laser._wire, "send", lambda message: (send(message), asked.append(message["do"]))
+            laser._wire, "send", lambda message: (send(message), sent.append(message["do"]))
         )
         failures: list[Exception] = []
-        waits = [_thread(laser.readback, failures)]
-        wait_until(held.exists, "the read-back under way")
-        waits += [_thread(step, failures) for step in (laser.arm, laser.enable)]
-        wait_until(lambda: {"arm", "enable"} <= set(asked), "both asked for")
+        joins = [_thread(laser.readback, failures)]
+        wait_until(waits.exists, "the read-back in progress")
+        joins += [_thread(step, failures) for step in (laser.arm, laser.enable)]
+        wait_until(lambda: {"arm", "enable"} <= set(sent), "both requested")
         laser.disable()
-        for wait in waits:
-            wait()
+        for join in joins:
+            join()
         assert len(failures) == 3, failures
-        assert not device.lit()
-        laser.close()
+        assert not awg.lit()
 
 
-def test_mute_generator_is_unknown_and_the_guard_insists(
-    device: Generator, monkeypatch: pytest.MonkeyPatch
+def test_mute_generator_is_unknown_and_the_guard_retries(
+    awg: AwgProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A guard that is replaced for being slow does not insist.
+    # A guard that is replaced for being slow does not retry.
     monkeypatch.setattr(guarded, "DISABLE_TIMEOUT_S", LONG_S)
-    with opened(device) as laser:
+    with opened(awg) as laser:
         light(laser)
-        device.press("MUTE")
-        with pytest.raises(DeviceError, match="gone"):
+        awg.do("mute")
+        with pytest.raises(DeviceError, match="laser state unknown"):
             laser.readback()
-        with pytest.raises(DeviceGoneError):
+        with pytest.raises(DeviceError, match="laser state unknown"):
             laser.disable()
         with contextlib.suppress(DeviceError):
             laser.close()
-        assert device.lit()
-        device.press("SPEAK")
-        device.off_after_s(time.monotonic_ns())
+        assert awg.lit()
+        awg.do("speak")
+        awg.off_after_s(time.monotonic_ns())
 
 
-def test_switching_off_is_tried_again_when_it_failed_in_the_dark(
-    laser: GuardedLaser, device: Generator
+def test_disabling_that_failed_without_light_is_retried_when_it_is_called_again(
+    laser: GuardedLaser, awg: AwgProcess
 ) -> None:
-    device.press("MUTE")
-    with pytest.raises(DeviceError, match="gone"):
+    awg.do("mute")
+    with pytest.raises(DeviceError, match="laser state unknown"):
         laser.disable()
-    device.press("SPEAK")
+    awg.do("speak")
     laser.disable()
+    laser.configure(SQUARE)
     light(laser)
-    assert device.lit()
+    assert awg.lit()
 
 
-def test_another_generator_does_not_pass_for_the_lost_one(device: Generator) -> None:
-    make = maker(MAKE, device.settings)
-    with pytest.raises(DeviceError, match="generator 41 is gone, 42 is there; connect 41"):
+def test_another_generator_is_not_taken_for_the_lost_one(awg: AwgProcess) -> None:
+    make = maker(AWG, {"backend": awg.backend})
+    with pytest.raises(DeviceError, match="generator 41 is gone, AWG1234567890 is there"):
         open_again(make, "41")
 
 

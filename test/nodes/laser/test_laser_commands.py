@@ -1,4 +1,4 @@
-"""The laser node's services while one of them is under way."""
+"""The laser node's services while one of them is in progress."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldL
     held = HeldLaser()
     monkeypatch.setattr(drivers, "make", lambda *_: held)
     context = Context()
-    # One beat and one arming have to last, whatever holds this process up.
+    # One heartbeat and one arming must last, whatever delays this process.
     given = ("-p", "watch:=none", "-p", "heartbeat_timeout:=60.0", "-p", "arm_timeout:=3600.0")
     rclpy.init(args=["--ros-args", *given], context=context, domain_id=observer.domain)
     node = LaserNode(context=context, namespace=NAMESPACE)
@@ -51,11 +51,11 @@ def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldL
     context.try_shutdown()
 
 
-def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser: HeldLaser) -> None:
+def test_disabling_does_not_wait_for_enabling(observer: Observer, laser: HeldLaser) -> None:
     observer.wait_for_state("laser", "active")
-    heart = observer.publisher(Header, CLIENT_HEARTBEAT, qos.heartbeat())
-    wait_until(heart.get_subscription_count, "the heartbeat's subscriber")
-    heart.publish(Header())
+    heartbeat = observer.publisher(Header, CLIENT_HEARTBEAT, qos.heartbeat())
+    wait_until(heartbeat.get_subscription_count, "the heartbeat's subscriber")
+    heartbeat.publish(Header())
     wait_until(lambda: observer.call(Trigger, "laser/arm").success, "arming")
     laser.hold = "enable"
     enabling = threading.Thread(
@@ -67,14 +67,14 @@ def test_switching_off_does_not_wait_for_switching_on(observer: Observer, laser:
         target=lambda: observer.call(SetBool, "laser/enable", SetBool.Request(data=False))
     )
     off.start()
-    assert laser.switched_off.wait(0.5 * DEADLINE_S), "switching off waits"
+    assert laser.disabled.wait(0.5 * DEADLINE_S), "disabling waits"
     laser.go.set()
     enabling.join()
     off.join()
-    assert laser.lightings == 0
+    assert laser.enablings == 0
 
 
-def test_interlock_that_goes_on_saying_open_switches_off_once(
+def test_interlock_that_is_reported_open_repeatedly_switches_off_once(
     observer: Observer, laser: HeldLaser
 ) -> None:
     observer.wait_for_state("laser", "active")

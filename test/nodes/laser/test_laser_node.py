@@ -1,4 +1,4 @@
-"""The laser node as a process: the emulated generator's own log says when there was light."""
+"""The laser node as a process: the emulated generator's own log shows when it was on."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from awg_process import AwgProcess
 from eschorty_ros.msg import LaserState
+from laser_bench import OFF_LIMIT_S, LaserBench
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, stamped_after, wait_until
 from std_msgs.msg import Bool, Header
-from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.emulation.awg.model import truth
@@ -25,7 +24,6 @@ from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
 
 MODULE = "eschorty_ros.nodes.laser.node"
-OFF_LIMIT_S = 0.25
 MAX_ON_S = 5.0
 STALE_S = 2.0
 PARAMETERS = {
@@ -36,77 +34,58 @@ PARAMETERS = {
 }
 
 
-class Bench:
-    """A laser node with its log, its state and a heartbeat that can be switched.
-
-    ``held`` ends the processes.
-    """
+class Bench(LaserBench):
+    """A laser node with a heartbeat that can be switched."""
 
     def __init__(
         self, held: contextlib.ExitStack, folder: Path, observer: Observer, **parameters: Any
     ) -> None:
-        self.awg = held.enter_context(AwgProcess(folder))
-        self.observer = observer
-        self.beating = False
-        self.process = held.enter_context(
-            NodeProcess(
-                MODULE,
-                {**PARAMETERS, "driver": "awg", "backend": self.awg.backend, **parameters},
-                domain=observer.domain,
-            )
-        )
-        self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
-        self._heart = observer.node.create_publisher(Header, "laser/heartbeat", qos.stream(10))
-        timer = observer.node.create_timer(0.03, self._beat)
+        super().__init__(held, folder, observer, **{**PARAMETERS, **parameters})
+        self.alive = False
+        self._heartbeat = observer.publisher(Header, CLIENT_HEARTBEAT, qos.stream(10))
+        timer = observer.node.create_timer(0.03, self._send)
         held.callback(observer.node.destroy_timer, timer)
-        self.interlock = observer.node.create_publisher(Bool, "laser/interlock", qos.stream(10))
         observer.wait_for_state("laser", "active")
-        wait_until(self._heart.get_subscription_count, "the heartbeat's subscriber")
+        wait_until(self._heartbeat.get_subscription_count, "the heartbeat's subscriber")
         wait_until(self.interlock.get_subscription_count, "the interlock's subscriber")
         wait_until(lambda: self.states, "a laser state")
 
-    def _beat(self) -> None:
-        if self.beating:
-            self._heart.publish(Header())
+    def _send(self) -> None:
+        if self.alive:
+            self._heartbeat.publish(Header())
 
-    def light(self) -> list[str]:
+    def outputs(self) -> list[str]:
         """ON and OFF as the generator logged them."""
         return self.awg.outputs()
 
     def switched_ns(self) -> list[int]:
-        """Times of the last light's begin and end, CLOCK_MONOTONIC."""
+        """Times at which the last light began and ended, CLOCK_MONOTONIC."""
         return [t_ns for t_ns, _ in truth(self.awg.log)[-2:]]
 
-    def arm(self) -> Any:
-        return self.observer.call(Trigger, "laser/arm")
-
-    def enable(self, on: bool = True) -> Any:
-        return self.observer.call(SetBool, "laser/enable", SetBool.Request(data=on))
-
     def switch_on(self) -> None:
-        """Heartbeat, arm, enable, in the order a client does it."""
-        self.beating = True
-        before = len(self.light())
+        """Heartbeat, arm, enable, in the order in which a client does it."""
+        self.alive = True
+        before = len(self.outputs())
 
         def lit() -> bool:
             assert self.arm().success
             answer = self.enable()
-            # The first beat may still be on its way.
+            # The first heartbeat may still be on its way.
             assert answer.success or CLIENT_HEARTBEAT in answer.message, answer.message
             return bool(answer.success)
 
         wait_until(lit, "light")
-        assert "ON" in self.light()[before:]
+        assert "ON" in self.outputs()[before:]
 
-    def wait_dark(self) -> None:
-        wait_until(lambda: self.light()[-1] == "OFF", "the laser off in the log")
+    def wait_until_off(self) -> None:
+        wait_until(lambda: not self.awg.lit(), "the laser off in the log")
 
     def close_interlock(self) -> None:
-        """Say that the interlock is closed; told on return."""
+        """Report the interlock as closed; published on return."""
         self.interlock.publish(Bool(data=False))
-        said_ns = time.time_ns()
+        reported_ns = time.time_ns()
         wait_until(
-            lambda: stamped_after(self.states, said_ns) and not self.states[-1].interlock_open,
+            lambda: stamped_after(self.states, reported_ns) and not self.states[-1].interlock_open,
             "the interlock closed",
         )
 
@@ -129,28 +108,28 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.fixture
 def bench(shared: Bench) -> Iterator[Bench]:
     yield shared
-    shared.beating = False
+    shared.alive = False
     shared.close_interlock()
     shared.enable(False)
     if shared.observer.lifecycle_state("laser") == "inactive":
         assert shared.observer.change_state("laser", "activate")
-    assert shared.light()[-1] == "OFF"
+    assert shared.outputs()[-1] == "OFF"
 
 
 def test_laser_is_off_at_start(bench: Bench) -> None:
-    assert bench.light() == ["OFF"]
+    assert bench.outputs() == ["OFF"]
     assert bench.states[-1].output == LaserState.OUTPUT_OFF
 
 
 def test_enable_is_refused_with_the_reason(bench: Bench) -> None:
     assert "not armed" in bench.enable().message
     bench.arm()
-    # Beats of the test before.
+    # Until the heartbeats of the test before are stale.
     time.sleep(1.2 * STALE_S)
     refused = bench.enable()
     assert not refused.success
     assert "heartbeat" in refused.message
-    assert "ON" not in bench.light()
+    assert "ON" not in bench.outputs()
 
 
 def test_arming_expires(tmp_path: Path) -> None:
@@ -161,7 +140,7 @@ def test_arming_expires(tmp_path: Path) -> None:
         assert bench.arm().success
         time.sleep(0.2)
         assert "arming expired" in bench.enable().message
-        assert "ON" not in bench.light()
+        assert "ON" not in bench.outputs()
 
 
 def test_open_interlock_refuses_and_switches_off(bench: Bench) -> None:
@@ -171,38 +150,38 @@ def test_open_interlock_refuses_and_switches_off(bench: Bench) -> None:
     bench.close_interlock()
     bench.switch_on()
     bench.interlock.publish(Bool(data=True))
-    bench.wait_dark()
+    bench.wait_until_off()
     assert not bench.enable().success
 
 
 def test_lost_heartbeat_switches_off(bench: Bench) -> None:
     bench.switch_on()
-    bench.beating = False
-    bench.wait_dark()
-    wait_until(lambda: "heartbeat" in bench.states[-1].reason, "the reason in laser/state")
+    bench.alive = False
+    bench.wait_until_off()
+    bench.wait_for_reason("heartbeat")
 
 
 def test_light_ends_after_the_longest_time_on(tmp_path: Path) -> None:
-    # No beat that a loaded machine holds up may end the light before.
+    # No heartbeat that a loaded machine delays may end the light before.
     with (
         Observer(free_domain(), "longest_observer") as own,
         running(tmp_path, own, heartbeat_timeout=60.0) as bench,
     ):
         bench.switch_on()
-        bench.wait_dark()
+        bench.wait_until_off()
         on_ns, off_ns = bench.switched_ns()
         # Counted from the request, which the generator takes some time to fulfil.
         assert (off_ns - on_ns) * 1e-9 < MAX_ON_S + OFF_LIMIT_S
-        wait_until(lambda: "max_on_time" in bench.states[-1].reason, "the reason in laser/state")
+        bench.wait_for_reason("max_on_time")
 
 
 def test_deactivate_switches_off_and_refuses(bench: Bench) -> None:
     bench.switch_on()
     assert bench.observer.change_state("laser", "deactivate")
-    assert bench.light()[-1] == "OFF"
+    assert bench.outputs()[-1] == "OFF"
     assert "inactive" in bench.arm().message
     assert not bench.enable().success
-    assert bench.light()[-1] == "OFF"
+    assert bench.outputs()[-1] == "OFF"
 
 
 def test_bad_parameter_is_refused_and_changes_nothing(bench: Bench) -> None:
@@ -218,7 +197,7 @@ def test_bad_parameter_is_refused_and_changes_nothing(bench: Bench) -> None:
     wait_until(lambda: bench.states[-1].frequency == 100.0, "the new frequency")
 
 
-def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
+def test_state_reports_every_switch_with_its_time(bench: Bench) -> None:
     bench.switch_on()
     assert bench.enable(False).success
     now_ns = time.time_ns()
@@ -226,27 +205,27 @@ def test_state_tells_every_switch_with_its_time(bench: Bench) -> None:
     assert bench.states[-1].output == LaserState.OUTPUT_OFF
     to_ros_ns = ros_minus_steady_ns()
     switched_ns = [t_ns + to_ros_ns for t_ns in bench.switched_ns()]
-    told_ns = sorted({s.output_since.sec * 10**9 + s.output_since.nanosec for s in bench.states})
-    # Each was told, when it had been read back.
-    for switch_ns, since_ns in zip(switched_ns, told_ns[-2:], strict=True):
-        assert since_ns > switch_ns - 1_000_000
-    assert told_ns[-2] < switched_ns[1]
+    since_ns = sorted({s.output_since.sec * 10**9 + s.output_since.nanosec for s in bench.states})
+    # Each is reported once it is read back.
+    for switch_ns, reported_ns in zip(switched_ns, since_ns[-2:], strict=True):
+        assert reported_ns > switch_ns - 1_000_000
+    assert since_ns[-2] < switched_ns[1]
 
 
-@pytest.mark.parametrize("pause_s", [None, 0.003, 0.02], ids=["once", "rapidly", "again"])
+@pytest.mark.parametrize("pause_s", [0.003, 0.02], ids=["rapidly", "again"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_switches_off_and_exits_clean(
-    number: int, pause_s: float | None, tmp_path: Path
+def test_repeated_signal_switches_off_and_exits_clean(
+    number: int, pause_s: float, tmp_path: Path
 ) -> None:
     with Observer(free_domain(), "signal_observer") as own, running(tmp_path, own) as bench:
         bench.switch_on()
-        bench.process.send(number)
-        while pause_s is not None and bench.process.running():
+        bench.node.send(number)
+        while bench.node.running():
             time.sleep(pause_s)
-            bench.process.send(number)
-        assert bench.process.wait() == 0
-        assert bench.light() == ["OFF", "ON", "OFF"]
-        assert "Traceback" not in bench.process.output
+            bench.node.send(number)
+        assert bench.node.wait() == 0
+        assert bench.outputs() == ["OFF", "ON", "OFF"]
+        assert "Traceback" not in bench.node.output
 
 
 def test_unknown_driver_is_one_clear_line() -> None:

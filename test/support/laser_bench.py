@@ -1,0 +1,68 @@
+"""The laser node with its real driver and guard on an emulated generator, each a process."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+from awg_process import AwgProcess
+from eschorty_ros.msg import LaserState
+from ros_process import NodeProcess, Observer, stamped_after, wait_until
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool, Trigger
+
+from eschorty_ros.nodes.ros import qos
+
+OFF_LIMIT_S = 0.25
+"""Longest time from a fault until the generator's log has the output off."""
+
+
+class LaserBench:
+    """Generator, laser node and what they publish; ``held`` ends the processes."""
+
+    def __init__(
+        self,
+        held: contextlib.ExitStack,
+        folder: Path,
+        observer: Observer,
+        module: str = "eschorty_ros.nodes.laser.node",
+        **parameters: Any,
+    ) -> None:
+        self._held = held
+        self.observer = observer
+        self.awg = held.enter_context(AwgProcess(folder))
+        parameters = {"driver": "awg", "backend": self.awg.backend, **parameters}
+        self.node = self.start(module, parameters)
+        self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
+        self.interlock = observer.publisher(Bool, "laser/interlock", qos.stream(10))
+
+    def start(self, module: str, parameters: dict[str, Any]) -> NodeProcess:
+        """Start another process of this bench, whose output is printed at its end."""
+        process = self._held.enter_context(
+            NodeProcess(module, parameters, domain=self.observer.domain)
+        )
+        self._held.callback(lambda: print(f"--- {process.module}\n{process.output}"))
+        return process
+
+    def arm(self) -> Any:
+        return self.observer.call(Trigger, "laser/arm")
+
+    def enable(self, on: bool = True) -> Any:
+        return self.observer.call(SetBool, "laser/enable", SetBool.Request(data=on))
+
+    def wait_for_state(self, output: int) -> None:
+        """Wait for a state from after now: this output, requested so, and a closed interlock."""
+        now_ns = time.time_ns()
+
+        def published() -> bool:
+            newest = self.states[-1:]
+            return stamped_after(newest, now_ns) and (
+                newest[0].requested == newest[0].output == output and not newest[0].interlock_open
+            )
+
+        wait_until(published, f"output {output} in laser/state")
+
+    def wait_for_reason(self, text: str) -> None:
+        wait_until(lambda: text in self.states[-1].reason, f"{text!r} in laser/state")
