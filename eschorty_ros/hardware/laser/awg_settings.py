@@ -34,9 +34,9 @@ class AwgSettings:
     vendor_ids: str = _field(
         "", "USB vendor ids in hex, with blanks between; empty = the profile's"
     )
-    channel: int = _field(1, "output that gates the laser", range=(1, 8))
-    low_v: float = _field(0.0, "gate voltage without light", "V", range=(0.0, HIGH_LIMIT_V))
-    high_v: float = _field(5.0, "gate voltage with light", "V", range=(0.0, HIGH_LIMIT_V))
+    channel: int = _field(1, "output that modulates the laser", range=(1, 8))
+    low_v: float = _field(0.0, "voltage without light", "V", range=(0.0, HIGH_LIMIT_V))
+    high_v: float = _field(5.0, "voltage with light", "V", range=(0.0, HIGH_LIMIT_V))
     high_max_v: float = _field(
         5.0,
         "the most the laser's input takes; clamped in the generator",
@@ -48,8 +48,8 @@ class AwgSettings:
     )
     readback: str = _field(
         "required",
-        "reading settings back: required = silence is a failure; best_effort = goes on after "
-        "silence; off = never asks",
+        "reading settings back: required = no reply is a failure; best_effort = goes on without "
+        "replies; off = never",
         choices=READBACK_POLICIES,
     )
     usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 2.0))

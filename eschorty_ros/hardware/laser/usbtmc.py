@@ -78,10 +78,7 @@ class UsbTmc:
     def write(self, message: bytes) -> None:
         """Send one message in one transfer.
 
-        Raises
-        ------
-        DeviceError
-            Gone, timed out, stalled or cut short; after that call ``clear``.
+        Raises ``DeviceError``: gone, timed out, stalled or cut short; then call ``clear``.
         """
         header = _HEADER.pack(*self._tags(_MESSAGE_OUT), 0, len(message), _END_OF_MESSAGE)
         self._send(header + message + bytes(-len(message) % 4), "sending a command")
@@ -89,11 +86,8 @@ class UsbTmc:
     def read(self) -> bytes:
         """Return one reply, joined up to its end of message.
 
-        Raises
-        ------
-        DeviceError
-            Gone, timed out, stalled, a wrong header, or a reply above 64 kB; after that call
-            ``clear``.
+        Raises ``DeviceError``: gone, timed out, stalled, a wrong header, or a reply above 64 kB;
+        then call ``clear``.
         """
         reply = b""
         while True:
@@ -108,12 +102,9 @@ class UsbTmc:
                 )
 
     def clear(self) -> None:
-        """INITIATE_CLEAR, CHECK_CLEAR until done, then clear the halt of both endpoints.
+        """Clear the buffers of both sides, then the halt of both endpoints.
 
-        Raises
-        ------
-        DeviceError
-            When the instrument does not answer.
+        Raises ``DeviceError`` when the instrument does not answer.
         """
         try:
             self._clear_buffers()
@@ -123,13 +114,7 @@ class UsbTmc:
             self._clear_halts()
 
     def reset(self) -> None:
-        """Reset the USB port.
-
-        Raises
-        ------
-        DeviceError
-            When the port cannot be reset.
-        """
+        """Reset the USB port; raises ``DeviceError`` when that fails."""
         try:
             self._device.reset()
         except usb.core.USBError as error:

@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from eschorty_ros.core.base.errors import DeviceError
@@ -26,12 +26,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import LaserModulator, LaserOutput
 from eschorty_ros.hardware.base.stalls import StallMeter, process_fault
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
-from eschorty_ros.hardware.laser_guard.messages import (
-    Message,
-    Wire,
-    failure_message,
-    readback_message,
-)
+from eschorty_ros.hardware.laser_guard.messages import Message, Wire, failure_message
 from eschorty_ros.hardware.laser_guard.opening import maker, open_again
 
 _TURN_S = 0.02
@@ -224,7 +219,7 @@ class Guard:
         if command == "readback":
             readback = laser.readback()
             self._lit |= readback.output is not LaserOutput.OFF
-            return readback_message(replace(readback, reason=readback.reason or self._tripped))
+            return asdict(replace(readback, reason=readback.reason or self._tripped))
         self._in_flight.refuse_void(ticket)
         if command == "arm":
             laser.arm()
@@ -235,12 +230,7 @@ class Guard:
     def _open(self, message: Message) -> Message:
         self._make = maker(message["make"], message["settings"])
         self._laser = self._make()
-        identity = self._laser.identity
-        return {
-            "model": identity.model,
-            "serial": identity.serial,
-            "firmware": identity.firmware,
-        }
+        return asdict(self._laser.identity)
 
     def _enable(self, laser: LaserModulator, ticket: int) -> None:
         if self._tripped:

@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from eschorty_ros.hardware.laser_guard.messages import (
     Message,
     Wire,
     failure_message,
-    modulation_message,
     raise_failure,
     readback_from,
 )
@@ -127,7 +127,7 @@ class GuardedLaser:
 
     def configure(self, modulation: Modulation) -> None:
         """Set waveform, frequency and duty; raises ``DeviceError`` when refused."""
-        self._call("configure", self._answer_timeout_s, modulation=modulation_message(modulation))
+        self._call("configure", self._answer_timeout_s, modulation=asdict(modulation))
 
     def arm(self) -> None:
         """Allow the next ``enable``."""

@@ -69,36 +69,11 @@ def raise_failure(message: Message) -> None:
         raise getattr(errors, message["error"], DeviceError)(message["text"])
 
 
-def modulation_message(modulation: Modulation) -> Message:
-    """Return the message of a modulation."""
-    return {
-        "frequency_hz": modulation.frequency_hz,
-        "duty": modulation.duty,
-        "waveform": modulation.waveform,
-    }
-
-
-def readback_message(readback: LaserReadback) -> Message:
-    """Return the message of a read-back."""
-    return {
-        "output": int(readback.output),
-        "modulation": modulation_message(readback.modulation),
-        "phase_epoch_ns": readback.phase_epoch_ns,
-        "output_since_ns": readback.output_since_ns,
-        "reason": readback.reason,
-        "warnings": readback.warnings,
-        "counters": dict(readback.counters),
-    }
-
-
 def readback_from(message: Message) -> LaserReadback:
-    """Return the read-back of a message."""
-    return LaserReadback(
-        LaserOutput(message["output"]),
-        Modulation(**message["modulation"]),
-        message["phase_epoch_ns"],
-        message["output_since_ns"],
-        message["reason"],
-        tuple(message["warnings"]),
-        message["counters"],
-    )
+    """Return the read-back whose fields ``dataclasses.asdict`` made a message of."""
+    fields = {
+        "output": LaserOutput(message["output"]),
+        "modulation": Modulation(**message["modulation"]),
+        "warnings": tuple(message["warnings"]),
+    }
+    return LaserReadback(**{**message, **fields})

@@ -11,7 +11,7 @@ import pytest
 from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
 from eschorty_ros.emulation.bus import UsbFault
 
-Say = Callable[[str], str]
+Exchange = Callable[[str], str]
 
 
 @pytest.fixture
@@ -20,10 +20,10 @@ def model() -> AwgModel:
 
 
 @pytest.fixture
-def say(model: AwgModel) -> Say:
-    """Send a message built by hand; for a query return its reply."""
+def exchange(model: AwgModel) -> Exchange:
+    """Sends a message composed here; returns the reply to a query."""
 
-    def said(text: str) -> str:
+    def exchanged(text: str) -> str:
         data = text.encode()
         head = struct.pack("<BBBBIB3x", 1, 5, 0xFA, 0, len(data), 1)
         model.bulk_out(ENDPOINT_OUT, head + data + bytes(-len(data) % 4), 0)
@@ -34,7 +34,7 @@ def say(model: AwgModel) -> Say:
         assert struct.unpack_from("<BBBBIB3x", reply) == (2, 6, 0xF9, 0, len(reply) - 12, 1)
         return reply[12:].decode()
 
-    return said
+    return exchanged
 
 
 @pytest.mark.parametrize(
@@ -51,9 +51,9 @@ def say(model: AwgModel) -> Say:
         (":SYSTem:LOCK OFF\n", ":CHAN1:LOAD?", "10000"),
     ],
 )
-def test_long_and_short_forms(say: Say, command: str, query: str, reply: str) -> None:
-    say(command)
-    assert say(query + "\n") == reply
+def test_long_and_short_forms(exchange: Exchange, command: str, query: str, reply: str) -> None:
+    exchange(command)
+    assert exchange(query + "\n") == reply
 
 
 @pytest.mark.parametrize(
@@ -66,50 +66,52 @@ def test_long_and_short_forms(say: Say, command: str, query: str, reply: str) ->
         ":NONSENSE 1", "",
     ],
 )  # fmt: skip
-def test_what_is_out_of_range_or_unknown_is_ignored(
-    model: AwgModel, say: Say, command: str
+def test_command_out_of_range_or_unknown_is_ignored(
+    model: AwgModel, exchange: Exchange, command: str
 ) -> None:
     before = [vars(channel).copy() for channel in model.channels]
-    say(command + "\n")
+    exchange(command + "\n")
     assert [vars(channel) for channel in model.channels] == before
 
 
-def test_clamp_holds_levels_and_the_load_scales_volts(model: AwgModel, say: Say) -> None:
+def test_clamp_holds_levels_and_the_load_scales_volts(model: AwgModel, exchange: Exchange) -> None:
     for text in ("LIM:LOW 0", "LIM:UPP 5", "LIM:ENAB ON", "BASE:HIGH 8", "BASE:LOW -3"):
-        say(f":CHAN1:{text}\n")
+        exchange(f":CHAN1:{text}\n")
     assert (model.channels[0].high_v, model.channels[0].low_v) == (5.0, 0.0)
-    say(":CHAN1:LOAD 50\n")
-    assert say(":CHAN1:BASE:HIGH?\n") == "2.5"
+    exchange(":CHAN1:LOAD 50\n")
+    assert exchange(":CHAN1:BASE:HIGH?\n") == "2.5"
 
 
-def test_replies_have_no_newline_and_silence_where_none_is_due(model: AwgModel, say: Say) -> None:
-    assert not say("*IDN?\n").endswith("\n")
+def test_replies_have_no_newline_and_come_only_where_one_is_due(
+    model: AwgModel, exchange: Exchange
+) -> None:
+    assert not exchange("*IDN?\n").endswith("\n")
     with pytest.raises(UsbFault, match="ETIMEDOUT"):
-        say(":SYSTem:ERRor?\n")
+        exchange(":SYSTem:ERRor?\n")
 
 
-def test_any_command_locks_the_panel(model: AwgModel, say: Say) -> None:
+def test_any_command_locks_the_panel(model: AwgModel, exchange: Exchange) -> None:
     assert model.touch("OUTPut", "ON")
-    say("*IDN?\n")
+    exchange("*IDN?\n")
     assert not model.touch("OUTPut", "OFF")
-    say(":SYST:LOCK OFF\n")
+    exchange(":SYST:LOCK OFF\n")
     assert model.touch("OUTPut", "OFF")
 
 
-def test_reset_and_power_up_are_dark(model: AwgModel, say: Say) -> None:
-    for restart in (lambda: say("*RST\n"), model.reboot, model.replug):
-        say(":CHAN1:OUTP ON\n")
+def test_reset_and_power_up_switch_off(model: AwgModel, exchange: Exchange) -> None:
+    for restart in (lambda: exchange("*RST\n"), model.reboot, model.replug):
+        exchange(":CHAN1:OUTP ON\n")
         assert model.output
         restart()
         assert not model.output
         assert model.channels[0].frequency_hz == 1000.0
 
 
-def test_log_and_world_hear_every_change_once(tmp_path: Path) -> None:
+def test_every_change_is_logged_and_reported_once(tmp_path: Path) -> None:
     log = tmp_path / "laser.log"
     model = AwgModel(lambda: 7, log, wait=lambda *_: False)
-    heard: list[tuple[int, bool, float]] = []
-    model.on_change = lambda t_ns, lit, wave: heard.append((t_ns, lit, wave.frequency_hz))
+    changes: list[tuple[int, bool, float]] = []
+    model.on_change = lambda t_ns, lit, wave: changes.append((t_ns, lit, wave.frequency_hz))
     for path, text in (
         ("BASE:WAVe", "SQU"), ("BASE:HIGH", "5"), ("OUTPut", "ON"), ("OUTPut", "ON"),
         ("BASE:FREQuency", "70"), ("BASE:HIGH", "1"), ("OUTPut", "OFF"),
@@ -118,5 +120,5 @@ def test_log_and_world_hear_every_change_once(tmp_path: Path) -> None:
     lines = truth(log)
     assert [state for _, state in lines] == ["OFF", "ON", "OFF"]
     assert [t_ns for t_ns, _ in lines] == sorted(t_ns for t_ns, _ in lines)
-    # Sine to square in the dark, on, 70 Hz, and too low a level to light.
-    assert heard == [(7, False, 1000.0), (7, True, 1000.0), (7, True, 70.0), (7, False, 70.0)]
+    # Sine to square while off, on, 70 Hz, and a level too low for light.
+    assert changes == [(7, False, 1000.0), (7, True, 1000.0), (7, True, 70.0), (7, False, 70.0)]

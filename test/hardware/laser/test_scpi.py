@@ -83,14 +83,14 @@ def test_any_reply_is_a_value_or_a_typed_error(reply: bytes, name: str) -> None:
 
 
 def test_one_fault_is_retried_two_are_raised() -> None:
-    fault = DeviceTimeoutError("silence")
+    fault = DeviceTimeoutError("no answer")
     link = Answering(fault, b"ON")
     layer = scpi(link)
     assert layer.get("output", 1) is True
     assert (link.counters, link.clears) == ({"faults": 1, "retries": 1}, 1)
     assert link.written == [b":CHANnel1:OUTPut?\n"] * 2
     link.replies[:] = [fault, fault]
-    with pytest.raises(DeviceTimeoutError, match="silence"):
+    with pytest.raises(DeviceTimeoutError, match="no answer"):
         layer.get("output", 1)
 
 

@@ -154,7 +154,7 @@ elif way == "segfault":
 elif way == "exit":
     os._exit(3)
 elif way == "exception":
-    raise RuntimeError("nobody catches this")
+    raise RuntimeError("not caught")
 elif way == "gil":
     # A library that never returns and keeps the interpreter to itself.
     ctypes.PyDLL(None).sleep(3)
