@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import ast
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "faults.md"
@@ -46,34 +46,26 @@ _BEGIN, _END = "<!-- made by `make faults` -->\n\n", "\n<!-- end -->"
 _DOCSTRING = re.compile(r"driver: (?P<driver>.+?)[;.] user reads: (?P<user>.+?\.\.\.|.+?)\.?$")
 
 
-@dataclass(frozen=True)
-class FaultTest:
-    """One test of a fault."""
+class FaultTest(NamedTuple):
+    """One test of a fault, a row of the table."""
 
     fault: str
+    case: str
     file: str
-    name: str
     driver: str
     user: str
 
-    @property
-    def row(self) -> str:
-        """Its line of the table."""
-        case = self.name.removeprefix("test_").replace("_", " ")
-        cells = (self.fault, case, self.file, self.driver, self.user)
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
 
 def fault_tests() -> list[FaultTest]:
-    """Every test of a fault, by reading the files; in the order of the list of faults."""
+    """Return every test of a fault, from the files, in the order of ``FAULTS``."""
     found = []
     for path in sorted((ROOT / "test").rglob("test_*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.FunctionDef) and (fault := _fault_of(node)):
-                text = " ".join((ast.get_docstring(node) or "").split())
-                match = _DOCSTRING.match(text)
+                case = node.name.removeprefix("test_").replace("_", " ")
+                match = _DOCSTRING.match(" ".join((ast.get_docstring(node) or "").split()))
                 driver, user = match.groups() if match else ("", "")
-                found.append(FaultTest(fault, path.name, node.name, driver, user))
+                found.append(FaultTest(fault, case, path.name, driver, user))
     return sorted(found, key=lambda test: FAULTS.index(test.fault))
 
 
@@ -85,11 +77,11 @@ def _fault_of(node: ast.FunctionDef) -> str:
 
 
 def page() -> str:
-    """The page with the table as the tests have it now."""
+    """Return the page with the table of the present tests."""
     head, _, rest = PAGE.read_text(encoding="utf-8").partition(_BEGIN)
     _, _, tail = rest.partition(_END)
     lines = ["| fault | case | test | driver | user reads |", "| --- | --- | --- | --- | --- |"]
-    lines += [test.row for test in fault_tests()]
+    lines += ["| " + " | ".join(c.replace("|", "\\|") for c in t) + " |" for t in fault_tests()]
     return head + _BEGIN + "\n".join(lines) + "\n" + _END + tail
 
 
