@@ -64,6 +64,7 @@ class AptBench:
         )
         self.port = MemoryPort(self)
         self.link: AptLink | None = None
+        self._due_ns = 0
         self.on_tick: Callable[[], None] = lambda: None
         self.stage = self.open()
         if home:
@@ -89,27 +90,38 @@ class AptBench:
         return self.link
 
     def _wait(self, condition: threading.Condition, seconds: float) -> None:
-        self._tick()
+        self._tick(self.now_ns + round(seconds * 1e9))
 
-    def _tick(self) -> None:
-        self.now_ns += TICK_NS
+    def _tick(self, limit_ns: int) -> None:
+        """Advance by a tick, or by many up to ``limit_ns`` while both sides are idle."""
+        idle_ns = min(limit_ns - self.now_ns, self._idle_ns())
+        self.now_ns += max(idle_ns // TICK_NS, 1) * TICK_NS
         self.on_tick()
         if self.link is not None:
             self.link.receive(self.model.step())
-            self.link.service()
+            self._due_ns = self.now_ns + round(self.link.service() * 1e9)
+
+    def _idle_ns(self) -> int:
+        if self.link is None:
+            return TICK_NS
+        if self.model._in._sent or self.model._out._sent:
+            return 0
+        to_end_ns = self.model.axis.plan.end_ns - self.clock_ns()
+        to_due_ns = self._due_ns - self.now_ns
+        return min(to_due_ns, to_end_ns) if to_end_ns > 0 else to_due_ns
 
     def advance(self, seconds: float) -> None:
         """Advance the clock."""
         end_ns = self.now_ns + round(seconds * 1e9)
         while self.now_ns < end_ns:
-            self._tick()
+            self._tick(end_ns)
 
     def until(self, condition: Callable[[], bool], limit_s: float = 10.0) -> None:
         """Advance the clock until a condition holds."""
         end_ns = self.now_ns + round(limit_s * 1e9)
         while not condition():
             assert self.now_ns < end_ns, f"not within {limit_s:g} s"
-            self._tick()
+            self._tick(end_ns)
 
     def move(self, position_mm: float, speed_mm_s: float = 200.0) -> None:
         """Move and wait for the end."""

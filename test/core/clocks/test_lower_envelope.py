@@ -88,8 +88,8 @@ def test_ever_growing_lag_is_not_taken_for_drift():
 def test_the_window_slides():
     """The oscillator changes its drift in the middle."""
     envelope = LowerEnvelope(10_000_000_000)
-    t, true, arrival = packets(40.0, 0.0, jitter)
-    bent = np.clip(t - 20_000_000, 0, None) // 10
+    t, true, arrival = packets(25.0, 0.0, jitter)
+    bent = np.clip(t - 8_000_000, 0, None) // 10
     off = errors(envelope, (t, true + bent, arrival + bent))
     assert np.abs(off[-1000:]).max() < 60_000
     assert abs(envelope.line.drift_ppb - 100_000) < 8000

@@ -27,22 +27,21 @@ def test_an_unknown_zero_is_an_error() -> None:
         clock.to_ns(5)
 
 
-@pytest.mark.parametrize("drift", [50e-6, -50e-6])
-def test_the_window_follows_a_drifting_oscillator_under_late_packets(drift: float) -> None:
-    """50 ppm over 60 s is 3 ms."""
+def test_the_window_follows_a_drifting_oscillator_under_late_packets() -> None:
+    """-50 ppm over 20 s are 1 ms."""
     rng = np.random.default_rng(6)
-    clock = SensorClock(window_ns=10_000_000_000)
-    t_us = np.arange(1, 60 * 250) * 4000
-    sent = EPOCH_NS + (t_us * (1.0 + drift) * 1000).astype(np.int64)
+    clock = SensorClock(window_ns=5_000_000_000)
+    t_us = np.arange(1, 20 * 250) * 4000
+    sent = EPOCH_NS + (t_us * (1.0 - 50e-6) * 1000).astype(np.int64)
     arrival = np.maximum.accumulate(sent + rng.exponential(2e6, t_us.size).astype(np.int64))
     errors = []
     for t, arrived, true in zip(t_us.tolist(), arrival.tolist(), sent.tolist(), strict=True):
         clock.observe(t, arrived)
         assert clock.residual_ns >= 0
         errors.append(clock.to_ns(t) - true)
-    assert np.abs(errors[2500:]).max() < 60_000
-    assert abs(clock.drift_ppm - drift * 1e6) < 6.0
-    assert 0 <= clock.offset_age_us < 10_000_000
+    assert np.abs(errors[1250:]).max() < 60_000
+    assert abs(clock.drift_ppm + 50.0) < 6.0
+    assert 0 <= clock.offset_age_us < 5_000_000
     assert clock.restarts == 0
 
 

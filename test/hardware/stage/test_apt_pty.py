@@ -163,12 +163,13 @@ def test_the_keep_alive_continues_while_a_caller_hangs(port: str, model: AptMode
 def test_a_write_before_a_stall_of_the_host_is_no_failure(
     port: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(apt_port, "_WRITE_S", 0.2)
     opened_port = apt_port.open_port(port)
     write = os.write
 
     def stalls(descriptor: int, data: bytes) -> int:
         count = write(descriptor, data)
-        time.sleep(2.0 * apt_port._WRITE_S)
+        time.sleep(0.4)
         return count
 
     try:
@@ -178,7 +179,8 @@ def test_a_write_before_a_stall_of_the_host_is_no_failure(
         opened_port.close()
 
 
-def test_a_port_that_takes_no_bytes_fails(tmp_path: Path) -> None:
+def test_a_port_that_takes_no_bytes_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apt_port, "_WRITE_S", 0.2)
     host, device = os.openpty()
     tty.setraw(device)
     opened_port = apt_port.open_port(os.ttyname(device))
