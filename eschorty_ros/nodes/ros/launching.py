@@ -79,38 +79,30 @@ def truth(name: str) -> Any:
     return ParameterValue(LaunchConfiguration(name), value_type=bool)
 
 
-def driver(real: str) -> Any:
-    """Return the driver at the emulated bench, or that of the real device."""
-    return IfElseSubstitution(LaunchConfiguration("fake"), "fake", real)
-
-
-def reliable(end: str) -> dict[str, Any]:
-    """Return parameters for lossless events at one end, as an emulated camera can wait."""
-    if_fake = IfElseSubstitution(LaunchConfiguration("fake"), "reliable", "best_effort")
-    return {f"qos_overrides.{EVENTS}.{end}.reliability": if_fake}
-
-
-def trigger_input() -> Any:
-    """Return the mode of the camera's trigger input, enabled if the argument ``trigger`` is set."""
-    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
-    return IfElseSubstitution(unwired, "disabled", "external")
-
-
 def instrument(**reconstruction: Any) -> dict[str, dict[str, Any]]:
-    """Return parameters of devices and reconstruction by node, from arguments of their names."""
+    """Return parameters of devices and reconstruction by node, from arguments of their names.
+
+    At an emulated bench the events are reliable at both ends, because its camera can wait.
+    """
+    fake = LaunchConfiguration("fake")
+    reliability = IfElseSubstitution(fake, "reliable", "best_effort")
+    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
     return {
         "camera": {
-            "driver": driver("evk4"),
-            "trigger_in_mode": trigger_input(),
-            **reliable("publisher"),
+            "driver": IfElseSubstitution(fake, "fake", "evk4"),
+            "trigger_in_mode": IfElseSubstitution(unwired, "disabled", "external"),
+            f"qos_overrides.{EVENTS}.publisher.reliability": reliability,
         },
-        "laser": {"driver": driver("awg"), "frequency": number("frequency")},
-        "stage": {"driver": driver("apt")},
+        "laser": {
+            "driver": IfElseSubstitution(fake, "fake", "awg"),
+            "frequency": number("frequency"),
+        },
+        "stage": {"driver": IfElseSubstitution(fake, "fake", "apt")},
         "reconstruction": {
             "calibration": text("calibration"),
             "trigger_source": text("trigger"),
             **reconstruction,
-            **reliable("subscription"),
+            f"qos_overrides.{EVENTS}.subscription.reliability": reliability,
         },
     }
 

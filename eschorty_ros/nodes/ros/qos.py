@@ -15,12 +15,7 @@ STATE_HISTORY = 100
 
 def events() -> QoSProfile:
     """Raw event packets: best effort, deep queue, as metavision_driver publishes them."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=EVENT_DEPTH,
-        reliability=ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return _profile(EVENT_DEPTH, ReliabilityPolicy.BEST_EFFORT)
 
 
 def latched(depth: int = 1) -> QoSProfile:
@@ -29,34 +24,32 @@ def latched(depth: int = 1) -> QoSProfile:
     ``depth`` is 1 where only the newest message counts, ``STATE_HISTORY`` where no change may be
     lost, such as the laser's state.
     """
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
+    return _profile(depth, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def stream(depth: int = STREAM_DEPTH) -> QoSProfile:
     """Messages that must all reach the present subscribers: reliable, volatile."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return _profile(depth, ReliabilityPolicy.RELIABLE)
 
 
 def heartbeat() -> QoSProfile:
     """Heartbeats: only the newest counts, and none is repeated."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=1,
-        reliability=ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return _profile(1, ReliabilityPolicy.BEST_EFFORT)
 
 
 def overridable() -> QoSOverridingOptions:
     """History, depth and reliability settable by the parameters ``qos_overrides.<topic>...``."""
     return QoSOverridingOptions.with_default_policies()
+
+
+def _profile(
+    depth: int,
+    reliability: ReliabilityPolicy,
+    durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=reliability,
+        durability=durability,
+    )
