@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import shutil
 import signal
@@ -29,9 +28,9 @@ from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.dds import use_profile
+from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 
 NAMESPACE = "/eschorty"
-_RESEND_S = 2.0
 # With util-linux the kernel ends the nodes however the tests end.
 _ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
 
@@ -219,19 +218,10 @@ class Observer:
 
         A fresh server may not know yet where its answers go, a killed one seems to be there still.
         """
-        futures: list[Any] = []
-        sent_s = -math.inf
-
-        def answered() -> bool:
-            nonlocal sent_s
-            if time.monotonic() - sent_s > _RESEND_S:
-                sent_s = time.monotonic()
-                futures.append(client.call_async(service_type.Request()))
-            return any(future.done() for future in futures)
-
         with self._client(service_type, name, deadline_s) as client:
-            wait_until(answered, f"an answer of {name}", deadline_s)
-            return next(future.result() for future in futures if future.done())
+            call = RepeatedCall(client, service_type.Request(), again=True)
+            wait_until(call.done, f"an answer of {name}", deadline_s)
+            return call.result()
 
     @contextlib.contextmanager
     def _client(self, service_type: Any, name: str, deadline_s: float) -> Iterator[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import threading
 import time
@@ -31,6 +30,7 @@ from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, ns_from_stamp, stamp_from_ns
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
+from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.nodes.ros.spin import run
 from eschorty_ros.nodes.ros.transforms import BASE, OPTICAL, STAGE
 from eschorty_ros.srv import BeginScan, EndScan
@@ -45,7 +45,6 @@ TABLE = (
 _PACKETS_AHEAD = 256
 _ROWS_AHEAD = 1000
 _POLL_S = 0.005
-_RESEND_S = 2.0
 
 
 class ReplayNode(Node):
@@ -252,23 +251,11 @@ class ReplayNode(Node):
                 raise DeviceError(f"{fault} for {timeout_s:g} s; check that it runs")
 
     def _call(self, client: Any, request: Any, *, again: bool = False) -> Any:
-        """Return a service's answer; with ``again`` the request is repeated.
-
-        A server that has just discovered this node may not know yet where to send its answer.
-        """
+        """Return a service's answer; see ``RepeatedCall``."""
         self._advanced_s = time.monotonic()
-        futures: list[Any] = []
-        sent_s = -math.inf
-
-        def answered() -> bool:
-            nonlocal sent_s
-            if not futures or (again and time.monotonic() - sent_s > _RESEND_S):
-                sent_s = time.monotonic()
-                futures.append(client.call_async(request))
-            return any(future.done() for future in futures)
-
-        self._wait(answered, f"no answer of {client.srv_name}")
-        answer = next(future.result() for future in futures if future.done())
+        call = RepeatedCall(client, request, again=again)
+        self._wait(call.done, f"no answer of {client.srv_name}")
+        answer = call.result()
         if not answer.success:
             raise DeviceError(f"reconstruction: {answer.message}")
         return answer

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -32,9 +31,9 @@ from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, ns_from_stamp
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
+from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.srv import BeginScan, EndScan
 
-_RESEND_S = 2.0
 # The heartbeat stops when the sequence has not ticked for so long.
 _TICK_LIMIT_S = 1.0
 # In the laser's refusals for want of a heartbeat.
@@ -236,26 +235,16 @@ class InstrumentClient(PacedWaiting):
         return future.result()
 
     def _call(self, name: str, request: Any, once_within_s: float | None = None) -> Any:
-        """Return a service's answer; the request is repeated unless ``once_within_s`` is given.
-
-        A server that has just discovered this node may not know yet where to send its answer.
-        A repeated request may be carried out twice.
-        """
-        futures: list[Any] = []
-        sent_s = -math.inf
+        """Return a service's answer; the request is repeated unless ``once_within_s`` is given."""
+        call = RepeatedCall(self._clients[name], request, again=once_within_s is None)
 
         def answered() -> bool:
-            nonlocal sent_s
-            repeat = once_within_s is None or not futures
-            if repeat and time.monotonic() - sent_s > _RESEND_S:
-                sent_s = time.monotonic()
-                with self._living_context():
-                    futures.append(self._clients[name].call_async(request))
-            return any(future.done() for future in futures)
+            with self._living_context():
+                return call.done()
 
         timeout_s = once_within_s or self._service_timeout_s
         self.wait(answered, timeout_s, f"{name.split('/')[0]}: no answer of {name}")
-        return next(future.result() for future in futures if future.done())
+        return call.result()
 
     @contextlib.contextmanager
     def _living_context(self) -> Iterator[None]:
