@@ -113,11 +113,6 @@ class PacketStream:
         return self._epoch
 
     @property
-    def clock_announced(self) -> bool:
-        """Whether the clock is exact because it was announced."""
-        return self._epoch is not None and self._epoch.clock.exact
-
-    @property
     def processed_until_ns(self) -> int | None:
         """ROS time up to which the stream has been reconstructed."""
         # Also read by other threads than the one that processes.

@@ -1,10 +1,11 @@
-"""The order of a calibration's capture: whatever fails, light off, collecting ended."""
+"""The steps of a capture: after any failure the laser is off and the collection has ended."""
 
 import math
 
 import pytest
+from recording_instrument import RecordingInstrument
 
-from eschorty_ros.control.calibration_sequence import check_request, run_capture
+from eschorty_ros.control.calibration_sequence import check_request
 from eschorty_ros.control.scan_sequence import End, ScanCanceled, ScanFailure
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.calibration import KnownTarget
@@ -13,29 +14,6 @@ from eschorty_ros.live.calibration_capture import CaptureRequest, Sweep
 TWO = (KnownTarget(1000.0), KnownTarget(1500.0))
 RESTING = CaptureRequest(TWO, "joint", 0.5, 70.0)
 MOVING = CaptureRequest(TWO[:1], "joint", sweep=Sweep(10.0, 60.0, 20.0, 1.0))
-
-
-class RecordingInstrument:
-    """Notes every call; the ``failing`` one raises ``error``."""
-
-    def __init__(self, failing=None, error=None):
-        self.calls = []
-        self._failing = failing
-        self._error = error
-
-    def __getattr__(self, name):
-        def call(*arguments):
-            self.calls.append(name)
-            if self._failing == (name, self.calls.count(name)):
-                raise self._error
-
-        return call
-
-    def capture(self, request):
-        return run_capture(self, request, self.begin, self.finish)
-
-    def done(self):
-        return [name for name in self.calls if name not in ("report", "watch", "shield")]
 
 
 @pytest.mark.parametrize(
@@ -49,7 +27,7 @@ def test_order_of_a_capture(request_, steps):
     instrument = RecordingInstrument()
     outcome = instrument.capture(request_)
     assert (outcome.end, outcome.message) == (End.SUCCEEDED, "")
-    assert instrument.done() == [*steps, "laser_off", "drain", "finish"]
+    assert instrument.steps() == [*steps, "laser_off", "drain", "finish"]
 
 
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("begin", 1),
@@ -73,7 +51,7 @@ def test_a_failure_on_the_way_out_fails_the_capture_and_the_rest_still_runs(step
     instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
     outcome = instrument.capture(RESTING)
     assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
-    assert instrument.done()[-3:] == ["laser_off", "drain", "finish"]
+    assert instrument.steps()[-3:] == ["laser_off", "drain", "finish"]
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_without_an_announcement_the_stamps_serve_and_the_phase_comes_from_the_e
     subject.add(items[0], 0.0)
     assert subject.process(0.5) == []
     parts = run(subject, items[1:], now_s=1.1)
-    assert not subject.clock_announced
+    assert not subject.epoch.clock.exact
     edges = np.unique(joined(parts).edge_us)
     period_us = MODULATION.period_us
     off_us = (edges - EDGE_US + period_us / 2) % period_us - period_us / 2
@@ -207,7 +207,7 @@ def test_nobody_waits_for_an_announcement_that_nobody_makes():
     subject = unannounced()
     subject.add(packets(line())[0], 0.0)
     subject.process(0.0)
-    assert (subject.held, subject.packets, subject.clock_announced) == (0, 1, False)
+    assert (subject.held, subject.packets, subject.epoch.clock.exact) == (0, 1, False)
 
 
 @pytest.mark.parametrize("gap_us", [1_000_000, 12_000_000, 40_000_000])
@@ -260,7 +260,7 @@ def test_packets_twice_or_in_the_wrong_order_are_no_restart_of_the_camera():
     subject = announced()
     run(subject, [*items[:4], items[5], items[4], *items[6:]])
     assert (subject.restarts, subject.packets_lost, subject.packets_late) == (0, 1, 1)
-    assert subject.clock_announced
+    assert subject.epoch.clock.exact
 
 
 def test_a_time_low_that_the_sensor_takes_back_does_not_move_the_clock():
