@@ -52,7 +52,8 @@ def test_a_failure_on_the_way_out_fails_the_scan_and_the_rest_still_runs(step):
     instrument = RecordingInstrument((step, 1), ScanFailure("laser: no answer"))
     outcome = run_scan(instrument, REQUEST, LIMITS)
     assert (outcome.end, outcome.message) == (End.ABORTED, "laser: no answer")
-    assert instrument.steps()[-3:] == ["laser_off", "drain", "end_scan"]
+    steps = [name for name in instrument.steps() if name != "stop_stage"]
+    assert steps[-3:] == ["laser_off", "drain", "end_scan"]
 
 
 def test_the_first_reason_stays():
