@@ -19,7 +19,7 @@ SINGLE_UNIT: Final = 0x50
 SOURCES: Final = frozenset({0x00, RACK, *range(0x21, 0x2B), SINGLE_UNIT})
 HEADER_BYTES: Final = 6
 LONG: Final = 0x80
-CHANNEL: Final = 1
+_DEFAULTS: Final = {"channel": 1, "reserved": 0}
 
 
 def bay_address(bay: int) -> int:
@@ -200,8 +200,12 @@ class Frame:
 
 
 def pack(name: str, destination: int, **values: int) -> bytes:
-    """Return the frame of the message ``name`` from the host; every field must be given."""
+    """Return the frame of the message ``name`` from the host.
+
+    Every field must be given but ``channel``, the only one by default, and ``reserved``, 0.
+    """
     layout = TO_CONTROLLER[name]
+    values = {key: value for key, value in _DEFAULTS.items() if key in layout.fields} | values
     fields = [values.pop(field) for field in layout.fields]
     if values:
         raise ArgumentError(f"{name} has no field {', '.join(values)}")

@@ -138,7 +138,7 @@ class AptSetup:
             if bay.integer("state") != 1:
                 raise DeviceError(f"stage: bay {settings.bay} of the rack is empty; check bay")
         info = self.request("request_info", "info", apt.RACK if rack else None)
-        axis = self.request("request_axis", "axis", channel=apt.CHANNEL)
+        axis = self.request("request_axis", "axis")
         counts = axis.integer("counts_per_unit")
         if not 100 <= counts <= 1_000_000:
             raise DeviceError(
@@ -167,17 +167,11 @@ class AptSetup:
     def write(self, axis: AxisData) -> None:
         """Write all settings but the trigger."""
         scale = axis.scale
-        self.send("set_profile_mode", channel=apt.CHANNEL, mode=0, jerk=0)
+        self.send("set_profile_mode", mode=0, jerk=0)
         self.write_velocity(axis, axis.speed_max_mm_s)
         # Reverse, to the reverse limit switch, as the manufacturer's own software sets it.
-        self.send(
-            "set_home",
-            channel=apt.CHANNEL,
-            direction=2,
-            limit=1,
-            velocity=scale.velocity(min(self._settings.homing_mm_s, axis.speed_max_mm_s)),
-            offset=0,
-        )
+        homing = scale.velocity(min(self._settings.homing_mm_s, axis.speed_max_mm_s))
+        self.send("set_home", direction=2, limit=1, velocity=homing, offset=0)
         self.send("resume_end_of_move")
 
     def write_velocity(self, axis: AxisData, speed_mm_s: float) -> tuple[float, float]:
@@ -192,8 +186,8 @@ class AptSetup:
             "acceleration": axis.scale.acceleration(axis.acceleration_mm_s2),
             "velocity": axis.scale.velocity(speed_mm_s),
         }
-        self.send("set_velocity", channel=apt.CHANNEL, minimum=0, **wanted)
-        answer = self.request("request_velocity", "velocity", channel=apt.CHANNEL)
+        self.send("set_velocity", minimum=0, **wanted)
+        answer = self.request("request_velocity", "velocity")
         for name, value in wanted.items():
             if answer.integer(name) != value:
                 raise DeviceError(
@@ -237,7 +231,7 @@ class AptSetup:
         }
         self._write_pulses(pulses, _STEPS_BOTH)
         kind = "pulses" if self._settings.controller == "kbd101" else "rack_trigger"
-        answer = self.request(f"request_{kind}", kind, channel=apt.CHANNEL)
+        answer = self.request(f"request_{kind}", kind)
         for name, value in pulses.items():
             if answer.integer(name) != value:
                 raise DeviceError(
@@ -250,42 +244,26 @@ class AptSetup:
         port = self._settings.trigger_port
         if self._settings.controller == "kbd101":
             if pulses:
-                self.send("set_pulses", channel=apt.CHANNEL, **pulses)
-            modes = [mode if number == port else 0 for number in (1, 2)]
-            self.send(
-                "set_ports",
-                channel=apt.CHANNEL,
-                mode_1=modes[0],
-                polarity_1=1,
-                mode_2=modes[1],
-                polarity_2=1,
-                reserved=0,
-            )
+                self.send("set_pulses", **pulses)
+            first, second = (mode if number == port else 0 for number in (1, 2))
+            self.send("set_ports", mode_1=first, polarity_1=1, mode_2=second, polarity_2=1)
             return
-        self.send("set_rack_trigger_state", channel=apt.CHANNEL, state=_DISARM)
+        self.send("set_rack_trigger_state", state=_DISARM)
         if not pulses:
             return
-        self._link.send(
-            apt.pack(
-                "set_rack_port",
-                apt.SINGLE_UNIT,
-                port=port,
-                mode=_OUTPUT,
-                source=self._settings.bay,
-            )
-        )
+        bay = self._settings.bay
+        wiring = apt.pack("set_rack_port", apt.SINGLE_UNIT, port=port, mode=_OUTPUT, source=bay)
+        self._link.send(wiring)
         self.send(
             "set_rack_trigger",
-            channel=apt.CHANNEL,
             in_mode=0,
             in_polarity=1,
             in_source=0,
             out_mode=mode,
             out_polarity=1,
-            reserved=0,
             **pulses,
         )
-        self.send("set_rack_trigger_state", channel=apt.CHANNEL, state=_ARM)
+        self.send("set_rack_trigger_state", state=_ARM)
 
 
 def _least(cap: float, counts: int, unit: float) -> float:

@@ -96,7 +96,7 @@ class AptStage:
     def _connect(self) -> None:
         self._setup.send("stop_updates")
         # The program that used it before may have left it moving.
-        self._setup.send("stop", channel=apt.CHANNEL, mode=_PROFILED)
+        self._setup.send("stop", mode=_PROFILED)
         axis = self._setup.read_axis()
         self._axis = axis
         self._tracker.scale = axis.scale
@@ -106,7 +106,7 @@ class AptStage:
         self.acceleration_mm_s2 = axis.acceleration_mm_s2
         self._setup.write(axis)
         self.trigger = self._setup.write_trigger(axis)
-        self._setup.send("set_enabled", channel=apt.CHANNEL, state=_ON)
+        self._setup.send("set_enabled", state=_ON)
         self._tracker.begin_motion(Kind.STOP, 0.0, 0.0, self.speed_max_mm_s, _ENABLE_S)
         self._link.call_every(_KEEP_ALIVE_S, self._keep_alive)
         self._link.call_every(1.0 / self._settings.poll_hz, self.request_status)
@@ -141,7 +141,7 @@ class AptStage:
             self._tracker.begin_motion(Kind.HOME, high, low, speed, limit_s)
             self._tracker.fit.expect_unknown(self._clock_ns())
             self._tracker.blocked_sense = 0
-            self._send_now("home", channel=apt.CHANNEL)
+            self._send_now("home")
 
     def move_to(self, position_mm: float, speed_mm_s: float) -> None:
         """Start a move; raises ``DeviceError`` when it is refused or stopped before it begins."""
@@ -161,7 +161,7 @@ class AptStage:
             self._orders += 1
             self._tracker.begin_motion(Kind.MOVE, start, target, speed, limit_s)
             order_ns = self._clock_ns()
-            self._send_now("move_absolute", channel=apt.CHANNEL, position=counts)
+            self._send_now("move_absolute", position=counts)
             self._tracker.fit.expect_move(
                 plan_move(order_ns + _MOVE_NS, start, target, speed, acceleration)
             )
@@ -225,11 +225,11 @@ class AptStage:
             moving = self._tracker.motion is not None
         with contextlib.suppress(DeviceError):
             if moving or failed:
-                self._send_now("stop", channel=apt.CHANNEL, mode=_PROFILED)
+                self._send_now("stop", mode=_PROFILED)
                 if not self._link.wait_until(lambda: self._tracker.motion is None, _CLOSE_S):
-                    self._send_now("stop", channel=apt.CHANNEL, mode=_IMMEDIATE)
+                    self._send_now("stop", mode=_IMMEDIATE)
                 if failed:
-                    self._send_now("set_enabled", channel=apt.CHANNEL, state=_OFF)
+                    self._send_now("set_enabled", state=_OFF)
             self._send_now("disconnect")
         self._link.close()
 
@@ -272,7 +272,7 @@ class AptStage:
 
     def _send_stop(self) -> None:
         with contextlib.suppress(DeviceError):
-            self._send_now("stop", channel=apt.CHANNEL, mode=_PROFILED)
+            self._send_now("stop", mode=_PROFILED)
 
     # Timers, in the writer's thread
 
@@ -282,9 +282,7 @@ class AptStage:
     def request_status(self) -> None:
         """Request a status unless one is on its way; see ``Actions``."""
         if self._tracker.begin_poll():
-            self._link.write(
-                apt.pack("request_status", self._settings.address, channel=apt.CHANNEL)
-            )
+            self._link.write(apt.pack("request_status", self._settings.address))
 
     def _check_health(self) -> None:
         # The writer must not block: it also keeps the controller's watchdog alive.
@@ -340,6 +338,6 @@ class AptStage:
         self._send_stop()
         if escalate:
             address, now_ns = self._settings.address, self._link.now_ns()
-            stop = apt.pack("stop", address, channel=apt.CHANNEL, mode=_IMMEDIATE)
-            disable = apt.pack("set_enabled", address, channel=apt.CHANNEL, state=_OFF)
+            stop = apt.pack("stop", address, mode=_IMMEDIATE)
+            disable = apt.pack("set_enabled", address, state=_OFF)
             self._stopping = [(now_ns + 200_000_000, stop), (now_ns + 300_000_000, disable)]

@@ -27,50 +27,36 @@ PACKED = [
     (apt.pack("request_info", 0x11), oracle.hw_req_info(0x11, 1)),
     (apt.pack("stop_updates", BAY), oracle.hw_stop_updatemsgs(BAY, 1)),
     (apt.pack("request_bay", 0x11, bay=2), oracle.rack_req_bayused(0x11, 1, 2)),
+    (apt.pack("set_enabled", BAY, state=1), oracle.mod_set_chanenablestate(BAY, 1, 1, 1)),
     (
-        apt.pack("set_enabled", BAY, channel=1, state=1),
-        oracle.mod_set_chanenablestate(BAY, 1, 1, 1),
-    ),
-    (
-        apt.pack(
-            "set_velocity", BAY, channel=1, minimum=0, acceleration=27_488, velocity=33_554_432
-        ),
+        apt.pack("set_velocity", BAY, minimum=0, acceleration=27_488, velocity=33_554_432),
         oracle.mot_set_velparams(BAY, 1, 1, 0, 27_488, 33_554_432),
     ),
-    (apt.pack("request_velocity", BAY, channel=1), oracle.mot_req_velparams(BAY, 1, 1)),
+    (apt.pack("request_velocity", BAY), oracle.mot_req_velparams(BAY, 1, 1)),
     (
-        apt.pack("set_home", BAY, channel=1, direction=2, limit=1, velocity=1_342_177, offset=-5),
+        apt.pack("set_home", BAY, direction=2, limit=1, velocity=1_342_177, offset=-5),
         oracle.mot_set_homeparams(BAY, 1, 1, 2, 1, 1_342_177, -5),
     ),
-    (apt.pack("home", BAY, channel=1), oracle.mot_move_home(BAY, 1, 1)),
+    (apt.pack("home", BAY), oracle.mot_move_home(BAY, 1, 1)),
     (
-        apt.pack("move_absolute", BAY, channel=1, position=-4_400_000),
+        apt.pack("move_absolute", BAY, position=-4_400_000),
         oracle.mot_move_absolute(BAY, 1, 1, -4_400_000),
     ),
-    (apt.pack("stop", BAY, channel=1, mode=2), oracle.mot_move_stop(BAY, 1, 1, 2)),
+    (apt.pack("stop", BAY, mode=2), oracle.mot_move_stop(BAY, 1, 1, 2)),
     (apt.pack("resume_end_of_move", BAY), oracle.mot_resume_endofmovemsges(BAY, 1)),
-    (apt.pack("request_status", BAY, channel=1), oracle.mot_req_dcstatusupdate(BAY, 1, 1)),
+    (apt.pack("request_status", BAY), oracle.mot_req_dcstatusupdate(BAY, 1, 1)),
     (apt.pack("keep_alive", BAY), oracle.mot_ack_dcstatusupdate(BAY, 1)),
-    (apt.pack("request_axis", BAY, channel=1), oracle.mot_req_stageaxisparams(BAY, 1, 1)),
+    (apt.pack("request_axis", BAY), oracle.mot_req_stageaxisparams(BAY, 1, 1)),
     (
-        apt.pack("set_profile_mode", BAY, channel=1, mode=0, jerk=100),
+        apt.pack("set_profile_mode", BAY, mode=0, jerk=100),
         oracle.mot_set_profilemodeparams(BAY, 1, 1, 0, 100),
     ),
     (
-        apt.pack(
-            "set_ports",
-            0x50,
-            channel=1,
-            mode_1=15,
-            polarity_1=1,
-            mode_2=0,
-            polarity_2=1,
-            reserved=0,
-        ),
+        apt.pack("set_ports", 0x50, mode_1=15, polarity_1=1, mode_2=0, polarity_2=1),
         oracle.mot_set_kcubetrigioconfig(0x50, 1, 1, 15, 1, 0, 1),
     ),
     (
-        apt.pack("set_pulses", 0x50, channel=1, **PULSES),
+        apt.pack("set_pulses", 0x50, **PULSES),
         oracle.mot_set_kcubeposttrigparams(0x50, 1, 1, *PULSES.values()),
     ),
 ]
@@ -86,7 +72,6 @@ def test_frames_of_the_manual() -> None:
     velocity = apt.pack(
         "set_velocity",
         apt.bay_address(2),
-        channel=1,
         minimum=0,
         acceleration=scale.acceleration(1000.0),
         velocity=scale.velocity(100.0),
@@ -155,6 +140,6 @@ def test_wrong_use_is_refused() -> None:
     with pytest.raises(ArgumentError, match="bay is 11"):
         apt.bay_address(11)
     with pytest.raises(ArgumentError, match="no field speed"):
-        apt.pack("home", BAY, channel=1, speed=3)
+        apt.pack("home", BAY, speed=3)
     with pytest.raises(ArgumentError, match="complete known message"):
         apt.parse(b"\x91\x04\x00\x00\x01\x21")

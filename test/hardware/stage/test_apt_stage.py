@@ -97,7 +97,7 @@ def test_profiled_stop_is_on_the_wire_at_once() -> None:
     bench.stage.move_to(200.0, 100.0)
     bench.advance(0.5)
     for _ in range(50):
-        bench.stage._setup.send("request_velocity", channel=1)
+        bench.stage._setup.send("request_velocity")
     asked_ns = bench.now_ns
     bench.stage.stop()
     assert bench.sent(0x0465)[-1] - asked_ns < 20_000_000
