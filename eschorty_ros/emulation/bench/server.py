@@ -106,20 +106,16 @@ def serve(folder: Path, settings: BenchSettings) -> None:
     with _locked(folder):
         bench = Bench(settings)
         with serving(bench, folder) as usb:
-            _announce(folder, settings)
+            print(
+                f"bench: {settings.scene}, {settings.calibration}; trigger {settings.trigger}; "
+                f"USB {usb_spec(folder)}, stage {stage_port(folder)}",
+                flush=True,
+            )
             termination.wait()
             # Ctrl-C reaches the nodes, too, which need their devices while they end.
             end_s = time.monotonic() + _LINGER_S
             while usb.clients and time.monotonic() < end_s:
                 time.sleep(_POLL_S)
-
-
-def _announce(folder: Path, settings: BenchSettings) -> None:
-    print(
-        f"bench: {settings.scene}, {settings.calibration}; trigger {settings.trigger}; "
-        f"USB {usb_spec(folder)}, stage {stage_port(folder)}",
-        flush=True,
-    )
 
 
 @contextlib.contextmanager
@@ -160,13 +156,13 @@ def _locked(folder: Path) -> Iterator[None]:
 @click.option("--missing-edges", type=click.FloatRange(0.0, 1.0), default=0.0, show_default=True,
               help="Share of the trigger edges that the camera misses.")  # fmt: skip
 @click.option("--sensor-ppm", type=float, default=0.0, show_default=True,
-              help="How much too fast the camera's clock runs.")  # fmt: skip
+              help="Rate error of the camera's clock, ppm.")  # fmt: skip
 @click.option("--generator-ppm", type=float, default=0.0, show_default=True,
-              help="How much too fast the generator's clock runs.")  # fmt: skip
+              help="Rate error of the generator's clock, ppm.")  # fmt: skip
 @click.option("--usb-jitter", type=click.FloatRange(0.0, 1000.0), default=0.0, show_default=True,
-              help="The camera's bytes come late by up to so many ms.")  # fmt: skip
+              help="Largest delay of the camera's bytes, ms.")  # fmt: skip
 @click.option("--laser-log", type=click.Path(dir_okay=False, path_type=Path),
-              help="File that gets a line '<ns> ON|OFF' at every change of the laser output, "
+              help="File for a line '<ns> ON|OFF' per change of the laser output, "
               "CLOCK_MONOTONIC.")  # fmt: skip
 def command(
     folder: Path | None,
