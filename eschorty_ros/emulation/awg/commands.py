@@ -119,10 +119,20 @@ def _value(path: str, name: str, low: float, high: float, decimals: int) -> Comm
         if value is not None:
             setattr(state, name, round(value, decimals))
 
-    return _command(path, put, lambda state: plain(getattr(state, name), decimals))
+    return _command(path, put, lambda state: _plain(getattr(state, name), decimals))
 
 
-def plain(value: float, decimals: int) -> str:
+def _level(path: str, name: str) -> Command:
+    def put(state: ChannelState, text: str) -> None:
+        value = _number(text, -LEVEL_LIMIT_V, LEVEL_LIMIT_V)
+        if value is not None:
+            levels = {"high_v": state.high_v, "low_v": state.low_v, name: round(value, 3)}
+            state.set_levels(**levels)
+
+    return _command(path, put, lambda state: _plain(getattr(state, name), 3))
+
+
+def _plain(value: float, decimals: int) -> str:
     """Return a plain decimal without trailing zeros."""
     text = f"{value:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
@@ -141,29 +151,17 @@ def _put_load(state: ChannelState, text: str) -> None:
         state.set_load(value)
 
 
-def _put_high(state: ChannelState, text: str) -> None:
-    value = _number(text, -LEVEL_LIMIT_V, LEVEL_LIMIT_V)
-    if value is not None:
-        state.set_levels(round(value, 3), state.low_v)
-
-
-def _put_low(state: ChannelState, text: str) -> None:
-    value = _number(text, -LEVEL_LIMIT_V, LEVEL_LIMIT_V)
-    if value is not None:
-        state.set_levels(state.high_v, round(value, 3))
-
-
 CHANNEL_COMMANDS = (
     _switch("OUTPut", "output"),
     _switch("OUTPut:SYNC", "sync"),
     _word("BASE:WAVe", "wave", WAVES),
     _word("MODe", "mode", MODES),
-    _command("BASE:FREQuency", _put_frequency, lambda state: plain(state.frequency_hz, 6)),
-    _command("BASE:HIGH", _put_high, lambda state: plain(state.high_v, 3)),
-    _command("BASE:LOW", _put_low, lambda state: plain(state.low_v, 3)),
+    _command("BASE:FREQuency", _put_frequency, lambda state: _plain(state.frequency_hz, 6)),
+    _level("BASE:HIGH", "high_v"),
+    _level("BASE:LOW", "low_v"),
     _value("BASE:DUTY", "duty_percent", 0.1, 99.9, 3),
     _value("BASE:PHASe", "phase_deg", -360.0, 360.0, 2),
-    _command("LOAD", _put_load, lambda state: plain(state.load_ohm, 0)),
+    _command("LOAD", _put_load, lambda state: _plain(state.load_ohm, 0)),
     _switch("INVersion", "inversion"),
     _switch("LIMit:ENABle", "limit"),
     _value("LIMit:LOWer", "limit_lower_v", -LEVEL_LIMIT_V, LEVEL_LIMIT_V, 3),

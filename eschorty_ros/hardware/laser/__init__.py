@@ -1,1 +1,1 @@
-"""Laser generator driver and its guard."""
+"""The driver of the generator that modulates the laser."""

@@ -19,7 +19,12 @@ from eschorty_ros.hardware.base.protocols import (
     LaserReadback,
 )
 from eschorty_ros.hardware.base.usb import find_device, open_backend
-from eschorty_ros.hardware.laser.awg_channel import NAME, AwgChannel, wanted_settings
+from eschorty_ros.hardware.laser.awg_channel import (
+    LIGHT_SETTINGS,
+    NAME,
+    AwgChannel,
+    wanted_settings,
+)
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
@@ -122,10 +127,8 @@ class AwgLaser:
     def enable(self) -> None:
         """Read all settings back, switch on, read that back.
 
-        Raises
-        ------
-        DeviceError
-            Not armed, not configured, a setting that differs, a failure; the output is off then.
+        Raises ``DeviceError`` when not armed or configured, when a setting differs, and for a
+        failure; the output is off then.
         """
         with self._command():
             if not self._armed:
@@ -142,10 +145,8 @@ class AwgLaser:
         Writes OUTPut OFF, lowers the levels, reads back; on a failure again after clearing the
         link, and again after opening the generator again.
 
-        Raises
-        ------
-        DeviceError
-            ``laser state unknown``: the generator did not confirm; ``readback`` is UNKNOWN then.
+        Raises ``DeviceError``, ``laser state unknown``, when the generator does not confirm;
+        ``readback`` is UNKNOWN then.
         """
         with self._in_flight.disabling("switched off meanwhile"), self._lock:
             self._armed = False
@@ -156,10 +157,8 @@ class AwgLaser:
     def readback(self) -> LaserReadback:
         """Read the output back and, while it is on, levels and waveform; UNKNOWN counts as on.
 
-        Raises
-        ------
-        DeviceError
-            No reply, or an output that is on differs from its settings; it is off then.
+        Raises ``DeviceError`` for no reply, and for an output that is on but differs from its
+        settings; it is off then.
         """
         with self._command():
             if self._open_channel is not None and self._output is not LaserOutput.UNKNOWN:
@@ -178,10 +177,7 @@ class AwgLaser:
     def close(self) -> None:
         """Switch off and release; idempotent.
 
-        Raises
-        ------
-        DeviceError
-            ``laser state unknown``; the generator is released all the same.
+        Raises ``DeviceError``, ``laser state unknown``, after releasing it all the same.
         """
         with self._in_flight.disabling("closed"), self._lock:
             if self._closed:
@@ -296,7 +292,7 @@ class AwgLaser:
             self._ready = False
             self._reason = f"{NAME}: output found off; restarted, or switched off by hand"
         elif self._output is LaserOutput.ON:
-            channel.verify_waveform()
+            channel.verify(LIGHT_SETTINGS)
         channel.unlock()
 
     def _enable(self) -> None:

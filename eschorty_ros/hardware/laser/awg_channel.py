@@ -16,6 +16,7 @@ from eschorty_ros.hardware.laser.scpi import Scpi
 from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 
 NAME = "laser generator"
+LIGHT_SETTINGS = ("waveform", "frequency", "high", "low", "duty")
 Result = TypeVar("Result")
 Wanted = dict[str, Value]
 
@@ -128,13 +129,7 @@ class AwgChannel:
         )
 
     def apply(self, wanted: Wanted) -> None:
-        """Make every setting of a disabled output, then read all of them back.
-
-        Raises
-        ------
-        DeviceError
-            A failure, or a setting that reads back as something else.
-        """
+        """Make every setting of a disabled output; raises ``DeviceError`` unless all read back."""
         self._wanted = dict(wanted)
         for name, value in wanted.items():
             if name == "high":
@@ -148,14 +143,19 @@ class AwgChannel:
         if self._lowered and "high" in self._wanted:
             self._set_levels(float(self._wanted["high"]), float(self._wanted["low"]))
 
-    def verify(self) -> None:
-        """Read every setting back; raises ``DeviceError`` that names those that differ."""
-        self._compare(self._wanted)
-
-    def verify_waveform(self) -> None:
-        """Read back what changes the light: levels, waveform, frequency and duty."""
-        light = ("waveform", "frequency", "high", "low", "duty")
-        self._compare({name: self._wanted[name] for name in light if name in self._wanted})
+    def verify(self, names: tuple[str, ...] = ()) -> None:
+        """Read settings back, by default all; raises ``DeviceError`` that names what differs."""
+        wrong = []
+        for name, value in self._wanted.items():
+            if names and name not in names:
+                continue
+            found = self._get(name, self._settings.channel)
+            if found is not None and not self._profile.settings[name].agrees(value, found):
+                wrong.append(f"{name} is {_shown(found)} instead of {_shown(value)}")
+        if wrong:
+            raise DeviceError(
+                f"{NAME}: {', '.join(wrong)}; check its display and the profile, then configure it"
+            )
 
     def enable(self) -> None:
         """Switch the output on; raises ``DeviceError``."""
@@ -169,10 +169,7 @@ class AwgChannel:
     def disable(self) -> None:
         """Write OUTPut OFF for all channels and lower the levels, without a retry; read back.
 
-        Raises
-        ------
-        DeviceError
-            A failure, or an output that reads back as on.
+        Raises ``DeviceError`` for a failure and for an output that reads back as on.
         """
         self._lowered = True
         for message in self._disabling:
@@ -206,17 +203,6 @@ class AwgChannel:
         for name, value in levels if high >= present else reversed(levels):
             self._set(name, value)
         self._lowered = False
-
-    def _compare(self, wanted: Wanted) -> None:
-        wrong = []
-        for name, value in wanted.items():
-            found = self._get(name, self._settings.channel)
-            if found is not None and not self._profile.settings[name].agrees(value, found):
-                wrong.append(f"{name} is {_shown(found)} instead of {_shown(value)}")
-        if wrong:
-            raise DeviceError(
-                f"{NAME}: {', '.join(wrong)}; check its display and the profile, then configure it"
-            )
 
     def _get(self, name: str, channel: int) -> Value | None:
         return self._read_back(lambda: self._scpi.get(name, channel))

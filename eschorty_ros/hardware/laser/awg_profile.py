@@ -82,7 +82,9 @@ class Setting(Schema):
             allowed = self.tolerance + self.tolerance_share * abs(float(wanted))
             return abs(float(found) - float(wanted)) <= allowed
         if self.kind == "keyword":
-            return same_keyword(str(wanted), str(found))
+            # SCPI keywords have a long form and a short one, which is its capitals.
+            short = "".join(letter for letter in str(wanted) if not letter.islower())
+            return str(found).upper() in (str(wanted).upper(), short)
         return bool(wanted) == bool(found)
 
     def check(self, name: str, value: Value) -> None:
@@ -135,12 +137,6 @@ class AwgProfile(Schema):
         if self.dark_limit_v < self.dark_high_v:
             raise ValueError("dark_limit_v lies below dark_high_v; raise it")
         return self
-
-
-def same_keyword(spelt: str, found: str) -> bool:
-    """Return whether a reply is a SCPI keyword in its long or short form, upper or lower case."""
-    short = "".join(letter for letter in spelt if not letter.islower())
-    return found.upper() in (spelt.upper(), short)
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> AwgProfile:

@@ -52,10 +52,7 @@ class Scpi:
     def get(self, name: str, channel: int) -> Value:
         """Return the value of ``name``: bool, float or keyword, by its kind.
 
-        Raises
-        ------
-        DeviceError
-            No reply, or twice one that is no value of that kind.
+        Raises ``DeviceError`` for no reply, and for two that are no value of that kind.
         """
         query = self._profile.settings[name].command.format(channel=channel) + "?"
         return self._attempt(lambda: self._parsed(name, query, self._ask(query)))

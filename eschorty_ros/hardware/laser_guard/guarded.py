@@ -140,10 +140,7 @@ class GuardedLaser:
     def disable(self) -> None:
         """Switch the output off and disarm; idempotent.
 
-        Raises
-        ------
-        DeviceError
-            When it is not confirmed that the output is off.
+        Raises ``DeviceError`` when it is not confirmed that the output is off.
         """
         if not self._lost:
             try:
@@ -166,10 +163,8 @@ class GuardedLaser:
     def close(self) -> None:
         """Switch off and release; idempotent.
 
-        Raises
-        ------
-        DeviceError
-            When it is not confirmed that the output is off; the guard retries for a while.
+        Raises ``DeviceError`` when it is not confirmed that the output is off; the guard retries
+        for a while.
         """
         if self._closing:
             return

@@ -13,10 +13,7 @@ from eschorty_ros.hardware.base.protocols import LaserModulator
 def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
     """Return the function that opens the generator: ``module:callable`` with keywords.
 
-    Raises
-    ------
-    DeviceError
-        When there is no such callable.
+    Raises ``DeviceError`` when there is no such callable.
     """
     module, _, attribute = name.partition(":")
     try:
@@ -31,10 +28,7 @@ def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator
 def open_again(make: Callable[[], LaserModulator], serial: str) -> LaserModulator:
     """Open the generator that was lost, which disables its output.
 
-    Raises
-    ------
-    DeviceError
-        It is not there, or there is another one, whose output proves nothing.
+    Raises ``DeviceError`` when it is not there; the output of another one proves nothing.
     """
     laser = make()
     found = laser.identity.serial

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.hardware.laser.awg_profile import SETTINGS, load_profile, same_keyword
+from eschorty_ros.hardware.laser.awg_profile import SETTINGS, Setting, load_profile
 
 PROFILE = Path(__file__).parents[3] / "config" / "awg_utg900e.yaml"
 
@@ -58,7 +58,7 @@ def test_unknown_name_lists_those_there_are() -> None:
     ],
 )
 def test_replies_in_long_and_short_form(spelt: str, found: str, same: bool) -> None:
-    assert same_keyword(spelt, found) is same
+    assert Setting(command="MODe", kind="keyword").agrees(spelt, found) is same
 
 
 def test_tolerance_is_for_digits_not_for_clamps() -> None:

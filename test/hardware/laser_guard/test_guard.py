@@ -172,7 +172,7 @@ class Owner:
     ) -> None:
         self.awg = awg
         self.process = subprocess.Popen(
-            [sys.executable, "-c", OWNER, AWG, awg.backend, str(timeout_s)],
+            [sys.executable, "-c", OWNER, "lazy_awg:open_laser", awg.backend, str(timeout_s)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,

@@ -1,0 +1,13 @@
+"""The generator's driver, imported only in the guard: its owner is small and ends quickly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from eschorty_ros.hardware.base.protocols import LaserModulator
+
+
+def open_laser(**settings: Any) -> LaserModulator:
+    from eschorty_ros.hardware.laser import awg
+
+    return awg.open_laser(**settings)
