@@ -32,7 +32,13 @@ def kernel(*arguments: Any, **options: Any) -> Any:
 def _compiled(function: Callable[..., Any], signatures: tuple[Any, ...], options: Any) -> Any:
     dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     # numba has no public way to say what a cached function depends on.
-    dispatcher._cache._cache_file._source_stamp = dispatcher.source_digest = _digest(function)
+    index = dispatcher._cache._cache_file
+    index._source_stamp = dispatcher.source_digest = _digest(function)
+    try:
+        index._load_index()
+    except Exception:
+        # It names a type of an earlier version that exists no more.
+        index.flush()
     for signature in signatures:
         dispatcher.compile(signature)
     if signatures:

@@ -50,3 +50,31 @@ def test_a_change_in_another_file_reaches_the_kernels_that_use_it(tmp_path, sign
     assert result(factor=20, scale=2) == 22
     assert result(factor=20, scale=3) == 23
     assert len(list(tmp_path.glob("cache/*/*_total*.nbi"))) == 1
+
+
+def test_an_argument_type_that_exists_no_more_does_not_break_the_cache(tmp_path):
+    """The cache's index refers to argument types by module and name."""
+    code = """
+from typing import NamedTuple
+from eschorty_ros.core.base.kernel import kernel
+
+class {name}(NamedTuple):
+    first: int
+    second: int
+
+@kernel
+def _sum(pair):
+    return pair.first + pair.second
+"""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+    }
+    for name in ("Pair", "Renamed"):
+        (tmp_path / "pairs.py").write_text(code.format(name=name))
+        call = f"from pairs import _sum, {name}; print(_sum({name}(1, 2)))"
+        done = subprocess.run(
+            [sys.executable, "-B", "-c", call], env=environment, capture_output=True, text=True
+        )
+        assert done.stdout == "3\n", done.stderr
