@@ -2,14 +2,13 @@
 
 from eschorty_ros.core.line.centroid import (
     FULL_COLUMN_METHODS,
-    FWHM_PER_SIGMA,
-    HALF_WIDTH_PER_FWHM,
     METHODS,
     RETURNS,
     Centroids,
     check_method,
     estimate,
 )
+from eschorty_ros.core.line.estimators import FWHM_PER_SIGMA, HALF_WIDTH_PER_FWHM
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
 from eschorty_ros.core.line.sigma import (
     METHOD_ERRORS,

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import integer, number, positive
+from eschorty_ros.core.base.arrays import integer, number
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import (
     HALF_PER_SIGMA,
+    HALF_WIDTH_PER_FWHM,
     _edge_midpoint,
     _fill_likelihood,
     _gauss_ml,
@@ -58,8 +59,6 @@ from eschorty_ros.core.line.window import (
 METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
 FULL_COLUMN_METHODS = ("mean", "median")
 RETURNS = ("strongest", "first", "last", "all")
-HALF_WIDTH_PER_FWHM = 1.3
-FWHM_PER_SIGMA = 2.3548200450309493
 
 # Codes are places in the tuples above. The methods up to MEAN are a window's mean.
 _MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID = range(5)
@@ -152,7 +151,6 @@ class PeriodSums(NamedTuple):
 
 def half_width_fixed(fwhm_px: float) -> int:
     """Return the half width of the averaging window for a line of ``fwhm_px``, fixed point."""
-    positive("fwhm_px", fwhm_px)
     return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), 3 * FRACTION)
 
 
@@ -175,30 +173,6 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
             f"'strongest', or one of {', '.join(windowed)} as centroid"
         )
     return METHODS.index(method), RETURNS.index(returns)
-
-
-def make_estimator(
-    method: str,
-    returns: str,
-    *,
-    seeded: bool,
-    events_min: int,
-    rows: int,
-    line_width_px: float,
-    model: ErrorModel,
-) -> Estimator:
-    """Return the settings of an estimator from checked values, see `estimate`."""
-    method_code, returns_code = check_method(method, returns)
-    return Estimator(
-        method=method_code,
-        returns=returns_code,
-        seeded=seeded,
-        events_min=events_min,
-        rows=rows,
-        half_max=half_width_fixed(line_width_px),
-        line_variance=VARIANCE_PER_WIDTH2 * line_width_px**2,
-        error_model=model,
-    )
 
 
 def make_scratch(half_max: int) -> Scratch:
@@ -288,15 +262,16 @@ def estimate(
     if not 0.5 <= number("line_width_px", line_width_px) <= height:
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
     integer("events_min", events_min, 1, 1 << 31)
-    check_method(method, returns)
-    estimator = make_estimator(
-        method,
-        returns,
+    method_code, returns_code = check_method(method, returns)
+    estimator = Estimator(
+        method=method_code,
+        returns=returns_code,
         seeded=False,
         events_min=events_min,
         rows=height,
-        line_width_px=line_width_px,
-        model=error_model(method, sigma_factor, sigma_floor_px, sigma_common_px),
+        half_max=half_width_fixed(line_width_px),
+        line_variance=VARIANCE_PER_WIDTH2 * line_width_px**2,
+        error_model=error_model(method, sigma_factor, sigma_floor_px, sigma_common_px),
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, scratch = grouped_columns(row_array, offset_array), make_scratch(estimator.half_max)

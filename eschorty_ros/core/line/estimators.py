@@ -7,8 +7,10 @@ import numpy as np
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST, ROW_MASK, _limits
 
-# A window's half width in standard deviations of the line: 1.3 x FWHM, fixed point.
-HALF_PER_SIGMA = 1.3 * 2.3548200450309493 * FRACTION
+FWHM_PER_SIGMA = 2.3548200450309493
+HALF_WIDTH_PER_FWHM = 1.3
+# A window's half width in standard deviations of the line, fixed point.
+HALF_PER_SIGMA = HALF_WIDTH_PER_FWHM * FWHM_PER_SIGMA * FRACTION
 _EM_ITERATIONS = 4
 _WEIGHT_ONE = 1 << 20
 # Reach of the likelihood in half widths of a window: 4.3 standard deviations.

@@ -10,7 +10,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.edges import EDGES_MAX
 from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
-from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
+from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler
 
 
 class PeriodCutter:
@@ -107,4 +107,4 @@ class PeriodCutter:
     ) -> int:
         t, x, y, p = (values[part] for values in events)
         self.lock.observe(t, p)
-        return self._assembler.merge(t, x, y, p, edges_us, indices, edge, drain)
+        return self._assembler.merge((t, x, y, p), Edges(edges_us, indices), edge, drain)

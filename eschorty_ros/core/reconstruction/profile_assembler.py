@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import EventArrays
@@ -16,13 +15,14 @@ from eschorty_ros.core.line.centroid import (
     Rows,
     Scratch,
     _estimate_columns,
+    check_method,
     empty_rows,
-    make_estimator,
+    half_width_fixed,
     make_scratch,
 )
 from eschorty_ros.core.line.columns import Columns, _append, empty_columns
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
-from eschorty_ros.core.line.sigma import CLIPPED, error_model
+from eschorty_ros.core.line.sigma import CLIPPED, VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
@@ -59,7 +59,7 @@ _STATE = np.dtype([(name, np.int64) for name in ("period", "edge_us", "phase", "
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
 
-class _Edges(NamedTuple):
+class Edges(NamedTuple):
     """Times and numbers of the beginnings of periods."""
 
     t_us: NDArray[np.int64]
@@ -140,12 +140,8 @@ class ProfileAssembler:
 
     def merge(
         self,
-        t: NDArray[np.int64],
-        x: NDArray[np.uint16],
-        y: NDArray[np.uint16],
-        p: NDArray[np.uint8],
-        edges: NDArray[np.int64],
-        indices: NDArray[np.int64],
+        events: tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]],
+        edges: Edges,
         first_edge: int,
         drain: bool,
     ) -> int:
@@ -153,10 +149,10 @@ class ProfileAssembler:
 
         Parameters
         ----------
-        t, x, y, p : int64, uint16, uint16, uint8, equal length
-            Events in time order.
-        edges, indices : int64, equal length
-            Times and numbers of the periods' beginnings; those before ``first_edge`` are done.
+        events : tuple of ndarray
+            Times in us, columns, rows and polarities in time order.
+        edges : Edges
+            Those before ``first_edge`` are done.
         drain : bool
             No more events come before the last edge: all edges are processed.
 
@@ -165,32 +161,24 @@ class ProfileAssembler:
         int
             First edge that is left.
         """
-        size = exact("t", t, np.int64).size
-        events = EventArrays(
-            np.ascontiguousarray(t),
-            exact("x", x, np.uint16, size),
-            exact("y", y, np.uint16, size),
-            exact("p", p, np.uint8, size),
-        )
-        times = exact("edges", edges, np.int64)
-        beginnings = _Edges(times, exact("indices", indices, np.int64, times.size))
-        progress = _Progress(0, integer("first_edge", first_edge, 0, times.size))
+        arrays = EventArrays(*events)
+        progress = _Progress(0, first_edge)
         while True:
             progress = _merge(
-                events, beginnings, progress, drain, self._gate, self._memory, self._state,
+                arrays, edges, progress, drain, self._gate, self._memory, self._state,
                 self._counters,
             )  # fmt: skip
-            if progress.event == size and (progress.edge == times.size or not drain):
+            left = progress.event < arrays.t.size or (drain and progress.edge < edges.t_us.size)
+            if not left:
                 return int(progress.edge)
             self._collect()
 
     def close(self) -> None:
         """Close the open period if it holds events; it stays open for further ones."""
         if self._state["phase"] == _FILLED:
-            none = np.empty(0, dtype=np.int64)
-            nowhere = np.empty(0, dtype=np.uint16)
-            edge, period = (np.array([self._state[name]]) for name in ("edge_us", "period"))
-            self.merge(none, nowhere, nowhere, np.empty(0, dtype=np.uint8), edge, period, 0, True)
+            none = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
+            again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
+            self.merge(none, again, first_edge=0, drain=True)
 
     def take(self) -> LineRows:
         """Return the rows of the periods closed since the last call."""
@@ -210,14 +198,16 @@ class ProfileAssembler:
 
 
 def _allocate(settings: Settings, model: RangeModel) -> _Memory:
-    estimator = make_estimator(
-        settings.centroid,
-        settings.returns,
+    method_code, returns_code = check_method(settings.centroid, settings.returns)
+    estimator = Estimator(
+        method=method_code,
+        returns=returns_code,
         seeded=True,
         events_min=settings.events_min,
         rows=model.rows,
-        line_width_px=settings.line_width_px,
-        model=error_model(
+        half_max=half_width_fixed(settings.line_width_px),
+        line_variance=VARIANCE_PER_WIDTH2 * settings.line_width_px**2,
+        error_model=error_model(
             settings.centroid,
             settings.sigma_factor,
             settings.sigma_floor_px,

@@ -90,7 +90,7 @@ def quantile_within_pixels(rows, share):
 
 
 @pytest.mark.parametrize("events", [1, 3, 8, 16, 41])
-def test_edge_mid_lies_between_the_eighths_of_the_footprint(events):
+def test_edge_mid_lies_between_the_eighths_of_the_line(events):
     rng = np.random.default_rng(SEED)
     for _ in range(50):
         rows = np.rint(rng.normal(300, 4, events)).astype(int)
@@ -99,8 +99,8 @@ def test_edge_mid_lies_between_the_eighths_of_the_footprint(events):
         assert found.row[0] == pytest.approx(np.mean(edges), abs=1e-9), f"seed {SEED}: {rows}"
 
 
-def test_edge_mid_does_not_see_a_skewed_middle():
-    """A flat footprint with more events on one side: its edges stay, its mean moves."""
+def test_edge_mid_does_not_depend_on_a_skewed_middle():
+    """A flat line with more events on one side: its edges stay, its mean moves."""
     flat = np.repeat(np.arange(290, 311), 8)
     skewed = np.concatenate([flat, np.repeat([296, 297, 298], 16)])
     there, back = (
@@ -113,7 +113,7 @@ def test_edge_mid_does_not_see_a_skewed_middle():
 @pytest.mark.parametrize("method", WINDOWED)
 @pytest.mark.parametrize("row", [0.0, 5.0, 12.0, 719.0])
 def test_line_cut_by_the_sensor_is_not_biased(method, row):
-    """The part on the sensor has its mean up to 0.8 sigma inside; the row is the whole line's."""
+    """The part on the sensor has its mean up to 0.8 sigma inside; the row is the full line's."""
     rng = np.random.default_rng(SEED)
     sigma, events, columns = 8.493, 100, 1500
     rows = np.rint(rng.normal(row, sigma, (columns, 4 * events)))
@@ -136,7 +136,7 @@ def test_stronger_of_two_surfaces_wins():
     assert np.abs(found.row - 300).max() < 4.0
 
 
-def test_two_equal_separate_groups_are_left_undecided():
+def test_two_equal_separate_groups_are_ambiguous():
     found = estimate([100, 100, 100, 600, 600, 600], [0, 6], line_width_px=5.0)
     assert np.isnan(found.row[0])
     assert found.ambiguous[0]
@@ -145,12 +145,12 @@ def test_two_equal_separate_groups_are_left_undecided():
 def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
     line = np.arange(290, 311).repeat(2)
     sigma = {}
-    for strays in (0, 1, 3):
-        rows = np.concatenate([line, np.linspace(20, 700, strays).astype(int)])
+    for background in (0, 1, 3):
+        rows = np.concatenate([line, np.linspace(20, 700, background).astype(int)])
         found = estimate(rows, [0, rows.size], "mean")
         error = found.row[0] - 300.0
-        assert abs(error) <= 2.0 * found.sigma_row[0], strays
-        sigma[strays] = found.sigma_row[0]
+        assert abs(error) <= 2.0 * found.sigma_row[0], background
+        sigma[background] = found.sigma_row[0]
     own = METHOD_ERRORS["mean"]
     floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2 + SIGMA_COMMON_PX**2
     spread2 = (own.factor * SIGMA_FACTOR) ** 2 * line.var(ddof=1) / line.size
@@ -158,20 +158,7 @@ def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
     assert sigma[0] < sigma[1] < sigma[3]
 
 
-@pytest.mark.parametrize(
-    ("rows", "offsets", "options"),
-    [
-        ([1, 720], [0, 2], {}),
-        ([-1], [0, 1], {}),
-        ([1.5], [0, 1], {}),
-        ([1], [0, 2], {}),
-        ([1, 2], [0, 2, 1, 2], {}),
-        ([1], [0, 1], {"method": "best"}),
-        ([1], [0, 1], {"line_width_px": float("nan")}),
-        ([1], [0, 1], {"height": 5000}),
-    ],
-)
-def test_bad_arguments_are_refused(rows, offsets, options):
-    with pytest.raises(ArgumentError) as caught:
-        estimate(rows, offsets, **options)
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize("offsets", [[0, 1], [0, 3], [1, 2], [0, 2, 1, 2]])
+def test_offsets_that_do_not_cover_the_rows_are_refused(offsets):
+    with pytest.raises(ArgumentError, match="offsets run from"):
+        estimate([300, 301], offsets)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from line_events import encoded
 
-from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, phase_gate
@@ -106,8 +105,6 @@ def test_gate_off_or_as_long_as_the_period_removes_nothing():
 
 def test_a_sine_has_no_edges_to_gate_by():
     assert phase_gate(Modulation(70.0, waveform="sine"), 1000).length_us == 0.0
-    with pytest.raises(ArgumentError, match="gate_us is -1; choose a whole number from 0 to"):
-        phase_gate(Modulation(70.0), -1)
 
 
 def test_points_do_not_depend_on_how_the_bytes_are_split():
