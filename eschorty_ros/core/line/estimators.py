@@ -135,15 +135,15 @@ def _gauss_ml(packed, column, window, first, last, half, rows, table):
         centre += np.int64(np.rint(shift))
         odds = (n - line) / line * per_row
         weights = np.int64(0)
-        moment = np.int64(0)
+        weighted = np.int64(0)
         for i in range(start, start + n):
             row = np.int64(packed[i] & ROW_MASK)
             if low <= row <= high:
                 d = row * FRACTION - centre
                 w = np.int64(_WEIGHT_ONE / (1.0 + odds * table[min(abs(d), table.size - 1)]))
                 weights += w
-                moment += w * d
+                weighted += w * d
         weights = max(weights, np.int64(1))
         line = max(weights / _WEIGHT_ONE, 1.0)
-        shift = moment / weights
+        shift = weighted / weights
     return (centre + shift) / FRACTION

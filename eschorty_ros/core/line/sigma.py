@@ -32,7 +32,7 @@ from eschorty_ros.core.line.window import FRACTION
 SIGMA_FACTOR = 0.05
 SIGMA_FLOOR_PX = 0.28
 SIGMA_COMMON_PX = 0.045
-SIGMA_LIMIT = 1e6
+_SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
 CLIPPED = 0.6
@@ -45,57 +45,39 @@ _JUMP = 0.2
 _WIDTH_SCATTER_PX = 0.7
 
 
-class MethodErrors(NamedTuple):
-    """An estimator's multiples of factor and floor, its ``b``, and its ``motion``."""
+class ErrorModel(NamedTuple):
+    """Coefficients of the variance of a row.
+
+    ``factor`` and ``floor`` are multiples of the settings in `METHOD_ERRORS`, and values in rows in
+    an `error_model`.
+    """
 
     factor: float
     floor: float
     background: float
     motion: float
+    median: bool = False
+    common: float = 0.0
+    clipped: float = 0.0
 
 
 METHOD_ERRORS = {
-    "mode_mean": MethodErrors(0.2, 0.89, 0.4, 0.20),
-    "mean": MethodErrors(0.4, 0.672, 1.0, 0.18),
-    "median": MethodErrors(0.2, 0.935, 1.48, 0.11),
-    "gauss_ml": MethodErrors(0.2, 0.91, 0.4, 0.20),
-    "edge_mid": MethodErrors(0.243, 0.885, 0.42, 0.18),
+    "mode_mean": ErrorModel(0.2, 0.89, 0.4, 0.20),
+    "mean": ErrorModel(0.4, 0.672, 1.0, 0.18),
+    "median": ErrorModel(0.2, 0.935, 1.48, 0.11, median=True),
+    "gauss_ml": ErrorModel(0.2, 0.91, 0.4, 0.20),
+    "edge_mid": ErrorModel(0.243, 0.885, 0.42, 0.18),
 }
-
-
-class ErrorModel(NamedTuple):
-    """Coefficients of the two parts of a row's variance."""
-
-    factor: float
-    floor: float
-    common: float
-    motion: float
-    background: float
-    clipped: float
-    median: bool
 
 
 def error_model(
     method: str,
-    sigma_factor: float = SIGMA_FACTOR,
-    sigma_floor_px: float = SIGMA_FLOOR_PX,
-    sigma_common_px: float = SIGMA_COMMON_PX,
+    sigma_factor: float,
+    sigma_floor_px: float,
+    sigma_common_px: float,
     clipped: float = CLIPPED,
 ) -> ErrorModel:
-    """Return the error model of an estimator.
-
-    Parameters
-    ----------
-    method : str
-        One of ``centroid.METHODS``.
-    sigma_factor : float
-        Factor ``a`` on s/sqrt(N).
-    sigma_floor_px : float
-        Part of a column's standard deviation that more events do not lessen.
-    sigma_common_px : float
-        Part that neighbouring columns share and smoothing does not lessen.
-    clipped : float
-        Standard deviation over the rows missing to the line's full width.
+    """Return the error model of an estimator; ``clipped`` is its coefficient of missing rows.
 
     Raises
     ------
@@ -103,14 +85,11 @@ def error_model(
         When a value is negative or not finite.
     """
     own = METHOD_ERRORS[method]
-    return ErrorModel(
-        factor=own.factor * number("sigma_factor", sigma_factor, 0.0, SIGMA_LIMIT),
-        floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, SIGMA_LIMIT),
-        common=float(number("sigma_common_px", sigma_common_px, 0.0, SIGMA_LIMIT)),
-        motion=own.motion,
-        background=own.background,
+    return own._replace(
+        factor=own.factor * number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),
+        floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, _SIGMA_LIMIT),
+        common=number("sigma_common_px", sigma_common_px, 0.0, _SIGMA_LIMIT),
         clipped=clipped,
-        median=method == "median",
     )
 
 
