@@ -143,10 +143,10 @@ class PeriodSums(NamedTuple):
     """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns."""
 
     squares: float
-    freedom: int
-    too_few_events: int
-    ambiguous: int
-    two_returns: int
+    freedom: np.int64
+    too_few_events: np.int64
+    ambiguous: np.int64
+    two_returns: np.int64
 
 
 def half_width_fixed(fwhm_px: float) -> int:
@@ -183,9 +183,10 @@ def make_scratch(half_max: int) -> Scratch:
 def empty_rows(returns: int, columns: int) -> Rows:
     """Return the rows of ``columns`` columns without any return."""
     shape = returns, columns
+    row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
     truncated, ambiguous = np.zeros(shape, np.bool_), np.zeros(columns, np.bool_)
-    return Rows(*np.full((4, *shape), np.nan), events, mean_dt_us, truncated, ambiguous)
+    return Rows(row, sigma2, common2, variance, events, mean_dt_us, truncated, ambiguous)
 
 
 def estimate(

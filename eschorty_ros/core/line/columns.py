@@ -27,7 +27,7 @@ class Columns(NamedTuple):
 class Appended(NamedTuple):
     """First event left, and the numbers of events not appended, by reason."""
 
-    next: int
+    next: np.int64
     over_limit: int
     outside: int
     gated: int

@@ -43,27 +43,27 @@ _FALSE_SECOND = 1000.0
 class Column(NamedTuple):
     """Place of one column in the packed events: ``events`` from ``start`` on, padded to blocks."""
 
-    start: int
-    events: int
-    blocks: int
+    start: np.int64
+    events: np.int64
+    blocks: np.int64
 
 
 class Sums(NamedTuple):
     """Sums over the events of a range of rows; d is the row minus the first row of the range."""
 
-    events: int
-    d: int
-    d2: int
-    time_us: int
+    events: np.int64
+    d: np.int64
+    d2: np.int64
+    time_us: np.int64
 
 
 class Window(NamedTuple):
     """Sums over the events of rows first..last, and their mean in fixed point."""
 
-    first: int
-    last: int
+    first: np.int64
+    last: np.int64
     sums: Sums
-    centre: int
+    centre: np.int64
 
 
 class Returns(NamedTuple):
@@ -81,9 +81,9 @@ class Returns(NamedTuple):
 class _Densest(NamedTuple):
     """Most events in a box, and the lowest and the highest row whose box holds so many."""
 
-    events: int
-    lowest: int
-    highest: int
+    events: np.int64
+    lowest: np.int64
+    highest: np.int64
 
 
 @kernel

@@ -105,6 +105,7 @@ class PeriodCutter:
         edge: int,
         drain: bool,
     ) -> int:
-        t, x, y, p = (values[part] for values in events)
-        self.lock.observe(t, p)
-        return self._assembler.merge((t, x, y, p), Edges(edges_us, indices), edge, drain)
+        t, x, y, p = events
+        ready = t[part], x[part], y[part], p[part]
+        self.lock.observe(t[part], p[part])
+        return self._assembler.merge(ready, Edges(edges_us, indices), edge, drain)

@@ -53,9 +53,9 @@ _COUNTERS = np.dtype(
         )
     ]
 )
-# ``phase`` is one of the three below, ``half`` the half width of a window for the open period in
+# ``status`` is one of the three below, ``half`` the half width of a window for the open period in
 # fixed point, ``rows`` the number of rows in the output.
-_STATE = np.dtype([(name, np.int64) for name in ("period", "edge_us", "phase", "half", "rows")])
+_STATE = np.dtype([(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows")])
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
 
@@ -128,7 +128,7 @@ class ProfileAssembler:
     def restart(self, modulation: Modulation) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``."""
         self._gate = phase_gate(modulation, self._gate_us)
-        self._state["phase"] = _CLOSED
+        self._state["status"] = _CLOSED
         self._state["half"] = self._memory.estimator.half_max
         self._memory.columns.counts[:] = 0
         self._memory.columns.seeds[:] = -1
@@ -175,7 +175,7 @@ class ProfileAssembler:
 
     def close(self) -> None:
         """Close the open period if it holds events; it stays open for further ones."""
-        if self._state["phase"] == _FILLED:
+        if self._state["status"] == _FILLED:
             none = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
             again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
             self.merge(none, again, first_edge=0, drain=True)
@@ -218,7 +218,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     )
     returns = 2 if settings.returns == "all" else 1
     shape = returns, model.columns
-    size = _OUTPUT_PROFILES * returns * model.columns
+    size, none = _OUTPUT_PROFILES * returns * model.columns, LineRows.empty()
     return _Memory(
         columns=empty_columns(model.columns, settings.column_limit),
         estimator=estimator,
@@ -233,13 +233,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         ),
         rows=empty_rows(*shape),
         scratch=make_scratch(estimator.half_max),
-        output=_Output(
-            *np.empty((3, size), np.int64),
-            np.empty(size, np.uint16),
-            *np.empty((3, size)),
-            np.empty(size, np.uint32),
-            np.empty(size, np.uint8),
-        ),
+        output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
     )
 
 
@@ -294,13 +288,13 @@ def _close(memory, state, counters):
 @kernel
 def _fill(events, first, limit_us, columns, rows, gate, state, counters):
     """Sort the events before ``limit_us`` into the open period; returns the first left."""
-    if state.phase == _CLOSED:
+    if state.status == _CLOSED:
         i = first
         while i < events.t.size and events.t[i] < limit_us:
             i += 1
         counters.events_before_first_edge += i - first
         return i
-    state.phase = _FILLED
+    state.status = _FILLED
     appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
     refused = appended.over_limit + appended.outside + appended.gated
     counters.events_binned += appended.next - first - refused
@@ -329,13 +323,13 @@ def _merge(events, edges, progress, drain, gate, memory, state, counters):
             i = _fill(events, i, limit_us, columns, rows, gate, state, counters)
         if edge == edges.t_us.size or (i == t.size and not drain):
             return _Progress(i, edge)
-        if state.phase == _FILLED:
+        if state.status == _FILLED:
             if state.rows > rows_max:
                 return _Progress(i, edge)
             _close(memory, state, counters)
-        elif state.phase == _EMPTY:
+        elif state.status == _EMPTY:
             counters.periods_empty += 1
-        state.phase = _EMPTY
+        state.status = _EMPTY
         state.edge_us = edges.t_us[edge]
         state.period = edges.period[edge]
         edge += 1

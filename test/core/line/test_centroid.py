@@ -127,15 +127,6 @@ def test_line_cut_by_the_sensor_is_not_biased(method, row):
     assert np.mean(np.abs(error) < 2 * found.sigma_row) > 0.95, f"seed {SEED}"
 
 
-def test_stronger_of_two_surfaces_wins():
-    rng = np.random.default_rng(SEED)
-    strong = np.rint(rng.normal(300, 4.0, (500, 60))).astype(int)
-    weak = np.rint(rng.normal(420, 4.0, (500, 40))).astype(int)
-    rows = np.hstack([weak, strong])
-    found = estimate(rows.ravel(), np.arange(501) * 100, line_width_px=10)
-    assert np.abs(found.row - 300).max() < 4.0
-
-
 def test_two_equal_separate_groups_are_ambiguous():
     found = estimate([100, 100, 100, 600, 600, 600], [0, 6], line_width_px=5.0)
     assert np.isnan(found.row[0])
