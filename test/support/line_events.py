@@ -27,7 +27,7 @@ def line_events(
     edge_us: int = 1000,
     latency_us: float = 200.0,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]:
-    """Independent events: half follow the rising edge, half the falling one, Gaussian in rows.
+    """Return independent events: half after the rising edge, half after the falling one, Gaussian.
 
     ``rows(period, columns)`` gives the true row, NaN where a column is dark.
     """
@@ -67,7 +67,7 @@ def encoded(
     events: tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]],
     triggers_us: NDArray[np.int64] | None = None,
 ) -> bytes:
-    """EVT3 bytes of the events, with rising trigger edges when given."""
+    """Return the EVT3 bytes of the events, with rising trigger edges when given."""
     t, x, y, p = events
     if triggers_us is None:
         return Encoder().encode(t, x, y, p)
@@ -77,7 +77,7 @@ def encoded(
 
 
 def blank_profiles(size: int, **values: NDArray[np.generic]) -> Profiles:
-    """Points whose fields are 0 unless given."""
+    """Return points whose fields are 0 unless given."""
     blank = Profiles.empty()
     kinds = {item.name: getattr(blank, item.name) for item in fields(Profiles)}
     zeros = {name: np.zeros(size, kind.dtype) for name, kind in kinds.items() if kind is not None}

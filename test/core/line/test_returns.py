@@ -1,4 +1,4 @@
-"""Two surfaces in one column: what is reported, in which order, and what smoothing makes of it."""
+"""Two surfaces in one column: which returns are reported, in which order, and their smoothing."""
 
 from __future__ import annotations
 
@@ -114,8 +114,8 @@ def test_ambiguous_columns_under_each_policy():
 
 
 @pytest.mark.parametrize("apart", [12.0, 16.0])
-def test_one_broad_footprint_is_not_two_surfaces(apart):
-    """Nearer than two widths: one footprint with a shoulder."""
+def test_one_broad_line_is_not_two_surfaces(apart):
+    """Nearer than two widths: one line with a shoulder."""
     rng = np.random.default_rng(SEED)
     rows = np.hstack([rng.normal(300.0, 4.2, (500, 30)), rng.normal(300.0 + apart, 4.2, (500, 25))])
     found = estimate(
@@ -133,7 +133,7 @@ def test_clouds_hold_both_returns():
 
 
 @pytest.mark.parametrize("method", ["mean", "median"])
-def test_whole_column_methods_cannot_tell_returns_apart(method):
+def test_full_column_methods_do_not_separate_returns(method):
     for refused in (
         lambda: Settings(centroid=method, returns="all"),
         lambda: Settings(returns="all", reflectance_compensation="on"),
