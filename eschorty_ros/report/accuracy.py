@@ -99,10 +99,6 @@ def stage_and_range_mm(
     stage_direction : tuple of float
         Unit vector of the stage.
 
-    Returns
-    -------
-    stage_mm, range_mm : ndarray of float64, shape (n,)
-
     Raises
     ------
     ArgumentError
@@ -229,10 +225,6 @@ def measure(
     stage_direction : tuple of float
     error_mm : ndarray of float64, shape (n,), optional
         Result of `range_error_mm` when it is already known.
-
-    Returns
-    -------
-    Accuracy
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)

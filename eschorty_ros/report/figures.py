@@ -46,10 +46,6 @@ def scan_figure(
     title : str
     stage_direction : tuple of float
 
-    Returns
-    -------
-    Figure
-
     Raises
     ------
     ArgumentError

@@ -21,10 +21,6 @@ def period_s(points: NDArray[np.void]) -> float:
     Parameters
     ----------
     points : ndarray of POINT_DTYPE
-
-    Returns
-    -------
-    float
     """
     order = np.lexsort((points["t"], points["column"]))
     t_s = points["t"][order]
@@ -57,10 +53,6 @@ def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
     points : ndarray of POINT_DTYPE, shape (n,)
     period : float
         Modulation period, seconds.
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
 
     Raises
     ------

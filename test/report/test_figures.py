@@ -49,7 +49,7 @@ def thin_sheet(points):
 
 
 @pytest.mark.parametrize("change", [lambda points: points, thin_sheet])
-def test_labels_of_the_3d_view_are_whole_and_apart(change):
+def test_labels_of_the_3d_view_are_inside_and_apart(change):
     figure = figures.scan_figure(change(step_cloud(lines=200)[0]))
     figure.canvas.draw()
     view = next(axes for axes in figure.axes if hasattr(axes, "zaxis"))
@@ -84,15 +84,12 @@ def test_the_depth_map_holds_each_point_once():
     np.testing.assert_allclose(image.get_extent(), (-0.5, 319.5, -0.35, 23.5 * 0.7), atol=1e-4)
 
 
-def test_one_profile_draws(tmp_path):
-    points, error = step_cloud(lines=1)
-    figures.save(figures.scan_figure(points, error), tmp_path / "one.png")
-    png_size(tmp_path / "one.png")
-
-
-def test_an_error_that_is_nowhere_known_draws(tmp_path):
-    points, error = step_cloud(lines=3)
-    figures.save(figures.scan_figure(points, np.full_like(error, np.nan)), tmp_path / "nan.png")
+@pytest.mark.parametrize(("lines", "known"), [(1, True), (3, False)])
+def test_one_profile_and_an_error_that_is_nowhere_known_are_drawn(tmp_path, lines, known):
+    points, error = step_cloud(lines)
+    error = error if known else np.full_like(error, np.nan)
+    figures.save(figures.scan_figure(points, error), tmp_path / "scan.png")
+    png_size(tmp_path / "scan.png")
 
 
 def test_an_empty_cloud_is_refused():

@@ -14,7 +14,6 @@ from eschorty_ros.cli import main
 from eschorty_ros.report.experiment import DataTable, Experiment, Finding, Outcome
 from eschorty_ros.report.figures import new_figure
 from eschorty_ros.report.page import band, number
-from eschorty_ros.report.sections import csv_text, describe
 
 
 def line_figure():
@@ -191,11 +190,3 @@ def test_bands_read_well(low, high, words):
 
 def test_nan_is_outside_every_band():
     assert not Finding("x", float("nan")).holds
-
-
-def test_a_figure_is_described_by_its_axes():
-    assert describe(line_figure()) == "Growth: events over time (s) (measured)"
-
-
-def test_csv_quotes_what_needs_it():
-    assert csv_text(DataTable(["a"], [['x,"y']])) == 'a\n"x,""y"\n'

@@ -153,10 +153,6 @@ def calibrate(
     date : str, optional
         ISO date for the file.
 
-    Returns
-    -------
-    CalibrationReport
-
     Raises
     ------
     ArgumentError

@@ -157,10 +157,6 @@ def fit(
         Standard deviations of Gaussian priors on free parameters, centred on ``design``; on a
         width bias centred on 0. Infinity means no prior.
 
-    Returns
-    -------
-    CalibrationFit
-
     Raises
     ------
     ArgumentError

@@ -109,10 +109,6 @@ def match_posts(
     nominal : RangeModel
         The build as designed: ``kk'`` holds within 15 %, ``b'`` within 120 rows.
 
-    Returns
-    -------
-    PostMatch
-
     Raises
     ------
     ArgumentError

@@ -38,10 +38,6 @@ def recorded_posts(
     progress : callable, optional
         Called with bytes read so far and bytes in all.
 
-    Returns
-    -------
-    PostMatch
-
     Raises
     ------
     CalibrationError
@@ -86,10 +82,6 @@ def recorded_moving_target(
         As in `recorded_posts`.
     range_at_zero_mm, range_per_stage, blocks
         As in `moving_target`, which also lists the errors.
-
-    Returns
-    -------
-    Targets
     """
     _check_sensor(recording, nominal)
     profiles = reconstruct_recording(recording, progress=progress).profiles

@@ -116,10 +116,6 @@ def read_distances(
     sigma_range_mm : float
         Standard deviation where the file gives none.
 
-    Returns
-    -------
-    list of KnownTarget
-
     Raises
     ------
     FormatError

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eschorty_ros.core.base.arrays import reals
-from eschorty_ros.core.optics.range_model import Array, RangeModel, depth_of_field_mm
+from eschorty_ros.core.base.arrays import Array, reals
+from eschorty_ros.core.optics.range_model import RangeModel, depth_of_field_mm
 
 
 def _cot(angle_deg: float) -> float:

@@ -148,12 +148,13 @@ def test_stated_intervals_cover_the_truth():
 def test_intervals_of_the_papers_method_cover_too_and_so_does_rejection():
     rng = np.random.default_rng(SEED)
     truth = RangeModel(DESIGN.k_mm, -37100.0, 0.0, -1140.0)
-    inside, robust = [], []
+    inside, robust, reduced = [], [], []
     for index in range(500):
         targets = see(rng, truth=truth)
         found = fit(targets, DESIGN)
         pulls = range_error_mm(found.model, truth) / found.range_sigma_mm(CHECK_MM)
         inside.append(np.abs(pulls) < 1.959964)
+        reduced.append(found.reduced_chi_square)
         if index < 150:
             report = calibrate(targets, NOMINAL, "paper", robust=True)
             pulls = range_error_mm(report.fit.model, truth) / report.fit.range_sigma_mm(CHECK_MM)
@@ -163,3 +164,4 @@ def test_intervals_of_the_papers_method_cover_too_and_so_does_rejection():
     )
     assert ((np.mean(inside, axis=0) >= 0.92) & (np.mean(inside, axis=0) <= 0.98)).all()
     assert np.mean(robust) >= 0.92
+    assert np.mean(reduced) == pytest.approx(1.0, abs=0.07)
