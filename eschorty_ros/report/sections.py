@@ -168,7 +168,7 @@ def describe(figure: Figure) -> str:
     return "; ".join(parts)
 
 
-def csv_text(table: DataTable) -> str:
+def _csv_text(table: DataTable) -> str:
     """Return header line and rows; numbers with every digit they have."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -195,6 +195,6 @@ def _write(name: str, outcome: Outcome, folder: Path) -> tuple[list[Picture], li
     for stem, table in outcome.tables.items():
         file = f"{name}-{stem}.csv"
         with atomic_write(folder / file) as stream:
-            stream.write(csv_text(table).encode())
+            stream.write(_csv_text(table).encode())
         sheets.append(Sheet(file, outcome.captions.get(stem, stem), table))
     return pictures, sheets

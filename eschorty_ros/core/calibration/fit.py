@@ -268,8 +268,8 @@ def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -
     problem : Problem
     start : Values
     cauchy_scale : float, optional
-        Residuals of targets count by Cauchy's loss beyond this many standard deviations; those of
-        priors stay squared.
+        Targets count by Cauchy's loss of their squared residuals' sum, in units of the square of
+        this many standard deviations; priors stay squared.
 
     Raises
     ------
@@ -281,16 +281,18 @@ def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -
 
     robust = cauchy_scale is not None
     tolerance = _START_TOLERANCE if robust else _TOLERANCE
-    targets = int(problem.observed.known.sum())
+    target = np.nonzero(problem.observed.known)[0]
 
     def residual(free: Array) -> Array:
         found = problem.residual(free)
-        return np.full(targets + len(problem.priors), _IMPOSSIBLE) if found is None else found
+        return np.full(target.size + len(problem.priors), _IMPOSSIBLE) if found is None else found
 
     def loss(square: Array) -> Array:
         rho = np.stack([square, np.ones_like(square), np.zeros_like(square)])
-        softened = 1.0 + square[:targets]
-        rho[:, :targets] = np.log(softened), 1.0 / softened, -1.0 / softened**2
+        # One loss for each target: a wrong one is wrong in all its channels.
+        joint = 1.0 + np.bincount(target, square[: target.size])[target]
+        rho[0, : target.size] = np.log(joint) / np.bincount(target)[target]
+        rho[1, : target.size] = 1.0 / joint
         return rho
 
     begin = problem.free(start)

@@ -56,7 +56,8 @@ def inliers(
     before = 0.0
     for _ in range(_ITERATIONS):
         problem = Problem(observed, design, names, priors, values)
-        scale = _scale(problem.whitened(values), observed.known)
+        # By the rows: the first line leaves width bias and k, so the widths, to the search.
+        scale = _scale(problem.whitened(values)[:, :1], observed.known[:, :1])
         if abs(scale - before) < _SCALE_CONVERGED * scale:
             break
         values, before = search(problem, values, cauchy_scale=_CAUCHY * scale), scale
