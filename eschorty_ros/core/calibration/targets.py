@@ -85,22 +85,14 @@ class Targets:
         spacing_mm: ArrayLike = math.nan,
         labels: Sequence[str] = (),
     ) -> None:
-        given = {
-            "row": row,
-            "range_mm": range_mm,
-            "sigma_row_px": sigma_row_px,
-            "sigma_range_mm": sigma_range_mm,
-            "column": column,
-            "width_px": width_px,
-            "sigma_width_px": sigma_width_px,
-            "size_mm": size_mm,
-            "spacing_px": spacing_px,
-            "sigma_spacing_px": sigma_spacing_px,
-            "spacing_mm": spacing_mm,
-        }
+        given = (row, range_mm, sigma_row_px, sigma_range_mm, column, width_px, sigma_width_px,
+                 size_mm, spacing_px, sigma_spacing_px, spacing_mm)  # fmt: skip
         size = np.atleast_1d(reals("row", row)).size
-        for name, value in given.items():
-            array = np.array(np.broadcast_to(_entries(name, value, size), size))
+        for name, value in zip(_NUMBERS, given, strict=True):
+            entries = reals(name, value)
+            if entries.ndim > 1 or entries.size not in (1, size):
+                raise ArgumentError(f"{name} has shape {entries.shape}; give one number or {size}")
+            array = np.array(np.broadcast_to(entries, size))
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         if not isinstance(labels, list | tuple):
@@ -171,10 +163,3 @@ class Targets:
 
 
 _NUMBERS = tuple(item.name for item in fields(Targets) if item.name != "labels")
-
-
-def _entries(name: str, value: ArrayLike, size: int) -> Array:
-    array = reals(name, value)
-    if array.ndim > 1 or array.size not in (1, size):
-        raise ArgumentError(f"{name} has shape {array.shape}; give one number or {size}")
-    return array
