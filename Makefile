@@ -61,10 +61,10 @@ tradeoff: $(SETUP)
 	@$(ENTER) python -m eschorty_experiments.readme_table report/tradeoff-changes.csv README.md
 
 faults: $(SETUP)
-	@$(ENTER) python test/support/fault_table.py
+	@$(ENTER) python docs/faults.py
 
 reference: $(SETUP)
-	@$(ENTER) python test/support/interface_tables.py
+	@$(ENTER) python docs/interfaces.py
 
 # Pure parts share the cores; what starts processes and devices runs alone.
 PURE := $(addprefix test/,core live control simulation stability report experiments)

@@ -1,6 +1,6 @@
 """docs/faults.md has a complete row for every test of a fault, and a test for every fault."""
 
-import fault_table
+import faults as fault_table
 
 
 def test_every_row_is_complete_and_every_fault_has_one():

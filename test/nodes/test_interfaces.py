@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-import interface_tables as tables
+import interfaces as tables
 from rclpy.node import Node
 
 README = Path(__file__).resolve().parents[2] / "README.md"

@@ -1,6 +1,6 @@
 """Writes the tables of docs/interfaces.md from the nodes: topics, services, actions, parameters.
 
-Usage: python test/support/interface_tables.py (or make reference).
+Usage: python docs/interfaces.py (or make reference).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.lifecycle import AUTO_START
 from eschorty_ros.nodes.ros.parameters import Param
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
+PAGE = Path(__file__).with_suffix(".md")
 NAMESPACE = "/eschorty"
 
 PARAMETERS = {

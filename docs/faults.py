@@ -2,7 +2,7 @@
 
 Every test with ``@pytest.mark.fault("<fault>")`` is a row, with a docstring
 ``driver: <what it does>; user reads: <what the user reads>``.
-Usage: python test/support/fault_table.py (or make faults).
+Usage: python docs/faults.py (or make faults).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "faults.md"
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = Path(__file__).with_suffix(".md")
 FAULTS = (
     "USB unplugged",
     "endpoint stalls",
