@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterator
 
@@ -73,7 +74,9 @@ def test_the_reason_is_logged_once(running: dict[str, NodeProcess]) -> None:
 
 
 def test_ctrl_c_ends_all_with_exit_code_0(running: dict[str, NodeProcess]) -> None:
-    codes = {name: process.interrupt() for name, process in running.items()}
+    for process in running.values():
+        process.send(signal.SIGINT)
+    codes = {name: process.wait() for name, process in running.items()}
     assert set(codes.values()) == {0}, codes
     for name, process in running.items():
         assert "Traceback" not in process.output, f"{name}: {process.output}"
