@@ -75,6 +75,14 @@ def test_every_command_it_shows_exists():
     assert shown <= set(COMMANDS)
 
 
+def test_paths_in_the_documents_exist():
+    for document in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for path in re.findall(
+            r"`((?:eschorty_ros|test|docs|config)/[\w/.]+)`", document.read_text()
+        ):
+            assert (ROOT / path).exists(), f"{document.name} names {path}"
+
+
 def test_the_architecture_names_files_and_functions_that_exist():
     """A list item's functions stand in a file of that item or, without one, of those before."""
     page = (ROOT / "docs" / "architecture.md").read_text()
