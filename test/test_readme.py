@@ -78,7 +78,7 @@ def test_every_command_it_shows_exists():
 def test_paths_in_the_documents_exist():
     for document in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         for path in re.findall(
-            r"`((?:eschorty_ros|test|docs|config)/[\w/.]+)`", document.read_text()
+            r"`((?:eschorty_ros|test|docs|config)/[\w/]+(?:\.\w+|/))`", document.read_text()
         ):
             assert (ROOT / path).exists(), f"{document.name} names {path}"
 
