@@ -187,7 +187,7 @@ def main() -> int:
             for name in names
         )
     )
-    print(f"seed {SEED}; at least {TARGETS} Mev/s per core of a 2.5 GHz Xeon asked for")
+    print(f"seed {SEED}; at least {TARGETS} Mev/s per core of a 2.5 GHz Xeon expected")
     rng = np.random.default_rng(SEED)
     fine = True
     with tempfile.TemporaryDirectory() as folder:

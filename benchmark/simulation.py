@@ -7,10 +7,10 @@ as the lit columns do; the first line, the whole sensor in the dark, is backgrou
 Measured on shared 2-core machines on several days, 640 columns or more: 4.4 to 5.8 Mev/s per core
 on the steps at 70 to 500 Hz (4.3 to 5.1 on surfaces that move within a lit phase), 2.9 to 3.6 at
 1 kHz; 0.7 to 0.8 at 5 kHz. All 1280 columns lit at 70 Hz run at 1.0 to 1.4 times real time. From
-1 kHz on a pixel rarely sets out from rest when the light changes: the risk of its noise is summed
-up, not looked up, and begun anew at each edge. A lit pixel and edge cost 60 to 100 ns at any
+1 kHz on a pixel rarely starts from rest when the light changes: the risk of its noise is summed
+up, not looked up, and begun again at each edge. A lit pixel and edge cost 60 to 100 ns at any
 frequency, but at 5 kHz only one in 14 makes an event; with 160 columns a quarter of the time goes
-into the edge as a whole.
+into the edge itself.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CASES = [
 
 
 def run(scene: str, lit: int, frequency_hz: float, seconds: float) -> tuple[float, int, int]:
-    """Thread seconds, events and bytes; a dark run has the whole sensor and no laser."""
+    """Thread seconds, events and bytes; a dark run has all columns and no laser."""
     calibration = load_calibration("config_3").model_copy(
         update={"columns": lit or 1280, "principal_column": (lit or 1280) / 2 - 0.5}
     )

@@ -116,8 +116,8 @@ class SlowDecoder:
         if kind == 15 and len(parts) < 2:
             parts.append(q)
             return True
-        whole = kind == 7 and len(parts) == 2
-        if whole:
+        complete = kind == 7 and len(parts) == 2
+        if complete:
             parts.append(q & 15)
         elif kind in (7, 15) or parts:
             self.counts["broken_continuations"] += 1

@@ -68,7 +68,7 @@ def integer_vector(
 ) -> NDArray[Any]:
     """Return ``values`` as a contiguous vector of ``dtype``, each from ``low`` to ``high``."""
     array = as_array(name, values)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iub"):
         raise ArgumentError(
             f"{name} is {array.dtype} of shape {array.shape}; give one axis of integers"
         )

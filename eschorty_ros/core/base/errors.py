@@ -18,7 +18,7 @@ class CalibrationError(EschortyError):
 
 
 class FitError(CalibrationError):
-    """Targets that do not determine the parameters asked for; names the condition number."""
+    """Targets that do not determine the free parameters; names the condition number."""
 
 
 class DeviceError(EschortyError):

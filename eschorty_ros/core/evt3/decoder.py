@@ -63,73 +63,53 @@ class _TriggerArrays(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """Counts of a decoder since it was made or reset.
-
-    ``events``, ``triggers``
-        Returned.
-    ``events_dropped``
-        Events in the stream that were not returned, for whatever reason.
-    ``events_before_time``
-        Of those: before the first TIME_HIGH (of the stream, or after a known gap).
-    ``events_without_y``
-        Of those: no valid ADDR_Y yet, or a row past the sensor's height.
-    ``events_without_base``
-        Of those: vectors before the first VECT_BASE_X.
-    ``events_past_width``
-        Of those: column past the sensor's width.
-    ``words_before_time``
-        Words of any type skipped before the first TIME_HIGH.
-    ``x_without_y``, ``vectors_without_base``, ``vectors_past_width``, ``y_past_height``
-        Words that break the grammar in this way.
-    ``broken_triples``, ``broken_continuations``
-        Incomplete sequences VECT_12 VECT_12 VECT_8 or OTHERS F F 7.
-    ``unknown_words``, ``legacy_y_words``
-        Types 9, B, C, D; type 1.
-    ``time_high_back``, ``time_high_jumps``, ``time_high_dropped``
-        TIME_HIGH that stepped back; forward jump of more than 0.4 s confirmed by the next one;
-        outlier the next one did not confirm.
-    ``time_low_back``
-        TIME_LOW below the time of an event already returned; time was held.
-    ``others_words``
-        OTHERS words of any subtype.
-    ``sensor_dropped_time_low``, ``sensor_dropped_time_high``, ``sensor_dropped_events``
-        The sensor's reports that its readout was saturated and dropped such words.
-    ``erc_events_in``, ``erc_events_out``
-        Sums of the event counts before and after the sensor's event-rate controller.
-    ``gaps``
-        Calls of ``note_gap``.
-    ``odd_byte``
-        1 while half a word waits for its second byte.
-    """
+    """Counts of a decoder since it was made or reset."""
 
     events: int = 0
+    """Returned, as are ``triggers``."""
     triggers: int = 0
     events_dropped: int = 0
+    """In the stream and not returned, for whatever reason; of those:"""
     events_before_time: int = 0
+    """Before the first TIME_HIGH of the stream or after a known gap."""
     events_without_y: int = 0
+    """Without a valid ADDR_Y, or in a row past the sensor's height."""
     events_without_base: int = 0
+    """In vectors before the first VECT_BASE_X."""
     events_past_width: int = 0
     words_before_time: int = 0
+    """Words of any type skipped before the first TIME_HIGH."""
     x_without_y: int = 0
+    """Words that break the grammar in this way, as the next three."""
     vectors_without_base: int = 0
     vectors_past_width: int = 0
     y_past_height: int = 0
     broken_triples: int = 0
+    """Incomplete sequences VECT_12 VECT_12 VECT_8."""
     broken_continuations: int = 0
+    """Incomplete sequences OTHERS F F 7."""
     unknown_words: int = 0
     legacy_y_words: int = 0
     time_high_back: int = 0
     time_high_jumps: int = 0
+    """Forward jumps of more than 0.4 s that the next TIME_HIGH confirmed."""
     time_high_dropped: int = 0
+    """Those that it did not confirm."""
     time_low_back: int = 0
+    """TIME_LOW below the time of an event already returned; time was held."""
     others_words: int = 0
     sensor_dropped_time_low: int = 0
+    """The sensor's reports that its saturated readout dropped words, as the next two."""
     sensor_dropped_time_high: int = 0
     sensor_dropped_events: int = 0
     erc_events_in: int = 0
+    """Sum of the event counts before the sensor's event-rate controller."""
     erc_events_out: int = 0
+    """And behind it."""
     gaps: int = 0
+    """Calls of ``note_gap``."""
     odd_byte: int = 0
+    """1 while half a word waits for its second byte."""
 
     @property
     def sensor_drop_words(self) -> int:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import integer
+from eschorty_ros.core.base.arrays import integer, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import words as w3
@@ -17,6 +15,7 @@ from eschorty_ros.core.evt3.events import EventArrays, first_fall
 _TRIGGER = np.uint16(w3.EXT_TRIGGER << 12)
 _DROP = np.uint16(w3.OTHERS << 12 | w3.DROPPED_EVENTS)
 _COUNT_MAX = (1 << 28) - 1
+_T_MAX = (1 << 62) - 1
 _IDLE_MAX_US = 3_600_000_000
 """Longest time without events that is filled with TIME_HIGH words: one hour, 1.8 MB."""
 _STATE = ("high", "low", "t_us", "row", "base", "polarity", "width")
@@ -96,12 +95,16 @@ class Encoder:
             For falling times, values outside the sensor, unequal lengths, or more than an hour
             without events. Nothing is encoded then.
         """
-        times = _checked("t", t, np.int64, 1 << 62)
-        columns = _checked("x", x, np.uint16, self.width)
-        rows = _checked("y", y, np.uint16, self.height)
-        polarities = _checked("p", p, np.uint8, 2)
-        trigger_times = _checked("trigger_t", _or_none(trigger_t), np.int64, 1 << 62)
-        edges = _checked("trigger_edge", _or_none(trigger_edge), np.uint8, 2)
+        times = integer_vector("t", t, np.int64, 0, _T_MAX)
+        columns = integer_vector("x", x, np.uint16, 0, self.width - 1)
+        rows = integer_vector("y", y, np.uint16, 0, self.height - 1)
+        polarities = integer_vector("p", p, np.uint8, 0, 1)
+        trigger_times = integer_vector(
+            "trigger_t", () if trigger_t is None else trigger_t, np.int64, 0, _T_MAX
+        )
+        edges = integer_vector(
+            "trigger_edge", () if trigger_edge is None else trigger_edge, np.uint8, 0, 1
+        )
         if not times.size == columns.size == rows.size == polarities.size:
             raise ArgumentError(
                 f"t, x, y, p have {times.size}, {columns.size}, {rows.size}, {polarities.size} "
@@ -112,7 +115,7 @@ class Encoder:
                 f"trigger_t has {trigger_times.size} entries and trigger_edge {edges.size}; "
                 "give one edge per trigger"
             )
-        drop_times = _checked("drop_t", _or_none(drop_t), np.int64, 1 << 62)
+        drop_times = integer_vector("drop_t", () if drop_t is None else drop_t, np.int64, 0, _T_MAX)
         report_times, counts = _reports(rate_counts)
         for name, series in (
             ("t", times),
@@ -146,8 +149,8 @@ class Encoder:
         ArgumentError
             When ``t_us`` lies before the time the stream has reached, or more than an hour after.
         """
-        integer("t_us", t_us, 0, (1 << 62) - 1)
-        self._refuse_fall("t_us", _checked("t_us", [t_us], np.int64, 1 << 62))
+        integer("t_us", t_us, 0, _T_MAX)
+        self._refuse_fall("t_us", np.array([t_us], np.int64))
         words = np.empty(self._high_words(t_us, t_us) + 1, dtype="<u2")
         n = _put_time(t_us, True, self._state, words, 0)
         return words[:n].tobytes()
@@ -180,9 +183,10 @@ def _reports(rate_counts: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[
         raise ArgumentError(
             f"rate_counts has shape {given.shape}; give time, events before and after per report"
         )
-    limits = ((1 << 62), _COUNT_MAX + 1, _COUNT_MAX + 1)
+    limits = (_T_MAX, _COUNT_MAX, _COUNT_MAX)
     times, *counts = (
-        _checked("rate_counts", given[:, k], np.int64, limit) for k, limit in enumerate(limits)
+        integer_vector("rate_counts", given[:, k], np.int64, 0, limit)
+        for k, limit in enumerate(limits)
     )
     return times, np.column_stack(counts)
 
@@ -210,26 +214,6 @@ def _merged_marks(
     return times[order], marks[order]
 
 
-def _or_none(values: ArrayLike | None) -> ArrayLike:
-    return () if values is None else values
-
-
-def _checked(name: str, values: ArrayLike, dtype: Any, limit: int) -> NDArray[Any]:
-    """Return ``values`` as a contiguous vector of ``dtype``, each in 0..limit-1."""
-    array = np.asarray(values)
-    if array.size == 0 and array.ndim == 1:
-        return np.empty(0, dtype=dtype)
-    if array.ndim != 1 or array.dtype.kind not in "iub":
-        raise ArgumentError(
-            f"{name} is {array.dtype} of shape {array.shape}; give a vector of integers"
-        )
-    lowest, highest = int(array.min()), int(array.max())
-    if lowest < 0 or highest >= limit:
-        wrong = lowest if lowest < 0 else highest
-        raise ArgumentError(f"{name} holds {wrong}; values lie in 0 to {limit - 1}")
-    return np.ascontiguousarray(array, dtype=dtype)
-
-
 def sort_readout(
     t: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], p: NDArray[np.uint8]
 ) -> EventArrays:
@@ -250,10 +234,10 @@ def sort_readout(
     ArgumentError
         When the times span more, or a value lies outside its range.
     """
-    times = _checked("t", t, np.int64, 1 << 62)
-    columns = _checked("x", x, np.uint16, w3.ADDRESSES)
-    rows = _checked("y", y, np.uint16, w3.ADDRESSES)
-    polarities = _checked("p", p, np.uint8, 2)
+    times = integer_vector("t", t, np.int64, 0, _T_MAX)
+    columns = integer_vector("x", x, np.uint16, 0, w3.ADDRESSES - 1)
+    rows = integer_vector("y", y, np.uint16, 0, w3.ADDRESSES - 1)
+    polarities = integer_vector("p", p, np.uint8, 0, 1)
     if times.size == 0:
         return EventArrays(times, columns, rows, polarities)
     origin = times.min()

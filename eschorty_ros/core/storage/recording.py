@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from eschorty_ros.core.base.arrays import as_array, file_path
+from eschorty_ros.core.base.arrays import as_array, file_path, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
@@ -199,20 +199,13 @@ def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
         )
     table = np.empty(next(iter(shapes)), dtype)
     for name, array in arrays.items():
-        if dtype[name].kind == "f":
+        kind = dtype[name]
+        if kind.kind == "f":
             table[name] = quantise_nm(array, name) / NM_PER_MM
         else:
-            table[name] = _integers(array, name, np.iinfo(dtype[name]))
+            limits = np.iinfo(kind)
+            table[name] = integer_vector(name, array, kind, limits.min, limits.max)
     return table
-
-
-def _integers(array: NDArray[Any], name: str, limits: np.iinfo[Any]) -> NDArray[Any]:
-    if array.size and array.dtype.kind not in "iu":
-        raise ArgumentError(f"{name} has dtype {array.dtype}; give integers")
-    wrong = (array < limits.min) | (array > limits.max)
-    if wrong.any():
-        raise ArgumentError(f"{name} is {array[wrong][0]}; choose {limits.min} to {limits.max}")
-    return array
 
 
 def _write_csv(path: str | os.PathLike[str], table: NDArray[np.void]) -> None:

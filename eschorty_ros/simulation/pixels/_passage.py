@@ -158,7 +158,7 @@ def _noisy(signal, levels, middle, noise, table, from_us, until_us, budget):
     Sums up the risk from ``from_us`` on until it reaches ``budget``, in steps over which the gaps
     change at a nearly steady pace. A moving signal can pass the nearer level only, the one on
     its side of ``middle``. Returns UNKNOWN when nothing happened up to ``until_us`` and the signal
-    still moves: ask again later. The steps do not depend on ``until_us``.
+    still moves: call again later. The steps do not depend on ``until_us``.
     """
     a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(signal, noise, from_us)
     settled = signal.settled

@@ -100,7 +100,7 @@ def _uniform(bits):
 
 @kernel
 def _key(t_us, column, row, polarity):
-    """Return an event as one sortable integer: whole us from ``t_us`` on, row, polarity, column."""
+    """Return an event as one sortable integer: time (us, rounded up), row, polarity, column."""
     return (np.int64(np.ceil(t_us)) << 22) | (row << 12) | (polarity << 11) | column
 
 

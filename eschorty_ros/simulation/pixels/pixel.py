@@ -211,7 +211,7 @@ class PixelArray:
             the footprint is made of parts that lie on different surfaces.
         low_row, high_row : ndarray of float64, same shape, optional
             Rows between which a patch is lit (edges between rows, so ``y - 0.5`` to ``y + 0.5``
-            is one row); the whole footprint when left out.
+            is one row); the complete footprint when left out.
 
         Raises
         ------

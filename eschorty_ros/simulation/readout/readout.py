@@ -1,4 +1,4 @@
-"""How events leave the sensor: row by row, and at a limited rate when that is asked for."""
+"""How events leave the sensor: row by row, and at a limited rate when one is set."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class ReadOut(NamedTuple):
 
 
 class _Queue(NamedTuple):
-    """Rows that wait and the time each was asked for; the events of each as a chain.
+    """Rows that wait and the time of each request; the events of each as a chain.
 
     ``heads`` has per row the last event, and as last entry the first free place; ``links`` per
     event the one before it, and per free place the next one. -1 ends a chain.
@@ -235,8 +235,8 @@ def _serve(until_us, state, queue, out):
     heads, links = queue.heads, queue.links
     n = out.counts.keys
     while state.queued > 0:
-        row, asked_us = queue.rows[state.first, 0], queue.rows[state.first, 1]
-        begin_ns = max(state.free_ns, asked_us * 1000)
+        row, request_us = queue.rows[state.first, 0], queue.rows[state.first, 1]
+        begin_ns = max(state.free_ns, request_us * 1000)
         t_us = -(-begin_ns // 1000)
         if t_us >= until_us:
             break

@@ -1,4 +1,4 @@
-"""The optional Open3D, loaded when a mesh or a window asks for it."""
+"""The optional Open3D, loaded when a mesh or a window needs it."""
 
 from __future__ import annotations
 

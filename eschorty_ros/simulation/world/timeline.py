@@ -61,9 +61,9 @@ class Gate:
     def fall_us(self, index: int) -> int:
         """Return the falling edge of period ``index``, us; at least 1 us from both rising edges."""
         numerator, denominator = self._period
-        share, whole = self._duty
+        share, parts = self._duty
         fall = self._origin_us + _round_ratio(
-            (index * whole + share) * numerator, whole * denominator
+            (index * parts + share) * numerator, parts * denominator
         )
         return max(self.rise_us(index) + 1, min(fall, self.rise_us(index + 1) - 1))
 
@@ -116,9 +116,9 @@ class Gate:
 
 def _round_ratio(numerator: int, denominator: int) -> int:
     """Nearest integer to a ratio, halves to even, as ``round`` of a Fraction."""
-    whole, rest = divmod(numerator, denominator)
-    up = 2 * rest > denominator or (2 * rest == denominator and whole % 2 == 1)
-    return whole + up
+    quotient, rest = divmod(numerator, denominator)
+    up = 2 * rest > denominator or (2 * rest == denominator and quotient % 2 == 1)
+    return quotient + up
 
 
 class Timeline(Generic[Setting]):

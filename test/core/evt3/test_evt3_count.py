@@ -29,16 +29,16 @@ def test_cuts_between_buffers_do_not_matter() -> None:
     payload[kinds == 0x2] &= 0xBFF
     payload[kinds == 0x3] &= 0x8FF
     data = words(0x8001, 0x6000, 0x0005, 0x3000, *(kinds << 12 | payload).tolist())
-    whole, cut = WordCounter(), WordCounter()
-    whole.add(data)
+    uncut, cut = WordCounter(), WordCounter()
+    uncut.add(data)
     for start in range(0, len(data), 14):
         cut.add(data[start : start + 14])
-    assert (whole.on, whole.off) == (cut.on, cut.off)
+    assert (uncut.on, uncut.off) == (cut.on, cut.off)
     decoder = Decoder()
     events = decoder.decode(data)
     print(f"seed 20: {len(events)} events, {decoder.counters}")
-    assert np.count_nonzero(events.p) == whole.on
-    assert len(events) == whole.on + whole.off
+    assert np.count_nonzero(events.p) == uncut.on
+    assert len(events) == uncut.on + uncut.off
 
 
 def test_counts_of_the_rate_control_agree_with_the_decoder() -> None:

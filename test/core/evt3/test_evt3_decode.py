@@ -199,8 +199,8 @@ def any_words() -> st.SearchStrategy[list[int]]:
     triple = st.tuples(st.integers(0, 4095), st.integers(0, 4095), st.integers(0, 255)).map(
         lambda q: [0x4000 | q[0], 0x4000 | q[1], 0x5000 | q[2]]
     )
-    whole = st.lists(st.one_of(word.map(lambda w: [w]), triple), max_size=60)
-    return whole.map(lambda parts: [0x8000, *(w for part in parts for w in part)])
+    complete = st.lists(st.one_of(word.map(lambda w: [w]), triple), max_size=60)
+    return complete.map(lambda parts: [0x8000, *(w for part in parts for w in part)])
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)

@@ -46,7 +46,7 @@ def test_vectors_end_at_the_sensors_edge() -> None:
     assert hex_words(data) == "8000 6000 0000 34E0 4000 4000 50FC"
 
 
-def test_advance_names_every_time_high() -> None:
+def test_advance_writes_every_time_high() -> None:
     encoder = evt3.Encoder()
     assert hex_words(encoder.advance(0)) == "8000"
     assert hex_words(encoder.advance(3 * 4096 + 1)) == "8001 8002 8003 6001"
@@ -97,7 +97,7 @@ def as_streams(runs: list) -> tuple[list, list]:
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(event_lists(), st.integers(0, 500), st.booleans())
-def test_round_trip(streams: tuple[list, list], cut: int, silent: bool) -> None:
+def test_round_trip(streams: tuple[list, list], cut: int, idle: bool) -> None:
     events, triggers = streams
     cut = min(cut, len(events))
     encoder = evt3.Encoder()
@@ -108,7 +108,7 @@ def test_round_trip(streams: tuple[list, list], cut: int, silent: bool) -> None:
         data += encoder.encode(
             *columns_of(part), [edge[0] for edge in edges], [edge[1] for edge in edges]
         )
-        if silent and part and part is not events:
+        if idle and part and part is not events:
             data += encoder.advance(encoder.time_us)
     decoder = evt3.Decoder()
     found = decoder.decode(data)
@@ -148,7 +148,7 @@ def test_sort_readout_orders_by_time_row_polarity_column() -> None:
         assert (values == expected[order]).all()
 
 
-def test_reports_of_the_rate_control_come_whole_before_the_events_of_their_time() -> None:
+def test_reports_of_the_rate_control_come_complete_before_the_events_of_their_time() -> None:
     reports = [[200, 0x7456123, 5], [400, 12, 12], [9000, 7, 0]]
     data = evt3.Encoder().encode(
         [150, 200, 8000], [1, 2, 3], [4, 4, 4], [1, 1, 1],
@@ -171,10 +171,7 @@ def test_reports_of_the_rate_control_come_whole_before_the_events_of_their_time(
 @pytest.mark.parametrize(
     ("reports", "message"),
     [
-        ([[5, 1]], r"rate_counts has shape \(1, 2\)"),
         ([5, 1, 1], r"rate_counts has shape \(3,\)"),
-        ([[5, 1, 1 << 28]], "rate_counts holds 268435456"),
-        ([[5, -1, 0]], "rate_counts holds -1"),
         ([[5, 1, 1], [4, 1, 1]], r"rate_counts\[1\] is 4 us"),
     ],
 )
@@ -187,12 +184,6 @@ def test_bad_reports_are_refused(reports: list, message: str) -> None:
     ("events", "message"),
     [
         (([5, 4], [0, 0], [0, 0], [0, 0]), r"t\[1\] is 4 us"),
-        (([0], [1280], [0], [0]), "x holds 1280"),
-        (([0], [0], [-1], [0]), "y holds -1"),
-        (([0], [0], [0], [-1]), "p holds -1"),
-        (([0], [0], [0], [2]), "p holds 2"),
-        (([-1], [0], [0], [0]), "t holds -1"),
-        (([0.5], [0], [0], [0]), "t is float64"),
         (([0, 1], [0], [0], [0]), "entries"),
         (([0, 4_000_000_000], [0, 0], [0, 0], [0, 0]), "stay within"),
         (([], [], [], [], [3], []), "one edge per trigger"),

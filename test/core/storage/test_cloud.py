@@ -103,8 +103,11 @@ def test_headers_as_written(tmp_path: Path) -> None:
 def test_truncated_or_longer_files_are_refused(tmp_path: Path, extension: str) -> None:
     file = tmp_path / f"c{extension}"
     write_cloud(file, cloud(5))
-    whole = file.read_bytes()
-    for data in [whole[:cut] for cut in range(0, len(whole), 7)] + [whole[:-1], whole + b"\0"]:
+    complete = file.read_bytes()
+    for data in [complete[:cut] for cut in range(0, len(complete), 7)] + [
+        complete[:-1],
+        complete + b"\0",
+    ]:
         file.write_bytes(data)
         with pytest.raises(FormatError, match=file.name) as caught:
             read_cloud(file)

@@ -113,8 +113,8 @@ def test_missing_file_is_one_line(tmp_path: Path) -> None:
 
 def test_written_file_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "out.raw"
-    moment = datetime.datetime(2024, 5, 6, 7, 8, 9, tzinfo=datetime.UTC)
-    with RawWriter(path, serial="0004ABCD", date=moment) as writer:
+    recorded = datetime.datetime(2024, 5, 6, 7, 8, 9, tzinfo=datetime.UTC)
+    with RawWriter(path, serial="0004ABCD", date=recorded) as writer:
         writer.write(WORDS)
         writer.write(b"")
         writer.write(WORDS)

@@ -232,7 +232,7 @@ def test_looking_in_between_changes_nothing(noise: float) -> None:
     assert np.array_equal(keys, left_alone.take(200_000))
 
 
-def test_dark_columns_stay_silent_and_untouched() -> None:
+def test_dark_columns_make_no_events_and_stay_untouched() -> None:
     pixels = PixelArray(8, ROWS, PixelParameters(), SEED)
     before = pixels._pixels.copy()
     columns = np.arange(8)

@@ -33,12 +33,12 @@ def burst(rng: np.random.Generator, events: int, span_us: int = 400) -> np.ndarr
     )  # fmt: skip
 
 
-def test_a_row_is_read_out_whole_and_rows_wait_for_each_other() -> None:
+def test_a_row_is_read_out_completely_and_rows_wait_for_each_other() -> None:
     readout = Readout(720, ReadoutParameters(row_time_us=10.0))
     requests = keys([100, 101, 103, 100, 104], [5, 5, 5, 9, 9], [1, 2, 3, 4, 5])
     out, drops, periods = readout.read_out(requests, 1000)
     t, x, y, _ = unpack(out)
-    # Row 5 asks first and alone; what comes later waits until row 9 is done.
+    # The request of row 5 is first and alone; later ones wait until row 9 is done.
     assert list(zip(t.tolist(), y.tolist(), x.tolist(), strict=True)) == [
         (100, 5, 1), (110, 9, 4), (110, 9, 5), (120, 5, 2), (120, 5, 3),
     ]  # fmt: skip
@@ -70,10 +70,10 @@ def test_cutting_the_calls_changes_nothing() -> None:
         readout.limit(0, EventRate(160, 200))
         return readout
 
-    whole = tight()
-    expected = whole.read_out(requests, 20_000)
-    assert whole.dropped > 100
-    assert whole.rate_dropped > 100
+    uncut = tight()
+    expected = uncut.read_out(requests, 20_000)
+    assert uncut.dropped > 100
+    assert uncut.rate_dropped > 100
     parts, readout = [], tight()
     times = np.unique(np.append(rng.integers(1000, 6000, 60), [0, 1200, 1400, 20_000]))
     for begin, end in itertools.pairwise(times):
@@ -84,9 +84,9 @@ def test_cutting_the_calls_changes_nothing() -> None:
     for field in ("keys", "drops_us", "periods"):
         cut = np.concatenate([getattr(part, field) for part in parts])
         assert np.array_equal(cut, getattr(expected, field)), field
-    assert (readout.dropped, readout.rate_dropped) == (whole.dropped, whole.rate_dropped)
-    assert readout.merged == whole.merged
-    lost = whole.dropped + whole.rate_dropped + whole.merged
+    assert (readout.dropped, readout.rate_dropped) == (uncut.dropped, uncut.rate_dropped)
+    assert readout.merged == uncut.merged
+    lost = uncut.dropped + uncut.rate_dropped + uncut.merged
     assert lost == requests.size - expected.keys.size
 
 
@@ -99,7 +99,7 @@ def test_the_rate_limit_holds_in_every_period_and_tells_what_it_drops() -> None:
     per_period = np.bincount((out >> 22) // 200)
     assert per_period.max() == 100
     assert out.size + readout.rate_dropped + readout.merged == requests.size
-    # The readout itself has room for all: it tells of no loss.
+    # The readout itself has room for all: it reports no loss.
     assert (readout.dropped, drops.size) == (0, 0)
     ends, came, passed = periods.T
     assert np.array_equal(ends, np.unique((out >> 22) // 200) * 200 + 200)
@@ -152,7 +152,7 @@ def test_a_limited_world_tells_in_its_stream_what_it_drops() -> None:
     assert world.rate_dropped > 1000
     assert events.t.size == world.events
     assert np.bincount(events.t // 200).max() == 20
-    # The last period is told when it is over.
+    # The last period is reported when it is over.
     open_period = int(np.count_nonzero(events.t >= 199_800))
     assert counters.erc_events_out == world.events - open_period
     assert counters.erc_events_in - counters.erc_events_out == world.rate_dropped

@@ -104,10 +104,10 @@ def test_a_seed_fixes_the_collage() -> None:
 
 def test_rays_may_come_one_by_one_and_in_any_order() -> None:
     for scene in (Leaves(), Face()):
-        whole = scene.range_mm(STAGE, COLUMNS, CONFIG_3)
+        complete = scene.range_mm(STAGE, COLUMNS, CONFIG_3)
         columns = COLUMNS[::-7]
         single = np.array([scene.range_mm(s, columns, CONFIG_3)[0] for s in STAGE[::40]])
-        assert np.array_equal(single, whole[::40, ::-7], equal_nan=True)
+        assert np.array_equal(single, complete[::40, ::-7], equal_nan=True)
 
 
 def test_the_face_has_nose_eyes_mouth_and_ears() -> None:

@@ -54,18 +54,18 @@ def controlled(preset_name: str = "paper") -> World:
 
 
 def test_factory_settings_change_nothing() -> None:
-    told = world()
-    told.set_sensor(0, SensorControl())
-    told.set_sensor(30_001, SensorControl())
-    assert told.advance(60_000) == world().advance(60_000)
+    controlled_world = world()
+    controlled_world.set_sensor(0, SensorControl())
+    controlled_world.set_sensor(30_001, SensorControl())
+    assert controlled_world.advance(60_000) == world().advance(60_000)
 
 
 @pytest.mark.parametrize("preset_name", ["paper", "noisy", "ideal"])
 def test_bytes_do_not_depend_on_how_time_is_cut(preset_name: str) -> None:
     print(f"seed {SEED}")
-    whole = controlled(preset_name)
-    expected = whole.advance(140_000)
-    assert whole.rate_dropped > 100
+    uncut = controlled(preset_name)
+    expected = uncut.advance(140_000)
+    assert uncut.rate_dropped > 100
     rng = random.Random(SEED)
     for longest_us in (300, 30_000):
         cut = controlled(preset_name)
@@ -165,7 +165,7 @@ def test_the_past_is_refused_and_the_future_can_be_replaced() -> None:
         changed.set_sensor(59_999, SensorControl())
 
 
-def test_streams_stay_whole() -> None:
+def test_streams_stay_complete() -> None:
     made = controlled()
     decoder = Decoder(64, 720)
     events = decoder.decode(made.advance(140_000))

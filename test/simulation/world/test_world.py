@@ -1,4 +1,4 @@
-"""The simulated world as a whole: bytes against truth."""
+"""The simulated world: bytes against truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WAVE = Modulation(70.0, 0.5, "square", 1000)
 
 
 def decoded(data: bytes, columns: int) -> tuple[np.ndarray, ...]:
-    """Events of a whole stream; fails on any anomaly the decoder counts."""
+    """Return the events of a stream; fails on any anomaly the decoder counts."""
     decoder = Decoder(columns, 720)
     events = decoder.decode(data)
     counters = {
@@ -61,16 +61,16 @@ def moving(scene, seed: int = SEED, **options) -> World:
 )
 def test_bytes_do_not_depend_on_how_time_is_cut(scene) -> None:
     print(f"seed {SEED}")
-    whole = moving(scene).advance(300_000)
-    assert len(whole) > 100_000
-    assert moving(scene, seed=SEED + 1).advance(300_000) != whole
+    uncut = moving(scene).advance(300_000)
+    assert len(uncut) > 100_000
+    assert moving(scene, seed=SEED + 1).advance(300_000) != uncut
     rng = random.Random(SEED)
     for longest_us in (300, 5_000, 70_000):
         world = moving(scene)
         parts = []
         while world.now_us < 300_000:
             parts.append(world.advance(min(world.now_us + rng.randint(0, longest_us), 300_000)))
-        assert b"".join(parts) == whole
+        assert b"".join(parts) == uncut
 
 
 def test_streams_are_clean_ordered_and_full_of_vectors() -> None:
@@ -347,12 +347,12 @@ def test_triggers_come_at_the_edges_of_the_gate_however_time_is_cut() -> None:
         world.trigger_input = world.laser_edges
         return world
 
-    whole = with_triggers().advance(300_000)
+    uncut = with_triggers().advance(300_000)
     world, parts = with_triggers(), []
     while world.now_us < 300_000:
         parts.append(world.advance(min(world.now_us + 1_777, 300_000)))
-    assert b"".join(parts) == whole
-    triggers = Decoder(96, 720).decode(whole).triggers
+    assert b"".join(parts) == uncut
+    triggers = Decoder(96, 720).decode(uncut).triggers
     gates = [
         (3_333, 150_007, Gate(WAVE)),
         (170_000, 300_000, Gate(Modulation(200.0, 0.3, "square", -77))),
