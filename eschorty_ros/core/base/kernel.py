@@ -50,7 +50,7 @@ def _digest(function: Callable[..., Any]) -> str:
     """Return a digest of the function's file and of all it uses from other files."""
     parts = [_file_digest(function.__code__.co_filename)]
     for name in sorted(set(_names(function.__code__))):
-        value = function.__globals__.get(name)
+        value: Any = function.__globals__.get(name)
         if isinstance(value, ModuleType):
             if value.__name__.startswith(__name__.partition(".")[0]):
                 parts.append(_file_digest(str(value.__file__)))

@@ -157,6 +157,7 @@ def _neighbours_fresh(cells, cell, pitch, oldest):
 @kernel(types.UniTuple(uint64, 2)(_I8, _U2, _U2, _U1, EVENT_ARRAYS, int32[::1], _S))
 def _filter(t_in, x_in, y_in, p_in, out, cells, s):
     """Compact the supported events into ``out``; return kept and outside counts."""
+    t_out, x_out, y_out, p_out = out
     n = np.uint64(0)
     outside = np.uint64(0)
     pitch = np.uint64(s.pitch)
@@ -182,9 +183,9 @@ def _filter(t_in, x_in, y_in, p_in, out, cells, s):
             cells, cell, pitch, oldest
         )
         cells[cell] = np.int32(stamp)
-        out.t[n] = t
-        out.x[n] = np.uint16(x)
-        out.y[n] = np.uint16(y)
-        out.p[n] = p_in[k]
+        t_out[n] = t
+        x_out[n] = np.uint16(x)
+        y_out[n] = np.uint16(y)
+        p_out[n] = p_in[k]
         n += np.uint64(kept)
     return n, outside

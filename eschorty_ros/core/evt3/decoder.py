@@ -188,7 +188,7 @@ class Decoder:
     @property
     def counters(self) -> Counters:
         """Counts since construction or ``reset``."""
-        return Counters(*self._counts.item(), odd_byte=len(self._odd))
+        return Counters(*self._counts.item(), len(self._odd))
 
     @property
     def time_us(self) -> int | None:
@@ -488,6 +488,7 @@ def _decode(words, width, height, s, c, out, triggers):
 
     ``out`` and ``triggers`` hold at least ``_bounds(words)`` entries.
     """
+    t_out, x_out, y_out, p_out = out
     end = np.uint64(words.size)
     one = np.uint64(1)
     i = np.uint64(0)
@@ -524,10 +525,10 @@ def _decode(words, width, height, s, c, out, triggers):
         if kind == w3.ADDR_X:
             x = np.int64(word & np.uint32(0x7FF))
             if x < limit:
-                out.t[n] = t
-                out.x[n] = np.uint16(x)
-                out.y[n] = np.uint16(row)
-                out.p[n] = np.uint8((word >> np.uint32(11)) & np.uint32(1))
+                t_out[n] = t
+                x_out[n] = np.uint16(x)
+                y_out[n] = np.uint16(row)
+                p_out[n] = np.uint8((word >> np.uint32(11)) & np.uint32(1))
                 n += one
             else:
                 _drop_x(c, row, limit)
@@ -548,10 +549,10 @@ def _decode(words, width, height, s, c, out, triggers):
                 polarity = np.uint8(s.polarity)
                 s.base = base + 32
                 while mask != np.uint64(0):
-                    out.t[n] = t
-                    out.x[n] = np.uint16(base + np.int64(ctz64(mask)))
-                    out.y[n] = np.uint16(row)
-                    out.p[n] = polarity
+                    t_out[n] = t
+                    x_out[n] = np.uint16(base + np.int64(ctz64(mask)))
+                    y_out[n] = np.uint16(row)
+                    p_out[n] = polarity
                     n += one
                     mask &= mask - one
             else:

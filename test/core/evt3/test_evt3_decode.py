@@ -19,7 +19,6 @@ from evt3_oracle import SlowDecoder
 from streams import RECORDING_SHARES, recording_like_words, words_of
 
 from eschorty_ros.core import evt3
-from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage.raw_file import RawReader
 
 RECORDING = Path(__file__).parents[4] / "shared/data/evt3_gen41_sample.raw"
@@ -163,12 +162,6 @@ def test_time_without_events() -> None:
     assert decoder.time_us == 4101
     decoder.reset()
     assert decoder.time_us is None
-
-
-@pytest.mark.parametrize("size", [{"width": 0}, {"height": 2049}])
-def test_impossible_sensor_is_refused(size: dict[str, int]) -> None:
-    with pytest.raises(ArgumentError, match=next(iter(size))):
-        evt3.Decoder(**size)
 
 
 def test_unaligned_and_read_only_input() -> None:
