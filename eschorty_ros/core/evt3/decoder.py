@@ -505,6 +505,8 @@ def _decode(words, width, height, s, c, out, triggers):
         i, n = _triple_by_words(words, i, s, c, out, n)
     if i < end and s.others_parts > 0:
         i = _continue_others(words, i, s, c)
+    base = s.base
+    polarity = np.uint8(s.polarity)
     while i < end:
         word = np.uint32(words[i])
         kind = word >> np.uint32(12)
@@ -533,7 +535,6 @@ def _decode(words, width, height, s, c, out, triggers):
             else:
                 _drop_x(c, row, limit)
         elif kind == w3.VECT_12:
-            base = s.base
             if (
                 i + one < end
                 and words[i] >> 12 == w3.VECT_12
@@ -546,21 +547,23 @@ def _decode(words, width, height, s, c, out, triggers):
                     | (np.uint64(words[i + one]) & np.uint64(0xFF)) << np.uint64(24)
                 )
                 i += np.uint64(2)
-                polarity = np.uint8(s.polarity)
-                s.base = base + 32
+                first = base
+                base += 32
                 while mask != np.uint64(0):
                     t_out[n] = t
-                    x_out[n] = np.uint16(base + np.int64(ctz64(mask)))
+                    x_out[n] = np.uint16(first + np.int64(ctz64(mask)))
                     y_out[n] = np.uint16(row)
                     p_out[n] = polarity
                     n += one
                     mask &= mask - one
             else:
                 s.t_us, s.row, s.limit = t, row, limit
+                s.base, s.polarity = base, polarity
                 i, n = _triple_by_words(words, i - one, s, c, out, n)
+                base = s.base
         elif kind == w3.VECT_BASE_X:
-            s.base = np.int64(word & np.uint32(0x7FF))
-            s.polarity = np.int64((word >> np.uint32(11)) & np.uint32(1))
+            base = np.int64(word & np.uint32(0x7FF))
+            polarity = np.uint8((word >> np.uint32(11)) & np.uint32(1))
         elif kind == w3.TIME_LOW:
             # The sensor may correct a TIME_LOW at once with a lower one: only the time of an event
             # already written may not be undercut.
@@ -586,7 +589,9 @@ def _decode(words, width, height, s, c, out, triggers):
             # It belongs to a triple whose first words are missing.
             c.broken_triples += 1
             s.t_us, s.row, s.limit = t, row, limit
+            s.base, s.polarity = base, polarity
             n = _vector(np.uint64(word) & np.uint64(0xFF), np.uint64(8), s, c, out, n)
+            base = s.base
         elif kind == w3.OTHERS:
             _begin_others(s, c, np.int64(word & np.uint32(0xFFF)))
             i = _continue_others(words, i, s, c)
@@ -602,6 +607,8 @@ def _decode(words, width, height, s, c, out, triggers):
     s.floor_us = t if n + m != mark else floor
     s.row = row
     s.limit = limit
+    s.base = base
+    s.polarity = polarity
     c.events += n
     c.triggers += m
     return n, m
