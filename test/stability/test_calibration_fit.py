@@ -41,6 +41,7 @@ def rows_of(truth: RangeModel, ranges_mm: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("build", BUILDS)
+@pytest.mark.hard_case(12)
 def test_noiseless_targets_of_table_1_return_the_build(build, measured):
     truth = load_calibration(build).model()
     ranges = np.linspace(1.01 * truth.range_limits_mm[0], 0.99 * truth.range_limits_mm[1], 9)
@@ -51,6 +52,7 @@ def test_noiseless_targets_of_table_1_return_the_build(build, measured):
     measured("the same with b free", relative(free, truth), 1e-9)
 
 
+@pytest.mark.hard_case(12)
 def test_clustered_posts_keep_all_digits(measured):
     """Posts at 1150..1300 mm: raw normal equations would square a condition number of 2.9e4."""
     found = fit(Targets(rows_of(TRUTH, CLUSTERED_MM), CLUSTERED_MM), NOMINAL)
@@ -58,6 +60,7 @@ def test_clustered_posts_keep_all_digits(measured):
     assert found.condition_number == pytest.approx(47.75, abs=0.01)
 
 
+@pytest.mark.hard_case(12)
 def test_weighted_line_equals_50_digits(measured):
     rng = np.random.default_rng(SEED)
     ranges = np.sort(rng.uniform(1150.0, 1300.0, 12))
@@ -88,6 +91,7 @@ def test_weighted_line_equals_50_digits(measured):
     st.floats(-20.0, 20.0),
     st.lists(st.integers(0, 719), min_size=3, max_size=30, unique=True),
 )
+@pytest.mark.hard_case(12)
 def test_any_build_comes_back(k_prime_px, b_prime_px, b_mm, rows):
     truth = RangeModel(NOMINAL.k_mm, k_prime_px, b_mm, b_prime_px)
     design = RangeModel(NOMINAL.k_mm, NOMINAL.k_prime_px, b_mm, NOMINAL.b_prime_px)
@@ -99,6 +103,7 @@ def test_any_build_comes_back(k_prime_px, b_prime_px, b_mm, rows):
 
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.permutations(range(9)))
+@pytest.mark.hard_case(12)
 def test_order_of_targets_does_not_change_a_bit(order):
     rng = np.random.default_rng(SEED)
     rows, index = TRUTH.row(SPREAD_MM) + rng.normal(0.0, 0.3, 9), np.array(order)
@@ -108,6 +113,7 @@ def test_order_of_targets_does_not_change_a_bit(order):
 
 
 @pytest.mark.parametrize("ranges", [(800.0, 2100.0), (1200.0, 1300.0), (1200.0, 1200.5)])
+@pytest.mark.hard_case(13)
 def test_two_posts_are_solved_exactly(ranges, measured):
     rows = TRUTH.row(ranges)
     found = fit(Targets(rows, ranges, 0.3), NOMINAL)
@@ -136,6 +142,7 @@ def test_two_posts_are_solved_exactly(ranges, measured):
     ],
 )
 @pytest.mark.parametrize("free", [("k_prime_px", "b_prime_px"), DATUM_FREE])
+@pytest.mark.hard_case(14)
 def test_singular_targets_are_refused_with_the_condition_number(rows, ranges, free):
     with pytest.raises(FitError, match=r"condition number inf.*; give targets") as refused:
         fit(Targets(rows, ranges), NOMINAL, free)
@@ -143,12 +150,14 @@ def test_singular_targets_are_refused_with_the_condition_number(rows, ranges, fr
     assert issubclass(FitError, CalibrationError)
 
 
+@pytest.mark.hard_case(14)
 def test_targets_that_approach_the_camera_as_rows_grow_are_no_build():
     with pytest.raises(FitError, match="k_prime_px is"):
         fit(Targets([500.0, 300.0], [1000.0, 1500.0]), NOMINAL)
 
 
 @pytest.mark.parametrize("ranges", [CLUSTERED_MM, SPREAD_MM])
+@pytest.mark.hard_case(15)
 def test_four_free_parameters_are_refused(ranges):
     targets = Targets(TRUTH.row(ranges), ranges)
     with pytest.raises(FitError, match=r"condition number inf; .*k_mm k_prime_px"):
@@ -163,6 +172,7 @@ def test_four_free_parameters_are_refused(ranges):
     assert np.abs(found.model.range_mm(TRUTH.row(ranges)) - ranges).max() < 0.05
 
 
+@pytest.mark.hard_case(16)
 def test_free_datum_on_clustered_posts_is_a_warning(measured):
     rng = np.random.default_rng(SEED)
     far_mm, errors = 2400.0, []
@@ -182,6 +192,7 @@ def test_free_datum_on_clustered_posts_is_a_warning(measured):
     assert 0.3 < half / (0.6745 * float(exact.range_sigma_mm(far_mm))) < 3.0
 
 
+@pytest.mark.hard_case(16)
 def test_spread_posts_or_a_prior_lift_the_warning():
     assert fit(Targets(TRUTH.row(SPREAD_MM), SPREAD_MM), NOMINAL, DATUM_FREE).verdicts == ()
     clustered = Targets(TRUTH.row(CLUSTERED_MM), CLUSTERED_MM)
