@@ -337,7 +337,7 @@ def _calibrate_simulated(
 
     design, built = load_calibration(nominal), load_calibration(as_built)
     with ended_by_signals(), TemporaryDirectory(prefix="eschorty_") as folder:
-        job = one_calibration.OneCalibration(
+        job = one_calibration.CalibrationJob(
             tuple(known), folder, calibration=nominal, as_built=as_built, method=method
         )
         with progress_bar("calibrating") as feedback:
