@@ -9,8 +9,7 @@ from eschorty_ros.core.optics.calibration_file import (
     refuse_other_instrument,
     save_calibration,
 )
-from eschorty_ros.core.optics.design import design, design_for_ranges
-from eschorty_ros.core.optics.optical_build import Design, DesignTable
+from eschorty_ros.core.optics.design import Design, DesignTable, design, design_for_ranges
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXELS_MAX,

@@ -1,25 +1,151 @@
 """Choosing an optical build: from lens and tilts to ranges, and from ranges to tilts.
 
 A build is a lens (focal length, f-number), a light sheet tilted by ``theta`` against the lens
-plane, a sensor tilted by ``theta'`` and the row offset ``b'`` that says which part of the sensor
-plane is used. All three planes meet in the Scheimpflug line, ``baseline_mm`` from the lens centre.
+plane, a sensor tilted by ``theta'`` and the row offset ``b'``, which selects the part of the sensor
+plane. All three planes meet in the Scheimpflug line, ``baseline_mm`` from the lens centre.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from eschorty_ros.core.base.arrays import integer, number, positive
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from eschorty_ros.core.base.arrays import Array, integer, number, positive, reals
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.optics.optical_build import Design
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXEL_UM,
     PIXELS_MAX,
     ROWS,
     RangeModel,
+    depth_of_field_mm,
     object_scale_mm,
 )
+
+
+@dataclass(frozen=True, slots=True)
+class DesignTable:
+    """Properties of a build at some ranges; arrays of one shape, float64, NaN out of reach.
+
+    Attributes
+    ----------
+    range_mm : ndarray
+        Range from the mechanical datum.
+    row : ndarray
+        Where it appears, px; may lie off the sensor, see ``in_view``.
+    in_view : ndarray of bool
+        Whether the row is on the sensor.
+    magnification : ndarray
+        Image size over object size.
+    range_per_row_mm : ndarray
+        Range step of one row (Eq. 4).
+    depth_of_field_mm : ndarray
+        In focus within plus and minus this (Eq. 3).
+    lateral_pitch_mm : ndarray
+        Distance of neighbouring columns along the laser line.
+    swath_mm : ndarray
+        Length of laser line that all columns see.
+    """
+
+    range_mm: Array
+    row: Array
+    in_view: NDArray[np.bool_]
+    magnification: Array
+    range_per_row_mm: Array
+    depth_of_field_mm: Array
+    lateral_pitch_mm: Array
+    swath_mm: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """An optical build with everything that follows from it; made by :func:`design`.
+
+    The sign of ``theta_prime_deg`` is the side to which the sensor is tilted; no formula uses it.
+    """
+
+    focal_length_mm: float
+    f_number: float
+    theta_deg: float
+    theta_prime_deg: float
+    model: RangeModel
+
+    @property
+    def baseline_mm(self) -> float:
+        """Lens centre to Scheimpflug line, ``f (cot theta + cot|theta'|)``, mm."""
+        sheet, sensor = math.radians(self.theta_deg), math.radians(abs(self.theta_prime_deg))
+        return self.focal_length_mm * (1.0 / math.tan(sheet) + 1.0 / math.tan(sensor))
+
+    @property
+    def range_limits_mm(self) -> tuple[float, float]:
+        """Nearest and farthest range on the sensor, rows 0 and ``rows - 1``, mm."""
+        return self.model.range_limits_mm
+
+    @property
+    def field_deg(self) -> float:
+        """Full scan angle of all columns, seen from the front focal line, degrees."""
+        return 2.0 * math.degrees(math.atan(0.5 * self.model.columns * self.column_pitch_rad))
+
+    @property
+    def column_pitch_rad(self) -> float:
+        """Scan angle of one column, ``p / k``, radians."""
+        return self.model.pixel_um * 1e-3 / self.model.k_mm
+
+    @property
+    def depth_of_field_rows(self) -> float:
+        """Half depth of field over range step, px: ``N p cos(theta') |k'| / (k sin theta)``.
+
+        The same at every range.
+        """
+        return (
+            self.f_number
+            * self.model.pixel_um
+            * 1e-3
+            * math.cos(math.radians(self.theta_prime_deg))
+            * -self.model.k_prime_px
+            / (self.model.k_mm * math.sin(math.radians(self.theta_deg)))
+        )
+
+    @property
+    def axis_range_mm(self) -> float:
+        """Range at which the light sheet crosses the optical axis, mm; infinite when parallel."""
+        theta = math.radians(self.theta_deg)
+        if self.theta_deg == 90.0:
+            return math.inf
+        depth = (self.baseline_mm * math.tan(theta) - self.focal_length_mm) / math.sin(theta)
+        return depth - self.model.b_mm
+
+    @property
+    def axis_row(self) -> float:
+        """Row that looks along the optical axis, px; usually just off the sensor."""
+        return float(self.model.row(self.axis_range_mm))
+
+    def at(self, range_mm: ArrayLike) -> DesignTable:
+        """Return the build's properties at ranges (mm, any shape)."""
+        ranges = reals("range_mm", range_mm)
+        row = self.model.row(ranges)
+        magnification = self.model.magnification(row)
+        with np.errstate(divide="ignore"):
+            pitch_mm = self.model.pixel_um * 1e-3 / magnification
+        return DesignTable(
+            range_mm=ranges,
+            row=row,
+            in_view=(row >= 0.0) & (row <= self.model.rows - 1),
+            magnification=magnification,
+            range_per_row_mm=self.model.range_per_row_mm(ranges),
+            depth_of_field_mm=depth_of_field_mm(
+                magnification,
+                self.f_number,
+                self.theta_deg,
+                self.theta_prime_deg,
+                self.model.pixel_um,
+            ),
+            lateral_pitch_mm=pitch_mm,
+            swath_mm=pitch_mm * self.model.columns,
+        )
 
 
 def design(
@@ -36,7 +162,7 @@ def design(
     columns: int = COLUMNS,
     rows: int = ROWS,
 ) -> Design:
-    """Build from lens, tilts and row offset (Eq. 1).
+    """Return the build of a lens, two tilts and a row offset (Eq. 1).
 
     Parameters
     ----------
@@ -58,6 +184,20 @@ def design(
     ------
     ArgumentError
         When a value is out of its range or a choice is not made exactly once.
+
+    Examples
+    --------
+    The paper's third build:
+
+    >>> build = design(
+    ...     focal_length_mm=24.0, f_number=2.0, theta_deg=85.87,
+    ...     theta_prime_deg=-7.62, b_prime_px=-1142.74,
+    ... )
+    >>> near_mm, far_mm = build.range_limits_mm
+    >>> print(f"{near_mm:.0f} to {far_mm:.0f} mm, baseline {build.baseline_mm:.1f} mm")
+    784 to 2115 mm, baseline 181.1 mm
+    >>> print(f"{build.at(1320.0).range_per_row_mm:.2f} mm per row at 1.32 m")
+    1.94 mm per row at 1.32 m
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
     integer("columns", columns, 1, PIXELS_MAX)
@@ -96,7 +236,7 @@ def design_for_ranges(
     columns: int = COLUMNS,
     rows: int = ROWS,
 ) -> Design:
-    """Build that sees ``near_mm`` at row 0 and ``far_mm`` at the last row (Eq. 2 at two rows).
+    """Return the build that sees ``near_mm`` at row 0 and ``far_mm`` at the last row (Eq. 2).
 
     The two ranges fix ``K`` and ``b'``; the lens fixes ``k``, so ``k'`` and the sensor tilt
     follow. Parameters as in :func:`design`.

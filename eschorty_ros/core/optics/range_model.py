@@ -1,7 +1,7 @@
 """Scheimpflug ranging: rows to ranges and back, magnification, sampling and lateral scale.
 
-Signs: ``k_mm > 0``, ``k_prime_px < 0``, ``b_prime_px < 0``, so ``K = k k' < 0`` and a row sees
-something only where ``row + b' < 0``. The pole ``row = -b'`` is infinitely far away.
+Signs: ``k_mm > 0``, ``k_prime_px < 0``, ``b_prime_px < 0``, so ``K = k k' < 0`` and a row has a
+range only where ``row + b' < 0``. The pole ``row = -b'`` is infinitely far away.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PIXELS_MAX = 1 << 16
 
 
 def object_scale_mm(focal_mm: float, theta_deg: float) -> float:
-    """``k = f / sin(theta)`` in mm, unrounded (Eq. 1).
+    """Return ``k = f / sin(theta)`` in mm, unrounded (Eq. 1).
 
     Raises
     ------
@@ -42,7 +42,7 @@ def depth_of_field_mm(
     theta_prime_deg: float,
     pixel_um: float = PIXEL_UM,
 ) -> Array:
-    """Half depth of field along the sheet, mm (Eq. 3).
+    """Return half the depth of field along the sheet, mm (Eq. 3).
 
     A focus tolerance, not a ranging error.
 
@@ -83,7 +83,7 @@ def _sheet_sine(theta_deg: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RangeModel:
-    """The calibrated range equation of one build (Eq. 2) and what follows from it.
+    """The calibrated range equation of one build (Eq. 2): rows to ranges and back, and scales.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class RangeModel:
         Column of zero scan angle; pixel centres are integers.
     theta_deg : float
         Tilt of the light sheet against the lens plane, above 0 up to 90. Ranging needs only
-        ``k`` and ``k'``; what lies off the sheet (:meth:`rows_per_mm_off_sheet`) needs it too.
+        ``k`` and ``k'``; points off the sheet (:meth:`rows_per_mm_off_sheet`) need it too.
     b_prime_1_px, b_prime_2_px : float
         Row offset across the columns, px: ``b'(column) = b' + b'1 u + b'2 u^2`` with ``u`` the
         :meth:`normalised_column`. Roll of the sheet against the sensor, and smile.
@@ -112,6 +112,18 @@ class RangeModel:
     ------
     ArgumentError
         When a parameter has the wrong sign or is not finite.
+
+    Examples
+    --------
+    >>> model = RangeModel(k_mm=24.0, k_prime_px=-37000.0, b_mm=0.0, b_prime_px=-1110.0)
+    >>> model.range_mm([0.0, 370.0, 1110.0])
+    array([ 800., 1200.,   nan])
+    >>> model.row(1200.0)
+    array(370.)
+    >>> print(f"{model.lateral_mm(column=0, range_mm=1200.0):.1f} mm along the line")
+    -155.4 mm along the line
+    >>> print(f"{model.range_sigma_mm(row=370.0, sigma_row=0.25):.2f} mm for 0.25 px")
+    0.41 mm for 0.25 px
     """
 
     k_mm: float
@@ -168,11 +180,11 @@ class RangeModel:
         return float(near), math.inf if math.isnan(far) else float(far)
 
     def normalised_column(self, column: ArrayLike) -> Array:
-        """``u``: 0 at the principal column, 1 half a sensor further, any shape."""
+        """Return ``u``: 0 at the principal column, 1 half a sensor further, any shape."""
         return np.asarray((reals("column", column) - self.principal_column) / (0.5 * self.columns))
 
     def row_offset_px(self, column: ArrayLike | None = None) -> Array:
-        """``b'`` in these columns, px, any shape; in the principal column by default."""
+        """Return ``b'`` in these columns, px, any shape; in the principal column by default."""
         if column is None:
             return np.asarray(self.b_prime_px)
         u = self.normalised_column(column)
@@ -180,15 +192,15 @@ class RangeModel:
             return np.asarray(self.b_prime_px + u * (self.b_prime_1_px + u * self.b_prime_2_px))
 
     def range_mm(self, row: ArrayLike, column: ArrayLike | None = None) -> Array:
-        """Range along the sheet from the mechanical datum, mm (Eq. 2 inverted).
+        """Return the range along the sheet from the mechanical datum, mm (Eq. 2 inverted).
 
-        ``row`` may lie off the sensor; ``column`` is where it was seen, by default the principal
-        one. They broadcast. NaN within 1 px of the pole and behind it (``row + b' > -1``).
+        ``row`` may lie off the sensor; ``column`` is the principal one by default. They broadcast.
+        NaN within 1 px of the pole and behind it (``row + b' > -1``).
         """
         return np.asarray(self.product_mm_px / self._image_px(row, column) - self.b_mm)
 
     def row(self, range_mm: ArrayLike, column: ArrayLike | None = None) -> Array:
-        """Row at which a range appears, px (Eq. 2); ``column`` as in :meth:`range_mm`.
+        """Return the row at which a range appears, px (Eq. 2); ``column`` as in :meth:`range_mm`.
 
         NaN where ``range + b <= 0``, or so little above that no number holds the row.
         """
@@ -199,7 +211,7 @@ class RangeModel:
         return np.where(np.isfinite(row), row, np.nan)
 
     def magnification(self, row: ArrayLike) -> Array:
-        """Image size over object size at ``row`` of the principal column: ``(row + b') / k'``.
+        """Return image size over object size at ``row``, principal column: ``(row + b') / k'``.
 
         A straight line in row that reaches 0 at the pole; NaN behind the pole.
         """
@@ -207,7 +219,7 @@ class RangeModel:
         return np.where(m >= 0.0, m, np.nan)
 
     def range_per_row_mm(self, range_mm: ArrayLike) -> Array:
-        """Range step of one row, mm per px (Eq. 4); NaN where ``range + b <= 0``."""
+        """Return the range step of one row, mm per px (Eq. 4); NaN where ``range + b <= 0``."""
         depth = self._depth_mm(range_mm)
         with np.errstate(over="ignore"):
             return np.asarray(depth * depth / -self.product_mm_px)
@@ -215,7 +227,7 @@ class RangeModel:
     def range_sigma_mm(
         self, row: ArrayLike, sigma_row: ArrayLike, column: ArrayLike | None = None
     ) -> Array:
-        """One-sigma range error (mm) of a row known to ``sigma_row`` px (Eq. 4).
+        """Return the standard deviation of the range, mm, for ``sigma_row`` px of the row (Eq. 4).
 
         The arguments broadcast; NaN where :meth:`range_mm` is NaN.
         """
@@ -225,12 +237,12 @@ class RangeModel:
             return np.asarray(-self.product_mm_px / (image * image) * sigma)
 
     def column_slope(self, column: ArrayLike) -> Array:
-        """Lateral offset per mm of depth at ``column``: ``(column - c0) p / k``, mm per mm."""
+        """Return the lateral offset per mm of depth: ``(column - c0) p / k``, mm per mm."""
         offset = reals("column", column) - self.principal_column
         return np.asarray(offset * (self.pixel_um * 1e-3 / self.k_mm))
 
     def lateral_mm(self, column: ArrayLike, range_mm: ArrayLike) -> Array:
-        """Position along the laser line, mm, of ``range_mm`` seen in ``column``.
+        """Return the position along the laser line, mm, of a point at ``range_mm`` in ``column``.
 
         Image columns meet at the front focal line, so the offset grows with ``range + b``.
         The arguments broadcast; NaN where ``range + b <= 0``.
@@ -241,7 +253,7 @@ class RangeModel:
             return np.asarray(slope * depth)
 
     def rows_per_mm_off_sheet(self, range_mm: ArrayLike) -> Array:
-        """Rows by which a point 1 mm beside the light sheet appears nearer, px per mm.
+        """Return by how many rows a point 1 mm beside the light sheet appears nearer, px per mm.
 
         The chief ray through a lens whose object plane is the sheet and whose image plane is the
         sensor: with depth ``R~ = R + b``, ``z = f + R~ sin(theta)`` along the optical axis and
@@ -250,8 +262,8 @@ class RangeModel:
         Little more than ``k / (p R~)``, one over the lateral pitch.
 
         Positive for a point on the sheet's far side from the lens, +y in ``eschorty_link``: its
-        row is *lower* by this number. Of a footprint that lies across the sheet, rows ``d``
-        above the centre see the surface ``d / rows_per_mm_off_sheet`` behind it (towards -y).
+        row is *lower* by this number. Across the line's width, rows ``d`` above the centre show
+        the surface ``d / rows_per_mm_off_sheet`` behind it (towards -y).
 
         Parameters
         ----------
@@ -286,13 +298,13 @@ class RangeModel:
             return np.asarray((self.k_mm / depth) ** 2 * lever / scale)
 
     def _image_px(self, row: ArrayLike, column: ArrayLike | None) -> Array:
-        """``row + b'``, NaN from one pixel before the pole on."""
+        """Return ``row + b'``, NaN from one pixel before the pole on."""
         rows, offset = reals("row", row), self.row_offset_px(column)
         broadcast("row and column", rows, offset)
         image = rows + offset
         return np.where(image <= -POLE_MARGIN_PX, image, np.nan)
 
     def _depth_mm(self, range_mm: ArrayLike) -> Array:
-        """``R + b``, NaN where it is not positive."""
+        """Return ``R + b``, NaN where it is not positive."""
         depth = reals("range_mm", range_mm) + self.b_mm
         return np.where(depth > 0.0, depth, np.nan)

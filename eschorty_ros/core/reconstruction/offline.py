@@ -1,4 +1,4 @@
-"""A whole recording at once."""
+"""The reconstruction of a recording."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOVING_SHARE = 0.8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """What a recording gave.
+    """Points and profiles of a recording.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Result:
     profiles : Profiles
         The same points before placing, with their rows and times.
     counters : dict
-        Those of the reconstructor, and ``points_without_stage``.
+        The reconstructor's, and ``points_without_stage``.
     profile_count, events : int
     seconds : float
         Wall time of reconstruction and placing, reading of the file included.
@@ -58,7 +58,7 @@ def reconstruct_recording(
     settings: Settings | None = None,
     progress: Callable[[int, int], Any] | None = None,
 ) -> Result:
-    """Reconstruct a whole recording.
+    """Return the points of a recording, placed along the stage's travel.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def reconstruct_recording(
 
 
 def stage_speed_mm_s(recording: Recording) -> float:
-    """Median speed of the recording's stage towards +y while it cruises; 0 when it rests."""
+    """Return the stage's median speed towards +y while it cruises; 0 when it rests."""
     first_us, last_us = recording.stage.first_us, recording.stage.last_us
     if first_us is None or last_us is None or last_us == first_us:
         return 0.0

@@ -1,6 +1,6 @@
 """The paper's processing in plain numpy, for comparison.
 
-Nothing compiled, from the bytes on. Per window: accumulate all events in a frame of columns by
+Nothing is compiled, from the bytes on. Per window: accumulate all events in a frame of columns by
 rows, take each column's mean row as the line and its standard deviation as the confidence, and
 turn rows into ranges with Eq. 2. No phase gate, no outlier rejection, no streaming: background
 anywhere in a column pulls its mean.
@@ -24,10 +24,10 @@ from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 def decode_all(
     data: bytes,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Decode a whole, well-formed EVT3 stream into times (us), columns and rows.
+    """Return times (us), columns and rows of a complete, well-formed EVT3 stream.
 
     Each word's time, row and vector base come from the latest word of the kind that sets them.
-    No checks, no triggers: what is not well-formed belongs to ``evt3.Decoder``.
+    No checks, no triggers: streams that are not well-formed need ``evt3.Decoder``.
     """
     view = byte_view("data", data)
     words = np.frombuffer(view, dtype="<u2", count=len(view) // 2)
@@ -75,7 +75,7 @@ def reconstruct(
     modulation: Modulation,
     events_min: int = 4,
 ) -> Profiles:
-    """Column means of every modulation period.
+    """Return the column means of every modulation period.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ _DTYPES = {
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LineRows:
-    """Rows of the line as arrays of equal length, by period, column, return index.
+    """Rows of the line as arrays of equal length, ordered by period, column and return index.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ class Profiles(LineRows):
 
 
 def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDArray[np.void]:
-    """Points in the moving frame ``eschorty_link``: x = range, z along the line, y = 0.
+    """Return the points in the moving frame ``eschorty_link``: x = range, z along the line, y = 0.
 
     Parameters
     ----------
@@ -151,8 +151,8 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
     Returns
     -------
     ndarray of POINT_DTYPE, shape (len(profiles),)
-        Metres and seconds; ``sigma`` is the range's standard deviation. Of REFLECTANCE_DTYPE where
-        the profiles know their reflectance.
+        Metres and seconds; ``sigma`` is the range's standard deviation. REFLECTANCE_DTYPE where
+        the profiles have a reflectance.
     """
     known = profiles.reflectance is not None
     integer("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
@@ -176,15 +176,14 @@ def place(
     stage_direction: ArrayLike,
     origin_us: int = 0,
 ) -> NDArray[np.void]:
-    """Points in ``eschorty_base``: ``P = P_link + s t_hat``, s at the mean time of the events used.
+    """Return the points in ``eschorty_base``: ``P = P_link + s t_hat``, s at the point's time.
 
     Parameters
     ----------
     profiles : Profiles
     model : RangeModel
     stage_position_mm : array_like of float64, shape (len(profiles),) or scalar
-        Stage position at ``profiles.t_us``. Points whose position is NaN are left out; the
-        difference in length is theirs to count by the caller.
+        Stage position at ``profiles.t_us``. Points whose position is NaN are left out.
     stage_direction : array_like of float64, shape (3,)
         Unit vector of the stage's motion.
     origin_us : int
@@ -193,7 +192,7 @@ def place(
     Returns
     -------
     ndarray of POINT_DTYPE
-        Or of REFLECTANCE_DTYPE, as :func:`place_link` gives them.
+        Or of REFLECTANCE_DTYPE, as from :func:`place_link`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Settings of the reconstruction; command line and ROS parameters are generated from them."""
+"""Settings of the reconstruction; command-line options and ROS parameters are made from them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _choice(default: str, choices: tuple[str, ...], description: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How events become points.
+    """Settings of the way from events to points.
 
     Every field carries ``metadata``: ``description``, ``unit`` and ``range`` (both ends included)
     or ``choices``.
@@ -51,11 +51,11 @@ class Settings:
     a third of the speed.
 
     The phase gate is off by default as well: how late a real sensor's events come depends on its
-    biases. 1000 us at 70 Hz and 600 us at 300 Hz keep what the simulated sensor sends. Windows
-    that cover the period, above about 1 kHz, remove nothing.
+    biases. 1000 us at 70 Hz and 600 us at 300 Hz keep the simulated sensor's events. Windows that
+    cover the period, above about 1 kHz, remove nothing.
 
-    So is the compensation of reflectance steps: it must know the stage's speed, and it holds back
-    as many profiles as a step takes to cross the line.
+    So is the compensation of reflectance steps: it needs the stage's speed, and it holds back as
+    many profiles as a step takes to cross the line.
 
     ``periods_per_profile`` is for frequencies at which a column gives fewer than ``events_min``
     events per period (above about 5 kHz).
@@ -64,6 +64,14 @@ class Settings:
     ------
     ArgumentError
         When a value lies outside its range or choices.
+
+    Examples
+    --------
+    >>> Settings(centroid="median", phase_gate_us=1000).line_width_px
+    20.0
+    >>> Settings(events_min=0)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...ArgumentError: events_min is 0; choose a whole number from 1 to 1000 events
     """
 
     centroid: str = _choice("mode_mean", METHODS, "column estimator")
@@ -123,8 +131,8 @@ class Settings:
         -10_000.0,
         10_000.0,
         "mm/s",
-        "stage speed towards +y, by which the compensation knows a step's way through the "
-        "line, 0 for a resting one; recordings tell their own",
+        "stage speed towards +y, from which the compensation follows a step through the "
+        "line, 0 for a resting one; a recording's own speed is used instead",
     )
     sigma_factor: float = _number(
         SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"

@@ -1,10 +1,11 @@
-"""Takes out the shift of the centroid where the line straddles a reflectance step.
+"""Compensation of the row's shift where the line straddles a reflectance step.
 
 Rows on the brighter side of a step are lit further out than rows on the darker side, and the
 centroid moves towards the brighter side by up to half the difference: 2.9 px from black to white
-(the paper's Fig. 7). A single profile does not tell this from a change of range. Its neighbours
-do: before and after the step has crossed the beam the line is as wide as either side alone makes
-it, the width between says how far the step has come, and the motion says from where.
+(the paper's Fig. 7). A single profile cannot distinguish this from a change of range. Its
+neighbours can: before and after the step has crossed the beam the line is as wide as either side
+alone makes it, the width between shows how far the step has come, and the stage's motion shows
+from which side.
 """
 
 from __future__ import annotations
@@ -12,18 +13,20 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line import ROOT_12, events_per_row
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.core.reconstruction._step import _middles, _step_shifts
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
 
-LAG_MAX = 256
+_LAG_MAX = 256
 """Most profiles held back; a beam that takes longer to cross is corrected in part."""
 
 _WIDTH_GATE_PX = 3.0
@@ -33,15 +36,36 @@ _ROW_GATE_PX = 6.0
 """Rows before and after that differ by more are two surfaces, not a step on one."""
 
 _AHEAD_SHARE = 0.8
-"""Part of the line's width to look ahead: what is left shifts little, and holding back costs."""
+"""Part of the line's width to look ahead: the rest shifts little, and holding back costs time."""
 
 _SIGMA_SHARE = 0.2
 _SIGMA_PX = 0.3
 """Standard deviation of a correction: a share of it, and what half the error of a width gives."""
 
+_REACH_COLUMNS = 2
+"""Columns on either side that the median of the widths takes in."""
+
+
+class _History(NamedTuple):
+    """The newest profiles, one per line of the arrays, at their number modulo the size."""
+
+    present: NDArray[np.bool_]
+    widths_px: Array
+    medians_px: Array
+    rows: Array
+
+
+class _Points(NamedTuple):
+    """Points of one profile: how many profiles back and ahead a step is off the line; shifts."""
+
+    column: NDArray[np.uint16]
+    back: NDArray[np.int64]
+    ahead: NDArray[np.int64]
+    shift_px: Array
+
 
 class StepCompensator:
-    """Corrects profiles as they stream by; holds back as many as cross the beam.
+    """Corrects a stream of profiles; holds back as many as a step takes to cross the beam.
 
     Parameters
     ----------
@@ -49,78 +73,90 @@ class StepCompensator:
         ``stage_speed_mm_s`` gives the speed and, by its sign, the direction of the surface.
     model : RangeModel
     modulation : Modulation
+
+    Attributes
+    ----------
+    columns_compensated : int
+        Points whose row was corrected.
     """
 
     def __init__(self, settings: Settings, model: RangeModel, modulation: Modulation) -> None:
+        self.columns_compensated = 0
         self._model = model
         self._every = settings.periods_per_profile
         # The stage carries the instrument towards +y, and +y appears at lower rows.
         self._sign = -math.copysign(1.0, settings.stage_speed_mm_s)
         step_mm = abs(settings.stage_speed_mm_s) * modulation.period_us * 1e-6 * self._every
         self._crossing_mm_px = settings.line_width_px / max(step_mm, 1e-9)
-        back, ahead = self._lags(np.array([self._farthest_mm()]))
-        self.delay = int(ahead[0])
+        far_mm = model.range_limits_mm[1]
+        back, ahead = self._lags(np.array([far_mm if math.isfinite(far_mm) else 1e6]))
+        self._delay = int(ahead[0])
         size = int(back[0] + ahead[0]) + 1
-        self._present = np.zeros(size, dtype=np.bool_)
-        self._widths = np.zeros((size, model.columns))
-        self._middles = np.zeros((size, model.columns))
-        self._rows = np.full((size, model.columns), np.nan)
-        self._per_row = np.full(size, np.nan)
+        self._history = _History(
+            present=np.zeros(size, np.bool_),
+            widths_px=np.zeros((size, model.columns)),
+            medians_px=np.zeros((size, model.columns)),
+            rows=np.full((size, model.columns), np.nan),
+        )
+        self._events_per_row = np.full(size, np.nan)
         self._held: list[tuple[int, LineRows]] = []
         self._newest = -1
         self._last_index: int | None = None
-        self._scratch = np.empty(5)
-        self.columns_compensated = 0
 
-    def push(self, profiles: LineRows) -> LineRows:
-        """Take whole profiles; returns the corrected ones whose neighbours are known by now."""
-        starts = np.flatnonzero(np.diff(profiles.period, prepend=-1 - profiles.period[:1]))
-        bounds = [*starts.tolist(), len(profiles)]
+    def push(self, rows: LineRows) -> LineRows:
+        """Return the corrected profiles whose neighbours are known by now.
+
+        Parameters
+        ----------
+        rows : LineRows
+            Complete profiles, in order.
+        """
+        starts = np.flatnonzero(np.diff(rows.period, prepend=-1 - rows.period[:1]))
         done = []
-        for begin, end in pairwise(bounds):
-            self._enter(profiles.select(slice(begin, end)))
-            done += self._release(self._newest - self.delay)
+        for begin, end in pairwise([*starts.tolist(), len(rows)]):
+            self._enter(rows.select(slice(begin, end)))
+            done += self._release(self._newest - self._delay)
         return LineRows.concatenate(done)
 
     def flush(self) -> LineRows:
-        """LineRows still held back; a point whose later neighbours are missing stays as it is."""
+        """Return the profiles held back; points without later neighbours are unchanged."""
         return LineRows.concatenate(self._release(self._newest))
 
     def _enter(self, profile: LineRows) -> None:
-        """Store one profile's widths and rows at its place in time."""
+        """Store the widths and rows of one profile at its place in time."""
         index = int(profile.period[0]) // self._every
         passed = 1 if self._last_index is None else index - self._last_index
         self._last_index = index
-        size = self._present.size
-        # A number that does not grow is a new grid: nothing before it is a neighbour.
+        history = self._history
+        size = history.present.size
+        # A number that does not grow is a new grid: no profile before it is a neighbour.
         passed = passed if 0 < passed < size else size
-        for skipped in range(passed):
-            slot = (self._newest + 1 + skipped) % size
-            self._present[slot] = False
-            self._per_row[slot] = np.nan
+        skipped = (self._newest + 1 + np.arange(passed)) % size
+        history.present[skipped] = False
+        self._events_per_row[skipped] = np.nan
         self._newest += passed
         slot = self._newest % size
-        self._present[slot] = True
-        self._per_row[slot] = events_per_row(profile.width_px, profile.events)
-        widths, line = self._widths[slot], self._rows[slot]
-        widths[:], line[:] = 0.0, np.nan
-        widths[profile.column] = self._full_width(profile)
+        history.present[slot] = True
+        self._events_per_row[slot] = events_per_row(profile.width_px, profile.events)
+        widths_px, line = history.widths_px[slot], history.rows[slot]
+        widths_px[:], line[:] = 0.0, np.nan
+        widths_px[profile.column] = self._full_width_px(profile)
         line[profile.column] = profile.row
-        _middles(widths, self._scratch, self._middles[slot])
+        _medians(widths_px, history.medians_px[slot])
         self._held.append((self._newest, profile))
 
-    def _full_width(self, profile: LineRows) -> NDArray[np.float64]:
-        """Full widths of the lit rows: the smaller of what spread and counts say, 1 px at least.
+    def _full_width_px(self, profile: LineRows) -> Array:
+        """Return the full widths of the lit rows, 1 px at least.
 
-        A gap between two lit parts widens the spread, and so does background; a refractory time
-        distorts the counts.
+        The smaller of what the rows' spread and the events' number give: a gap between two lit
+        parts widens the spread, and so does background; a refractory time distorts the number.
         """
-        width = ROOT_12 * profile.width_px
-        known = self._per_row[np.isfinite(self._per_row)]
+        width_px = ROOT_12 * profile.width_px
+        known = self._events_per_row[np.isfinite(self._events_per_row)]
         if known.size:
             # Over many profiles: in a single one every column may straddle a step.
-            width = np.minimum(width, profile.events / np.median(known))
-        return np.maximum(width, 1.0)
+            width_px = np.minimum(width_px, profile.events / np.median(known))
+        return np.maximum(width_px, 1.0)
 
     def _release(self, until: int) -> list[LineRows]:
         done = []
@@ -128,42 +164,119 @@ class StepCompensator:
             done.append(self._corrected(*self._held.pop(0)))
         return done
 
-    def _corrected(self, place: int, profile: LineRows) -> LineRows:
-        shift = np.empty(len(profile))
-        _step_shifts(
-            profile.column,
-            *self._lags(self._model.range_mm(profile.row, profile.column)),
-            self._widths,
-            self._middles,
-            self._rows,
-            self._present,
-            self._newest,
-            place,
-            self._sign,
-            _WIDTH_GATE_PX,
-            _ROW_GATE_PX,
-            self._scratch,
-            shift,
-        )
-        moved = shift != 0.0
+    def _corrected(self, number: int, profile: LineRows) -> LineRows:
+        back, ahead = self._lags(self._model.range_mm(profile.row, profile.column))
+        shift_px = np.zeros(len(profile))
+        points = _Points(profile.column, back, ahead, shift_px)
+        _shifts(points, self._history, number, self._newest, self._sign)
+        moved = shift_px != 0.0
         if not moved.any():
             return profile
         self.columns_compensated += int(np.count_nonzero(moved))
-        added = np.where(moved, np.hypot(_SIGMA_PX, _SIGMA_SHARE * shift), 0.0)
+        added_px = np.where(moved, np.hypot(_SIGMA_PX, _SIGMA_SHARE * shift_px), 0.0)
         return replace(
             profile,
-            row=profile.row - self._sign * shift,
-            sigma_row=np.hypot(profile.sigma_row, added),
+            row=profile.row - self._sign * shift_px,
+            sigma_row=np.hypot(profile.sigma_row, added_px),
         )
 
-    def _lags(self, range_mm: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """LineRows back and ahead until a step at the middle of the line has left it."""
+    def _lags(self, range_mm: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return profiles back and ahead until a step at the middle of the line has left it."""
         rows_per_mm = self._model.rows_per_mm_off_sheet(range_mm)
         profiles = np.nan_to_num(self._crossing_mm_px / np.maximum(rows_per_mm, 1e-9), nan=1.0)
-        back = np.clip(np.ceil(profiles), 1, LAG_MAX).astype(np.int64)
-        ahead = np.clip(np.rint(_AHEAD_SHARE * profiles), 1, LAG_MAX).astype(np.int64)
+        back = np.clip(np.ceil(profiles), 1, _LAG_MAX).astype(np.int64)
+        ahead = np.clip(np.rint(_AHEAD_SHARE * profiles), 1, _LAG_MAX).astype(np.int64)
         return back, ahead
 
-    def _farthest_mm(self) -> float:
-        far_mm = self._model.range_limits_mm[1]
-        return far_mm if math.isfinite(far_mm) else 1e6
+
+@kernel
+def _shifts(points, history, number, newest, sign):
+    """Write the shift of each point of profile ``number``.
+
+    Positive towards the rows from which the surface comes; ``sign`` is the sense of these rows.
+    A point is not corrected where a neighbour is missing, nor where the correction would not bring
+    it nearer to its neighbours.
+    """
+    size = history.present.size
+    present = number % size
+    scratch = np.empty(2 * _REACH_COLUMNS + 1)
+    for k in range(points.column.size):
+        column = np.int64(points.column[k])
+        first, last = number - points.back[k], number + points.ahead[k]
+        if first <= newest - size or last > newest:
+            continue
+        before, after = first % size, last % size
+        if not (history.present[before] and history.present[after]):
+            continue
+        width_before = history.medians_px[before, column]
+        width_after = history.medians_px[after, column]
+        if abs(width_after - width_before) < _WIDTH_GATE_PX:
+            continue
+        row_before, row_after = history.rows[before, column], history.rows[after, column]
+        if abs(row_before - row_after) > _ROW_GATE_PX:
+            continue
+        width = _median(history.widths_px[present], column, True, scratch)
+        shift = _centroid_shift(width_before, width, width_after)
+        expected = _interpolated(row_before, row_after, points.back[k], points.ahead[k])
+        difference = history.rows[present, column] - expected
+        if not abs(difference - sign * shift) > abs(difference):
+            points.shift_px[k] = shift
+
+
+@kernel
+def _centroid_shift(before, now, after):
+    """Return the shift of the line's centroid towards the rows from which the surface comes, px.
+
+    The arguments are full widths of the lit rows on the surface before the step, across it and
+    behind it. The wider side shows ``low / 2 + half`` rows on one side of the centre, the other
+    ``low / 2``. As the step crosses, rows of the wider side first appear beyond a gap, then
+    replace dark rows, then lit ones (no change of width), and at last the narrower side's rows go.
+    """
+    low = min(before, after)
+    high = max(before, after)
+    extra = min(max(now - low, 0.0), high - low)
+    if extra == 0.0:
+        size = 0.0
+    elif 2.0 * extra <= high - low:
+        size = extra * (high - extra) / (2.0 * now)
+    else:
+        size = 0.5 * (high - low - extra)
+    return size if after >= before else -size
+
+
+@kernel
+def _medians(widths, medians):
+    """Write the median of the columns around each column; those without a point count as 0."""
+    scratch = np.empty(2 * _REACH_COLUMNS + 1)
+    for column in range(widths.size):
+        medians[column] = _median(widths, column, False, scratch)
+
+
+@kernel
+def _median(widths, column, lit_only, scratch):
+    """Return the median of the columns around one; with ``lit_only`` of those with a point."""
+    n = 0
+    first = max(column - _REACH_COLUMNS, 0)
+    for c in range(first, min(column + _REACH_COLUMNS + 1, widths.size)):
+        value = widths[c]
+        if value == 0.0 and lit_only:
+            continue
+        k = n
+        while k > 0 and scratch[k - 1] > value:
+            scratch[k] = scratch[k - 1]
+            k -= 1
+        scratch[k] = value
+        n += 1
+    if n == 0:
+        return 0.0
+    return 0.5 * (scratch[(n - 1) // 2] + scratch[n // 2])
+
+
+@kernel
+def _interpolated(row_before, row_after, back, ahead):
+    """Return the row between two neighbours in time, or that of the only one; NaN without any."""
+    if np.isnan(row_before):
+        return row_after
+    if np.isnan(row_after):
+        return row_before
+    return (row_before * ahead + row_after * back) / (back + ahead)

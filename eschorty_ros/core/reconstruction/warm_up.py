@@ -10,24 +10,22 @@ from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.settings import Settings
 
-FREQUENCY_HZ = 1000.0
-
 
 def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
-    """Run a few events through a reconstruction of its own.
+    """Run a few events through a separate reconstruction.
 
-    The first run on a machine compiles for some seconds; later runs load what that left in
-    numba's cache. A node does this before it takes data, which would pile up meanwhile; a command
-    before it takes the time.
+    The first run on a machine compiles for some seconds; later runs load numba's cache. A node
+    does this before it accepts data, which would pile up meanwhile; a command before it measures
+    the time.
 
     Parameters
     ----------
     calibration : Calibration
     settings : Settings, optional
-        What is to be compiled: filter and estimator.
+        Filter and estimator to compile.
     """
     periods, columns, events = 4, 8, 6
-    modulation = Modulation(FREQUENCY_HZ, on_edge_us=0)
+    modulation = Modulation(1000.0, on_edge_us=0)
     t, column, event = np.meshgrid(
         np.arange(periods) * 1000 + 100, np.arange(columns), np.arange(events), indexing="ij"
     )

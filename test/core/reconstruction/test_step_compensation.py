@@ -17,7 +17,7 @@ from eschorty_ros.core.reconstruction import (
     reconstruct_recording,
     stage_speed_mm_s,
 )
-from eschorty_ros.core.reconstruction._step import _shift
+from eschorty_ros.core.reconstruction.step_compensation import _centroid_shift
 from eschorty_ros.simulation.pixels import PixelParameters
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
@@ -155,8 +155,8 @@ def test_shift_agrees_with_lit_rows_counted(low, high):
             continue
         width, centre = lit.sum() * 0.01, y[lit].mean()
         # The new surface, at low rows, is the wider one: the centroid moves down.
-        assert -_shift(low, width, high) == pytest.approx(centre, abs=0.02)
-        assert _shift(high, width, low) == pytest.approx(centre, abs=0.02)
+        assert -_centroid_shift(low, width, high) == pytest.approx(centre, abs=0.02)
+        assert _centroid_shift(high, width, low) == pytest.approx(centre, abs=0.02)
 
 
 @pytest.mark.parametrize(("before", "after"), [(0.04, 1.0), (1.0, 0.1), (0.2, 0.8)])
