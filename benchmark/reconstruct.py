@@ -3,10 +3,10 @@
 Usage: python benchmark/reconstruct.py [--seconds S] [--repeats N]
 
 Every row is one pass over the same bytes in one thread, in CPU time; the best repeat counts. The
-numpy reference is numpy from the bytes on: it decodes, accumulates each period in a frame and takes
-column mean and standard deviation as the paper does. The rows below it say what numpy does with
-events our decoder has decoded: the same, and the least it can do, the column mean alone from two
-bincounts, without spread, time or frame.
+numpy reference is numpy from the bytes on: it decodes, accumulates each period in a frame and
+computes column mean and standard deviation as the paper does. The last rows are numpy with events
+from our decoder: the same, and the least possible, the column mean alone from two bincounts,
+without spread, time or frame.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ import numpy as np
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
-from eschorty_ros.core.reconstruction import paper_method as reference
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, paper_method
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import World
 
@@ -90,12 +89,12 @@ def ours(data: bytes, modulation: Modulation, settings: Settings) -> Profiles:
 
 
 def plain(data: bytes, modulation: Modulation) -> Profiles:
-    return reference.reconstruct(*reference.decode_all(data), CALIBRATION.model(), modulation)
+    return paper_method.reconstruct(*paper_method.decode_all(data), CALIBRATION.model(), modulation)
 
 
 def plain_after_decoding(data: bytes, modulation: Modulation) -> Profiles:
     events = Decoder().decode(data)
-    return reference.reconstruct(events.t, events.x, events.y, CALIBRATION.model(), modulation)
+    return paper_method.reconstruct(events.t, events.x, events.y, CALIBRATION.model(), modulation)
 
 
 def column_sums(data: bytes, modulation: Modulation) -> int:

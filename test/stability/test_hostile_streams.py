@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reconstructing import CALIBRATION, assert_events_add_up
 
 from eschorty_ros.core.line import FULL_COLUMN_METHODS, METHODS, RETURNS
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
-
-CALIBRATION = load_calibration("config_3")
-PARTS = ("events_binned", "events_over_column_limit", "events_outside_sensor",
-         "events_outside_phase", "events_filtered", "events_gated", "events_held")  # fmt: skip
 
 WORDS = 6000
 
@@ -78,8 +74,8 @@ def test_any_words_are_survived_and_counted(seed, cut, chosen, modulation, betwe
     else:
         reconstructor.set_modulation(Modulation(1000.0))
     parts += [reconstructor.push(data[cut:]), reconstructor.flush()]
-    found, counts = Profiles.concatenate(parts), reconstructor.counters
-    assert counts["events"] == sum(counts[name] for name in PARTS)
+    found = Profiles.concatenate(parts)
+    assert_events_add_up(reconstructor)
     for name in ("row", "sigma_row", "range_mm", "sigma_mm", "width_px"):
         assert np.isfinite(getattr(found, name)).all(), name
     assert (found.sigma_row > 0.0).all()

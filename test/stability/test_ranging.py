@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from line_events import blank_profiles
+from paper_builds import exact_range_mm
 
 from eschorty_ros.core.optics import BUILDS, RangeModel, depth_of_field_mm, load_calibration
 from eschorty_ros.core.reconstruction import place
@@ -15,13 +16,6 @@ from eschorty_ros.core.storage import POINT_DTYPE
 
 ROWS = np.arange(720)
 POLE_DISTANCES_PX = np.array([1e-12, 1e-9, 1e-6, 1e-3, 0.5, 0.999999])
-# Table 1 as printed: k' px, b' px.
-TABLE_1 = {
-    "nominal": ("-36510.29", "-1084.00"),
-    "config_1": ("-32409.56", "-1086.04"),
-    "config_2": ("-37413.82", "-1075.30"),
-    "config_3": ("-37261.86", "-1142.74"),
-}
 
 
 def model(build: str) -> RangeModel:
@@ -33,11 +27,11 @@ def model(build: str) -> RangeModel:
 def test_range_evaluation(build, measured):
     """Every row against 50 digits from the decimal numbers of the file."""
     with mpmath.workdps(50):
-        k_prime, b_prime = (mpmath.mpf(text) for text in TABLE_1[build])
-        product = k_prime * 24 / mpmath.sin(mpmath.radians(mpmath.mpf("85.87")))
         errors = [
-            abs(mpmath.mpf(float(ours)) * (int(row) + b_prime) / product - 1)
-            for row, ours in zip(ROWS, model(build).range_mm(ROWS), strict=True)
+            abs(mpmath.mpf(float(ours)) / exact - 1)
+            for exact, ours in zip(
+                exact_range_mm(build, ROWS), model(build).range_mm(ROWS), strict=True
+            )
         ]
         measured("rows 0..719 to mm, relative", max(errors), 4e-16)
 

@@ -1,11 +1,11 @@
-"""Relative reflectance of a point from how wide its line looks and how many events it gave.
+"""Relative reflectance of a point from the line's width and the number of events.
 
-A logarithmic sensor sees a Gaussian footprint as far out as its contrast reaches the threshold, so
+A logarithmic sensor shows a Gaussian line as far out as its contrast reaches the threshold, so
 the full width W of the lit rows obeys ``W^2 = 8 sigma^2 ln(A rho / (e^theta - 1))``: linear in
-``ln rho`` with a slope that only the optical footprint's sigma decides. At high frequencies, where
+``ln rho`` with a slope that depends on the line's sigma alone. At high frequencies, where
 the photoreceptor's bandwidth limits the swing, the offset changes and the slope does not. Evenly
-lit rows have the variance ``W^2 / 12`` and a number of events in proportion to W; the smaller W of
-the two counts. Above about 1 kHz rows give an event in some periods only and neither holds.
+lit rows have the variance ``W^2 / 12`` and a number of events in proportion to W; the smaller W is
+used. Above about 1 kHz rows give an event in some periods only and neither holds.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from eschorty_ros.core.base.errors import ArgumentError
 ROOT_12 = math.sqrt(12.0)
 """Full width over standard deviation of evenly spread rows."""
 
-# Standard deviation of ln(rho): what the pixels' thresholds leave however many the events,
-# comparator noise in each row's few events, and whole rows at the two ends of the line.
+# Standard deviation of ln(rho): the mismatch of the pixels' thresholds, comparator noise in each
+# row's few events, and the quantisation to rows at the two ends of the line.
 _FIXED = 0.11
 _PER_EVENT = 0.18
 _ENDS_PX = 0.41
@@ -32,7 +32,7 @@ _LOG_MAX = math.log(1e3)
 
 
 def events_per_row(width_px: Array, events: NDArray[np.integer]) -> float:
-    """Events of one lit row: the median of events over full width, NaN without a usable point."""
+    """Return the events of one lit row: the median of events over full width, NaN without any."""
     width_px, counts = _checked(width_px, events)
     usable = width_px > 0.0
     if not usable.any():
@@ -47,7 +47,7 @@ def relative_reflectance(
     footprint_sigma_px: float,
     white_width_px: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Reflectance of each point relative to its profile's median or to a white target.
+    """Return each point's reflectance relative to its profile's median or to a white target.
 
     Parameters
     ----------
@@ -65,8 +65,8 @@ def relative_reflectance(
     Returns
     -------
     reflectance, sigma : ndarray of float64, shape (n,)
-        ``sigma`` is the standard deviation of one point; the reference's is not in it. NaN where
-        the width belongs to no line: a spread over background, more than a factor of 1000 off.
+        ``sigma`` is the standard deviation of one point, without the reference's. NaN where the
+        reflectance would be off by more than a factor of 1000: background, not the line.
 
     Raises
     ------

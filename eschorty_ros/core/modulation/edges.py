@@ -12,7 +12,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.modulation.modulation import Modulation
 
 EDGES_MAX = 1 << 14
-"""Most edges per call; bounds the work between two looks at the events."""
+"""Most edges per call; bounds the memory between two batches of events."""
 
 _JUMP_PERIODS = 4096  # longer gaps are skipped in one step
 _TOLERANCE_SHARE = 4  # a trigger belongs to an edge within this part of the period

@@ -1,4 +1,4 @@
-"""The laser's modulation as the reconstruction and the laser driver both see it."""
+"""The laser's modulation, for the reconstruction and the laser driver."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FREQUENCY_MAX_HZ = 20_000.0
 
 @dataclass(frozen=True, slots=True)
 class Modulation:
-    """A periodic laser gate.
+    """A periodic modulation of the laser's power.
 
     Parameters
     ----------
@@ -24,9 +24,9 @@ class Modulation:
     duty : float
         Share of the period with the laser on, strictly between 0 and 1.
     waveform : {"square", "sine", "pulse"}
-        ``square`` and ``pulse`` are both full light for ``duty`` of the period; generators name
-        them apart. ``sine`` rises as half a cosine wave for ``duty`` of the period and falls as
-        another for the rest; its rising edge is where the light is least.
+        ``square`` and ``pulse`` are both full power for ``duty`` of the period; generators
+        distinguish them. ``sine`` rises as half a cosine wave for ``duty`` of the period and falls
+        as another for the rest; its rising edge is where the power is least.
     on_edge_us : int, optional
         Sensor time of one rising edge, int64 microseconds; ``None`` when unknown.
 
@@ -34,6 +34,12 @@ class Modulation:
     ------
     ArgumentError
         When a value lies outside its range.
+
+    Examples
+    --------
+    >>> modulation = Modulation(70.0, on_edge_us=1000)
+    >>> [modulation.edge_us(index) for index in (0, 1, 2, 70)]
+    [1000, 15286, 29571, 1001000]
     """
 
     frequency_hz: float
@@ -63,9 +69,9 @@ class Modulation:
         return 1e6 / self.frequency_hz
 
     def edge_us(self, index: int) -> int:
-        """Sensor time of rising edge ``index``, rounded to the microsecond.
+        """Return the sensor time of rising edge ``index``, rounded to the microsecond.
 
-        Exact for any index: the period is a ratio of integers, never an accumulated float.
+        Exact for any index: the period is a ratio of integers, not an accumulated float.
         """
         if self.on_edge_us is None:
             raise ArgumentError("on_edge_us is None; give the sensor time of one rising edge")

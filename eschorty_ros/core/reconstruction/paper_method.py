@@ -21,9 +21,7 @@ from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 
 
-def decode_all(
-    data: bytes,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def decode_all(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return times (us), columns and rows of a complete, well-formed EVT3 stream.
 
     Each word's time, row and vector base come from the latest word of the kind that sets them.

@@ -26,8 +26,7 @@ def _number(
     default: float, low: float, high: float, unit: str, description: str
 ) -> Any:  # a dataclass field stands in for the value it describes
     return field(
-        default=default,
-        metadata={"description": description, "unit": unit, "range": (low, high)},
+        default=default, metadata={"description": description, "unit": unit, "range": (low, high)}
     )
 
 

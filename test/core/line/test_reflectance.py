@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from reconstructing import reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.line import ROOT_12, relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, place_link
+from eschorty_ros.core.reconstruction import Profiles, Settings, place_link
 from eschorty_ros.core.storage import (
     POINT_DTYPE,
     REFLECTANCE_DTYPE,
@@ -42,8 +43,7 @@ def profiles_of(frequency_hz: float, truth: np.ndarray, **settings) -> Profiles:
     data = Encoder(columns, 720).encode(*sort_readout(line.t, line.x, line.y, line.p))
     calibration = load_calibration("config_3").model_copy(update={"columns": columns})
     wanted = Settings(smoothing_half_width=0, isolation_events=0, **settings)
-    reconstructor = Reconstructor(calibration, modulation, wanted)
-    found = Profiles.concatenate([reconstructor.push(data), reconstructor.flush()])
+    found, _ = reconstruct(data, modulation, wanted, calibration=calibration)
     return found.select(found.period >= 2)
 
 

@@ -5,18 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from line_events import encoded, line_events
+from reconstructing import reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.line import RETURNS, estimate
-from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import (
-    Profiles,
-    Reconstructor,
-    Settings,
-    place_link,
-)
+from eschorty_ros.core.reconstruction import Settings, place_link
 
 SEED = 31
 CALIBRATION = load_calibration("config_3")
@@ -39,10 +34,7 @@ def two_surfaces(near_events=100.0, far_events=115.0, far=lambda c: c >= 0, slop
 
 
 def run(data, **settings):
-    reconstructor = Reconstructor(
-        CALIBRATION, Modulation(70.0, on_edge_us=1000), Settings(column_limit=256, **settings)
-    )
-    found = Profiles.concatenate([reconstructor.push(data), reconstructor.flush()])
+    found, reconstructor = reconstruct(data, settings=Settings(column_limit=256, **settings))
     # The line's width is known after a few periods.
     return found.select(found.period >= 4), reconstructor.counters
 

@@ -49,18 +49,6 @@ def test_every_third_edge():
     assert indices.tolist() == [9, 12, 15, 18]
 
 
-def test_jump_keeps_the_grid():
-    far = 10**15
-    schedule = EdgeSchedule(Modulation(69.99731))
-    schedule.anchor(0, 0)
-    collect(schedule, 50_000)
-    schedule.jump(far)
-    edges, indices = collect(schedule, far + 30_000)
-    period = 1_000_000 / Fraction(69.99731)
-    assert edges.tolist() == [round(int(k) * period) for k in indices]
-    assert len(edges) < 10
-
-
 def test_triggers_replace_predictions_and_missing_ones_are_bridged():
     rng = np.random.default_rng(SEED)
     true_us = 500 + np.arange(60) * 1000 + np.cumsum(rng.integers(-3, 4, 60))

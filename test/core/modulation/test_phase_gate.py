@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from line_events import encoded
+from reconstructing import reconstruct
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, phase_gate
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import World
 
@@ -20,8 +21,6 @@ SEED = 20261121
 COLUMNS = 128
 CALIBRATION = load_calibration("config_3").model_copy(update={"columns": COLUMNS})
 EDGE_US = 3_217
-PARTS = ("events_binned", "events_over_column_limit", "events_outside_sensor",
-         "events_outside_phase", "events_filtered", "events_gated", "events_held")  # fmt: skip
 
 
 def line(frequency_hz: float, duty: float = 0.5, periods: int = 24):
@@ -47,13 +46,10 @@ def stream(parts, triggers_us=None) -> bytes:
     return encoded((t[order], x[order], y[order], p[order]), triggers_us)
 
 
-def run(data: bytes, modulation: Modulation, gate_us: int, piece: int = 1 << 20):
-    reconstructor = Reconstructor(CALIBRATION, modulation, Settings(phase_gate_us=gate_us))
-    parts = [reconstructor.push(data[k : k + piece]) for k in range(0, len(data), piece)]
-    found = Profiles.concatenate([*parts, reconstructor.flush()])
-    counts = reconstructor.counters
-    assert counts["events"] == sum(counts[name] for name in PARTS), counts
-    return found, counts
+def run(data: bytes, modulation: Modulation, gate_us: int, **settings: int):
+    chosen = Settings(phase_gate_us=gate_us, **settings)
+    found, reconstructor = reconstruct(data, modulation, chosen, calibration=CALIBRATION)
+    return found, reconstructor.counters
 
 
 def phases(kind: str, frequency_hz: float, duty: float, until_us: int):
@@ -81,7 +77,7 @@ def test_signal_stays_and_background_goes(kind, frequency_hz, duty, gate_us, cut
     modulation, triggers = phases(kind, frequency_hz, duty, end_us)
     _, both = run(stream([signal_part, noise_part], triggers), modulation, gate_us)
     seen = both["events"] - both["events_outside_phase"]
-    # The phase is known here whatever was estimated, so that signal and noise can be told apart.
+    # The phase is known here, so that signal and noise can be distinguished.
     exact = replace(modulation, on_edge_us=EDGE_US)
     _, quiet = run(stream([signal_part]), exact, gate_us)
     _, noise = run(stream([noise_part]), exact, gate_us)
@@ -107,28 +103,10 @@ def test_a_sine_has_no_edges_to_gate_by():
     assert phase_gate(Modulation(70.0, waveform="sine"), 1000).length_us == 0.0
 
 
-def test_points_do_not_depend_on_how_the_bytes_are_split():
-    signal = line(70.0, periods=6)
-    parts = [(signal.t, signal.x, signal.y, signal.p), background(2.0, int(signal.t[-1]))]
-    data = stream(parts)
-    modulation = Modulation(70.0, on_edge_us=EDGE_US)
-    whole, counts = run(data, modulation, 1000)
-    assert counts["events_gated"] > 1000
-    for piece in (997, 8192):
-        split, split_counts = run(data, modulation, 1000, piece)
-        assert split_counts == counts
-        np.testing.assert_array_equal(split.row, whole.row)
-        np.testing.assert_array_equal(split.t_us, whole.t_us)
-
-
 def test_several_periods_per_profile_are_gated_each():
     signal = line(300.0, periods=12)
-    modulation = Modulation(300.0, on_edge_us=EDGE_US)
-    settings = Settings(phase_gate_us=600, periods_per_profile=4)
-    reconstructor = Reconstructor(CALIBRATION, modulation, settings)
-    reconstructor.push(stream([(signal.t, signal.x, signal.y, signal.p)]))
-    reconstructor.flush()
-    counts = reconstructor.counters
+    data = stream([(signal.t, signal.x, signal.y, signal.p)])
+    _, counts = run(data, Modulation(300.0, on_edge_us=EDGE_US), 600, periods_per_profile=4)
     assert counts["events_gated"] <= 0.05 * counts["events"], f"seed {SEED}"
 
 

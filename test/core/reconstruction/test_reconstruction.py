@@ -3,56 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import settings as hypothesis_settings
-from hypothesis import strategies as st
 from line_events import encoded, line_events
+from reconstructing import CALIBRATION, KNOWN, assert_same, reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.line import METHOD_ERRORS, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import (
-    Profiles,
-    Reconstructor,
-    Settings,
-    place,
-    place_link,
-)
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, place, place_link
 
 SEED = 77
-CALIBRATION = load_calibration("config_3")
 MODEL = CALIBRATION.model()
 RAW = Settings(smoothing_half_width=0)
-PARTS = ("events_binned", "events_over_column_limit", "events_outside_sensor",
-         "events_outside_phase", "events_filtered", "events_gated", "events_held")  # fmt: skip
 
 
 def flat(k, c):
     return np.full(c.shape, 350.0)
-
-
-def run(data, modulation=None, settings=None, cuts=(), calibration=CALIBRATION):
-    reconstructor = Reconstructor(
-        calibration, modulation or Modulation(70.0, on_edge_us=1000), settings
-    )
-    limits = [0, *sorted(cuts), len(data)]
-    parts = [reconstructor.push(data[a:b]) for a, b in pairwise(limits)]
-    parts.append(reconstructor.flush())
-    counts = reconstructor.counters
-    assert counts["events"] == sum(counts[name] for name in PARTS)
-    assert counts["events_held"] == 0
-    return Profiles.concatenate(parts), reconstructor
-
-
-def assert_same(a: Profiles, b: Profiles):
-    for item in fields(Profiles):
-        np.testing.assert_array_equal(getattr(a, item.name), getattr(b, item.name), item.name)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +33,7 @@ def test_rows_reach_the_bound_and_every_lit_column_has_a_point(fwhm, events, bac
     data = encoded(
         line_events(rng, flat, events=events, fwhm_px=fwhm, background=background, periods=12)
     )
-    found, _ = run(data, settings=Settings(smoothing_half_width=0, line_width_px=20.0))
+    found, _ = reconstruct(data, settings=Settings(smoothing_half_width=0, line_width_px=20.0))
     found = found.select(found.period >= 4)
     sigma2 = (fwhm / 2.3548) ** 2 + 1 / 12
     error = found.row - 350.0
@@ -80,27 +49,37 @@ def test_background_alone_gives_practically_no_points():
     data = encoded(
         line_events(rng, lambda k, c: np.where(c == 0, 350.0, np.nan), periods=60, events=22.0)
     )
-    found, _ = run(data)
+    found, _ = reconstruct(data)
     false = np.count_nonzero(found.column != 0)
     assert false <= 1e-4 * 60 * 1280, f"seed {SEED}: {false}"
 
 
-@hypothesis_settings(derandomize=True, max_examples=12, deadline=None)
-@given(st.data())
-def test_any_split_gives_the_same_points(data):
-    mode = data.draw(st.sampled_from(["edge", "estimate", "trigger", "filter"]))
-    stream, modulation, settings = SPLIT_CASES[mode]
-    whole, _ = run(stream, modulation, settings)
-    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=40))
-    parts, _ = run(stream, modulation, settings, cuts)
+def _split_cases():
+    rng = np.random.default_rng(SEED)
+    events = line_events(rng, flat, frequency_hz=500.0, periods=12, columns=300, edge_us=5000)
+    edges = 5000 + np.arange(12) * 2000 + rng.integers(-20, 21, 12)
+    data, known = encoded(events), Modulation(500.0, on_edge_us=1000)
+    return {
+        "edge": (data, known, Settings()),
+        "estimate": (data, Modulation(500.0), Settings()),
+        "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
+        "filter": (data, known, Settings(noise_filter="activity")),
+        "gate": (data, known, Settings(phase_gate_us=500)),
+    }
+
+
+SPLIT_CASES = _split_cases()
+
+
+@pytest.mark.parametrize("case", SPLIT_CASES)
+def test_any_split_gives_the_same_points_and_counts(case):
+    rng = np.random.default_rng(SEED)
+    stream, modulation, settings = SPLIT_CASES[case]
+    whole, a = reconstruct(stream, modulation, settings)
     assert len(whole) > 1000
-    assert_same(whole, parts)
-
-
-def test_many_tiny_pieces_give_the_same_points():
-    for stream, modulation, settings in SPLIT_CASES.values():
-        whole, a = run(stream, modulation, settings)
-        parts, b = run(stream, modulation, settings, range(37, len(stream), 997))
+    random_cuts = [rng.integers(0, len(stream), size).tolist() for size in (1, 5, 40)]
+    for cuts in (*random_cuts, range(37, len(stream), 997)):
+        parts, b = reconstruct(stream, modulation, settings, cuts)
         assert_same(whole, parts)
         assert a.counters == b.counters
 
@@ -114,9 +93,9 @@ def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():
     stream = np.insert(words, places, 0x6FFF)
     cuts = 2 * (places + np.arange(1, len(places) + 1))
     modulation = Modulation(5000.0, on_edge_us=1000)
-    whole, a = run(stream.tobytes(), modulation)
-    parts, b = run(stream.tobytes(), modulation, None, cuts.tolist())
-    plain, _ = run(words.tobytes(), modulation)
+    whole, a = reconstruct(stream.tobytes(), modulation)
+    parts, b = reconstruct(stream.tobytes(), modulation, None, cuts.tolist())
+    plain, _ = reconstruct(words.tobytes(), modulation)
     assert len(cuts) > 10
     assert_same(whole, plain)
     assert_same(whole, parts)
@@ -130,7 +109,9 @@ def test_a_time_high_that_steps_back_reopens_no_period():
     place = np.flatnonzero(words >> 12 == 8)[2] + 1
     high = words[place - 1]
     ahead = np.insert(words, place, [high + 2, high])
-    found, _ = run(ahead.tobytes(), Modulation(5000.0, on_edge_us=1000), None, [2 * (place + 1)])
+    found, _ = reconstruct(
+        ahead.tobytes(), Modulation(5000.0, on_edge_us=1000), None, [2 * (place + 1)]
+    )
     since_us = found.t_us - found.edge_us
     assert since_us.min() >= 0
     assert since_us.max() < 200
@@ -147,8 +128,8 @@ def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
     edges = 5000 + np.arange(first, 20) * period_us - 150
     stream = encoded((t, x, y, p), edges[:1])
     modulation = Modulation(1e6 / period_us)
-    whole, a = run(stream, modulation)
-    parts, b = run(stream, modulation, None, range(0, len(stream), 2048))
+    whole, a = reconstruct(stream, modulation)
+    parts, b = reconstruct(stream, modulation, None, range(0, len(stream), 2048))
     assert_same(whole, parts)
     assert a.counters == b.counters
     late = np.unique(whole.edge_us[whole.edge_us >= edges[0]])
@@ -165,27 +146,11 @@ def test_a_profile_of_several_periods_after_a_long_dark_stretch_has_its_own_time
     for shift in range(every):
         later = t >= 1000 + (20 + shift) * 200
         stream = encoded((t + later * (dark_us + 200 * shift), x, y, p))
-        found, _ = run(stream, Modulation(frequency_hz, on_edge_us=1000), settings,
+        found, _ = reconstruct(stream, Modulation(frequency_hz, on_edge_us=1000), settings,
                        range(0, len(stream), 512))  # fmt: skip
         since_us = found.t_us - found.edge_us
         assert since_us.min() >= 0
         assert since_us.max() < every * 200, f"seed {SEED}, shift {shift}"
-
-
-def _split_cases():
-    rng = np.random.default_rng(SEED)
-    events = line_events(rng, flat, frequency_hz=500.0, periods=12, columns=300, edge_us=5000)
-    edges = 5000 + np.arange(12) * 2000 + rng.integers(-20, 21, 12)
-    data = encoded(events)
-    return {
-        "edge": (data, Modulation(500.0, on_edge_us=1000), Settings()),
-        "estimate": (data, Modulation(500.0), Settings()),
-        "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
-        "filter": (data, Modulation(500.0, on_edge_us=1000), Settings(noise_filter="activity")),
-    }
-
-
-SPLIT_CASES = _split_cases()
 
 
 def test_step_scene_invents_nothing_between_the_surfaces():
@@ -195,7 +160,7 @@ def test_step_scene_invents_nothing_between_the_surfaces():
         return np.where((c // 100) % 2 == 0, 300.0, 360.0)
 
     data = encoded(line_events(rng, step, events=60.0, fwhm_px=5.0))
-    found, _ = run(data)
+    found, _ = reconstruct(data)
     distance = np.minimum(np.abs(found.row - 300), np.abs(found.row - 360))
     assert distance.max() < 3.0
     truth = step(0, found.column.astype(int))
@@ -205,7 +170,7 @@ def test_step_scene_invents_nothing_between_the_surfaces():
 def test_slope_is_unbiased():
     rng = np.random.default_rng(SEED)
     data = encoded(line_events(rng, lambda k, c: 100 + 0.4 * c, events=80.0, fwhm_px=6.0))
-    found, _ = run(data)
+    found, _ = reconstruct(data)
     error = found.row - (100 + 0.4 * found.column)
     inner = (found.column > 5) & (found.column < 1274)
     independent = inner.sum() / 5
@@ -217,7 +182,7 @@ def test_second_surface_appears_and_the_seed_is_not_stale():
     data = encoded(
         line_events(rng, lambda k, c: np.full(c.shape, 500.0 if k >= 5 else 200.0), events=30.0)
     )
-    found, _ = run(data)
+    found, _ = reconstruct(data)
     truth = np.where(found.period >= 5, 500.0, 200.0)
     assert np.abs(found.row - truth).max() < 20
     assert len(found) > 0.98 * 10 * 1280
@@ -227,7 +192,7 @@ def test_second_surface_appears_and_the_seed_is_not_stale():
 def test_line_at_the_edge_of_the_sensor(row):
     rng = np.random.default_rng(SEED)
     data = encoded(line_events(rng, lambda k, c: np.full(c.shape, row), events=60.0, columns=200))
-    found, _ = run(data, settings=RAW)
+    found, _ = reconstruct(data, settings=RAW)
     assert len(found) > 0.95 * 10 * 200
     assert np.abs(found.row - row).max() < 20
     assert np.mean(np.abs(found.row - row) < 2 * found.sigma_row) > 0.95
@@ -238,7 +203,7 @@ def test_one_event_and_constant_columns():
     x = np.array([5] + [9] * 20)
     y = np.array([300] + [400] * 20)
     events = sort_readout(t + np.arange(21), x, y, np.ones(21, int))
-    found, _ = run(encoded(events), settings=Settings(events_min=1, isolation_events=0))
+    found, _ = reconstruct(encoded(events), settings=Settings(events_min=1, isolation_events=0))
     assert found.column.tolist() == [5, 9]
     assert found.row.tolist() == [300.0, 400.0]
     floor_px = METHOD_ERRORS["mode_mean"].floor * SIGMA_FLOOR_PX
@@ -250,7 +215,7 @@ def test_one_event_and_constant_columns():
 def test_events_over_the_column_limit_are_counted():
     rng = np.random.default_rng(SEED)
     events = line_events(rng, flat, columns=50, events=100.0, periods=4)
-    found, reconstructor = run(encoded(events), settings=Settings(column_limit=64))
+    found, reconstructor = reconstruct(encoded(events), settings=Settings(column_limit=64))
     assert len(found) == 4 * 50
     assert found.events.max() <= 64
     expected = sum(
@@ -268,7 +233,7 @@ def test_jittered_and_missing_triggers_lose_no_event():
     parts = [line_events(rng, flat, periods=1, edge_us=int(edge), background=0.0) for edge in edges]
     events = tuple(np.concatenate(values) for values in zip(*parts, strict=True))
     data = encoded(sort_readout(*events), np.delete(edges, [7, 8]))
-    found, reconstructor = run(data, Modulation(70.0))
+    found, reconstructor = reconstruct(data, Modulation(70.0))
     assert found.profile_count == 20
     kept = np.unique(found.edge_us)
     np.testing.assert_array_equal(np.delete(kept, [7, 8]), np.delete(edges, [7, 8]))
@@ -282,7 +247,7 @@ def test_jittered_and_missing_triggers_lose_no_event():
 def test_phase_is_estimated_and_nothing_is_lost():
     rng = np.random.default_rng(SEED)
     data = encoded(line_events(rng, flat, periods=8, edge_us=9000))
-    found, reconstructor = run(data, Modulation(70.0))
+    found, reconstructor = reconstruct(data, Modulation(70.0))
     assert not reconstructor.phase_missing
     assert reconstructor.phase is not None
     error = (reconstructor.phase.edge_us - 9000 + 7143) % (1e6 / 70) - 7143
@@ -300,7 +265,7 @@ def test_noise_before_the_laser_is_kept_back_and_the_phase_still_found():
     )  # fmt: skip
     lit = line_events(rng, flat, periods=8, edge_us=500_000)
     data = encoded(sort_readout(*(np.concatenate(v) for v in zip(dark, lit, strict=True))))
-    found, reconstructor = run(data, Modulation(70.0))
+    found, reconstructor = reconstruct(data, Modulation(70.0))
     assert not reconstructor.phase_missing
     assert np.count_nonzero(found.t_us > 500_000) > 0.98 * 8 * 1280
 
@@ -312,7 +277,7 @@ def test_no_phase_is_said():
         rng.integers(0, 80_000, n), rng.integers(0, 1280, n), rng.integers(0, 720, n),
         rng.integers(0, 2, n),
     ))  # fmt: skip
-    found, reconstructor = run(data, Modulation(70.0))
+    found, reconstructor = reconstruct(data, Modulation(70.0))
     assert reconstructor.phase_missing
     assert reconstructor.counters["events_binned"] == n
     assert len(found) == 0
@@ -324,7 +289,7 @@ def test_time_wrap_of_the_sensor_inside_a_period():
     t, x, y, p = line_events(rng, flat, periods=6, columns=200, edge_us=edge)
     start = (np.array([0, 10**7]), np.array([0, 0]), np.array([0, 0]), np.array([1, 1]))
     events = tuple(np.concatenate(v) for v in zip(start, (t, x, y, p), strict=True))
-    found, _ = run(encoded(events), Modulation(70.0, on_edge_us=edge))
+    found, _ = reconstruct(encoded(events), Modulation(70.0, on_edge_us=edge))
     assert found.profile_count == 6
     assert len(found) > 0.98 * 6 * 200
     assert found.t_us.max() > 1 << 24
@@ -337,19 +302,19 @@ def test_flush_twice_and_pushing_on():
     cut = int(np.searchsorted(t, 1000 + 3 * 1e6 / 70))
     first = encoder.encode(t[:cut], x[:cut], y[:cut], p[:cut])
     second = encoder.encode(t[cut:], x[cut:], y[cut:], p[cut:])
-    reconstructor = Reconstructor(CALIBRATION, Modulation(70.0, on_edge_us=1000))
+    reconstructor = Reconstructor(CALIBRATION, KNOWN)
     a = Profiles.concatenate([reconstructor.push(first), reconstructor.flush()])
     assert len(reconstructor.flush()) == 0
     b = Profiles.concatenate([reconstructor.push(second), reconstructor.flush()])
-    whole, _ = run(first + second)
+    whole, _ = reconstruct(first + second)
     assert_same(Profiles.concatenate([a, b]), whole)
 
 
 def test_gap_keeps_the_grid():
     rng = np.random.default_rng(SEED)
     data = encoded(line_events(rng, flat, periods=10, columns=300))
-    whole, _ = run(data)
-    reconstructor = Reconstructor(CALIBRATION, Modulation(70.0, on_edge_us=1000))
+    whole, _ = reconstruct(data)
+    reconstructor = Reconstructor(CALIBRATION, KNOWN)
     half = len(data) // 2 & ~1
     parts = [reconstructor.push(data[: half - 4000])]
     reconstructor.note_gap()
@@ -364,7 +329,7 @@ def test_new_modulation_starts_a_new_grid():
     slow = line_events(rng, flat, periods=4, columns=100)
     fast = line_events(rng, flat, frequency_hz=500.0, periods=8, columns=100, edge_us=100_000)
     encoder = Encoder()
-    reconstructor = Reconstructor(CALIBRATION, Modulation(70.0, on_edge_us=1000))
+    reconstructor = Reconstructor(CALIBRATION, KNOWN)
     parts = [reconstructor.push(encoder.encode(*slow))]
     reconstructor.set_modulation(Modulation(500.0, on_edge_us=100_000))
     parts += [reconstructor.push(encoder.encode(*fast)), reconstructor.flush()]
@@ -380,7 +345,7 @@ def test_several_periods_per_profile():
                     fwhm_px=4.0, edge_us=0)
     )  # fmt: skip
     settings = Settings(periods_per_profile=50)
-    found, _ = run(data, Modulation(10_000.0, on_edge_us=0), settings)
+    found, _ = reconstruct(data, Modulation(10_000.0, on_edge_us=0), settings)
     assert np.unique(found.edge_us).tolist() == [0, 5000, 10_000, 15_000]
     assert np.unique(found.period).tolist() == [0, 50, 100, 150]
     assert np.abs(found.row - 350).max() < 3
@@ -392,7 +357,7 @@ def test_twenty_kilohertz_periods_are_closed_without_loss():
         line_events(rng, flat, frequency_hz=20_000.0, periods=2000, columns=20, events=10.0,
                     fwhm_px=3.0, edge_us=0)
     )  # fmt: skip
-    found, _ = run(data, Modulation(20_000.0, on_edge_us=0))
+    found, _ = reconstruct(data, Modulation(20_000.0, on_edge_us=0))
     assert found.profile_count == 2000
 
 
@@ -402,14 +367,14 @@ def test_weak_isolated_points_are_rejected():
     t = 5000 + np.arange(6)
     lone = (t, np.full(6, 700), np.full(6, 500), np.ones(6, int))
     data = encoded(sort_readout(*(np.concatenate(v) for v in zip(events, lone, strict=True))))
-    found, reconstructor = run(data)
+    found, reconstructor = reconstruct(data)
     assert not (found.column == 700).any()
     assert reconstructor.counters["columns_isolated"] == 1
 
 
 def test_placing():
     rng = np.random.default_rng(SEED)
-    found, _ = run(encoded(line_events(rng, flat, periods=2)))
+    found, _ = reconstruct(encoded(line_events(rng, flat, periods=2)))
     position = np.full(len(found), 12.0)
     position[3] = np.nan
     points = place(found, MODEL, position, (0.0, 1.0, 0.0), origin_us=1000)

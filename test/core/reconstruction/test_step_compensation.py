@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from eschorty_experiments._crossing import SPEED_MM_S, Crossing, crossing
+from reconstructing import assert_same, reconstruct
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import (
-    Profiles,
     Reconstructor,
     Settings,
     reconstruct_recording,
@@ -110,21 +110,16 @@ def test_a_compensated_row_becomes_a_range_in_its_own_column(bend):
     )
 
 
-def assert_same(a: Profiles, b: Profiles):
-    for item in fields(Profiles):
-        np.testing.assert_array_equal(getattr(a, item.name), getattr(b, item.name), item.name)
-
-
 def test_points_do_not_depend_on_how_the_bytes_are_split():
     case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=16, seed=SEED)
     whole, counts = case.reconstruct(reflectance_compensation="on")
     settings = Settings(reflectance_compensation="on", stage_speed_mm_s=SPEED_MM_S)
-    for piece in (1000, 7777):
-        reconstructor = Reconstructor(case.calibration, case.modulation, settings)
-        parts = [
-            reconstructor.push(case.data[k : k + piece]) for k in range(0, len(case.data), piece)
-        ]
-        assert_same(Profiles.concatenate([*parts, reconstructor.flush()]), whole)
+    for size in (1000, 7777):
+        cuts = range(size, len(case.data), size)
+        parts, reconstructor = reconstruct(
+            case.data, case.modulation, settings, cuts, case.calibration
+        )
+        assert_same(parts, whole)
         assert reconstructor.counters == counts
 
 

@@ -10,19 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from paper_builds import TABLE_1, exact_k_mm, exact_range_mm
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import BUILDS, RangeModel, load_calibration
 
 ROWS = np.arange(720)
 
-# Paper, Table 1: k' px, b' px, R_near mm, R_far mm, row of R_far (the print's own convention).
-TABLE_1 = {
-    "nominal": ("-36510.29", "-1084.00", 810.45, 2413.54, 720),
-    "config_1": ("-32409.56", "-1086.04", 718.07, 2124.69, 719),
-    "config_2": ("-37413.82", "-1075.30", 837.23, 2526.73, 719),
-    "config_3": ("-37261.86", "-1142.74", 784.61, 2115.93, 719),
-}
 # Recomputed with unrounded k: K mm px, R(0), R(719), R(720) mm, m at row 0.
 RECOMPUTED = {
     "nominal": (-878528, 810.450, 2406.927, 2413.539, 0.02969),
@@ -43,13 +37,6 @@ models = st.builds(
 
 def model(build: str) -> RangeModel:
     return load_calibration(build).model()
-
-
-def exact_range_mm(build: str, rows: np.ndarray) -> list[mpmath.mpf]:
-    """Eq. 2 with 50 digits from the decimal numbers of the file."""
-    k_prime, b_prime = (mpmath.mpf(text) for text in TABLE_1[build][:2])
-    k = mpmath.mpf(24) / mpmath.sin(mpmath.radians(mpmath.mpf("85.87")))
-    return [k * k_prime / (int(row) + b_prime) for row in rows]
 
 
 @pytest.mark.parametrize("build", BUILDS)
@@ -76,7 +63,7 @@ def test_derived_quantities_against_50_digits(build: str) -> None:
     m = model(build)
     with mpmath.workdps(50):
         exact = exact_range_mm(build, ROWS)
-        k = mpmath.mpf(24) / mpmath.sin(mpmath.radians(mpmath.mpf("85.87")))
+        k = exact_k_mm()
         product = abs(k * mpmath.mpf(TABLE_1[build][0]))
         step = np.array([float(r * r / product) for r in exact])
         scale = np.array([float(k / r) for r in exact])
