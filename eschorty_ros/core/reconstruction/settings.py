@@ -68,9 +68,6 @@ class Settings:
     --------
     >>> Settings(centroid="median", phase_gate_us=1000).line_width_px
     20.0
-    >>> Settings(events_min=0)  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    ...ArgumentError: events_min is 0; choose a whole number from 1 to 1000 events
     """
 
     centroid: str = _choice("mode_mean", METHODS, "column estimator")
