@@ -26,7 +26,7 @@ class _State(NamedTuple):
     step: int = 0
     elapsed_us: int = 0
     remainder: int = 0
-    index: int = 0
+    number: int = 0
     last_us: int = 0
     triggered: bool = False
     missed: int = 0
@@ -112,7 +112,7 @@ class EdgeSchedule:
 
     def middle_after(self, multiple: int) -> int:
         """Return the middle of the period that begins with the next multiple of ``multiple``."""
-        ahead = multiple - self._state.index % multiple
+        ahead = multiple - self._state.number % multiple
         step = self._state.step + ahead
         return self._edge_us(step) + self._parts.quotient_us // 2
 
@@ -196,7 +196,7 @@ class EdgeSchedule:
             step=step,
             elapsed_us=elapsed_us,
             remainder=remainder,
-            index=self._state.index + step - self._state.step,
+            number=self._state.number + step - self._state.step,
             last_us=self._edge_us(step),
         )
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 _CAPACITY = 4096
 _DTYPES = (np.int64, np.uint16, np.uint16, np.uint8)
 
-EventArrays = tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]]
-"""Times in us, columns, rows and polarities."""
+EventArrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Times in us (int64), columns (uint16), rows (uint16) and polarities (uint8)."""
 
 
 class HeldEvents:
