@@ -57,7 +57,7 @@ class Posts:
     line: Line
 
 
-def see_posts(build: Design, nominal: Design, rng: np.random.Generator) -> Posts:
+def measure_posts(build: Design, nominal: Design, rng: np.random.Generator) -> Posts:
     """Place posts evenly in range, measure their rows and widths with noise, calibrate.
 
     Parameters

@@ -12,8 +12,8 @@ from eschorty_experiments._posts import (
     POSTS,
     SIGMA_ROW_PX,
     Posts,
+    measure_posts,
     pulls,
-    see_posts,
 )
 from eschorty_ros.core.optics import Design
 from eschorty_ros.report.experiment import (
@@ -37,25 +37,25 @@ FOCUS_ROWS = {"nominal": 14.65, "config_1": 12.97, "config_2": 15.02, "config_3"
 def run(effort: Effort, progress: Progress) -> Outcome:
     """Calibrate the three builds on simulated posts; repeat to check the stated errors."""
     made = builds()
-    seen = {}
+    measured = {}
     for name, seed in zip(CALIBRATED, _seeds(effort), strict=True):
-        seen[name] = see_posts(made[name], made["nominal"], np.random.default_rng(seed))
+        measured[name] = measure_posts(made[name], made["nominal"], np.random.default_rng(seed))
     progress(0.2, "repeats")
     drawn, chi_square = _repeats(made, effort)
     progress(0.6, "figures")
     return Outcome(
         findings=[
-            *_curve_findings(made, seen),
-            *_magnification_findings(made, seen),
+            *_curve_findings(made, measured),
+            *_magnification_findings(made, measured),
             Finding("mean reduced chi square of repeated calibrations", chi_square, 0.88, 1.12),
             Finding("share of repeats whose k' errs by less than its stated sigma",
                     float(np.mean(np.abs(drawn[:, 0]) < 1.0)), 0.58, 0.78),
         ],
-        tables={"posts": _posts_table(made, seen), "fits": _fits_table(made, seen)},
+        tables={"posts": _posts_table(made, measured), "fits": _fits_table(made, measured)},
         figures={
-            "curves": _curves_figure(made, seen),
-            "residuals": _residuals_figure(made, seen),
-            "magnification": _magnification_figure(made, seen),
+            "curves": _curves_figure(made, measured),
+            "residuals": _residuals_figure(made, measured),
+            "magnification": _magnification_figure(made, measured),
         },
         captions={
             "curves": "Range over row (Eq. 2) of the four builds, lines, with the calibration "
@@ -89,26 +89,26 @@ def _repeats(made: dict[str, Design], effort: Effort) -> tuple[np.ndarray, float
     drawn, chi_square = [], []
     for _ in range(effort.choose(400, 80)):
         for name in CALIBRATED:
-            posts = see_posts(made[name], made["nominal"], rng)
+            posts = measure_posts(made[name], made["nominal"], rng)
             drawn.append(pulls(posts, made[name]))
             chi_square.append(posts.fit.reduced_chi_square)
     return np.array(drawn), float(np.mean(chi_square))
 
 
-def _curve_findings(made: dict[str, Design], seen: dict[str, Posts]) -> list[Finding]:
-    residual = np.concatenate([posts.fit.residual_px for posts in seen.values()])
+def _curve_findings(made: dict[str, Design], measured: dict[str, Posts]) -> list[Finding]:
+    residual = np.concatenate([posts.fit.residual_px for posts in measured.values()])
     rows = np.arange(720.0)
     curve = [
         np.max(np.abs(posts.fit.model.range_mm(rows) - made[name].model.range_mm(rows))
                / made[name].model.range_per_row_mm(made[name].model.range_mm(rows)))
-        for name, posts in seen.items()
+        for name, posts in measured.items()
     ]  # fmt: skip
     focus = [abs(build.depth_of_field_rows - FOCUS_ROWS[name]) for name, build in made.items()]
-    least_focus = min(made[name].depth_of_field_rows for name in seen)
+    least_focus = min(made[name].depth_of_field_rows for name in measured)
     findings = [
         Finding(f"{name}: fitted k' and b', largest error over its stated sigma",
                 float(np.max(np.abs(pulls(posts, made[name])))), high=3.0)
-        for name, posts in seen.items()
+        for name, posts in measured.items()
     ]  # fmt: skip
     return [
         *findings,
@@ -124,9 +124,9 @@ def _curve_findings(made: dict[str, Design], seen: dict[str, Posts]) -> list[Fin
     ]  # fmt: skip
 
 
-def _magnification_findings(made: dict[str, Design], seen: dict[str, Posts]) -> list[Finding]:
+def _magnification_findings(made: dict[str, Design], measured: dict[str, Posts]) -> list[Finding]:
     findings = []
-    for name, posts in seen.items():
+    for name, posts in measured.items():
         model = made[name].model
         findings += [
             Finding(f"{name}: slope of the magnification times k'",
@@ -137,9 +137,9 @@ def _magnification_findings(made: dict[str, Design], seen: dict[str, Posts]) -> 
     return findings
 
 
-def _posts_table(made: dict[str, Design], seen: dict[str, Posts]) -> DataTable:
+def _posts_table(made: dict[str, Design], measured: dict[str, Posts]) -> DataTable:
     rows: list[list[float | str]] = []
-    for name, posts in seen.items():
+    for name, posts in measured.items():
         model = made[name].model
         step = model.range_per_row_mm(posts.range_mm)
         focus = made[name].at(posts.range_mm).depth_of_field_mm
@@ -162,9 +162,9 @@ def _posts_table(made: dict[str, Design], seen: dict[str, Posts]) -> DataTable:
     )
 
 
-def _fits_table(made: dict[str, Design], seen: dict[str, Posts]) -> DataTable:
+def _fits_table(made: dict[str, Design], measured: dict[str, Posts]) -> DataTable:
     rows: list[list[float | str]] = []
-    for name, posts in seen.items():
+    for name, posts in measured.items():
         model, fit = made[name].model, posts.fit
         sigma = np.sqrt(np.diag(fit.covariance))
         rows.append(
@@ -200,14 +200,14 @@ def _colour(made: dict[str, Design], name: str) -> str:
     return f"C{list(made).index(name)}"
 
 
-def _curves_figure(made: dict[str, Design], seen: dict[str, Posts]) -> Figure:
+def _curves_figure(made: dict[str, Design], measured: dict[str, Posts]) -> Figure:
     figure = new_figure(8.0, 5.0)
     axes = figure.add_subplot()
     rows = np.arange(720.0)
     for name, build in made.items():
         style = "--" if name == "nominal" else "-"
         axes.plot(rows, build.model.range_mm(rows), style, color=_colour(made, name), label=name)
-    for name, posts in seen.items():
+    for name, posts in measured.items():
         axes.plot(posts.row, posts.range_mm, "o", color=_colour(made, name), markersize=4.5)
     axes.plot([], [], "o", color="0.4", label="posts")
     axes.set(xlabel="row (px)", ylabel="range (mm)", title="Fig. 4A: range over row")
@@ -216,10 +216,10 @@ def _curves_figure(made: dict[str, Design], seen: dict[str, Posts]) -> Figure:
     return figure
 
 
-def _residuals_figure(made: dict[str, Design], seen: dict[str, Posts]) -> Figure:
+def _residuals_figure(made: dict[str, Design], measured: dict[str, Posts]) -> Figure:
     figure = new_figure(11.0, 4.6)
     in_mm, in_rows = figure.subplots(1, 2)
-    for name, posts in seen.items():
+    for name, posts in measured.items():
         colour, build = _colour(made, name), made[name]
         ranges = np.linspace(*build.range_limits_mm, 200)
         step, focus = build.model.range_per_row_mm(ranges), build.at(ranges).depth_of_field_mm
@@ -245,7 +245,7 @@ def _residuals_figure(made: dict[str, Design], seen: dict[str, Posts]) -> Figure
     return figure
 
 
-def _magnification_figure(made: dict[str, Design], seen: dict[str, Posts]) -> Figure:
+def _magnification_figure(made: dict[str, Design], measured: dict[str, Posts]) -> Figure:
     figure = new_figure(8.0, 4.6)
     axes = figure.add_subplot()
     for name, build in made.items():
@@ -253,7 +253,7 @@ def _magnification_figure(made: dict[str, Design], seen: dict[str, Posts]) -> Fi
         style = "--" if name == "nominal" else "-"
         axes.plot(rows, build.model.magnification(rows), style, color=_colour(made, name),
                   label=name)  # fmt: skip
-    for name, posts in seen.items():
+    for name, posts in measured.items():
         axes.plot(posts.row, posts.magnification, "o", color=_colour(made, name), markersize=4.5)
     axes.plot([], [], "o", color="0.4", label="posts")
     axes.axvspan(719.5, 1200.0, color="0.93", label="off the sensor")

@@ -1,4 +1,4 @@
-"""All events of a capture as one picture: how many every pixel sent."""
+"""All events of a capture as one picture: the count of each pixel."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class Rejected:
     Attributes
     ----------
     index : int
-        Place among the targets given.
+        Index among the targets given.
     label : str
     reason : str
     """
@@ -89,7 +89,7 @@ class CalibrationReport:
     prior_ratio : dict of str to float
         Posterior over prior standard deviation.
     verdicts : tuple of str
-        ``identifiable`` where it is, then every reservation.
+        ``identifiable`` where it applies, then every reservation.
     """
 
     calibration: Calibration
@@ -179,7 +179,7 @@ def calibrate(
     _refuse_undetermined(targets, names)
     used = np.ones(len(targets), dtype=bool)
     rejected: tuple[Rejected, ...] = ()
-    if _wants_rejection(method, robust, len(targets)):
+    if _rejects_outliers(method, robust, len(targets)):
         used, rejected = _rejection(targets, design, names, priors)
     kept = targets.select(used)
     found = fit(kept, design, names, prior_sigma=priors)
@@ -188,7 +188,7 @@ def calibrate(
         labels = listed([entry.label for entry in rejected[:LISTED]], len(rejected))
         lines = (*lines, f"{len(rejected)} of {len(targets)} targets rejected: {labels}")
     residual = Observed.of(targets, design, names).residual(found.values)
-    # A target that was left out may lie in front of the focal line of the others' curve.
+    # A rejected target may be in front of the focal line of the others' curve.
     residual_px = np.full(len(targets), np.nan) if residual is None else residual[:, 0]
     alone_px = residual_px.copy()
     alone_px[used] = leave_one_out_px(kept, design, found)
@@ -290,7 +290,7 @@ def _refuse_undetermined(targets: Targets, names: tuple[str, ...]) -> None:
         )
 
 
-def _wants_rejection(method: Method, robust: bool | None, size: int) -> bool:
+def _rejects_outliers(method: Method, robust: bool | None, size: int) -> bool:
     if robust and size < _ROBUST_TARGETS_MIN:
         raise ArgumentError(
             f"robust is True with {size} targets; give {_ROBUST_TARGETS_MIN} or more, or leave it "
@@ -312,7 +312,7 @@ def _rejection(
                 index,
                 targets.labels[index],
                 f"{_CHANNELS[channel]} {observed.measured[index, channel]:.1f} px at "
-                f"{targets.range_mm[index]:.0f} mm lies {abs(distance[index, channel]):.1f} sigma "
+                f"{targets.range_mm[index]:.0f} mm is {abs(distance[index, channel]):.1f} sigma "
                 "from the curve of the others",
             )
         )
@@ -322,7 +322,10 @@ def _rejection(
 def _calibration(
     nominal: Calibration, found: CalibrationFit, kept: Targets, method: Method, date: str | None
 ) -> Calibration:
-    """Design with the fitted parameters; the width bias belongs to the targets, not to a build."""
+    """Return the design with the fitted parameters.
+
+    The width bias is left out: it is a property of the targets, not of a build.
+    """
     fitted = [name for name in found.free if name != WIDTH_BIAS]
     at = [found.free.index(name) for name in fitted]
     matrix = found.covariance[np.ix_(at, at)]

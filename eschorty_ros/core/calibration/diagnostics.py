@@ -46,7 +46,7 @@ class KProfile:
     delta_chi_square : ndarray of float64, shape (n,)
         Above the smallest; the prior on k is left out, the others count.
     interval_mm : tuple of float
-        95 % interval; infinite on a side where it lies beyond the profile.
+        95 % interval; infinite on a side where it ends beyond the profile.
     """
 
     k_mm: Array
@@ -57,7 +57,7 @@ class KProfile:
 def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KProfile | None:
     """Return the profile likelihood of k within four standard deviations.
 
-    ``None`` where k was fixed, or the other parameters are not determined for any k.
+    ``None`` when k was fixed, or the other parameters are not determined for any k.
     """
     if "k_mm" not in found.free:
         return None
@@ -102,8 +102,8 @@ def _interval(k_mm: Array, delta: Array) -> tuple[float, float]:
 def leave_one_out_px(targets: Targets, design: RangeModel, found: CalibrationFit) -> Array:
     """Return the row of each target minus the row that the others predict, shape (n,).
 
-    By the leverage of each target, which is exact where the model is linear. NaN where the others
-    do not determine the parameters.
+    It is calculated from the leverage of each target, which is exact for a linear model. NaN where
+    the others do not determine the parameters.
     """
     observed = Observed.of(targets, design, found.free)
     problem = Problem(observed, design, found.free, found.prior_sigma, found.values)
@@ -122,7 +122,7 @@ def prior_ratios(found: CalibrationFit) -> dict[str, float]:
 
 
 def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tuple[str, ...]:
-    """Return ``identifiable`` where it is, then a line for every reservation with its remedy."""
+    """Return ``identifiable`` where it applies, then each reservation with its remedy."""
     ratios = prior_ratios(found)
     held = {name: ratio for name, ratio in ratios.items() if ratio > _PRIOR_SHARE}
     lines = []
@@ -138,7 +138,7 @@ def verdicts(targets: Targets, design: RangeModel, found: CalibrationFit) -> tup
         pull = (found.values[name] - getattr(design, name, 0.0)) / spread
         if abs(pull) > _RESIDUAL_SIGMA:
             lines.append(
-                f"{name} lies {abs(pull):.1f} prior sigmas from the design; check the nominal "
+                f"{name} is {abs(pull):.1f} prior sigmas from the design; check the nominal "
                 "build or widen its prior"
             )
     lines += _sizes(targets, design, found)
@@ -154,7 +154,7 @@ def _remedy(name: str) -> str:
 
 
 def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[str]:
-    """Return a line when known sizes contradict a k that stayed as designed."""
+    """Return a line when known sizes contradict a k that was fixed at its design value."""
     if "k_mm" in found.free or not targets.lateral:
         return []
     names, priors = ["k_mm", *found.free], dict(found.prior_sigma)
@@ -171,7 +171,7 @@ def _sizes(targets: Targets, design: RangeModel, found: CalibrationFit) -> list[
         return []
     return [
         f"sizes contradict k_mm: they give {k_mm:.3f} with a sigma of {sigma:.3f}, "
-        f"{away:.1f} sigma from the {design.k_mm:.3f} it was held at; method joint fits it"
+        f"{away:.1f} sigma from its fixed value {design.k_mm:.3f}; method joint fits it"
     ]
 
 
@@ -186,15 +186,15 @@ def _coverage(targets: Targets, found: CalibrationFit) -> list[str]:
         worst = np.nanmax(found.range_sigma_mm([near, far]))
         lines.append(
             f"extrapolates outside {targets.range_mm.min():.0f} to {targets.range_mm.max():.0f} mm "
-            f"(rows {first:.0f} to {last:.0f}): the sensor sees {near:.0f} to {far:.0f} mm, where "
-            f"sigma grows to {worst:.2g} mm"
+            f"(rows {first:.0f} to {last:.0f}): the sensor covers {near:.0f} to {far:.0f} mm, "
+            f"where sigma grows to {worst:.2g} mm"
         )
     near, far = model.range_limits_mm
     third = near + (far - near) * 2.0 / 3.0
     beyond = int((targets.range_mm >= third).sum())
     if math.isfinite(third) and beyond < _FAR_SHARE * len(targets):
         lines.append(
-            f"{beyond} of {len(targets)} targets lie in the far third, beyond {third:.0f} mm; put "
+            f"{beyond} of {len(targets)} targets are in the far third, beyond {third:.0f} mm; put "
             "at least a third of them there"
         )
     return lines

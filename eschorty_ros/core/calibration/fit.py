@@ -43,7 +43,7 @@ PRIOR_SIGMA = {
     "b_prime_2_px": 5.0,
     WIDTH_BIAS: 3.0,
 }
-"""How far a build is expected from its design; k lies within `K_PRIOR_SHARE` of it."""
+"""Standard deviation of a build's parameters from its design; of k it is `K_PRIOR_SHARE`."""
 K_PRIOR_SHARE = 0.01
 _REWEIGHTINGS = 3
 _TOLERANCE = float(np.finfo(np.float64).eps)
@@ -160,7 +160,7 @@ def fit(
     Raises
     ------
     ArgumentError
-        When a target lies off the sensor or behind the focal line, or a name is unknown.
+        When a target is off the sensor or behind the focal line, or a name is unknown.
     FitError
         When the targets do not determine the parameters; names the condition number.
 
@@ -228,7 +228,7 @@ def solve(
     """
     closed = set(names) == set(PAPER_FREE) and not priors and not observed.known[:, 1:].any()
     values = values_of(design)
-    # A range error weighs with the slope of the curve, which the fit has yet to find.
+    # The weight of a range error depends on the slope of the curve, which the fit determines.
     for _ in range(1 + _REWEIGHTINGS * bool(observed.sigma_range_mm.any())):
         problem = Problem(observed, design, names, priors, values)
         if not names:
@@ -243,7 +243,7 @@ def solve(
 
 
 def _straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Values:
-    """Row = K x - b' on x = 1 / (R + b), centred: one column of condition 1."""
+    """Fit row = K x - b' on x = 1 / (R + b), centred: one column of condition 1."""
     rows = observed.measured[:, 0]
     x = 1.0 / (observed.range_mm + design.b_mm)
     weight = 1.0 / (sigma * sigma)
@@ -276,7 +276,7 @@ def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -
     FitError
         When the search does not converge.
     """
-    # Importing it takes 0.3 s, which only a calibration has to spend.
+    # Only a calibration needs it, and the import takes 0.3 s.
     from scipy.optimize import least_squares
 
     robust = cauchy_scale is not None

@@ -17,10 +17,10 @@ from eschorty_ros.core.reconstruction import Profiles
 # Standard deviation of a stage position by the encoder.
 _SIGMA_STAGE_MM = 0.01
 _NEAREST_MM = 1.0
-_SEEN_SHARE = 0.5
+_LIT_SHARE = 0.5
 _OUTLIER_PX = 4.0
 _PAIRED_MAX = 300
-# A moving line is seen late by this much; the other way round on the way back.
+# The events of a moving line lag it by this much, with the opposite sign on the way back.
 _LATE_PX = 0.23
 
 
@@ -34,8 +34,8 @@ def moving_target(
 ) -> Targets:
     """Turn every profile of a moving flat target into a target of known range.
 
-    A line that moves over the pixels is seen a fraction of a row late, at any speed: join sweeps
-    forth and back (``Targets.concatenate``), and it cancels.
+    The events of a line that moves over the pixels lag it by a fraction of a row, at any speed:
+    join sweeps forth and back (``Targets.concatenate``), and the lag cancels.
 
     Parameters
     ----------
@@ -45,8 +45,8 @@ def moving_target(
         Stage position at each point's time, as ``StageTrack.position_mm`` gives it; points with
         NaN are left out.
     range_at_zero_mm : float
-        Range of the target with the stage at 0. Its error moves all targets alike: it is an error
-        of ``b`` that no number of profiles shows.
+        Range of the target with the stage at 0. Its error shifts all targets alike and becomes an
+        error of ``b``, which no number of profiles reveals.
     range_per_stage : float
         Range gained per stage travel: 1 when the stage moves the target away along the sheet,
         -1 towards the sensor, the cosine of the angle in between.
@@ -56,14 +56,14 @@ def moving_target(
     Returns
     -------
     Targets
-        By time, then column, in the columns that half of the profiles show; ``label`` is the stage
-        position in mm. Profiles more than 4 px off the line through the others, or with the target
-        in few columns, are left out.
+        By time, then column, in the columns with points in half of the profiles; the label is the
+        stage position in mm. Profiles more than 4 px off the line through the others, or with the
+        target in few columns, are left out.
 
     Raises
     ------
     ArgumentError
-        When the positions do not belong to the points, or a value is out of its range.
+        When ``stage_mm`` has another length than the points, or a value is out of its range.
     FitError
         When too few columns or profiles show a target.
     """
@@ -79,7 +79,7 @@ def moving_target(
     integer("blocks", blocks, 1, 64)
     used = np.isfinite(position) & np.isfinite(profiles.row) & (profiles.return_index == 0)
     profiles, position = profiles.select(used), position[used]
-    low, high = _seen_columns(profiles)
+    low, high = _lit_columns(profiles)
     inside = (profiles.column >= low) & (profiles.column <= high)
     profiles, position = profiles.select(inside), position[inside]
     if high - low + 1 < COLUMNS_MIN * blocks:
@@ -93,10 +93,10 @@ def moving_target(
     return _measured(profiles, position, group, range_at_zero_mm, range_per_stage)
 
 
-def _seen_columns(profiles: Profiles) -> tuple[int, int]:
-    """Return the first and last column in which half of the profiles show something."""
-    seen = np.bincount(profiles.column)
-    often = np.flatnonzero(seen >= max(_SEEN_SHARE * profiles.profile_count, 1.0))
+def _lit_columns(profiles: Profiles) -> tuple[int, int]:
+    """Return the first and last column with points in half of the profiles."""
+    points = np.bincount(profiles.column)
+    often = np.flatnonzero(points >= max(_LIT_SHARE * profiles.profile_count, 1.0))
     if not often.size:
         raise FitError("no column shows a target in half of the profiles; check laser and focus")
     return int(often[0]), int(often[-1])
@@ -133,7 +133,7 @@ def _measured(
     if not (range_mm >= _NEAREST_MM).all():
         raise ArgumentError(
             f"range_at_zero_mm is {range_at_zero_mm!r}: at a stage position of "
-            f"{at_mm[np.argmin(range_mm)]:g} mm the target would lie at or behind the datum"
+            f"{at_mm[np.argmin(range_mm)]:g} mm the target would be at or behind the datum"
         )
     targets = Targets(
         row=centre[enough],

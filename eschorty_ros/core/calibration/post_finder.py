@@ -12,7 +12,7 @@ from eschorty_ros.core.calibration.aggregate_frame import AggregateFrame
 from eschorty_ros.core.line import HALF_WIDTH_PER_FWHM, SIGMA_FLOOR_PX
 
 COLUMNS_MIN = 8
-"""Columns of the narrowest target; a narrower run is no post."""
+"""Columns of the narrowest target."""
 _ROW_JUMP_PX = 4.0
 _GAP_COLUMNS = 2
 _INNER = 0.6
@@ -25,13 +25,13 @@ GRID_SIGMA_PX = 0.15
 
 It is 0.05 px RMS with the noise of simulated pixels, 0.3 px without any.
 """
-# A column sees the post or does not: an edge between two columns is known to this.
+# The standard deviation of a uniform distribution: an edge is anywhere between two columns.
 _EDGE_SIGMA_PX = 12.0**-0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Post:
-    """One post as a capture shows it.
+    """One post in a capture.
 
     Attributes
     ----------
@@ -62,9 +62,9 @@ def find_posts(frame: AggregateFrame, line_width_px: float = 20.0) -> list[Post]
     """Find runs of neighbouring columns whose line keeps its row.
 
     The row of a column is the centroid of the counts in a window around the line's densest
-    place, centred on itself, so that even background does not pull it. The row of a post is a
-    parabola through the rows of its inner columns, taken at its middle: it holds for flat, tilted
-    and round posts.
+    place. The window is centred on the centroid itself, so that uniform background does not bias
+    it. The row of a post is that of a parabola through the rows of its inner columns, at its
+    middle, which fits flat, tilted and round posts.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class _Columns:
         return np.clip(centre, 0.0, self.rows - 1.0)
 
     def runs(self) -> list[tuple[int, int]]:
-        """Return first and last column of runs that keep their row, across a few dark columns."""
+        """Return first and last column of runs that keep their row, across a few unlit columns."""
         runs: list[tuple[int, int]] = []
         for column in np.flatnonzero(self.lit).tolist():
             index = self._continued(runs, column)
@@ -208,7 +208,7 @@ class _Columns:
 
 
 def _without_hot_pixels(counts: NDArray[np.uint32]) -> Array:
-    """Limit each pixel's count to what a line gives by the count of its row's neighbours."""
+    """Limit each pixel's count to the most that a line gives beside its neighbours in the row."""
     value = counts.astype(np.float64)
     beside = np.zeros_like(value)
     beside[:, 1:] = value[:, :-1]

@@ -17,13 +17,13 @@ from eschorty_ros.core.optics import RangeModel
 
 _HINT_COLUMNS = 20.0
 _HINT_ROWS = 30.0
-# How far kk' (a share) and b' (rows) may lie from the nominal build's.
+# Largest deviation of kk' (a share) and b' (rows) from the nominal build's.
 _SCALE_TOLERANCE = 0.15
 _OFFSET_TOLERANCE_PX = 120.0
 _SIZE_TOLERANCE = 0.3
 _ROW_TOLERANCE_PX = 3.0
 _SIGMAS = 5.0
-# Another assignment must be this many times worse, in squared shares of the tolerance.
+# Another assignment must be worse by this factor and this sum, in squared shares of the tolerance.
 _CLEARLY, _CLOSE = 4.0, 0.02
 
 
@@ -38,7 +38,7 @@ class KnownTarget:
     size_mm : float
         Width along the laser line; NaN when unknown.
     column, row : float
-        Where it should be seen, px; NaN when anywhere.
+        Where it is expected, px; NaN where unknown.
     label : str
         Its name in messages; its range by default.
 
@@ -69,13 +69,13 @@ class KnownTarget:
 
     @property
     def hinted(self) -> bool:
-        """True when the column or row where it should be seen is known."""
+        """True when the column or row where it is expected is known."""
         return not (math.isnan(self.column) and math.isnan(self.row))
 
 
 @dataclass(frozen=True, slots=True)
 class PostMatch:
-    """Posts matched to known targets, and what matches nothing.
+    """Posts matched to known targets, and the unmatched ones of both.
 
     Attributes
     ----------
@@ -95,12 +95,12 @@ class PostMatch:
 def match_posts(
     posts: Sequence[Post], known: Sequence[KnownTarget], nominal: RangeModel
 ) -> PostMatch:
-    """Find the post that every known target is.
+    """Find the post of every known target.
 
-    A target with a pixel hint is the post nearest to the hint. The others follow from what the
-    range equation demands for any constants: rows are a straight line in ``1 / (R + b)``.
-    Of all lines through two posts whose ``kk'`` and ``b'`` lie near the nominal ones, the one that
-    most posts agree with wins. Sizes, where known, rule out posts of another width.
+    A target with a pixel hint is the post nearest to the hint. The others follow from the range
+    equation, which for any constants makes rows a straight line in ``1 / (R + b)``. Of all lines
+    through two posts whose ``kk'`` and ``b'`` are near the nominal ones, the line that most posts
+    agree with is used. Sizes, where known, exclude posts of another width.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class _LineSearch:
         self._line: tuple[float, float] | None = None
 
     def best(self) -> list[tuple[int, int]]:
-        """Return the pairs that most posts agree with."""
+        """Return the pairs of the line that most posts agree with."""
         found: dict[tuple[tuple[int, int], ...], float] = {}
         for first, second, slope, offset in self._lines():
             pairs = self._agreeing(slope, offset)
@@ -211,7 +211,7 @@ class _LineSearch:
         return self._line[0] / (target.range_mm + self._nominal.b_mm) + self._line[1]
 
     def _lines(self) -> list[tuple[tuple[int, int], tuple[int, int], float, float]]:
-        """Return every line through two pairs that a build near the nominal one could have."""
+        """Return every line through two pairs that is possible for a build near the nominal one."""
         low, high = (self._nominal.product_mm_px * (1.0 + side * _SCALE_TOLERANCE)
                      for side in (1, -1))  # fmt: skip
         candidates = np.argwhere(self._allowed)
@@ -279,7 +279,7 @@ def _left_over(
     matched, found = ({pair[side] for pair in pairs} for side in (0, 1))
     for i, post in enumerate(posts):
         if i not in matched:
-            reason = "no known target belongs there"
+            reason = "it matches no known target"
             if post.row_cut:
                 reason = "the sensor's edge cuts its line"
             lines.append(f"post at column {post.column:.0f}, row {post.row:.1f}: {reason}")
@@ -302,16 +302,16 @@ def _targets(
 ) -> Targets | None:
     if not pairs:
         return None
-    seen = [posts[i] for i, _ in pairs]
+    measured = [posts[i] for i, _ in pairs]
     true = [known[j] for _, j in pairs]
     return Targets(
-        row=[post.row for post in seen],
+        row=[post.row for post in measured],
         range_mm=[target.range_mm for target in true],
-        sigma_row_px=[post.sigma_row for post in seen],
+        sigma_row_px=[post.sigma_row for post in measured],
         sigma_range_mm=[target.sigma_range_mm for target in true],
-        column=[math.nan if post.column_cut else post.column for post in seen],
-        width_px=[math.nan if post.column_cut else post.width_px for post in seen],
-        sigma_width_px=[post.sigma_width_px for post in seen],
+        column=[math.nan if post.column_cut else post.column for post in measured],
+        width_px=[math.nan if post.column_cut else post.width_px for post in measured],
+        sigma_width_px=[post.sigma_width_px for post in measured],
         size_mm=[target.size_mm for target in true],
         labels=[target.label for target in true],
     )

@@ -59,7 +59,7 @@ def recorded_posts(
     posts = find_posts(frame)
     if not posts:
         raise FitError(
-            f"{recording.path}: no post is seen in {frame.events} events; check laser, focus and "
+            f"{recording.path}: no post found in {frame.events} events; check laser, focus and "
             "that the posts cross the sheet"
         )
     return match_posts(posts, known, nominal.model())
@@ -99,5 +99,6 @@ def _check_sensor(recording: Recording, nominal: Calibration) -> None:
     if (made.columns, made.rows) != (nominal.columns, nominal.rows):
         raise CalibrationError(
             f"{recording.path} has a sensor of {made.columns} x {made.rows} and the nominal build "
-            f"{nominal.name} one of {nominal.columns} x {nominal.rows}; choose the build's own"
+            f"{nominal.name} one of {nominal.columns} x {nominal.rows}; choose a nominal build "
+            "with the recording's sensor"
         )

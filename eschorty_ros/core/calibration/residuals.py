@@ -152,7 +152,7 @@ class Problem:
     priors : mapping of str to float
         Standard deviations.
     at : Values
-        Where the targets' covariances are taken.
+        Parameters at which the targets' covariances are evaluated.
     """
 
     def __init__(
@@ -171,7 +171,6 @@ class Problem:
         self._centre = np.array([self._fixed[name] for name in self.priors])
         self._spread = np.array(list(self.priors.values()))
         self._which = [names.index(name) for name in self.priors]
-        # Channels that were not measured would only lengthen the Jacobian.
         self._rows = observed.known.ravel()
 
     def values(self, free: Array) -> Values:
@@ -218,7 +217,7 @@ class Problem:
 def condition_number(jacobian: Array) -> float:
     """Return largest over smallest singular value with columns of unit length.
 
-    Parameters may so differ in unit by any factor. Infinite where rank is missing.
+    The units of the parameters do not matter. Infinite for a Jacobian that lacks rank.
     """
     scaled, _ = _unit_columns(jacobian)
     if scaled.shape[0] < scaled.shape[1]:

@@ -37,7 +37,7 @@ _PAIRED_MAX = 40
 def inliers(
     observed: Observed, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
 ) -> tuple[Mask, Array]:
-    """Find the targets that one curve explains.
+    """Find the targets that follow one curve.
 
     Returns
     -------
@@ -49,14 +49,14 @@ def inliers(
     Raises
     ------
     FitError
-        When no curve explains more than half of the targets.
+        When no curve fits more than half of the targets.
     """
     values = _least_median(observed, design)
     refuse_singular(Problem(observed, design, names, priors, values), values)
     before = 0.0
     for _ in range(_ITERATIONS):
         problem = Problem(observed, design, names, priors, values)
-        # By the rows: the first line leaves width bias and k, so the widths, to the search.
+        # By the rows: widths depend on k and the width bias, which the first line does not fit.
         scale = _scale(problem.whitened(values)[:, :1], observed.known[:, :1])
         if abs(scale - before) < _SCALE_CONVERGED * scale:
             break
@@ -65,7 +65,7 @@ def inliers(
 
 
 def _least_median(observed: Observed, design: RangeModel) -> Values:
-    """Line through two targets with the smallest median residual; k and b of the design."""
+    """Return the line through two targets with the least median residual, k and b as designed."""
     x = 1.0 / (observed.range_mm + design.b_mm)
     rows, sigma = observed.measured[:, 0], observed.sigma[:, 0]
     sigma = np.hypot(sigma, design.product_mm_px * x * x * observed.sigma_range_mm)
@@ -132,7 +132,7 @@ def _scale(distance: Array, known: Mask) -> float:
 def _refuse_contradictions(kept: Mask, scale: float, observed: Observed) -> None:
     if scale > _SCALE_MAX:
         raise FitError(
-            f"the targets contradict each other: even the better half lies {scale:.0f} times "
+            f"the targets contradict each other: even the better half is {scale:.0f} times "
             "farther from any curve than their sigmas allow; check ranges, which target is which "
             "and sigma_row_px"
         )

@@ -113,8 +113,8 @@ class Targets:
         for name in _POSITIVE_OR_UNKNOWN:
             value = getattr(self, name)
             self._refuse(name, np.isinf(value) | (value <= 0.0), "choose a positive number or NaN")
-        for seen, sigma, _ in _SIZES:
-            unknown = np.isfinite(getattr(self, seen)) & np.isnan(getattr(self, sigma))
+        for measured, sigma, _ in _SIZES:
+            unknown = np.isfinite(getattr(self, measured)) & np.isnan(getattr(self, sigma))
             self._refuse(sigma, unknown, "choose a positive number")
 
     def __len__(self) -> int:

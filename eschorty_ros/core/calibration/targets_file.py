@@ -112,7 +112,7 @@ def read_distances(
     ----------
     path : path
         CSV with a header line: ``range_mm``, and any of ``range_sigma_mm``, ``size_mm``,
-        ``column`` and ``row`` (where the post should be seen), ``label``.
+        ``column`` and ``row`` (where the post is expected), ``label``.
     sigma_range_mm : float
         Standard deviation where the file gives none.
 
@@ -168,7 +168,7 @@ def _read(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[_Line
     except csv.Error as cause:
         raise FormatError(f"{path}: {cause}; give a CSV file") from cause
     if not lines:
-        raise FormatError(f"{path}: it holds no line; begin with the header {','.join(needed)}")
+        raise FormatError(f"{path}: it has no lines; begin with the header {','.join(needed)}")
     header = lines[0][1]
     _check_header(path, header, known, needed)
     made = []

@@ -16,7 +16,7 @@ DRIFT_MAX_PPB = 200_000
 Time = TypeVar("Time", int, NDArray[np.int64])
 T_US_LIMIT = TIME_LIMIT // NS_PER_US
 _PPB_TIMES_US = 1_000_000
-# Each iteration leaves 2e-4 of the error, the largest drift.
+# Each iteration reduces the error to 2e-4 of it, the largest drift.
 _ITERATIONS = 8
 
 
@@ -25,7 +25,7 @@ class ClockLine:
     """ROS time as a straight function of sensor time.
 
     ``ns = origin_ns + (t - origin_us) 1000 (1 + drift_ppb 1e-9)``, rounded down to the nanosecond
-    from exact integers, so no digits are lost after decades of uptime. Strictly increasing.
+    from exact integers, so its precision does not depend on the uptime. Strictly increasing.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class ClockLine:
     Raises
     ------
     ArgumentError
-        When a value lies outside its range.
+        When a value is outside its range.
     """
 
     origin_us: int
@@ -53,7 +53,6 @@ class ClockLine:
         """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         if isinstance(t_us, np.ndarray):
             since = _within("t_us", t_us, T_US_LIMIT) - self.origin_us
-            # Half the range where the drift adds to it.
             return self._elapsed_ns(_within("t_us", since, self._reach_us)) + self.origin_ns
         since_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT) - self.origin_us
         return int(self._elapsed_ns(since_us)) + self.origin_ns
@@ -65,20 +64,21 @@ class ClockLine:
         return int(self._since_us(integer("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT) - self.origin_ns))
 
     def shifted(self, by_ns: int) -> ClockLine:
-        """Return the line that lies ``by_ns`` later."""
+        """Return the line shifted by ``by_ns`` of ROS time."""
         by_ns = integer("by_ns", by_ns, -2 * TIME_LIMIT, 2 * TIME_LIMIT)
         return ClockLine(self.origin_us, self.origin_ns + by_ns, self.drift_ppb)
 
     @property
     def _reach_us(self) -> int:
+        """Longest time from the origin whose conversion fits into 64 bits."""
         return T_US_LIMIT // 2 if self.drift_ppb else 2 * T_US_LIMIT
 
-    # Both take an int or an array of int64.
+    # The arguments of both are an int or an array of int64.
 
     def _elapsed_ns(self, since_us: Any) -> Any:
         if not self.drift_ppb:
             return since_us * NS_PER_US
-        # In two steps, as the product of both would leave 64 bits.
+        # In two steps, as the product of both would exceed 64 bits.
         millions, rest = since_us // _PPB_TIMES_US, since_us % _PPB_TIMES_US
         late = millions * self.drift_ppb + rest * self.drift_ppb // _PPB_TIMES_US
         return since_us * NS_PER_US + late
@@ -92,7 +92,7 @@ class ClockLine:
 
 
 def _within(name: str, values: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
-    """Return ``values`` as int64; refuse those that leave 64 bits when converted."""
+    """Return ``values`` as int64; refuse those that would exceed 64 bits when converted."""
     checked = times(name, values)
     wrong = (checked > limit) | (checked < -limit)
     if wrong.any():

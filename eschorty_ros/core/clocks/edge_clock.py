@@ -1,4 +1,4 @@
-"""The sensor's clock from a stage's trigger edges, as they come in."""
+"""The sensor's clock from a stage's trigger edges, as they arrive."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class EdgeClock:
     Attributes
     ----------
     fit : EdgeFit or None
-        The last fit that held.
+        The last successful fit.
     pulses : PulseTrain or None
-        The pulses the stage gives; without them no fit is made.
+        The pulses that the stage sends; without them no fit is made.
     edges_dropped : int
-        Edges beyond those kept: the input sees a source faster than a stage.
+        Edges dropped because more than 8192 came in the last minute, faster than from a stage.
     """
 
     def __init__(self, pulses: PulseTrain | None = None) -> None:
@@ -74,9 +74,9 @@ class EdgeClock:
         track : StageTrack
             Odometry over ROS time, us.
         arrivals : ClockLine
-            The clock by the packets' arrivals.
+            The clock from the packets' arrivals.
         now : bool
-            Fit every new edge, not only after 50 ms of them.
+            Fit as soon as there is a new edge, not only after 50 ms of them.
         """
         last_us = track.last_us
         if self.pulses is None or last_us is None or self._t_us.size == 0:

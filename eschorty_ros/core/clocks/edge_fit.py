@@ -1,9 +1,9 @@
-"""Offset and drift of the sensor's clock from pulses a stage gives at known positions.
+"""Offset and drift of the sensor's clock from pulses that a stage sends at known positions.
 
 Pulse ``n`` begins as the carriage passes ``first + n interval``. The odometry gives the ROS time of
-that, the camera's trigger input the sensor time. Which pulse an edge belongs to follows from the
-approximate clock and, where that is not good to a pulse, from the ramps: there the pulses are
-further apart in time, and only the right shift lays all edges onto the pulses.
+that, the camera's trigger input the sensor time. An edge is assigned to its pulse by the
+approximate clock and, where that is not accurate to a pulse, by the ramps: there the pulses are
+further apart in time, and only the right shift of the clock aligns all edges with pulses.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ EDGES_MIN = 8
 # A KBD101 samples its position every 102 us, so an edge is late by half of that on average.
 SAMPLING_US = 102
 _SPEED_MIN_MM_S = 5.0
-# On ramps the odometry's straight lines cut the corners.
+# On ramps, linear interpolation of the odometry is not accurate enough.
 _STEADY_US = 20_000
 _STEADY_SHARE = 0.1
 _SHARE_MIN = 0.6
 _SHARE_GOOD = 0.97
-# Lateness of the packets' arrivals over which the edges are searched: first of a usual host, then
-# of a slow one.
+# Range of the arrivals' lateness that is searched: first of a usual host, then of a slow one.
 _NEAR_MS = (-10.0, 30.0)
 _FAR_MS = (-10.0, 5_000.0)
 _STEP_MS = 1.0
@@ -39,7 +38,8 @@ _CANDIDATES = 12
 # distinguishes the pulses.
 _NEAR_COST_PER_MS = 2e-4
 _FAR_COST_PER_MS = 1e-7
-# Edges this near to a pulse (share of the interval) belong to it, even if the fit leaves them out.
+# Edges this near to a pulse (share of the interval) count as its edges even where the fit omits
+# them.
 _BELONGS = 0.1
 _DRIFT_SIGMA = 20e-6
 _NOISE_MM = 0.01
@@ -48,7 +48,7 @@ _ITERATIONS = 6
 
 @dataclass(frozen=True, slots=True)
 class EdgeFit:
-    """Relation of the clocks by the edges.
+    """Relation of the clocks from the edges.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class EdgeFit:
 def fit_edges(
     t_us: NDArray[np.int64], track: StageTrack, pulses: PulseTrain, arrivals: ClockLine
 ) -> EdgeFit | None:
-    """Return the clock that lays the edges onto the pulses.
+    """Return the clock that aligns the edges with the pulses.
 
     Parameters
     ----------
@@ -84,13 +84,13 @@ def fit_edges(
         Odometry over ROS time, us.
     pulses : PulseTrain
     arrivals : ClockLine
-        The clock by the packets' arrivals; late rather than early.
+        The clock from the packets' arrivals; late rather than early.
 
     Returns
     -------
     EdgeFit or None
         ``None`` when fewer than 8 edges have a position, too many fit no pulse, or the drift
-        leaves its bounds: the edges are then not those of this stage.
+        is out of its bounds: the edges are then not those of this stage.
     """
     t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     if t_us.size < EDGES_MIN or pulses.count == 0:
@@ -106,7 +106,7 @@ def fit_edges(
 class _Match:
     """Edges against the pulses under shifts of the clock.
 
-    ``late_ms`` is by how much the arrivals' clock is late.
+    ``late_ms`` is the lateness of the arrivals' clock.
     """
 
     def __init__(
@@ -122,12 +122,12 @@ class _Match:
         self._some_us = self._all_us[::stride] if stride > 1 else self._all_us
 
     def best(self, span_ms: tuple[float, float], cost_per_ms: float) -> EdgeFit | None:
-        """Return the fit about the best shift within a span."""
+        """Return the fit at the best shift within a span."""
         late_ms = self._search(span_ms, cost_per_ms)
         return None if late_ms is None else self._fit(late_ms)
 
     def _search(self, span_ms: tuple[float, float], cost_per_ms: float) -> float | None:
-        """Return the shift that lays most edges on pulses; ``None`` if no edge has a position."""
+        """Return the shift with most edges on pulses; ``None`` if no edge has a position."""
         late_ms = np.arange(span_ms[0], span_ms[1], self._step_ms())
         rows = max(_SEARCHED_AT_ONCE // self._some_us.size, 1)
         cost = np.concatenate(

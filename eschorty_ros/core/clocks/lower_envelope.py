@@ -1,9 +1,9 @@
 """A clock from arrivals with one-sided delays: the line below all of them.
 
 A packet may be late by any time, but never early. The relation of the clocks is therefore the line
-that lies below all points (sensor time, arrival) and touches those without delay: an edge of their
-lower convex hull (Moon, Skelly, Towsley: Estimation and removal of
-clock skew from network delay measurements, INFOCOM 1999).
+below all points (sensor time, arrival) that touches those without delay: an edge of their lower
+convex hull (Moon, Skelly, Towsley: Estimation and removal of clock skew from network delay
+measurements, INFOCOM 1999).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from eschorty_ros.core.base.arrays import TIME_LIMIT, integer
 from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, T_US_LIMIT, ClockLine
 
 _BINS = 600
-# Points further above the line are late because of the host and fix nothing.
+# Points further above the line are late because of the host and do not count.
 _PROMPT_NS = 5e6
-# A drift costs as much as it amounts to over this span, so that short windows have none.
+# The cost of a drift is its amount over this span, so that short windows have none.
 _DRIFT_COST_SPAN_US = 1e6
 
 
@@ -27,9 +27,9 @@ class LowerEnvelope:
     """Offset and drift from packets whose arrival is late by an unknown time of 0 or more.
 
     Of each bin of sensor time only the earliest arrival is kept. Of the hull's edges with a drift
-    within 200 ppm the one nearest to most points is chosen: points more than 5 ms above all count
-    the same, so a host that lags for seconds neither shifts nor tilts the line as long as the
-    window holds some packets that were in time.
+    within 200 ppm the one nearest to most points is chosen: all points more than 5 ms above it
+    count the same, so a host that lags for seconds neither shifts nor tilts the line as long as
+    the window contains some packets without delay.
 
     Parameters
     ----------
@@ -47,13 +47,13 @@ class LowerEnvelope:
     def __init__(self, window_ns: int) -> None:
         self._window_ns = integer("window_ns", window_ns, 1, TIME_LIMIT)
         self._bin_us = max(window_ns // (NS_PER_US * _BINS), 1)
-        # Each: number of its bin, sensor time, arrival.
+        # Number of the bin, sensor time, arrival.
         self._points: deque[tuple[int, int, int]] = deque()
         self.line: ClockLine | None = None
         self.touched_us = 0
 
     def __len__(self) -> int:
-        """Return the count of points held."""
+        """Return the count of points in the window."""
         return len(self._points)
 
     def observe(self, t_us: int, arrival_ns: int) -> ClockLine:

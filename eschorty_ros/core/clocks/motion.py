@@ -91,17 +91,17 @@ class MotionPlan:
 
         Returns
         -------
-        float64, shape (n,)
+        ndarray of float64, shape (n,)
             NaN where it is never reached.
         """
-        wanted = vector("position_mm", position_mm)
-        passing = np.where(wanted == self.position_mm, 0.0, np.nan)
+        place = vector("position_mm", position_mm)
+        passing = np.where(place == self.position_mm, 0.0, np.nan)
         position, velocity, began_s = self.position_mm, self.velocity_mm_s, 0.0
         for duration_s, acceleration in zip(
             self.durations_s, self.accelerations_mm_s2, strict=True
         ):
             with np.errstate(all="ignore"):
-                elapsed_s = _first_root(wanted - position, velocity, acceleration, duration_s)
+                elapsed_s = _first_root(place - position, velocity, acceleration, duration_s)
             passing = np.where(np.isnan(passing), began_s + elapsed_s, passing)
             position += velocity * duration_s + 0.5 * acceleration * duration_s**2
             velocity += acceleration * duration_s

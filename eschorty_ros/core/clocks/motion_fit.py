@@ -1,10 +1,10 @@
-"""Where a stage is, from encoder readings that arrive late.
+"""Position of a stage over time, from encoder readings that arrive late.
 
-A reading is exact in place and vague in time: it was taken after its request and before its
-receipt. The ordered motion, pieces of constant acceleration, is known but for its start. Each
-reading bounds the start from both sides, so that many readings fix it far better than their delays
-spread. Where the motion is unknown, or contradicts the readings, positions lie on lines between
-readings.
+The position of a reading is exact and its time uncertain: it was taken after its request and before
+its receipt. The ordered motion, pieces of constant acceleration, is known except for its start.
+Each reading bounds the start from both sides, so that many readings determine it to far less than
+the spread of their delays. Where the motion is unknown, or contradicts the readings, positions are
+interpolated linearly between readings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _AGREEING_SHARE = 0.8
 _KEPT_SHARE = 0.6
 _REFIT_GROWTH = 1.2
 _START_LATEST_S = 0.5
-# Readings at less than this share of the fastest one's speed fix no time.
+# Readings at less than this share of the fastest one's speed do not determine the start.
 _FAST_SHARE = 0.5
 _SHAPE_READINGS_MIN = 8
 _SPEED_SIGMA = 0.02
@@ -47,7 +47,7 @@ class MotionFit:
     Parameters
     ----------
     tolerance_mm : float
-        How far the carriage may lie beside its ordered motion; also when it counts as resting.
+        Largest deviation of the carriage from its ordered motion, and from rest.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class MotionFit:
 
     @property
     def residual_mm(self) -> float:
-        """How far readings lie outside the motion under way, root mean square; NaN if unknown."""
+        """Root mean square deviation of readings from the motion under way; NaN if unknown."""
         return self._legs[-1].residual_mm
 
     @property
@@ -92,13 +92,13 @@ class MotionFit:
         ----------
         position_mm : float
         latest_ns, earliest_ns : int
-            When it can have been taken at the latest (receipt, less the line's own time) and at
-            the earliest (request).
+            Bounds of the time at which it was taken: its receipt, less the transfer time of the
+            serial line, and its request.
 
         Raises
         ------
         ArgumentError
-            When a value is not finite or the earliest lies after the latest.
+            When a value is not finite or the earliest time is after the latest.
         """
         number("position_mm", position_mm, -POSITION_LIMIT_MM, POSITION_LIMIT_MM)
         latest_ns = integer("latest_ns", latest_ns, -TIME_LIMIT, TIME_LIMIT)
@@ -156,10 +156,10 @@ class MotionFit:
         ArgumentError
             Before the first reading.
         """
-        wanted = times("t_ns", t_ns)
+        at_ns = times("t_ns", t_ns)
         if not self._at_ns:
             raise ArgumentError("the position is unknown; add a reading first")
-        flat = wanted.reshape(-1)
+        flat = at_ns.reshape(-1)
         position, velocity = np.empty(flat.shape), np.empty(flat.shape)
         begins = np.array([leg.from_ns for leg in self._legs])
         which = np.maximum(np.searchsorted(begins, flat, side="right") - 1, 0)
@@ -170,10 +170,10 @@ class MotionFit:
                 position[chosen], velocity[chosen] = self._between(int(index), flat[chosen])
             else:
                 position[chosen], velocity[chosen] = plan.state(flat[chosen])
-        return position.reshape(wanted.shape), velocity.reshape(wanted.shape)
+        return position.reshape(at_ns.shape), velocity.reshape(at_ns.shape)
 
     def _between(self, index: int, t_ns: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return states on lines between a leg's readings and the known motions beside it."""
+        """Return states interpolated between a leg's readings and the known motions beside it."""
         legs = self._legs
         begin_ns = legs[index].from_ns
         end_ns = legs[index + 1].from_ns if index + 1 < len(legs) else TIME_LIMIT
@@ -182,7 +182,7 @@ class MotionFit:
         # Beside another unknown leg its readings count, too.
         low = bisect_right(self._at_ns, begin_ns) if before is not None else 0
         high = bisect_left(self._at_ns, end_ns) if after is not None else len(self._at_ns)
-        # A fit may hold thousands of readings; take those about the wanted times.
+        # Of possibly thousands of readings only those around the requested times are needed.
         first = max(bisect_right(self._at_ns, int(t_ns.min()), low, max(low, high)) - 1, low)
         last = bisect_left(self._at_ns, int(t_ns.max()), first, max(first, high)) + 1
         chosen = slice(first, min(last, high))
@@ -193,13 +193,13 @@ class MotionFit:
             knots.append((end_ns, float(after.state(end_ns)[0])))
         at_s = np.array([at_ns - knots[0][0] for at_ns, _ in knots]) * 1e-9
         positions = np.array([position for _, position in knots])
-        wanted_s = (np.clip(t_ns, -TIME_LIMIT, TIME_LIMIT) - knots[0][0]) * 1e-9
-        position = np.interp(wanted_s, at_s, positions)
+        t_s = (np.clip(t_ns, -TIME_LIMIT, TIME_LIMIT) - knots[0][0]) * 1e-9
+        position = np.interp(t_s, at_s, positions)
         if len(knots) < 2:
             return position, np.zeros_like(position)
         slopes = np.diff(positions) / np.maximum(np.diff(at_s), 1e-9)
-        piece = np.clip(np.searchsorted(at_s, wanted_s) - 1, 0, len(slopes) - 1)
-        inside = (wanted_s >= at_s[0]) & (wanted_s <= at_s[-1])
+        piece = np.clip(np.searchsorted(at_s, t_s) - 1, 0, len(slopes) - 1)
+        inside = (t_s >= at_s[0]) & (t_s <= at_s[-1])
         return position, np.where(inside, slopes[piece], 0.0)
 
     def _begin(self, leg: _Leg) -> None:
@@ -227,7 +227,7 @@ class _Reading:
 
 
 class _Leg:
-    """A stretch of time with an unknown motion, from ``from_ns`` on."""
+    """A span of time with an unknown motion, from ``from_ns`` on."""
 
     residual_mm = math.nan
     sigma_mm = math.nan
@@ -254,9 +254,9 @@ class _Move(_Leg):
     Parameters
     ----------
     planned : MotionPlan
-        Starts at rest, as early as it can.
+        Starts at rest, at the earliest possible time.
     tolerance_mm : float
-        How far a reading may lie beside the motion.
+        Largest deviation of a reading from the motion.
     usual : _Delays
         Of the readings of earlier motions.
     """
@@ -287,9 +287,9 @@ class _Move(_Leg):
         if abs(reading.position_mm - shape.position_mm) <= tolerance_mm:
             if reading.earliest_ns is not None and self._timing is None:
                 ramp = max((abs(a) for a in shape.accelerations_mm_s2), default=1.0)
-                unseen_s = math.sqrt(4.0 * tolerance_mm / ramp)
-                asked_s = (reading.earliest_ns - self.from_ns) * 1e-9 - unseen_s
-                self._not_before_s = max(self._not_before_s, asked_s)
+                within_s = math.sqrt(4.0 * tolerance_mm / ramp)
+                request_s = (reading.earliest_ns - self.from_ns) * 1e-9
+                self._not_before_s = max(self._not_before_s, request_s - within_s)
             return
         if abs(shape.end_mm - reading.position_mm) <= tolerance_mm:
             duration_s = (shape.end_ns - shape.start_ns) * 1e-9
@@ -324,7 +324,7 @@ class _Move(_Leg):
         return min(first, last), max(first, last)
 
     def _append_passings(self, readings: list[_Reading]) -> None:
-        """Append when and how fast the shape passes the readings."""
+        """Append the time and speed at which the shape passes each reading."""
         positions = np.array([reading.position_mm for reading in readings])
         passing_s = self._shape.passing_s(positions)
         at_ns = self._shape.start_ns + np.nan_to_num(np.rint(passing_s * 1e9)).astype(np.int64)
@@ -386,7 +386,7 @@ class _Move(_Leg):
         return agreeing / len(passing_s)
 
     def _rms_outside_mm(self) -> float:
-        """Return how far readings lie outside what their times allow, root mean square."""
+        """Return the root mean square distance of readings from the motion within their times."""
         plan = self.plan()
         if plan is None:
             return math.nan
@@ -406,7 +406,7 @@ class _Move(_Leg):
 class _Stop(_Leg):
     """The profiled end of a move, which begins some time after it was ordered.
 
-    The place where the carriage comes to rest gives the time at which the ramp began.
+    The position where the carriage comes to rest determines the time at which the ramp began.
     """
 
     def __init__(
@@ -451,9 +451,9 @@ class _Stop(_Leg):
 
 @dataclass(frozen=True, slots=True)
 class _Delays:
-    """Mean time (s) from request to sample and from sample to receipt, the line's own left out.
+    """Mean time (s) from request to sample and from sample to receipt, without the transfer.
 
-    A request is written to an idle line; an answer waits for adapter, kernel and scheduler.
+    A request is written to an idle line; an answer is delayed by adapter, kernel and scheduler.
     """
 
     before_s: float = 1e-4
@@ -474,18 +474,19 @@ class _Timing:
 def _start_of(
     earliest_s: Array, latest_s: Array, slack_s: Array, speed: Array, usual: _Delays
 ) -> _Timing:
-    """Estimate the start from the bounds that each reading alone puts on it.
+    """Estimate the start from the bounds of each reading.
 
     Delays are positive: the true start is after all ``earliest`` and before all ``latest``. The
-    extremes miss it by the mean delay over the number of readings, as for exponential delays; both
-    sides are joined by the inverse squares of that. The usual delay counts as one reading more.
+    extremes are off by the mean delay over the number of readings, as for exponential delays; the
+    two are averaged with the inverse squares of that as weights. The usual delay counts as one
+    more reading.
 
     Parameters
     ----------
     earliest_s, latest_s : float64, shape (n,)
         ``-inf`` for an unknown earliest.
     slack_s : float64, shape (n,)
-        Uncertainty of time that the position's own brings.
+        Uncertainty of time due to that of the position.
     speed : float64, shape (n,)
     usual : _Delays
         Of earlier motions.
@@ -554,7 +555,7 @@ def _fitted_shape(
             acceleration * math.exp(log_acceleration),
         )
 
-    # scipy takes longer to import than a stage to be read.
+    # The import takes longer than a reading of the stage.
     from scipy.optimize import least_squares
 
     def residuals(parameters: Array) -> Array:

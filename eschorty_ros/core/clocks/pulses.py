@@ -51,9 +51,10 @@ class PulseTrain:
 def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return the edges with which the pulses begin, out of rising and falling ones.
 
-    A pulse has one width and the pauses vary with the speed: where the time from rising to falling
-    edges is the steadier one, or the shorter one if both are as steady, pulses begin rising. Edges
-    of one kind only are returned as they are.
+    All pulses have one width and the gaps between them vary with the speed: pulses begin with the
+    rising edge when the time from rising to falling edges varies less than that from falling to
+    rising ones, or is the shorter one if both vary alike. Edges of one kind only are returned
+    unchanged.
 
     Parameters
     ----------

@@ -13,8 +13,7 @@ class SensorClock:
 
     With ``zero_ns`` given (announced by the camera) the relation is fixed and exact. Without it
     offset and drift are the lower envelope of the packets' arrivals over a sliding window, see
-    `LowerEnvelope`, until a better relation is known from
-    trigger edges (:meth:`adopt`).
+    `LowerEnvelope`, until a better relation is known from trigger edges (:meth:`adopt`).
 
     The estimate may step at an observation, never between two of them: times converted between
     two observations are strictly monotone. When arrival or sensor time goes back (clock set,
@@ -32,7 +31,7 @@ class SensorClock:
     restarts : int
         Times the window was dropped.
     residual_ns : int or None
-        How much later than by this clock the last observed packet arrived.
+        Lateness of the last observed packet by this clock.
     """
 
     def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:
@@ -48,12 +47,12 @@ class SensorClock:
 
     @property
     def exact(self) -> bool:
-        """Whether the zero was announced."""
+        """True when the zero was announced."""
         return self._fixed is not None
 
     @property
     def from_edges(self) -> bool:
-        """Whether the relation comes from trigger edges."""
+        """True when the relation comes from trigger edges."""
         return self._adopted is not None
 
     @property
@@ -63,7 +62,7 @@ class SensorClock:
 
     @property
     def arrival_line(self) -> ClockLine | None:
-        """The relation by the packets' arrivals alone."""
+        """The relation from the packets' arrivals alone."""
         return self._fixed or self._envelope.line
 
     @property
@@ -73,7 +72,7 @@ class SensorClock:
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster ROS time passes than sensor time; 0 while the relation is unknown."""
+        """Excess rate of ROS time over sensor time; 0 while the relation is unknown."""
         return 0.0 if self.line is None else self.line.drift_ppb * 1e-3
 
     @property
@@ -82,13 +81,13 @@ class SensorClock:
         return 0 if self._last is None or self._fixed else self._last[0] - self._envelope.touched_us
 
     def goes_on(self, t_us: int, arrival_ns: int) -> bool:
-        """Return whether neither time lies before the last observed."""
+        """Return true when neither time is before the last observed."""
         t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         return self._last is None or (t_us >= self._last[0] and arrival_ns >= self._last[1])
 
     def observe(self, t_us: int, arrival_ns: int) -> None:
-        """Add one arrival: the event of sensor time ``t_us`` came at ROS time ``arrival_ns``."""
+        """Add one arrival: of the event of sensor time ``t_us`` at ROS time ``arrival_ns``."""
         t_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT)
         arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         if self._fixed is None:

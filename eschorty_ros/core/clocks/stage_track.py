@@ -16,7 +16,7 @@ def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np
     """Return positions rounded to the nanometre, int64.
 
     Positions read from text with six decimals and from ROS metres give the same integers, so a
-    recording and the live nodes place points identically. ``name`` stands in errors.
+    recording and the live nodes place points identically. ``name`` is used in errors.
 
     Raises
     ------
@@ -39,7 +39,7 @@ class StageTrack:
     Parameters
     ----------
     max_gap_us : int, optional
-        Longest distance of two samples that is still bridged, us; ``None`` bridges any.
+        Longest gap between two samples that is interpolated, us; ``None`` for any.
 
     Attributes
     ----------
@@ -58,12 +58,12 @@ class StageTrack:
         self._end = 0
 
     def __len__(self) -> int:
-        """Return the count of samples held."""
+        """Return the count of samples kept."""
         return self._end - self._begin
 
     @property
     def first_us(self) -> int | None:
-        """Time of the oldest sample held, ``None`` when there is none."""
+        """Time of the oldest sample kept, ``None`` when there is none."""
         return int(self._t_us[self._begin]) if len(self) else None
 
     @property
@@ -128,7 +128,7 @@ class StageTrack:
         return np.where(unknown, np.nan, position)
 
     def forget_before(self, t_us: int) -> None:
-        """Release samples that no query at ``t_us`` or later needs."""
+        """Drop samples that no query at ``t_us`` or later needs."""
         integer("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)
         held = self._t_us[self._begin : self._end]
         self._begin += max(int(np.searchsorted(held, t_us, side="right")) - 1, 0)

@@ -55,7 +55,7 @@ class ActivityFilter:
     Raises
     ------
     ArgumentError
-        When a value lies outside its range.
+        When a value is outside its range.
 
     Notes
     -----

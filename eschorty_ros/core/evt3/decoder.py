@@ -140,7 +140,7 @@ class Decoder:
     Raises
     ------
     ArgumentError
-        When a size lies outside its range.
+        When a size is outside its range.
 
     Notes
     -----

@@ -44,7 +44,7 @@ class Encoder:
     Raises
     ------
     ArgumentError
-        When a size lies outside its range.
+        When a size is outside its range.
     """
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
@@ -232,7 +232,7 @@ def sort_readout(
     Raises
     ------
     ArgumentError
-        When the times span more, or a value lies outside its range.
+        When the times span more, or a value is outside its range.
     """
     times = integer_vector("t", t, np.int64, 0, _T_MAX)
     columns = integer_vector("x", x, np.uint16, 0, w3.ADDRESSES - 1)

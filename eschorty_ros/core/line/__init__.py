@@ -1,4 +1,4 @@
-"""From the events of one period to one row per column with its sigma."""
+"""From the events of one period to one row per column with its standard deviation."""
 
 from eschorty_ros.core.line.centroid import (
     FULL_COLUMN_METHODS,

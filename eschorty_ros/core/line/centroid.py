@@ -60,7 +60,7 @@ METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
 FULL_COLUMN_METHODS = ("mean", "median")
 RETURNS = ("strongest", "first", "last", "all")
 
-# Codes are places in the tuples above. The methods up to MEAN are a window's mean.
+# Codes are indices of the tuples above. The methods up to _MEAN are a window's mean.
 _MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID = range(5)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 # A full column wider than this many times the line's variance holds background.
@@ -84,7 +84,7 @@ class Centroids:
     events : int64
         Events used.
     ambiguous : bool
-        Two separate, equally dense groups of events where the strongest is asked for: no row.
+        Two separate, equally dense groups of events with ``returns="strongest"``: no row.
     edge : bool
         The first or last row of the sensor cuts the line, which ``sigma_row`` allows for.
     """
@@ -100,9 +100,9 @@ class Centroids:
 class Estimator(NamedTuple):
     """Settings of an estimator.
 
-    ``half_max`` is the half width of a window for the line at its widest, fixed point, and
-    ``line_variance`` the variance of its rows there. With ``seeded`` the search begins at the
-    column's last row, or at its neighbour's.
+    ``half_max`` is the half width of a window for the widest line, fixed point, and
+    ``line_variance`` the variance of its rows. With ``seeded`` the search begins at the column's
+    last row, or at its neighbour's.
     """
 
     method: int
@@ -169,8 +169,8 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
     if method in FULL_COLUMN_METHODS and returns != "strongest":
         windowed = [name for name in METHODS if name not in FULL_COLUMN_METHODS]
         raise ArgumentError(
-            f"returns is {returns!r} and {method!r} takes a column as a whole; choose "
-            f"'strongest', or one of {', '.join(windowed)} as centroid"
+            f"returns is {returns!r} and {method!r} averages the full column; choose 'strongest', "
+            f"or one of {', '.join(windowed)} as centroid"
         )
     return METHODS.index(method), RETURNS.index(returns)
 
@@ -202,24 +202,24 @@ def estimate(
     sigma_floor_px: float = SIGMA_FLOOR_PX,
     sigma_common_px: float = SIGMA_COMMON_PX,
 ) -> Centroids:
-    """Return the row of the line in each column, every column on its own.
+    """Return the row of the line in each column, independently of the others.
 
     Parameters
     ----------
     rows : array of integer, shape (N,)
         Rows of the events, 0 to ``height`` - 1, grouped by column in any order.
     offsets : array of int64, shape (columns + 1,)
-        Column ``c`` owns ``rows[offsets[c]:offsets[c + 1]]``.
+        Column ``c`` has the events ``rows[offsets[c]:offsets[c + 1]]``.
     method : {"mode_mean", "mean", "median", "gauss_ml", "edge_mid"}
         ``mode_mean`` averages the densest window (half width 1.3 x ``line_width_px``, at most 5
-        mean-shift steps) and ignores background elsewhere. ``gauss_ml`` goes on from there to the
-        greatest likelihood of a Gaussian of ``line_width_px`` on uniform background; ``edge_mid``
-        takes the middle between the window's quantiles 1/8 and 7/8, the edges of the line.
-        ``mean`` and ``median`` use the full column (``mean`` is the method of the paper).
+        mean-shift steps) and ignores background elsewhere. ``gauss_ml`` maximises from there the
+        likelihood of a Gaussian of ``line_width_px`` on uniform background; ``edge_mid`` is the
+        middle between the window's quantiles 1/8 and 7/8, the edges of the line. ``mean`` and
+        ``median`` use the full column (``mean`` is the method of the paper).
     returns : {"strongest", "first", "last", "all"}
-        Which returns to give where a second surface stands behind the first: another window at
-        least 2 x ``line_width_px`` away whose inner half holds at least half as many events, and
-        more than background explains. ``first`` is the one at the least row, hence the nearest.
+        Returns to report where a column has a second one: another window at least
+        2 x ``line_width_px`` away whose inner half has at least half as many events, and more than
+        background explains. ``first`` is the one at the least row, hence the nearest.
     line_width_px : float
         Full width of the line at half maximum, rows.
     height : int
@@ -236,17 +236,18 @@ def estimate(
     Raises
     ------
     ArgumentError
-        When rows, offsets or a parameter lie outside what is described above.
+        When rows, offsets or a parameter are not as described above.
 
     Notes
     -----
     Every method is exactly symmetric under mirroring and shifting of the rows and does not depend
-    on their order. Of equally dense windows the one that ends with more events wins, then the
-    narrower one; overlapping ones are merged; two separate equal ones give NaN where the strongest
-    is asked for, since any choice would prefer a direction, and are both returned otherwise.
+    on their order. Of equally dense windows the one that ends with more events is used, then the
+    narrower one; overlapping ones are merged; of two separate equal ones the strongest is NaN,
+    since any choice would prefer a direction, while the other ``returns`` report them both.
 
-    A window that the sensor's edge cuts holds part of a Gaussian: the three windowed methods give
-    the row of the full line (truncated normal), ``mean`` and ``median`` a sigma that covers it.
+    A window that the sensor's edge cuts contains part of a Gaussian: the three windowed methods
+    return the row of the full line (truncated normal), ``mean`` and ``median`` a sigma that covers
+    the difference.
 
     Examples
     --------
@@ -349,7 +350,7 @@ def _find(packed, column, half, estimator, seed):
     if seed >= 0:
         window = _mean_shift(packed, column, seed, half, 0, ROW_LAST)
         events = window.sums.events
-        # Otherwise a window elsewhere may hold more.
+        # Otherwise a window elsewhere may have more.
         if events >= estimator.events_min and 2 * events > column.events:
             return Returns(FOUND, False, window, window)
     return _search(packed, column, half, estimator)
@@ -357,9 +358,9 @@ def _find(packed, column, half, estimator, seed):
 
 @kernel
 def _all_returns(packed, column, half, estimator, found):
-    """Look for a second return beside the one that was found.
+    """Search for a second return beside the one that was found.
 
-    Two equally strong ones are undecided only where the strongest is asked for.
+    Two equally strong ones are no ambiguity here, as both can be reported.
     """
     if found.status == TOO_FEW:
         return found
@@ -451,7 +452,7 @@ def _estimate_columns(columns, half, estimator, out, scratch):
             if not windowed:
                 columns.seeds[c] = np.int64(np.rint(FRACTION * row))
             common2 = _shared_variance(columns.seeds[c], last, model)
-            # Until a profile has shown the line's width, no part of it can be known to be missing.
+            # Missing rows are detectable only after a profile has given the line's width.
             if not estimate.truncated and half < estimator.half_max:
                 common2 += _clipping_variance(variance, line_variance, model)
             used = window.sums.events

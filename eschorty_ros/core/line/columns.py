@@ -15,7 +15,7 @@ from eschorty_ros.core.modulation.phase_gate import _outside
 class Columns(NamedTuple):
     """Packed events by column: ``counts`` of them from ``starts`` on, with room for padding.
 
-    ``seeds`` are the last rows of the lines, fixed point; -1 for none.
+    ``seeds`` are the rows of the lines in the last period, fixed point; -1 for none.
     """
 
     packed: NDArray[np.uint32]
@@ -25,7 +25,7 @@ class Columns(NamedTuple):
 
 
 class Appended(NamedTuple):
-    """First event left, and the numbers of events not appended, by reason."""
+    """Index of the first event not read, and the numbers of events not appended, by reason."""
 
     next: np.int64
     over_limit: int
@@ -56,7 +56,7 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
 
 @kernel
 def _append(events, first, limit_us, edge_us, columns, rows, gate):
-    """Append the events before ``limit_us`` that the gate lets through to `empty_columns`."""
+    """Append the events before ``limit_us`` that pass the gate to `empty_columns`."""
     t, x, y, p = events
     packed, counts = columns.packed, columns.counts
     size = np.uintp(counts.size)

@@ -45,37 +45,37 @@ def _median(packed, column, counts):
         counts[row] += 1
         low = min(low, row)
         high = max(high, row)
-    seen = np.int64(0)
+    below = np.int64(0)
     lower = np.int64(-1)
     upper = np.int64(-1)
     for middle in range(low, high + 1):
         row = np.int64(middle)
-        seen += counts[row]
+        below += counts[row]
         counts[row] = 0
-        if lower < 0 and 2 * seen >= n:
+        if lower < 0 and 2 * below >= n:
             lower = np.int64(row)
-        if upper < 0 and 2 * seen > n:
+        if upper < 0 and 2 * below > n:
             upper = np.int64(row)
     return (lower + upper) / 2.0
 
 
 @kernel
 def _quantile_edge(counts, low, high, step, total):
-    """Return the row behind which ``total / _EDGE_PART`` events lie, going from low to high.
+    """Return the row up to which, from ``low`` on, there are ``total / _EDGE_PART`` events.
 
-    A row is a pixel half a row to either side with its events spread evenly over it. Between two
-    rows with events the quantile may lie anywhere; the middle is taken.
+    The events of a row are spread evenly over its pixel, half a row to either side. A quantile that
+    may be anywhere between two rows with events is put in the middle.
     """
-    seen = np.int64(0)
+    before = np.int64(0)
     row = low
     while True:
         here = counts[row]
-        if _EDGE_PART * (seen + here) >= total and here > 0:
+        if _EDGE_PART * (before + here) >= total and here > 0:
             break
-        seen += here
+        before += here
         row += step
-    if _EDGE_PART * (seen + here) > total:
-        return row + step * ((total / _EDGE_PART - seen) / here - 0.5)
+    if _EDGE_PART * (before + here) > total:
+        return row + step * ((total / _EDGE_PART - before) / here - 0.5)
     other = row + step
     while other != high and counts[other] == 0:
         other += step
@@ -106,7 +106,7 @@ def likelihood_size(half: int) -> int:
 def _fill_likelihood(table, half):
     """Return ``exp(d^2 / 2 sigma^2)`` for distances of 0, 1, 2... fixed-point steps from the line.
 
-    ``sigma`` is the line's for which a window has the half width ``half``; the result is a view of
+    ``sigma`` is that of a line whose window has the half width ``half``; the result is a view of
     ``table``.
     """
     size = np.int64(np.ceil(_REACH * half)) + FRACTION

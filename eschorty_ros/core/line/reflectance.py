@@ -1,11 +1,12 @@
-"""Relative reflectance of a point from the line's width and the number of events.
+"""Relative reflectance of a point from the width of its line and the number of its events.
 
-A logarithmic sensor shows a Gaussian line as far out as its contrast reaches the threshold, so
-the full width W of the lit rows obeys ``W^2 = 8 sigma^2 ln(A rho / (e^theta - 1))``: linear in
-``ln rho`` with a slope that depends on the line's sigma alone. At high frequencies, where
-the photoreceptor's bandwidth limits the swing, the offset changes and the slope does not. Evenly
-lit rows have the variance ``W^2 / 12`` and a number of events in proportion to W; the smaller W is
-used. Above about 1 kHz rows give an event in some periods only and neither holds.
+The pixels of a logarithmic sensor fire where the contrast of the Gaussian footprint exceeds their
+threshold, so the full width W of the lit rows obeys
+``W^2 = 8 sigma^2 ln(A rho / (e^theta - 1))``: linear in ``ln rho`` with a slope that depends on the
+optical footprint's sigma alone. At high frequencies, where the photoreceptor's bandwidth limits the
+swing, the offset changes and the slope does not. Evenly lit rows have the variance ``W^2 / 12`` and
+a number of events proportional to W; the smaller W of the two is used. Above about 1 kHz a row has
+an event in some periods only and neither relation holds.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from eschorty_ros.core.base.errors import ArgumentError
 ROOT_12 = math.sqrt(12.0)
 """Full width over standard deviation of evenly spread rows."""
 
-# Standard deviation of ln(rho): the mismatch of the pixels' thresholds, comparator noise in each
-# row's few events, and the quantisation to rows at the two ends of the line.
+# Standard deviation of ln(rho) due to the mismatch of the pixels' thresholds, whatever the number
+# of events; due to comparator noise in each row's few events; and, in px, due to the quantisation
+# to rows at the two ends of the line.
 _FIXED = 0.11
 _PER_EVENT = 0.18
 _ENDS_PX = 0.41
@@ -32,7 +34,10 @@ _LOG_MAX = math.log(1e3)
 
 
 def events_per_row(width_px: Array, events: NDArray[np.integer]) -> float:
-    """Return the events of one lit row: the median of events over full width, NaN without any."""
+    """Return the events of one lit row: the median over the points of events over full width.
+
+    NaN without a usable point.
+    """
     width_px, counts = _checked(width_px, events)
     usable = width_px > 0.0
     if not usable.any():
@@ -47,7 +52,7 @@ def relative_reflectance(
     footprint_sigma_px: float,
     white_width_px: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Return each point's reflectance relative to its profile's median or to a white target.
+    """Return the reflectance of each point relative to its profile's median or a white target.
 
     Parameters
     ----------
@@ -65,14 +70,14 @@ def relative_reflectance(
     Returns
     -------
     reflectance, sigma : ndarray of float64, shape (n,)
-        ``sigma`` is the standard deviation of one point, without the reference's. NaN where the
-        reflectance would be off by more than a factor of 1000: background, not the line.
+        ``sigma`` is the standard deviation of one point, without that of the reference. NaN where
+        the reflectance is more than a factor of 1000 off: the width is then that of background.
 
     Raises
     ------
     ArgumentError
-        When shapes differ, ``footprint_sigma_px`` lies outside 0.1 to 1000 px or
-        ``white_width_px`` outside 0 to 1000 px.
+        When shapes differ, ``footprint_sigma_px`` is not within 0.1 to 1000 px or
+        ``white_width_px`` not within 0 to 1000 px.
     """
     edge_us = integer_vector("edge_us", edge_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     width_px, counts = _checked(width_px, events)
@@ -93,7 +98,7 @@ def relative_reflectance(
         per_row = events_per_row(width_px[part], counts[part])
         width2[part] = 12.0 * width_px[part] * width_px[part]
         if not math.isnan(per_row):
-            # Background widens the spread most, a refractory time distorts the counts.
+            # Background mainly increases the spread, a refractory time mainly reduces the counts.
             width2[part] = np.minimum(width2[part], np.square(counts[part] / per_row))
             variance[part] += (_PER_EVENT / per_row) ** 2
         if white_width_px == 0.0:

@@ -1,22 +1,22 @@
 """Error model of a row, by estimator.
 
-The variance of a row has two parts. Smoothing over columns lessens the column's own::
+The variance of a row has two parts. The column's own is reduced by smoothing over columns::
 
     a^2 min(s^2, s0^2) / N + floor^2 + b^2 (s^2 - s0^2) / N
 
 with s the standard deviation of the N rows used and s0 that of the line itself. The first term is
 small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
-from the mismatch of the pixels' thresholds, which more events of the same pixels do not lessen. The
-last term is for events beyond the line's own, which scatter independently. Neighbouring columns
+from the mismatch of the pixels' thresholds, which more events of the same pixels do not reduce. The
+last term is for events that are not the line's, which scatter independently. Neighbouring columns
 share the other part::
 
     common^2 + motion^2 * shift of the line since the last profile + (jump * that shift)^2
              + (clipped * rows missing to the line's full width)^2
 
-The last term is for lines that an edge of the scene clips; a dark surface looks narrow, too, and
-gets a larger sigma than it needs. The constants are fitted to the simulated scenes of the report's
-sigma experiment, at 70, 300 and 1000 Hz; `sigma_factor`, `sigma_floor_px` and `sigma_common_px`
-adapt them to an instrument.
+The last term is for lines that an edge of the scene clips; the line on a surface of low reflectance
+is narrow, too, and its sigma larger than necessary. The constants are fitted to the simulated
+scenes of the report's sigma experiment, at 70, 300 and 1000 Hz; `sigma_factor`, `sigma_floor_px`
+and `sigma_common_px` adapt them to an instrument.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SIGMA_LIMIT = 1e6
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
 CLIPPED = 0.6
 
-# A line that moves further lies on another surface: its last row carries no information.
+# A line that moves further is on another surface: its last row carries no information.
 _SHIFT_MAX_PX = 8.0
 # Standard deviation over the shift of a line that jumps.
 _JUMP = 0.2
@@ -97,8 +97,8 @@ def error_model(
 def _background(excess, count, row, rows):
     """Return the number of background events, evenly spread, behind ``excess`` variance.
 
-    The second value is the share of their mean square distance that they have in common, as most of
-    them lie on one side of a line away from the middle.
+    The second value is the share of their mean square distance that is common to all, as most of
+    them are on one side of a line away from the sensor's middle.
     """
     offset = 0.5 * (rows - 1.0) - row
     square = rows * rows / 12.0 + offset * offset
@@ -109,9 +109,8 @@ def _background(excess, count, row, rows):
 def _own_variance(variance, line_variance, count, row, rows, model):
     """Return the variance of one column's row, px squared, without what its neighbours share.
 
-    What a column has beyond ``line_variance`` comes from events that do not repeat from pixel to
-    pixel and scatter independently. Without any spread the row has the variance of its
-    quantisation, a twelfth.
+    Variance in excess of ``line_variance`` comes from background events, which scatter
+    independently. Without any spread the row has the variance of its quantisation, a twelfth.
     """
     floor2 = model.floor**2
     sigma2 = model.factor**2 * min(variance, line_variance) / count + floor2
@@ -135,8 +134,8 @@ def _shared_variance(centre, last, model):
     """Return the variance that neighbouring columns share, from the line's shift.
 
     ``centre`` is the line's row and ``last`` that of the last profile, fixed point, negative when
-    there was none. Pixels keep a memory of where the line was: on a surface that recedes, points
-    lag behind.
+    there was none. A pixel's response depends on the last period, too, so points lag on a surface
+    that recedes.
     """
     shift = 0.0
     if last >= 0:
@@ -148,8 +147,8 @@ def _shared_variance(centre, last, model):
 def _clipping_variance(variance, line_variance, model):
     """Return the variance of a row whose events spread less than the line.
 
-    An edge of range or reflectance within the line's thickness leaves only a part of it, and the
-    middle of that part lies off the line by up to half of what is missing.
+    An edge of range or reflectance within the line's thickness leaves only a part of it, whose
+    middle is off the line's by up to half of the missing rows.
     """
     missing = np.sqrt(12.0) * (np.sqrt(line_variance) - np.sqrt(variance)) - _WIDTH_SCATTER_PX
     return (model.clipped * max(missing, 0.0)) ** 2

@@ -30,7 +30,7 @@ class Smoothing(NamedTuple):
 
 @kernel
 def _nearest(row, c, target):
-    """Return the return of column ``c`` whose row is nearest to ``target``; the first if none."""
+    """Return the index of column ``c``'s return nearest to the row ``target``; 0 if it has none."""
     best = 0
     for k in range(1, row.shape[0]):
         if abs(row[k, c] - target) < abs(row[best, c] - target) or np.isnan(row[best, c]):
@@ -40,10 +40,10 @@ def _nearest(row, c, target):
 
 @kernel
 def _partner(row, k, c, other):
-    """Return the offset and index of the return of ``other`` on the surface of ``k`` of ``c``.
+    """Return the offset and index of the return in column ``other`` that continues ``k`` of ``c``.
 
-    Each of the two is the nearest to the other among its column's returns; the offset is NaN when
-    they are not.
+    Two returns continue each other when each is the nearest to the other in its column; the offset
+    is NaN otherwise.
     """
     index = _nearest(row, other, row[k, c])
     if _nearest(row, c, row[index, other]) != k:
@@ -53,12 +53,13 @@ def _partner(row, k, c, other):
 
 @kernel
 def _smooth(row, sigma2, common2, smoothing):
-    """Average each point with symmetric pairs of neighbours; returns how many were averaged.
+    """Average each point with symmetric pairs of neighbours; return the number of averaged points.
 
-    The pairs grow outwards and end at the first one that is incomplete or beyond the gate: a slope
-    stays, no average reaches across a larger step, no dark column is filled. The columns' own
-    variances ``sigma2`` are independent, so that of the mean of n is their sum over n squared;
-    ``common2`` is what neighbours share, as they meet the pixel rows at the same place, and stays.
+    The pairs are added outwards up to the first one that is incomplete or beyond the gate: a slope
+    is preserved, no average crosses a larger step, no empty column is filled. The columns' own
+    variances ``sigma2`` are independent, so that of the mean of n is their sum over n squared. The
+    variance ``common2`` is shared by neighbours, whose lines cross the pixel rows at the same
+    place, and is not reduced.
     """
     half_width, gate = smoothing.half_width, smoothing.gate_px
     out_row, out_sigma2 = smoothing.row, smoothing.sigma2
@@ -107,7 +108,7 @@ def _is_isolated(row, k, c, gate):
 
 @kernel
 def _reject_isolated(row, events, smoothing):
-    """Make weak points without a neighbour near in rows NaN; returns their number."""
+    """Set weak points without a neighbour at a similar row to NaN; return their number."""
     isolated = smoothing.isolated
     returns, columns = row.shape
     count = 0

@@ -1,4 +1,4 @@
-"""Row of a line that the first or last row of the sensor cuts: the truncated normal, inverted."""
+"""Row of a line that the sensor's first or last row truncates, from the truncated normal."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _ITERATIONS = 30
 _SCATTER = 1.0
 # A column with more than this many times the line's variance holds background.
 _BACKGROUND_FREE = 2.0
-# Square of the least factor on s/sqrt(N): a fit to part of a line amplifies what counts vary.
+# Square of the least factor on s/sqrt(N): a fit to part of a line amplifies the scatter of counts.
 _FACTOR2_MIN = 0.24**2
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
 _HALF_BIAS2 = 1.7519
 
 
 class RowEstimate(NamedTuple):
-    """A row, its variance, and whether the edge of the sensor cuts the line."""
+    """A row and its variance; ``truncated`` where the edge of the sensor cuts the line."""
 
     row: float
     sigma2: float
@@ -33,10 +33,10 @@ class RowEstimate(NamedTuple):
 
 
 class TruncatedFit(NamedTuple):
-    """Centre and sigma of a Gaussian of which only the part beyond 0 is seen.
+    """Centre and sigma of a Gaussian of which only the part beyond 0 is measured.
 
-    ``ratio`` is the part's variance over sigma squared, ``moved`` what fitting sigma moved the
-    centre by.
+    ``ratio`` is the part's variance over sigma squared, ``moved`` the change of the centre due to
+    fitting sigma.
     """
 
     centre: float
@@ -61,9 +61,10 @@ def _newton_step(mean, centre, sigma):
 def _fit_truncated(mean, variance, count, sigma_max):
     """Fit a Gaussian whose ``count`` events beyond 0 have this mean and variance.
 
-    Sigma is ``sigma_max`` unless the variance is smaller than that lets expect and at most a third
-    of the line is cut away, beyond which the two are hard to tell apart; then both are fitted. The
-    centre is 0 or more. A part that keeps 3 of its standard deviations from 0 is not truncated.
+    Sigma is ``sigma_max`` unless the variance is smaller than expected with it and at most a third
+    of the line is cut away; then both are fitted. When more is cut away, centre and sigma cannot be
+    separated. The centre is 0 or more. A part whose mean is more than 3 of its standard deviations
+    from 0 is not truncated.
     """
     if mean > 3.0 * np.sqrt(variance):
         return TruncatedFit(mean, np.sqrt(variance), 1.0, 0.0)
@@ -86,10 +87,10 @@ def _fit_truncated(mean, variance, count, sigma_max):
 def _correct_truncation(row, sigma2, variance, window, half, rows, model):
     """Return the row of the full line where the edge of the sensor may cut the window.
 
-    The line is taken to be centred on the sensor. Real lines are flatter than a Gaussian: seven
-    tenths of what the correction adds count as an error, all of it at the end of that range, and
-    half of what fitting the line's width changes. The more is cut off, the more the counts scatter
-    as independent ones do.
+    The line is assumed to be centred on the sensor. As real lines are flatter than a Gaussian,
+    seven tenths of the correction count as its standard deviation, all of it when the centre is at
+    the sensor's edge, plus half of the change due to fitting the line's width. The more is cut off,
+    the more the counts scatter like independent ones.
     """
     count = window.sums.events
     reach = half / FRACTION
@@ -107,7 +108,7 @@ def _correct_truncation(row, sigma2, variance, window, half, rows, model):
     wider2 = scatter2 * line.sigma**2 / (line.ratio * count) + model.floor**2
     wider2 += share * shift**2 + 0.25 * line.moved**2
     row = row - shift if from_low < from_high else row + shift
-    # Another estimate than the mean may start closer to the edge than the correction is long.
+    # The correction of the mean may move a row from another estimator off the sensor.
     return RowEstimate(min(max(row, -0.5), rows - 0.5), max(sigma2, wider2), True)
 
 
@@ -115,7 +116,7 @@ def _correct_truncation(row, sigma2, variance, window, half, rows, model):
 def _full_column_estimate(row, variance, line_variance, count, rows, model):
     """Return a row estimated from a full column, with a variance that covers its truncation."""
     sigma2 = _own_variance(variance, line_variance, count, row, rows, model)
-    # Background makes a column wide; it does not bring the line to the edge.
+    # Background widens a column without moving the line to the edge.
     line = min(variance, _BACKGROUND_FREE * line_variance)
     reach = 3.0 * np.sqrt(line)
     truncated = row < reach or rows - 1.0 - row < reach

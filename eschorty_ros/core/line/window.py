@@ -4,8 +4,8 @@ An event is one uint32: the row in the low 10 bits, the time since the period's 
 upper 22. A column's events are padded with ``PAD`` to a multiple of ``BLOCK`` entries, so that the
 inner loops run on full vector registers without a remainder.
 
-All sums are integers, hence exact and independent of the order of the events and of the row they
-are counted from. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places,
+All sums are integers, hence exact and independent of the order of the events and of the origin of
+the rows. Window centres are fixed-point numbers with ``FRACTION_BITS`` binary places,
 rounded half to even: mirroring the rows mirrors every window exactly. Half widths and gaps are
 fixed-point numbers, too.
 """
@@ -34,7 +34,7 @@ _ONE = np.uint32(1 << 20)
 # Entries summed in 32 bits: 512 times (row or row squared or time) still fits.
 _CHUNK = np.uintp(512)
 _PAIRWISE_MAX = 192
-# No event has this row: nothing is avoided.
+# No event is near this row, so that no row is avoided.
 _NOWHERE = -(1 << 40)
 # Chance of a false second return per column: one in this many, at most.
 _FALSE_SECOND = 1000.0
@@ -79,7 +79,7 @@ class Returns(NamedTuple):
 
 
 class _Densest(NamedTuple):
-    """Most events in a box, and the lowest and the highest row whose box holds so many."""
+    """Most events in a box, and the lowest and the highest row whose box has so many."""
 
     events: np.int64
     lowest: np.int64
@@ -159,7 +159,7 @@ def _limits(centre, half, first, last):
 
 @kernel
 def _full_column(packed, column):
-    """Return the window over all rows; its centre is not known and given as -1."""
+    """Return the window over all rows; its centre is not computed and set to -1."""
     sums = _window_sums(packed, column, 0, ROW_LAST)
     return Window(np.int64(0), np.int64(ROW_LAST), sums, np.int64(-1))
 
@@ -168,8 +168,9 @@ def _full_column(packed, column):
 def _mean_shift(packed, column, centre, half, first, last):
     """Move a window to the mean of its events, ``_ITERATIONS_MAX`` times at most.
 
-    It stops when the mean moves by less than a sixteenth of the half width: a window of three
-    standard deviations would gain less than a hundredth of one. It stays within rows first..last.
+    It stops when the mean moves by a sixteenth of the half width or less: in a window of three
+    standard deviations a further step would change the mean by less than a hundredth of one. It
+    stays within rows first..last.
     """
     low, high = _limits(centre, half, first, last)
     sums = _window_sums(packed, column, low, high)
@@ -228,9 +229,9 @@ def _densest_histogram(packed, column, radius, avoid, gap):
 
 @kernel
 def _densest(packed, column, half, avoid, gap):
-    """Find the box of half the window's width, around an event, that holds most events.
+    """Find the box of half the window's width, centred on an event, with most events.
 
-    Events nearer than ``gap`` to ``avoid`` are no centres of a box.
+    No box is centred on an event nearer than ``gap`` to ``avoid``.
     """
     radius = max(half >> (FRACTION_BITS + 1), 1)
     if column.events <= _PAIRWISE_MAX:
@@ -258,8 +259,9 @@ def _mean_shift_beside(packed, column, half, seed, avoid):
 def _resolve_tie(packed, column, half, densest, avoid):
     """Run the mean shift from the equally dense rows and choose without preferring a direction.
 
-    The window with more events wins, then the one with the smaller spread. Windows that overlap are
-    restarted from their common mean; two separate windows without any difference are ambiguous.
+    The window with more events is chosen, then the one with the smaller spread. From windows that
+    overlap the mean shift restarts at their common mean; two separate windows that are equal in
+    both are ambiguous.
     """
     a = _mean_shift_beside(packed, column, half, densest.lowest * FRACTION, avoid)
     if densest.lowest == densest.highest:
@@ -287,9 +289,9 @@ def _densest_window(packed, column, half):
 
 @kernel
 def _exceeds_background(events, others, half, rows):
-    """Return whether a window holds more ``events`` than background of the others' density.
+    """Return true when a window has more ``events`` than background of the others' density.
 
-    The background is uniform; the excess has to reach 4 standard deviations.
+    The background is uniform; the excess has to exceed 4 standard deviations.
     """
     width = (2 * half) / FRACTION + 1.0
     if width >= rows:
@@ -301,11 +303,11 @@ def _exceeds_background(events, others, half, rows):
 
 @kernel
 def _is_significant(events, others, half, rows):
-    """Return whether background hardly ever puts ``events`` into any window of a column.
+    """Return true when background has ``events`` in any window of a column with low probability.
 
-    ``others`` events lie outside the two windows. The test is Chernoff's bound on the Poisson tail,
-    times the number of windows the search chooses from; one more background event than observed
-    guards against none observed.
+    The probability is Chernoff's bound on the Poisson tail, times the number of windows that the
+    search chooses from. Its density is that of the ``others`` events outside the two windows and
+    one more, in case there are none.
     """
     width = (2 * half) / FRACTION + 1.0
     expected = (others + 1.0) * width / max(rows - 2.0 * width, width)
@@ -323,11 +325,11 @@ def _box_events(packed, column, centre, half):
 
 @kernel
 def _second_return(packed, column, half, rows, events_min, a):
-    """Look for another surface than that of window ``a``.
+    """Search for the return of another surface than that of window ``a``.
 
-    It lies 2 full widths at half maximum away or more (the half width of a window is 1.3 of them),
-    the box around it holds at least half as many events as that around ``a``, and background does
-    not explain it.
+    It is 2 full widths at half maximum away or more (the half width of a window is 1.3 of them),
+    the box around it has at least half as many events as that around ``a``, and they are
+    significant against background.
     """
     alone = Returns(FOUND, False, a, a)
     gap = half * 20 // 13
@@ -345,7 +347,7 @@ def _second_return(packed, column, half, rows, events_min, a):
     if 2 * _box_events(packed, column, b.centre, half) < strength:
         return alone
     if abs(a.centre - b.centre) <= 2 * half:
-        # The windows overlap: each keeps to its side of the middle.
+        # Overlapping windows are each limited to their side of the middle.
         centre_a, centre_b = a.centre, b.centre
         a = _mean_shift_beside(packed, column, half, centre_a, centre_b)
         b = _mean_shift_beside(packed, column, half, centre_b, centre_a)

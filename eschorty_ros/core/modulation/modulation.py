@@ -33,7 +33,7 @@ class Modulation:
     Raises
     ------
     ArgumentError
-        When a value lies outside its range.
+        When a value is outside its range.
 
     Examples
     --------

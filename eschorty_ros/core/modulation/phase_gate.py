@@ -59,7 +59,7 @@ def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
     Raises
     ------
     ArgumentError
-        When ``gate_us`` lies outside its range.
+        When ``gate_us`` is outside its range.
     """
     integer("gate_us", gate_us, 0, GATE_MAX_US)
     period_us, length_us = modulation.period_us, float(LEAD_US + gate_us)

@@ -62,7 +62,7 @@ class Settings:
     Raises
     ------
     ArgumentError
-        When a value lies outside its range or choices.
+        When a value is outside its range or choices.
 
     Examples
     --------

@@ -59,7 +59,7 @@ def test_verdicts_name_what_the_targets_leave_open():
     assert any(line.startswith("prior dominates b_mm") for line in lines)
     outside = next(line for line in lines if line.startswith("extrapolates outside"))
     assert "1150 to 1300 mm" in outside
-    assert any(line.startswith("0 of 6 targets lie in the far third") for line in lines)
+    assert any(line.startswith("0 of 6 targets are in the far third") for line in lines)
     two = calibrate(posts(ranges_mm=np.array([800.0, 2100.0])), NOMINAL, "paper")
     assert any(line.startswith("no degrees of freedom") for line in two.verdicts)
     assert "identifiable" not in two.verdicts
@@ -67,11 +67,11 @@ def test_verdicts_name_what_the_targets_leave_open():
 
 def test_residuals_larger_than_stated_are_reported():
     targets = posts(ranges_mm=ALL_ROWS_MM)
-    bold = Targets(targets.row, targets.range_mm, 0.02, 0.0)
-    lines = calibrate(bold, NOMINAL, "paper").verdicts
+    understated = Targets(targets.row, targets.range_mm, 0.02, 0.0)
+    lines = calibrate(understated, NOMINAL, "paper").verdicts
     assert any(line.startswith("residuals exceed the stated sigmas") for line in lines)
     far = Targets(DESIGN.row(NINE_MM) - 10.0, NINE_MM + 30.0, 0.3, 0.0)
-    assert any("b_mm lies" in line for line in calibrate(far, NOMINAL).verdicts)
+    assert any("b_mm is" in line for line in calibrate(far, NOMINAL).verdicts)
 
 
 def test_an_outlier_is_named_with_its_reason():

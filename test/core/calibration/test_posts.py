@@ -170,7 +170,7 @@ def test_hints_come_before_ranges():
     assert result.targets is not None
     assert result.targets.labels == ("left", "1500 mm")
     assert result.rejected == (
-        f"post at column 100, row {posts[0].row:.1f}: no known target belongs there",
+        f"post at column 100, row {posts[0].row:.1f}: it matches no known target",
     )
     result = match_posts(posts, [KnownTarget(1200.0, column=300.0)], NOMINAL)
     assert result.targets is None

@@ -73,7 +73,7 @@ def test_distances_with_sizes_and_hints(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds no line; begin with the header row,range_mm"),
+        ("", "it has no lines; begin with the header row,range_mm"),
         ("row,range_mm\n", "a header and no targets"),
         ("row\n1\n", "column 'range_mm' is missing; add it"),
         ("row,range\n1,2\n", "column 'range' is not known; did you mean range_mm?"),
