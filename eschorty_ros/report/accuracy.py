@@ -61,7 +61,7 @@ class Accuracy:
     Attributes
     ----------
     periods : int
-        Modulation periods that lie entirely within the sweep.
+        Modulation periods entirely within the sweep.
     points : int
         All points of the cloud.
     completeness : float
@@ -73,7 +73,7 @@ class Accuracy:
     within_1_sigma, within_2_sigma : float
         Share of points whose error is within one and two of their own sigma.
     off_target : int
-        Points where the scene holds nothing; they enter no error statistic.
+        Points where the scene has no surface; they enter no error statistic.
     """
 
     periods: int
@@ -145,7 +145,7 @@ def true_range_mm(
 def lit_columns(
     scene: KnownScene, model: RangeModel, positions_mm: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return where a column sees the scene within the rows, shape (positions, columns)."""
+    """Return a mask of the columns whose line is within the rows, shape (positions, columns)."""
     columns = np.arange(model.columns, dtype=np.int64)
     near_mm, far_mm = model.range_limits_mm
     lit = np.zeros((len(positions_mm), model.columns), dtype=np.bool_)
@@ -172,10 +172,10 @@ def complete_periods(
     sweep: Sweep,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the modulation periods that lie within the sweep from one end to the other.
+    """Return the modulation periods within the sweep, from one end to the other.
 
-    The points place one period on the stage; the others follow one pitch apart, whether they
-    have points or not. Without any point the periods are taken to begin with the sweep.
+    The points determine the stage position of one period; the others follow one pitch apart, with
+    or without points. Without any point the first period begins with the sweep.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def measure(
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
     error_mm: NDArray[np.float64] | None = None,
 ) -> Accuracy:
-    """Compare a cloud with the scene it was taken of.
+    """Compare a cloud with its scene.
 
     Parameters
     ----------

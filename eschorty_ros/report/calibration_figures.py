@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SIGMA_ROW_PX = 0.3
-"""Centroid error of a measurement that the range sigma is drawn for."""
+"""Centroid error for which the sigma of a range is drawn."""
 # More targets than _MANY are drawn small; at most _FEW rejected ones get a number.
 _MANY, _FEW = 60, 6
 SYMBOLS = {
@@ -185,7 +185,7 @@ def _profile(axes: Axes, report: CalibrationReport) -> None:
 
 
 def covariance_figure(report: CalibrationReport) -> Figure:
-    """Draw ellipses that hold the truth with 39 and 95 %, pair by pair, with the design."""
+    """Draw ellipses that contain the truth with 39 and 95 %, pair by pair, with the design."""
     free = report.fit.free
     shown = [pair for pair in _PAIRS if set(pair) <= set(free)][:_PANELS]
     if not shown:
@@ -236,7 +236,7 @@ def _ellipses(axes: Axes, report: CalibrationReport, pair: tuple[str, str]) -> N
 
 
 def _interval(axes: Axes, report: CalibrationReport, name: str) -> None:
-    """Draw the normal density of the only parameter there is."""
+    """Draw the normal density of a single fitted parameter."""
     value, sigma = report.fit.values[name], math.sqrt(report.fit.covariance[0, 0])
     x = np.linspace(-4.0, 4.0, 200)
     axes.plot(value + sigma * x, np.exp(-0.5 * x * x), color="C0", label="fitted")
@@ -247,12 +247,12 @@ def _interval(axes: Axes, report: CalibrationReport, name: str) -> None:
 
 
 def _marker(report: CalibrationReport) -> float:
-    """Return the size of a point, smaller where points would hide each other."""
+    """Return the marker size of a target, smaller where they would hide each other."""
     return 6.0 if len(report.targets) <= _MANY else 2.0
 
 
 def _rejected(axes: Axes, at: Array, residual: Array, limit: float, size: float) -> None:
-    """Draw crosses, at the rim where they lie beyond it, with their number if they are few."""
+    """Draw crosses, those beyond the limits at the rim; few of them with their residual."""
     if not at.size:
         return
     axes.plot(at, np.clip(residual, -0.93 * limit, 0.93 * limit), "x", color="C3", ms=size,

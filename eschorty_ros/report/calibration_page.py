@@ -26,7 +26,7 @@ _FIGURES: tuple[tuple[Callable[[CalibrationReport], Figure], str], ...] = (
         drawn.curve_figure,
         "Left: range over row (Eq. 2), fitted and as designed, with the targets. Right: standard "
         "deviation of a range that the fit's own uncertainty causes, alone and with the centroid "
-        "of one measurement. Where it is grey there are no targets: the curve is extrapolated.",
+        "of one measurement. Grey areas have no targets: there the curve is extrapolated.",
     ),
     (
         drawn.residual_figure,
@@ -39,12 +39,12 @@ _FIGURES: tuple[tuple[Callable[[CalibrationReport], Figure], str], ...] = (
         drawn.magnification_figure,
         "Magnification over row (Eq. 1): a straight line that reaches 0 at row -b', where the "
         "range is infinite. Points are known sizes (less the width bias) and spacings; they alone "
-        "separate k from k'. With k fitted, right: how chi-square rises when k is held elsewhere.",
+        "separate k from k'. With k fitted, right: chi-square over fixed values of k.",
     ),
     (
         drawn.covariance_figure,
-        "Uncertainty of the fitted parameters, pair by pair: ellipses that hold the truth with 39 "
-        "and 95 %. A thin slanted one means that only a combination of the two is known.",
+        "Uncertainty of the fitted parameters, pair by pair: ellipses that contain the truth with "
+        "39 and 95 %. A thin slanted one means that only a combination of the two is determined.",
     ),
 )
 
@@ -68,7 +68,7 @@ def calibration_html(report: CalibrationReport, made_with: Mapping[str, str]) ->
     ----------
     report : CalibrationReport
     made_with : mapping of str to str
-        Facts for the head of the page, such as where the targets come from.
+        Facts for the head of the page, such as the source of the targets.
 
     Returns
     -------
@@ -118,8 +118,8 @@ def _facts(report: CalibrationReport) -> dict[str, str]:
         "reduced chi-square": f"{number(fit.reduced_chi_square)} with {fit.dof} degrees of freedom",
         "residual, RMS": f"{number(calibration.residual_rms_px or 0.0)} px",
         "condition number": number(fit.condition_number),
-        "ranges seen by the fit": "{:.0f} to {:.0f} mm".format(*(calibration.range_mm or (0, 0))),
-        "ranges the sensor sees": f"{near:.0f} to {far:.0f} mm",
+        "ranges of the targets": "{:.0f} to {:.0f} mm".format(*(calibration.range_mm or (0, 0))),
+        "ranges of the sensor": f"{near:.0f} to {far:.0f} mm",
     }
     if report.profile:
         low, high = report.profile.interval_mm

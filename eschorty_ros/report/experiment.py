@@ -16,7 +16,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much to simulate: the same code, more or fewer columns, periods and repeats.
+    """Size of a run: the same code with more or fewer columns, periods and repeats.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One number and the band it must lie in, both ends included.
+    """One number and the band that it must be within, both ends included.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """True when the value lies in its band; NaN never does."""
+        """True when the value is within its band; NaN never is."""
         return self.low <= self.value <= self.high
 
 
@@ -92,7 +92,7 @@ class Outcome:
     captions : dict
         What a table or figure shows, by the same stems.
     remarks : list of str
-        Sentences for the reader: disagreements explained, what it costs, what was left out.
+        Sentences for the reader: explained disagreements, costs, omissions.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -113,7 +113,7 @@ class Experiment:
     title : str
         Heading on the page.
     run : callable
-        ``run(effort, progress) -> Outcome``; imports what it needs itself.
+        ``run(effort, progress) -> Outcome``.
     """
 
     name: str

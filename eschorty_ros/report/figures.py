@@ -1,6 +1,6 @@
 """Pictures of a cloud: depth map, 3-D view, range error and error against sigma.
 
-Every function returns a matplotlib figure that belongs to no window; `save` writes it.
+Every function returns a matplotlib figure without a window; `save` writes it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def scan_figure(
     title: str = "",
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Figure:
-    """Draw depth map and 3-D view; with the error known, its map and its histogram too.
+    """Draw depth map and 3-D view; with a known error, its map and its histogram too.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def design_figure(table: DesignTable, title: str) -> Figure:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure that belongs to no window."""
+    """Return an empty figure without a window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -157,7 +157,7 @@ def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
         When the cloud is empty.
     """
     if len(points) == 0:
-        raise ArgumentError("the cloud holds 0 points; there is nothing to draw")
+        raise ArgumentError("the cloud has 0 points; give one with points to draw")
     period = period_s(points)
     profile = (
         profile_index(points, period) if period > 0.0 else np.zeros(len(points), dtype=np.int64)
@@ -182,9 +182,9 @@ def image_of(
 
 
 def _line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rising limits of a map's lines, one more than there are lines.
+    """Return the limits of a map's lines in rising order, one more than there are lines.
 
-    The stage accelerates, so that lines differ in height; a stage at rest gives lines of height 1.
+    Lines differ in height while the stage accelerates; with the stage at rest their height is 1.
     """
     at = np.sort(stage_mm)
     if at[-1] - at[0] < 1e-6:
@@ -194,14 +194,14 @@ def _line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _central(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return limits that a few outliers do not stretch."""
+    """Return limits that do not depend on a few outliers."""
     low, high = np.nanpercentile(values, [0.5, 99.5])
     margin = max(0.05 * (high - low), 0.5)
     return float(low - margin), float(high + margin)
 
 
 def _error_bound(error_mm: NDArray[np.float64]) -> float:
-    """Return a symmetric limit that shows the noise; depth edges saturate it."""
+    """Return a symmetric limit on the scale of the noise; depth edges exceed it."""
     size_mm = np.abs(error_mm[np.isfinite(error_mm)])
     return max(3.0 * float(np.percentile(size_mm, 68.0)), 1e-3) if size_mm.size else 1.0
 
@@ -252,13 +252,13 @@ def _view_3d(
     axes.set(xlabel="y, stage (mm)", ylabel="x, range (mm)", zlabel="z, line (mm)")
     axes.set_title(f"Point cloud ({shown.size:,} points shown)")
     _true_to_scale(axes, np.stack([cloud[name] for name in "yxz"]) * 1e3)
-    # Seen from the sensor with the line upright, y runs to the left.
+    # From the sensor's view with the line upright, y points to the left.
     axes.invert_xaxis()
     axes.view_init(elev=18.0, azim=-58.0)
 
 
 def _true_to_scale(axes: Any, xyz_mm: NDArray[np.floating[Any]]) -> None:
-    """Give every axis the same millimetres per inch and room for the labels of a short one."""
+    """Set the same scale for all axes, with room for the labels of a short one."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = xyz_mm.min(axis=1), xyz_mm.max(axis=1)
@@ -271,7 +271,7 @@ def _true_to_scale(axes: Any, xyz_mm: NDArray[np.floating[Any]]) -> None:
     for k, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
         count = max(round(TICKS_IN_3D * spans[k] / longest), 3)
         ticks = MaxNLocator(count).tick_values(low[k], high[k])
-        # Labels of two axes would meet in a corner.
+        # In a corner the labels of two axes would overlap.
         inner = (ticks > low[k] + 0.1 * spans[k]) & (ticks < high[k] - 0.02 * spans[k])
         axis.set_ticks(ticks[inner])
         axis.set_tick_params(labelsize="small")

@@ -18,7 +18,7 @@ from eschorty_ros.report.sections import Section
 def write_page(
     folder: Path, sections: Sequence[Section], made_with: Mapping[str, str], pending: int = 0
 ) -> Path:
-    """Write ``index.html``; the pictures and tables it links are there already.
+    """Write ``index.html``; the pictures and tables that it links must exist.
 
     Parameters
     ----------

@@ -7,16 +7,16 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 
-# Returns of one period, in their mean times; a part of the period.
+# Largest difference of the mean times of two returns of one period, as a share of the period.
 RETURNS_APART = 0.2
 
 
 def period_s(points: NDArray[np.void]) -> float:
     """Return the modulation period of a cloud in seconds, NaN when no column has two points.
 
-    A column's points lie a multiple of the period apart, mostly one, so their distances in time
-    give a first guess; straight-line fits over doubling spans then refine it. Two returns of one
-    period lie a small part of it apart and are left out of the guess.
+    The times between a column's points are multiples of the period, mostly one period, and give a
+    first estimate; straight-line fits over doubling spans refine it. Two returns of one period are
+    a small part of it apart and are left out of the first estimate.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ def period_s(points: NDArray[np.void]) -> float:
     if gaps.size == 0:
         return float("nan")
     gaps = gaps[gaps > RETURNS_APART * np.quantile(gaps, 0.75)]
-    guess = float(np.median(gaps))
-    period = float(gaps.sum() / np.maximum(np.rint(gaps / guess), 1.0).sum())
+    first = float(np.median(gaps))
+    period = float(gaps.sum() / np.maximum(np.rint(gaps / first), 1.0).sum())
     elapsed = np.sort(points["t"]) - points["t"].min()
     elapsed -= _phase(elapsed[elapsed <= 16.0 * period] / period) * period
     span = 16.0 * period

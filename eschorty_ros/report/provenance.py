@@ -31,7 +31,7 @@ def provenance(effort: Effort) -> dict[str, str]:
 
 
 def cpu_model() -> str:
-    """Return the name of the processor as the system gives it."""
+    """Return the name of the processor as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

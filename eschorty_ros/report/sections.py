@@ -35,7 +35,7 @@ class Picture:
     file : str
         Name beside the page.
     caption, alt : str
-        Its content in words; what is drawn where, for readers without the picture.
+        Its content in words, and a description of its axes for readers without the picture.
     width_px, height_px : int
     """
 
@@ -63,7 +63,7 @@ class Section:
     ----------
     name, title : str
     seconds : float
-        Time it took.
+        Its duration.
     findings : sequence of Finding
     pictures : sequence of Picture
     sheets : sequence of Sheet
@@ -71,7 +71,7 @@ class Section:
     failure : str
         One line when the experiment failed, else empty.
     trace : str
-        Where it failed.
+        Traceback of the failure.
     """
 
     name: str
@@ -99,7 +99,7 @@ def run_sections(
 ) -> Iterator[Section]:
     """Run experiments in order; yield each as soon as its files are written.
 
-    An experiment that fails becomes a section with its failure; the next one runs.
+    The section of an experiment that fails names its failure, and the next experiment runs.
 
     Parameters
     ----------
@@ -130,12 +130,12 @@ def run_sections(
             outcome = experiment.run(effort, within)
             pictures, sheets = _write(name, outcome, folder)
         except Exception as error:
-            what = " ".join(str(error).split()) or "no message"
+            message = " ".join(str(error).split()) or "no message"
             yield Section(
                 name,
                 title,
                 time.perf_counter() - start,
-                failure=f"{type(error).__name__}: {what}",
+                failure=f"{type(error).__name__}: {message}",
                 trace=traceback.format_exc(),
             )
             continue
@@ -151,7 +151,7 @@ def run_sections(
 
 
 def describe(figure: Figure) -> str:
-    """Return what is drawn where: title, axes and named lines of every part of a figure."""
+    """Return title, axes and named lines of every part of a figure in words."""
     parts = []
     for axes in figure.axes:
         x, y = axes.get_xlabel(), axes.get_ylabel()
@@ -169,7 +169,7 @@ def describe(figure: Figure) -> str:
 
 
 def _csv_text(table: DataTable) -> str:
-    """Return header line and rows; numbers with every digit they have."""
+    """Return header line and rows; numbers with all their digits."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(table.columns)
@@ -179,7 +179,7 @@ def _csv_text(table: DataTable) -> str:
 
 
 def _digits(value: float) -> str:
-    # numpy's numbers would name their type.
+    # The repr of a numpy number includes its type.
     return repr(value.item() if hasattr(value, "item") else value)
 
 

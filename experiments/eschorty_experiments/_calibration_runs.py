@@ -72,7 +72,7 @@ CASES = (
 )
 PAPER = Method("paper: k', b'", ("k_prime_px", "b_prime_px"), False)
 FREE_B = Method("b too, no prior", ("k_prime_px", "b_mm", "b_prime_px"), False)
-SIZES = Method("joint, sizes as seen", PARAMETERS, True)
+SIZES = Method("joint, sizes as measured", PARAMETERS, True)
 JOINT = Method("joint, width bias fitted", (*PARAMETERS, WIDTH_BIAS), True)
 METHODS = (PAPER, FREE_B, SIZES, JOINT)
 

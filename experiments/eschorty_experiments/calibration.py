@@ -66,7 +66,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         },
         captions={
             "comparison": "Left: range error (RMS over repeats) of nine posts of two sizes by four "
-            "methods. Right: error of lateral lengths, which is that of k. Sizes taken as seen are "
+            "methods. Right: error of lateral lengths, which is that of k. Sizes as measured are "
             "ruined by blooming; with the width bias fitted, two sizes make up for it.",
             "outliers": f"Range error at {CHECK_MM[-1]:.0f} mm when {OUTLIERS} of {OUTLIER_POSTS} "
             f"posts are {OUTLIER_PX[0]:.0f} to {OUTLIER_PX[1]:.0f} rows off: share of calibrations "
@@ -93,7 +93,7 @@ def _findings(
     ratio = two[JOINT.name].range_rms_mm[_AT] / two[PAPER.name].range_rms_mm[_AT]
     far = [float(np.sqrt(np.mean(error**2))) for error in (robust, plain)]
     return [
-        Finding("lateral scale, one size without blooming, sizes as seen",
+        Finding("lateral scale, one size without blooming, sizes as measured",
                 1e2 * one[SIZES.name].scale_rms, high=0.25, unit="%"),
         Finding("lateral scale, two sizes bloomed, width bias fitted",
                 1e2 * two[JOINT.name].scale_rms, high=0.25, unit="%"),
@@ -101,7 +101,7 @@ def _findings(
                 high=0.25, unit="%"),
         Finding("lateral scale of the paper's method, which keeps k",
                 1e2 * two[PAPER.name].scale_rms, 0.4, 0.6, "%"),
-        Finding("lateral scale, one size bloomed, sizes as seen",
+        Finding("lateral scale, one size bloomed, sizes as measured",
                 1e2 * bloomed[SIZES.name].scale_rms, low=3.0, unit="%"),
         Finding("lateral scale, one size bloomed, width bias fitted",
                 1e2 * bloomed[JOINT.name].scale_rms, high=0.6, unit="%"),
