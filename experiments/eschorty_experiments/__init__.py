@@ -23,7 +23,7 @@ NAMES: tuple[str, ...] = (
 
 
 def load(name: str) -> Experiment:
-    """Experiment by name.
+    """Return an experiment by name.
 
     Raises
     ------

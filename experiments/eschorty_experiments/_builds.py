@@ -28,7 +28,7 @@ def builds() -> dict[str, Design]:
 
 
 def beam_rows(build: Design) -> float:
-    """Rows that the divergence of the beam covers, at every range: ``k w / (p cos theta')``."""
+    """Return the rows under the beam's divergence, at every range ``k w / (p cos theta')``."""
     pixel_mm = build.model.pixel_um * 1e-3
     tilt = math.cos(math.radians(build.theta_prime_deg))
     return build.model.k_mm * BEAM_MRAD * 1e-3 / (pixel_mm * tilt)

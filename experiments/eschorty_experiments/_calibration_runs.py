@@ -90,7 +90,7 @@ def _fit(targets: Targets, design: RangeModel, method: Method) -> CalibrationFit
 def compare(
     case: Case, design: RangeModel, truth: RangeModel, rng: np.random.Generator, repeats: int
 ) -> dict[str, Score]:
-    """Repeat the calibration of one case by every method that fits it; scores by its name."""
+    """Repeat the calibration of one case by every method that applies; return scores by method."""
     # Without known sizes there is no width bias to fit.
     sized = "size_mm" in case.posts
     methods = [method for method in METHODS if sized or WIDTH_BIAS not in method.free]
@@ -102,7 +102,7 @@ def compare(
         targets = measured_posts(truth, case.range_mm, rng, **case.posts)
         for method in methods:
             found = _fit(targets, design, method)
-            # A far row behind the fitted pole has no range: as wrong as can be.
+            # A far row behind the fitted pole has no range and counts as an infinite error.
             error = np.nan_to_num(found.model.range_mm(true_row) - FINE_MM, nan=np.inf)
             errors[method.name].append(error)
             ratio = found.model.lateral_mm(1200.0, 1320.0) / truth.lateral_mm(1200.0, 1320.0)
@@ -121,7 +121,7 @@ def compare(
 def outliers(
     nominal: Calibration, truth: RangeModel, rng: np.random.Generator, repeats: int
 ) -> tuple[Array, Array]:
-    """Errors at the farthest check range: joint fit with rejection, and plain least squares."""
+    """Return errors at the farthest check range: joint fit with rejection, plain least squares."""
     ranges = np.linspace(NINE_MM[0], NINE_MM[-1], OUTLIER_POSTS)
     far_mm, far_row = CHECK_MM[-1], truth.row(CHECK_MM[-1])
     robust, plain = [], []
@@ -132,14 +132,14 @@ def outliers(
         # Inwards, so that they stay on the sensor.
         away = np.where(row[wrong] > 0.5 * truth.rows, -1.0, 1.0)
         row[wrong] += rng.uniform(*OUTLIER_PX, OUTLIERS) * away
-        seen = Targets(row, ranges, good.sigma_row_px, good.sigma_range_mm)
-        robust.append(float(calibrate(seen, nominal).fit.model.range_mm(far_row)) - far_mm)
-        plain.append(float(fit(seen, nominal.model()).model.range_mm(far_row)) - far_mm)
+        targets = Targets(row, ranges, good.sigma_row_px, good.sigma_range_mm)
+        robust.append(float(calibrate(targets, nominal).fit.model.range_mm(far_row)) - far_mm)
+        plain.append(float(fit(targets, nominal.model()).model.range_mm(far_row)) - far_mm)
     return np.array(robust), np.array(plain)
 
 
 def coverage(design: RangeModel, rng: np.random.Generator) -> dict[str, float]:
-    """Share of truths inside their stated 95 % interval, by what is stated."""
+    """Return the share of truths inside their stated 95 % interval, by quantity."""
     priors = _priors(design, JOINT.free)
     inside = []
     for _ in range(COVERAGE_RUNS):

@@ -17,7 +17,7 @@ from eschorty_ros.simulation.world import simulate_line
 RANGE_MM = 1320.0
 SPEED_MM_S = 300.0
 BOARD = 0.8
-"""Reflectance of the board around the step: a line that is dark as a whole gives no profile."""
+"""Reflectance of the board around the step: without any lit column there is no profile."""
 
 BOARD_COLUMNS = 16
 _SETTLING_PERIODS = 2
@@ -39,9 +39,9 @@ class Crossing:
     line_row : float64, shape (columns,)
         Row of the line's centre.
     offset_rows : float64, shape (profiles, columns)
-        Where the step lies: rows above the line's centre.
+        Position of the step: rows above the line's centre.
     target : bool, shape (columns,)
-        Columns that see the step; the others see the uniform board.
+        Columns on the step; the others are on the uniform board.
     """
 
     data: bytes
@@ -52,7 +52,7 @@ class Crossing:
     target: NDArray[np.bool_]
 
     def reconstruct(self, **settings: float | str) -> tuple[Profiles, dict[str, int]]:
-        """Points and counters of the stream, reconstructed with ``settings``."""
+        """Return points and counters of the stream, reconstructed with ``settings``."""
         chosen = Settings(**{"stage_speed_mm_s": SPEED_MM_S, **settings})  # type: ignore[arg-type]
         reconstructor = Reconstructor(self.calibration, self.modulation, chosen)
         found = Profiles.concatenate([reconstructor.push(self.data), reconstructor.flush()])
@@ -60,7 +60,7 @@ class Crossing:
 
 
 def rows_per_profile(frequency_hz: float) -> float:
-    """Rows a step moves from one period to the next."""
+    """Return the rows that a step moves from one period to the next."""
     model = load_calibration("config_3").model()
     return float(model.rows_per_mm_off_sheet(RANGE_MM)) * SPEED_MM_S / frequency_hz
 
@@ -77,24 +77,24 @@ def crossing(
     background_hz: float = 0.0,
     seed: int = 0,
 ) -> Crossing:
-    """Let a step between two reflectances cross the line.
+    """Simulate a step between two reflectances that crosses the line.
 
-    The stage moves towards +y, so what it comes to lies below the line's centre (at lower rows).
-    Every profile is simulated at rest with the step where it lies then, on pixels of its own.
+    The stage moves towards +y, so the surface ahead is below the line's centre (at lower rows).
+    Every profile is simulated at rest with the step at its position then, on pixels of its own.
 
     Parameters
     ----------
     parameters : PixelParameters
     frequency_hz : float
     before, after : array_like, scalar or shape (columns,)
-        Reflectance of the surface that is seen first and of the one that follows.
+        Reflectance of the first surface and of the one that follows.
     columns : int
-        Columns that see the step; ``BOARD_COLUMNS`` more see the board.
+        Columns on the step; ``BOARD_COLUMNS`` more are on the board.
     margin_rows : float
-        How far from the line's centre the step begins and ends.
+        Distance from the line's centre at which the step begins and ends.
     slanted : bool
-        Spread the step's place over the columns by what it moves between profiles; otherwise it
-        lies at the centre of all columns at once in the middle profile.
+        Spread the step's position over the columns by its way between profiles; otherwise it is at
+        the centre of all columns at once in the middle profile.
     background_hz : float
     seed : int
     """

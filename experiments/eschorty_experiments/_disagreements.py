@@ -1,4 +1,4 @@
-"""Contradictions of the paper with itself or with its equations, and the right values."""
+"""Contradictions within the paper or with its equations, and the right values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from eschorty_ros.report.experiment import DataTable
 
 
 def disagreements(made: dict[str, Design]) -> DataTable:
-    """List printed statement, right value and reason.
+    """Return the printed statements with right value and reason.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ def _of_table_1(made: dict[str, Design]) -> list[list[str]]:
             "Table 1, far range of the design",
             "2413.54 mm",
             f"{last:.2f} mm at row 719",
-            f"the design takes row 720 ({beyond:.2f} mm), the builds row 719",
+            f"the design uses row 720 ({beyond:.2f} mm), the builds row 719",
         ],
         [
             "Table 1, kk'",
             "with k = 24.06 mm",
             f"k = {nominal.k_mm:.7f} mm",
-            "kk' takes the rounded k, the ranges the unrounded one: 1 part in 10000",
+            "kk' uses the rounded k, the ranges the unrounded one: 1 part in 10000",
         ],
         [
             "Table 1, kk' of Config 3",
@@ -78,7 +78,7 @@ def _of_table_2(made: dict[str, Design]) -> list[list[str]]:
             "Table 2, working distance",
             "0.8 to 2.5 m",
             f"Config 3 ends at {final.range_limits_mm[1] * 1e-3:.3f} m",
-            "the final build gives up far range for near",
+            "the final build has a shorter near range at the cost of the far range",
         ],
     ]
 
@@ -96,7 +96,7 @@ def _of_scans(made: dict[str, Design]) -> list[list[str]]:
             "at 2.43 m, elsewhere about 1 m",
             f"row {rows['config_3']:.0f} in Config 3, {rows['config_1']:.0f} in Config 1, "
             f"{rows['nominal']:.0f} in the design, {rows['config_2']:.0f} in Config 2",
-            "the sensor ends at row 719: only Config 2 sees 2.43 m",
+            "the sensor ends at row 719: only Config 2 covers 2.43 m",
         ],
         [
             "Fig. 8, point spacing",
@@ -122,7 +122,7 @@ def _of_scans(made: dict[str, Design]) -> list[list[str]]:
             "text, 1 mrad beam and 20 row line",
             "both",
             f"1 mrad is {beam_rows(nominal):.1f} rows",
-            "20 rows is the width in events of a sensor that sees logarithms",
+            "20 rows is the width in events of a sensor with logarithmic response",
         ],
     ]
 
@@ -132,7 +132,7 @@ _OF_THE_TEXT: tuple[list[str], ...] = (
         "text, event rates",
         "million megaevents per second",
         "0.01 to 1 Mev/s shown; 128 M/s is 1280 columns at 100 kHz for one row",
-        "a slip of units",
+        "an error of units",
     ],
     [
         "text, breakdown",
@@ -149,20 +149,20 @@ _OF_THE_TEXT: tuple[list[str], ...] = (
     [
         "text, column mean",
         "justified by a zero-mean Gaussian",
-        "uniform background draws the mean to the middle row",
+        "uniform background biases the mean towards the middle row",
         "background is not Gaussian; the default estimator is robust to it",
     ],
     [
         "Fig. 7, linear extrapolation",
         "7.5 px",
         "10 to 29 px in simulation",
-        "it hangs on the first two points",
+        "it depends on the first two points",
     ],
     [
         "text, drift formula",
         "-2 log R + log σ² against -log reflectance",
-        "names kept apart here",
-        "signs and symbols clash: R is range and reflectance, sigma width and divergence",
+        "distinct names here",
+        "signs and symbols conflict: R is range and reflectance, sigma width and divergence",
     ],
     [
         "text, anti-flicker",

@@ -33,11 +33,11 @@ class Drawn:
 
     @property
     def bound_px(self) -> float:
-        """Cramer-Rao bound of the row; whole rows add a twelfth to the variance."""
+        """Cramer-Rao bound of the row; the rounding to rows adds a twelfth to the variance."""
         return float(np.sqrt((self.fwhm_px / FWHM_PER_SIGMA) ** 2 + 1 / 12) / np.sqrt(self.signal))
 
     def estimate(self, method: str, returns: str = "strongest") -> Centroids:
-        """Rows by the package's estimator, given the line's width."""
+        """Return the rows by the package's estimator, given the line's width."""
         offsets = np.arange(len(self.rows) + 1) * self.rows.shape[1]
         return estimate(
             self.rows.ravel(), offsets, method, returns=returns, line_width_px=self.fwhm_px
@@ -65,11 +65,11 @@ def draw(
     events : int
         Of the line and its background, per column.
     background : float
-        Share of them that lies anywhere on the sensor.
+        Share of them that is uniform over the sensor.
     second : float
         Events of a second line, as a multiple of the first's, in addition.
     apart_px : float
-        How much further down the second line is.
+        Distance of the second line, towards higher rows.
     centre : float, optional
         Row of every line, anywhere in 200 to 400 otherwise. Events off the sensor are drawn again.
     """
@@ -83,16 +83,16 @@ def draw(
     rows[noise] = rng.uniform(-0.5, ROWS - 0.5, int(noise.sum()))
     extra = round(second * events * (1.0 - background))
     beyond = rng.normal(truth[:, None] + apart_px, sigma, (columns, extra))
-    whole = np.clip(np.rint(np.hstack([rows, beyond])), 0, ROWS - 1).astype(np.int64)
-    return Drawn(truth, whole, fwhm_px, events * (1.0 - background))
+    rounded = np.clip(np.rint(np.hstack([rows, beyond])), 0, ROWS - 1).astype(np.int64)
+    return Drawn(truth, rounded, fwhm_px, events * (1.0 - background))
 
 
 def error_over_bound(drawn: Drawn, found: Centroids) -> float:
-    """68 % quantile of the absolute error over the bound; a missing row counts as far off."""
+    """Return the 68 % quantile of the absolute error over the bound, a missing row as far off."""
     error = np.nan_to_num(np.abs(found.row - drawn.truth), nan=float(ROWS))
     return float(np.quantile(error, 0.6827)) / drawn.bound_px
 
 
 def gross_share(drawn: Drawn, found: Centroids) -> float:
-    """Share of columns whose row is off by more than 2 FWHM, or missing."""
+    """Return the share of columns whose row is off by more than 2 FWHM, or missing."""
     return float(np.mean(~(np.abs(found.row - drawn.truth) <= 2.0 * drawn.fwhm_px)))

@@ -25,7 +25,7 @@ class Case(NamedTuple):
 
 
 class Second(NamedTuple):
-    """Return a method's rows of a column with a second line: the strongest return, then all."""
+    """Errors of one method beside a second line: of the strongest return, then of both."""
 
     method: str
     strength: float
@@ -38,7 +38,7 @@ class Second(NamedTuple):
 
 
 def bounds_figure(cases: list[Case]) -> Figure:
-    """Error over the bound against events, width and background share."""
+    """Draw the error over the bound against events, width and background share."""
     figure = new_figure(11.0, 4.6)
     panels = (
         ("events", "events per column", lambda c: c.fwhm_px == 20.0 and c.background == 0.1),
@@ -67,7 +67,7 @@ def bounds_figure(cases: list[Case]) -> Figure:
 
 
 def returns_figure(cases: list[Case], seconds: list[Second]) -> Figure:
-    """Gross errors, and how often a second line is reported."""
+    """Draw the shares of gross errors and of reported second lines."""
     figure = new_figure(11.0, 4.4)
     gross, strength, apart = figure.subplots(1, 3)
     for method, marker in zip(METHODS, "os^xd", strict=True):

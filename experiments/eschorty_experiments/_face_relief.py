@@ -1,4 +1,4 @@
-"""Relief of the scanned face: how far nose and ears come out over their true height."""
+"""Relief of the scanned face: measured over true heights of nose and ears."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from eschorty_ros.simulation.scenes import EAR_OFF_MM, Face
 
 
 def face_relief(scene: Face, result: Result, errors: ScanErrors) -> tuple[float, float]:
-    """Measured over true height of the nose above the cheeks, and the same for cheeks and ears."""
+    """Return measured over true height of the nose over the cheeks, and of the cheeks over ears."""
     points = result.points
     across = np.abs(points["y"] * 1e3 - scene.centre_stage_mm)
     up = points["z"] * 1e3

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EDGE_MM = 3.0
-"""Half of the footprint along the stage: nearer to a leaf's rim the line lies on two leaves."""
+"""Half of the footprint along the stage: nearer to a leaf's rim the line is on two leaves."""
 
 EDGE_COLUMNS = 3
 """The default smoothing reaches two columns."""
@@ -40,7 +40,7 @@ class LevelStep:
     scatter_mm : float
         Root mean square of their standard deviations.
     d_prime : float
-        ``step_mm / scatter_mm``: how well one point tells the two apart.
+        ``step_mm / scatter_mm``: separation of the two by single points.
     points : int
         Points of the smaller one.
     """
@@ -56,7 +56,7 @@ class LevelStep:
 def level_residuals(
     leaves: Leaves, result: Result, model: RangeModel, pitch_mm: float
 ) -> NDArray[np.float64]:
-    """Level of the middle layer and range relative to it, for points well inside a blade.
+    """Return level of the middle layer and range relative to it, for points well inside a blade.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def level_residuals(
 
 
 def _inside(leaf: NDArray[np.intp], lines: int) -> NDArray[np.bool_]:
-    """Return where the same leaf is hit all around, ``lines`` lines and a few columns each way."""
+    """Return a mask of places with the same leaf ``lines`` lines and a few columns each way."""
     inside = leaf >= 0
     for axis, reach in ((0, lines), (1, EDGE_COLUMNS)):
         for shift in range(1, reach + 1):
@@ -129,7 +129,7 @@ def level_steps(residuals: NDArray[np.float64]) -> list[LevelStep]:
 
 
 def level_figure(residuals: dict[str, NDArray[np.float64]]) -> Figure:
-    """Histograms of the three levels, one panel per scan."""
+    """Draw histograms of the three levels, one panel per scan."""
     figure = new_figure(6.0 * len(residuals), 4.0)
     edges = np.linspace(-2.5, (LEVELS - 1) * SEPARATION_MM + 2.5, 100)
     for k, (label, values) in enumerate(residuals.items()):

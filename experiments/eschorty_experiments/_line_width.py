@@ -46,12 +46,12 @@ class Point:
 def measure(
     parameters: PixelParameters, frequency_hz: float, columns: int, periods: int, seed: int
 ) -> Point:
-    """Simulate a resting line and count its events over whole periods, once it has settled."""
+    """Simulate a resting line and count its events over complete periods in the steady state."""
     modulation = Modulation(frequency_hz)
     settle = int(np.ceil(SETTLE_US / modulation.period_us))
     start_us = round(settle * modulation.period_us)
     stop_us = round((settle + periods) * modulation.period_us)
-    # A line lies anywhere between the centres of two rows.
+    # A line may be anywhere between the centres of two rows.
     line_row = LINE_ROW + np.random.default_rng(seed).uniform(-0.5, 0.5, columns)
     events = simulate_line(
         parameters, modulation, stop_us, columns=columns, rows=ROWS, line_row=line_row, seed=seed
@@ -69,7 +69,7 @@ def measure(
 
 
 def swing(parameters: PixelParameters, frequency_hz: float, contrast: float) -> float:
-    """Peak-to-peak log swing of a pixel under a square wave of duty 1/2 once it has settled.
+    """Return the steady peak-to-peak log swing of a pixel under a square wave of duty 1/2.
 
     The photoreceptor's relative rate falls from ``u_dark`` to ``u_bright`` during each lit half
     and returns during the dark one; the source follower then attenuates as one pole.
@@ -97,9 +97,10 @@ def swing(parameters: PixelParameters, frequency_hz: float, contrast: float) -> 
 
 
 def closed_form_width(parameters: PixelParameters, frequency_hz: float) -> float:
-    """Rows whose swing exceeds the threshold; 0 where none does.
+    """Return the number of rows whose swing exceeds the threshold.
 
-    Without noise and mismatch. At low frequency ``2 sigma sqrt(2 ln(A / (e^theta - 1)))``.
+    Without noise and mismatch; 0 where no row does. At low frequency
+    ``2 sigma sqrt(2 ln(A / (e^theta - 1)))``.
     """
     threshold = max(parameters.threshold_on, parameters.threshold_off)
     low, high = 0.0, parameters.amplitude
@@ -115,7 +116,7 @@ def closed_form_width(parameters: PixelParameters, frequency_hz: float) -> float
 
 
 def full_width_half_maximum(counts: NDArray[np.integer]) -> int:
-    """Rows from the first to the last bin that reaches half of the mean of the three highest.
+    """Return the rows from first to last bin with half of the three highest bins' mean or more.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Posts at known ranges as a build would see them, and the calibration made from them."""
+"""Posts at known ranges, measured by a build, and the calibration made from them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Line:
     Attributes
     ----------
     slope : float
-        Per px; Eq. 1 says ``1 / k'``.
+        Per px; ``1 / k'`` by Eq. 1.
     zero_row : float
-        Row of magnification 0; Eq. 1 says ``-b'``.
+        Row of magnification 0; ``-b'`` by Eq. 1.
     """
 
     slope: float
@@ -63,9 +63,9 @@ def measure_posts(build: Design, nominal: Design, rng: np.random.Generator) -> P
     Parameters
     ----------
     build : Design
-        The instrument as it is.
+        The instrument as built.
     nominal : Design
-        Where the fit takes its fixed k and b from.
+        The source of the fit's fixed k and b.
     rng : Generator
 
     Returns
@@ -87,7 +87,7 @@ def measure_posts(build: Design, nominal: Design, rng: np.random.Generator) -> P
 
 
 def pulls(posts: Posts, build: Design) -> Array:
-    """Error of the fitted k' and b' over the standard deviation the fit states, shape (2,)."""
+    """Return the errors of the fitted k' and b' over their standard deviations, shape (2,)."""
     error = [
         posts.fit.model.k_prime_px - build.model.k_prime_px,
         posts.fit.model.b_prime_px - build.model.b_prime_px,

@@ -22,7 +22,7 @@ Task = Callable[[Kind], NDArray[Any]]
 
 
 def precision_table(effort: Effort) -> DataTable:
-    """Largest errors against extended precision and time per value, in both types."""
+    """Return the largest errors against extended precision and times per value of both types."""
     model = load_calibration("config_3").model()
     count = effort.choose(200_000, 20_000)
     rng = np.random.default_rng(effort.seed)
@@ -53,7 +53,7 @@ def precision_table(effort: Effort) -> DataTable:
 
 
 def precision_findings(table: DataTable) -> list[Finding]:
-    """Hold ranges, for which float32 would do, against spreads and times, for which not."""
+    """Return errors of ranges, where float32 suffices, and of spreads and times, where not."""
     at = {str(row[0]): [float(value) for value in row[2:4]] for row in table.rows}
     (ranges, spread, stage) = (
         next(errors for name, errors in at.items() if name.startswith(start))

@@ -47,7 +47,7 @@ class Measured:
 def measure_reflectance(
     parameters: PixelParameters, frequency_hz: float, effort: Effort
 ) -> Measured:
-    """Columns of log-uniform reflectance, referred to a white target seen the same way."""
+    """Measure columns of log-uniform reflectance, relative to a white target in the same setup."""
     columns = effort.choose(1024, 320)
     rng = np.random.default_rng(effort.seed)
     truth = np.exp(rng.uniform(np.log(BINS[0]), 0.0, columns))
@@ -66,7 +66,7 @@ def measure_reflectance(
 
 
 def summarise(measured: Measured) -> list[list[float]]:
-    """Per range of reflectance: median error, scatter (68 %), stated sigma, shares within it."""
+    """Return by range of reflectance: median error, scatter (68 %), sigma, shares within it."""
     rows = []
     for low, high in pairwise(BINS):
         inside = (measured.truth >= low) & (measured.truth < high)

@@ -30,12 +30,12 @@ class ScanErrors:
     ----------
     error_mm : ndarray of float64, shape (points,)
         Measured minus true range at each point's own stage position and column; NaN where the
-        scene holds nothing.
+        scene has no surface.
     gross : ndarray of bool, shape (points,)
-        More than ``GROSS_PX`` rows off, or where the scene holds nothing.
+        More than ``GROSS_PX`` rows off, or where the scene has no surface.
     inside : ndarray of bool, shape (points,)
-        ``RIM_MM`` ahead and behind along the stage the scene goes on: the line's thickness lies on
-        one surface.
+        The surface continues for ``RIM_MM`` ahead and behind along the stage, so that the line's
+        thickness is on one surface.
     completeness : float
         Share of the truth's periods and columns that have a point.
     """
@@ -68,18 +68,18 @@ class ScanErrors:
         return float(np.mean(self.gross)) if self.gross.size else float("nan")
 
     def away_from_rims(self) -> ScanErrors:
-        """Pick the points whose line lies on one surface."""
+        """Return the points whose line is on one surface."""
         at = self.inside
         return ScanErrors(self.error_mm[at], self.gross[at], at[at], self.completeness)
 
     def quantile_mm(self, share: float) -> float:
-        """Quantile of the absolute error; NaN without points."""
+        """Return a quantile of the absolute error; NaN without points."""
         size = np.abs(self.error_mm[np.isfinite(self.error_mm)])
         return float(np.quantile(size, share)) if size.size else float("nan")
 
 
 def pooled(parts: Sequence[ScanErrors]) -> ScanErrors:
-    """All points of several scans together; the completeness is the mean of theirs."""
+    """Return the points of several scans together; the completeness is the mean of theirs."""
     return ScanErrors(
         np.concatenate([part.error_mm for part in parts]),
         np.concatenate([part.gross for part in parts]),
@@ -91,17 +91,17 @@ def pooled(parts: Sequence[ScanErrors]) -> ScanErrors:
 def scan_errors(
     profiles: Profiles, recording: Recording, scene: KnownScene, every: int = 1
 ) -> ScanErrors:
-    """Compare every point with the scene at its own time, the recording's truth with the points.
+    """Compare every point with the scene at its time, and the recording's truth with the points.
 
     Parameters
     ----------
     profiles : Profiles
     recording : Recording
-        With its truth; the stage is taken from it.
+        With its truth and its stage positions.
     scene : KnownScene
-        What was recorded.
+        The recorded scene.
     every : int
-        Look at every so many columns; the truth of all of them takes longer than the scan.
+        Compare one of so many columns; the truth of all takes longer to compute than the scan.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def _completeness(
 
 
 def period_of(t_us: NDArray[np.int64], modulation: Modulation) -> NDArray[np.int64]:
-    """Modulation period in which a time lies, counted from the recorded rising edge."""
+    """Return the number of a time's modulation period, counted from the recorded rising edge."""
     since_us = t_us - (modulation.on_edge_us or 0)
     return np.floor(since_us / modulation.period_us).astype(np.int64)
 

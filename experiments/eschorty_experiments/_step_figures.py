@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fits:
-    """Logarithmic and linear fit of shift against contrast, and what each explains."""
+    """Logarithmic and linear fit of shift against contrast, and R² of each."""
 
     log: Array
     linear: Array
@@ -52,7 +52,7 @@ class Passage:
 
 
 def fit(contrast: Array, shift: Array) -> Fits:
-    """Least squares of ``a + b ln(contrast)`` and ``a + b contrast``."""
+    """Return the least-squares fits of ``a + b ln(contrast)`` and ``a + b contrast``."""
     log = np.polyfit(np.log(contrast), shift, 1)
     linear = np.polyfit(contrast, shift, 1)
     total = float(np.sum((shift - shift.mean()) ** 2))
@@ -64,7 +64,7 @@ def fit(contrast: Array, shift: Array) -> Fits:
 
 
 def step_figure(curves: list[Curve], passages: list[Passage]) -> Figure:
-    """Shift against contrast per frequency, and over the passage of a step through the line."""
+    """Draw the shift against contrast per frequency, and as a step passes through the line."""
     figure = new_figure(13.0, 4.4)
     axes = [figure.add_subplot(1, 3, k + 1) for k in range(3)]
     for place, curve in zip(axes[:2], curves, strict=True):
@@ -113,11 +113,11 @@ def _contrast(axes: Axes, curve: Curve) -> None:
 def reflectance_figure(
     truth: list[Array], measured: list[Array], frequencies_hz: tuple[float, ...]
 ) -> Figure:
-    """Measured against true reflectance, one panel per frequency, logarithmic axes."""
+    """Draw measured against true reflectance, one panel per frequency, logarithmic axes."""
     figure = new_figure(13.0, 4.4)
-    for k, (true, seen) in enumerate(zip(truth, measured, strict=True)):
+    for k, (true, found) in enumerate(zip(truth, measured, strict=True)):
         axes = figure.add_subplot(1, len(truth), k + 1)
-        axes.loglog(true, seen, ".", ms=3, alpha=0.4)
+        axes.loglog(true, found, ".", ms=3, alpha=0.4)
         limits = (0.045, 1.7)
         axes.plot(limits, limits, "k--", lw=1)
         axes.set(

@@ -21,7 +21,7 @@ _MARKERS = "osD^vP"
 
 
 def pareto_figure(summaries: Sequence[Summary]) -> Figure:
-    """Log-log panels with the front marked, the default ringed, the baseline a star."""
+    """Draw log-log panels with the front marked, the default ringed, the baseline a star."""
     figure = new_figure(13.5, 8.6)
     filters = list(dict.fromkeys(one.variant.filters for one in summaries))
     for row, (name, error_mm) in enumerate(_ERRORS.items()):

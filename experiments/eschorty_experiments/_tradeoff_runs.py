@@ -64,11 +64,11 @@ class Variant:
 
     @property
     def is_default(self) -> bool:
-        """Return whether these are the settings a user gets."""
+        """True for the default settings."""
         return self.settings == DEFAULT
 
     def run(self, data: bytes, recording: Recording) -> Profiles:
-        """Profiles of a whole stream."""
+        """Return the profiles of a stream."""
         if self.settings is None:
             model = recording.calibration.model()
             events = reference.decode_all(data)
@@ -82,13 +82,13 @@ class Variant:
 
 
 def filters_of(settings: Settings) -> str:
-    """Name the filters of ``settings``."""
+    """Return the names of the filters of ``settings``."""
     names = [] if settings.noise_filter == "none" else [settings.noise_filter]
     return " + ".join([*names, "gate"] if settings.phase_gate_us else names) or "none"
 
 
 def variants() -> list[Variant]:
-    """Baseline, then every estimator with every filter and smoothing."""
+    """Return the baseline, then every estimator with every filter and smoothing."""
     return [Variant(None)] + [
         Variant(
             replace(
@@ -106,7 +106,7 @@ def variants() -> list[Variant]:
 
 
 def one_change() -> list[Variant]:
-    """Baseline, default, and the variants that differ from it in one respect."""
+    """Return baseline, default, and the variants that differ from it in one setting."""
     kept = []
     for variant in variants()[1:]:
         same = (
@@ -151,14 +151,14 @@ def record_streams(
     for name in SCENES:
         scene = named(name)
         note(f"simulating {name}")
-        quiet = _record(name, scene, 0.0, 0.0, travel_mm, seed)
-        streams.append(quiet)
-        model = quiet.recording.calibration.model()
-        t_us = quiet.recording.stage_samples["t_us"]
+        noiseless = _record(name, scene, 0.0, 0.0, travel_mm, seed)
+        streams.append(noiseless)
+        model = noiseless.recording.calibration.model()
+        t_us = noiseless.recording.stage_samples["t_us"]
         pixel_seconds = model.columns * model.rows * float(t_us[-1] - t_us[0]) * 1e-6
         for share in BACKGROUND_SHARES:
             if share:
-                rate_hz = quiet.events * share / (1.0 - share) / pixel_seconds
+                rate_hz = noiseless.events * share / (1.0 - share) / pixel_seconds
                 streams.append(_record(name, scene, share, rate_hz, travel_mm, seed))
     return streams
 
@@ -183,7 +183,7 @@ def _record(
             background_hz,
         )
         data = b"".join(RawReader(recording.events_path).chunks(_CHUNK_BYTES))
-        # Read while the file is there.
+        # The truth is read from the file on first access, before the folder is deleted.
         assert recording.truth is not None
         reconstructor = Reconstructor(recording.calibration, recording.modulation)
         reconstructor.push(data)
@@ -195,10 +195,10 @@ def _record(
 
 
 def measure(variant: Variant, stream: Stream, repeats: int, with_memory: bool) -> Measured:
-    """Take the shortest CPU time of some repeats, the errors, and the peak memory if wanted.
+    """Measure the shortest CPU time of some repeats, the errors, and optionally the peak memory.
 
-    The time runs from EVT3 bytes in memory to profiles with ranges. The memory is what Python and
-    numpy allocate meanwhile at most (tracemalloc); the bytes themselves are not counted.
+    The time is from EVT3 bytes in memory to profiles with ranges. The memory is the most that
+    Python and numpy allocate meanwhile (tracemalloc), without the bytes themselves.
     """
     seconds = float("inf")
     profiles = Profiles.empty()
@@ -212,7 +212,7 @@ def measure(variant: Variant, stream: Stream, repeats: int, with_memory: bool) -
 
 
 def peak_bytes(task: Callable[[], object]) -> int:
-    """Most bytes that Python and numpy hold at once during ``task`` beyond those held before."""
+    """Return the most bytes that Python and numpy allocate during ``task`` beyond those before."""
     tracemalloc.start()
     try:
         before, _ = tracemalloc.get_traced_memory()

@@ -1,4 +1,4 @@
-"""Tables of the trade-off, and the settings that no other beats."""
+"""Tables of the trade-off, and its Pareto front."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Summary:
 
 
 def summary(measured: Sequence[Measured], share: float) -> Summary:
-    """Put the runs of one variant at one background together."""
+    """Return the summary of the runs of one variant at one background."""
     chosen = [one for one in measured if one.stream.background_share == share]
     seconds = sum(one.seconds for one in chosen)
     peaks = [one.peak_bytes for one in measured if math.isfinite(one.peak_bytes)]
@@ -47,12 +47,12 @@ def summary(measured: Sequence[Measured], share: float) -> Summary:
 
 
 def of(summaries: Sequence[Summary], variant: Variant) -> dict[float, Summary]:
-    """Summaries of a variant by background."""
+    """Return the summaries of a variant by background."""
     return {one.background_share: one for one in summaries if one.variant == variant}
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Find the points that no other beats in both coordinates: indices, by the first one."""
+    """Return the indices of the points with no better one in both coordinates, by the first one."""
     front: list[int] = []
     best = math.inf
     for index in sorted(range(len(points)), key=lambda k: points[k]):
@@ -63,7 +63,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def changes_table(summaries: Sequence[Summary]) -> DataTable:
-    """Baseline, default, and the default with one setting changed; the README shows this table."""
+    """Return baseline, default, and the default with one setting changed, the README's table."""
     percent = [f"{100 * share:g}" for share in BACKGROUND_SHARES]
     columns = [
         "setting",
@@ -96,7 +96,7 @@ def changes_table(summaries: Sequence[Summary]) -> DataTable:
 
 
 def summary_table(summaries: Sequence[Summary]) -> DataTable:
-    """Every variant at every background."""
+    """Return every variant at every background."""
     fronts = {}
     for share in BACKGROUND_SHARES:
         at = [one for one in summaries if one.background_share == share]
@@ -143,7 +143,7 @@ def summary_table(summaries: Sequence[Summary]) -> DataTable:
 
 
 def runs_table(measured: Sequence[Measured]) -> DataTable:
-    """Every variant on every scene and background."""
+    """Return every variant on every scene and background."""
     return DataTable(
         [
             "scene",

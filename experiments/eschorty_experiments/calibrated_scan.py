@@ -49,7 +49,7 @@ MOVED_TRAVEL_MM = (10.0, 210.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """One scan of the staircase, read with two calibrations; mm, shape (n,)."""
+    """One scan of the staircase, reconstructed with two calibrations; mm, shape (n,)."""
 
     true_mm: Array
     before_mm: Array
@@ -72,24 +72,24 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         figures={"before_after": _figure(scan, report, design.model(), truth)},
         captions={
             "before_after": "Range error of a staircase of nine levels, every point of the scan. "
-            "Above: read with the design; the line is what the difference of the builds costs. "
-            "Below: read with the calibration on nine posts; circles are medians, the line is the "
-            "calibration's own error and the band its stated standard deviation.",
+            "Above: calculated with the design; the line is the error due to the difference of the "
+            "builds. Below: calculated with the calibration on nine posts; circles are medians, "
+            "the line is the calibration's own error and the band its stated standard deviation.",
             "levels": "Errors by level: median over the points, and median of their magnitude",
         },
         remarks=[
             "As built kk' is 4 % smaller and b' 40 px nearer 0 than designed; posts, staircase and "
             "moved target are simulated with the event pixels of the preset paper, the truth is "
             "known.",
-            f"The posts stand at {Posts().known_mm[0]:.0f} to {Posts().known_mm[-1]:.0f} mm and "
-            "are found in the sum of all events. The target moved by the stage is swept forth and "
-            "back at two places and gives one known range per profile.",
+            f"The posts are at {Posts().known_mm[0]:.0f} to {Posts().known_mm[-1]:.0f} mm and are "
+            "found in the sum of all events. The target moved by the stage is swept forth and back "
+            "at two places, with one known range per profile.",
         ],
     )
 
 
 def rms_mm(model: RangeModel, truth: RangeModel) -> float:
-    """RMS error of ranges read with ``model``, 0.8 to 2.1 m."""
+    """Return the RMS error of ranges calculated with ``model``, 0.8 to 2.1 m."""
     error = model.range_mm(truth.row(CHECK_MM)) - CHECK_MM
     return float(np.sqrt(np.mean(error**2)))
 
@@ -133,7 +133,7 @@ def _staircase(
             for calibration in (design, calibrated)
         ]
     truth = scene.range_mm([0.0], np.arange(built.columns), built.model())[0]
-    # Rows do not depend on the calibration: both hold the same points.
+    # Rows do not depend on the calibration: both have the same points.
     true_mm = truth[read[0].column]
     return Scan(true_mm, read[0].range_mm - true_mm, read[1].range_mm - true_mm)
 
@@ -153,7 +153,7 @@ def _moved(effort: Effort, design: Calibration, built: Calibration) -> Targets:
 
 
 def _narrow(build: Calibration) -> Calibration:
-    """Keep the few columns that suffice for a flat target."""
+    """Return the build with the few columns that suffice for a flat target."""
     return build.model_copy(
         update={"columns": MOVED_COLUMNS, "principal_column": 0.5 * (MOVED_COLUMNS - 1)}
     )
@@ -201,7 +201,7 @@ def _figure(scan: Scan, report: CalibrationReport, design: RangeModel, truth: Ra
     figure = new_figure(9.0, 6.5)
     above, below = figure.subplots(2, 1, sharex=True)
     rng = np.random.default_rng(0)
-    # Points of a level have one true range: spread them so that they can be seen.
+    # Points of a level have one true range and would overlap.
     x_mm = scan.true_mm + rng.uniform(-30.0, 30.0, scan.true_mm.size)
     row = truth.row(CHECK_MM)
     for axes, error_mm, model, name in (

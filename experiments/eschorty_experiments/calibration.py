@@ -66,8 +66,8 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         },
         captions={
             "comparison": "Left: range error (RMS over repeats) of nine posts of two sizes by four "
-            "methods. Right: error of lateral lengths, which is that of k. Sizes as measured are "
-            "ruined by blooming; with the width bias fitted, two sizes make up for it.",
+            "methods. Right: error of lateral lengths, which is that of k. Blooming biases sizes "
+            "as measured; the fit of the width bias to two sizes corrects it.",
             "outliers": f"Range error at {CHECK_MM[-1]:.0f} mm when {OUTLIERS} of {OUTLIER_POSTS} "
             f"posts are {OUTLIER_PX[0]:.0f} to {OUTLIER_PX[1]:.0f} rows off: share of calibrations "
             "within an error.",
@@ -77,10 +77,11 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         remarks=[
             "As built k 24.20 mm, k' -37100 px, b 1.5 mm, b' -1140 px against the design config_3; "
             "rows err by 0.3 px, ranges by 1 mm, widths by 0.42 px (one sigma).",
-            "Ranges know k and k' only as a product. The paper's method keeps k: its lateral "
-            "lengths err by what k is off, here 0.57 %, and b's 1.5 mm.",
-            "Freeing b without a prior is never worth it: the curve bends the same way for b as "
-            "for k' and b' together. Posts within 150 mm of each other then say nothing about 2 m.",
+            "Ranges depend on k and k' only through their product. The paper's method keeps k: the "
+            "error of its lateral lengths is that of k, here 0.57 %, and that of b, 1.5 mm.",
+            "A free b without a prior always increases the error: a change of b bends the curve "
+            "like one of k' and b' together. Posts within 150 mm of each other then do not "
+            "determine ranges at 2 m.",
             "Intervals are checked on truths drawn from the priors, as the fit assumes.",
         ],
     )

@@ -91,11 +91,11 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "line, and share of errors within two reported sigma",
         },
         remarks=[
-            "Events are independent and their number is fixed; a real pixel repeats itself, which "
-            "the reported sigma allows for and this bound does not.",
-            "mean and median take the whole column: background anywhere on the 720 rows moves the "
-            "mean, which is the paper's method, beyond two widths.",
-            "edge_mid pays a quarter of its precision for looking at the footprint's edges alone.",
+            "Events are independent and their number is fixed; those of a real pixel are "
+            "correlated, which the reported sigma allows for and this bound does not.",
+            "mean and median use the full column: background anywhere on the 720 rows moves the "
+            "mean, which is the paper's method, by more than two widths.",
+            "edge_mid loses a quarter of its precision by using the footprint's edges alone.",
             "A second return needs half the strength of the first in its box, two widths of "
             "distance, and more events than background explains in any window of the column.",
         ],
@@ -163,7 +163,7 @@ def _seconds(rng: np.random.Generator, columns: int) -> list[Second]:
 def _both_returns(
     drawn: Drawn, method: str, strength: float, apart_px: float
 ) -> tuple[float, float, float]:
-    """Share of columns with a second return, and the errors of both over their own bounds."""
+    """Return the share of columns with a second return, and both errors over their own bounds."""
     found = drawn.estimate(method, "all")
     both = np.isfinite(found.row[:, 1])
     if both.sum() < REPORTED_MIN:

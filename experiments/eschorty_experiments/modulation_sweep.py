@@ -79,7 +79,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
 
 
 def _periods(frequency_hz: float, effort: Effort) -> int:
-    """Half a second, or enough events at high frequency; a part of it in a fast run."""
+    """Return the periods of half a second, or fewer at high frequency and in a fast run."""
     return min(round(frequency_hz * effort.choose(500, 200) * 1e-3), effort.choose(2000, 400))
 
 
@@ -120,15 +120,15 @@ def _remarks(sweeps: dict[str, list[Point]], parameters: dict[str, PixelParamete
     paper, narrow = sweeps["paper"], sweeps["narrow"]
     return [
         "Width: rows from the first to the last bin at half of the mean of the three highest, "
-        "both ends counted, in each column alone; the lines lie anywhere between two rows.",
+        "both ends counted, in each column alone; the lines are anywhere between two rows.",
         f"Counts peak at {_peak_hz(paper):g} Hz (paper) and {_peak_hz(narrow):g} Hz (narrow). The "
         "paper has them fall from about 1 kHz on; preset paper stays flat over some kHz and dips "
         "near 1 kHz, where pixels still in their refractory time skip every other edge.",
         "Preset paper ends at "
-        f"{paper[-1].width_px:g} rows at 20 kHz where the paper has 2: noise on the swing lets "
-        "rows beyond the edge fire now and then. Preset narrow reaches "
-        f"{narrow[-1].width_px:g} rows. What it takes: {_differences(parameters)}.",
-        f"What it costs: at 20 kHz {narrow[-1].rate_hz:.0f} events per second and column are left "
+        f"{paper[-1].width_px:g} rows at 20 kHz where the paper has 2: with noise on the swing "
+        "rows beyond the edge fire occasionally. Preset narrow reaches "
+        f"{narrow[-1].width_px:g} rows. It needs {_differences(parameters)}.",
+        f"Its cost: at 20 kHz {narrow[-1].rate_hz:.0f} events per second and column are left "
         f"of {paper[-1].rate_hz:.0f} with preset paper, at 1 kHz "
         f"{_at(narrow, 1000.0).rate_hz:.0f} of {_at(paper, 1000.0).rate_hz:.0f}; a sensor with so "
         "little noise is a fit to the printed widths, not a measurement.",
@@ -136,10 +136,11 @@ def _remarks(sweeps: dict[str, list[Point]], parameters: dict[str, PixelParamete
         f"{_at(paper, 50.0).rate_hz * SENSOR_COLUMNS * 1e-6:.1f} Mev/s at 50 Hz and "
         f"{max(point.rate_hz for point in paper) * SENSOR_COLUMNS * 1e-6:.0f} Mev/s at the most; "
         "the paper's 0.01 to 1 Mev/s means a partly filled line, filters or higher thresholds.",
-        "The closed form takes a pixel's reference at an end of its swing. After the refractory "
-        "time it lies anywhere in between, and only noise or a larger swing makes the pixel fire "
+        "The closed form assumes a pixel's reference at an end of its swing. After the refractory "
+        "time it is anywhere in between, and only noise or a larger swing makes the pixel fire "
         "again: preset narrow, with little noise, ends below its closed form.",
-        "Parameters are fitted to curves the paper describes in words; it publishes no data.",
+        "Parameters are fitted to curves that the paper describes in words, as it publishes no "
+        "data.",
     ]
 
 
@@ -148,7 +149,7 @@ def _peak_hz(points: list[Point]) -> float:
 
 
 def _differences(parameters: dict[str, PixelParameters]) -> str:
-    """Parameters in which the presets differ, as text."""
+    """Return the parameters in which the presets differ, as text."""
     pair = [asdict(parameters[name]) for name in PRESETS]
     return ", ".join(
         f"{key} {pair[1][key]:g} (paper {pair[0][key]:g})"

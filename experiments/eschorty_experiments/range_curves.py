@@ -84,7 +84,7 @@ def _seeds(effort: Effort) -> list[np.random.SeedSequence]:
 
 
 def _repeats(made: dict[str, Design], effort: Effort) -> tuple[np.ndarray, float]:
-    """Give pulls of k' and b', shape (repeats * builds, 2), and the mean reduced chi square."""
+    """Return pulls of k' and b', shape (repeats * builds, 2), and the mean reduced chi square."""
     rng = np.random.default_rng([effort.seed, 41])
     drawn, chi_square = [], []
     for _ in range(effort.choose(400, 80)):

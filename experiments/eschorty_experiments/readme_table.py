@@ -34,7 +34,7 @@ _COLUMNS = {
 
 
 def markdown(table: str) -> str:
-    """Markdown table of the text of ``tradeoff-changes.csv``.
+    """Return the Markdown table of the text of ``tradeoff-changes.csv``.
 
     Raises
     ------
@@ -59,12 +59,12 @@ def markdown(table: str) -> str:
 
 
 def replaced(document: str, table: str) -> str:
-    """``document`` with ``table`` between the markers.
+    """Return ``document`` with ``table`` between the markers.
 
     Raises
     ------
     ArgumentError
-        When it does not hold each marker once, in order.
+        When it does not have each marker once, in order.
     """
     before, begin, rest = document.partition(BEGIN)
     _, end, after = rest.partition(END)

@@ -1,4 +1,4 @@
-"""Fig. 7: shift of the centroid at reflectance steps, what is left of it, and reflectance."""
+"""Fig. 7: shift of the centroid at reflectance steps, before and after compensation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STEP_HZ = (70.0, 1000.0)
 UNIFORM = (0.1, 0.4, 1.0)
 # At 1 kHz a row gives half as many events per period.
 ERROR_MAX = {70.0: 0.15, 300.0: 0.15, 1000.0: 0.2}
-# Columns on either side of a group that see another contrast in their neighbourhood.
+# Columns at either side of a group with another contrast in their neighbourhood.
 _BORDER = 4
 _BIN_ROWS = 2.0
 # A step at the line's centre needs profiles in which it has left the line on either side.
@@ -57,14 +57,14 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         passages.append(_passage(parameters, frequency_hz, effort))
         uniform += [_uniform(parameters, frequency_hz, rho, effort) for rho in UNIFORM]
     progress(0.7, "reflectance")
-    seen = [measure_reflectance(parameters, f, effort) for f in REFLECTANCE_HZ]
+    measured = [measure_reflectance(parameters, f, effort) for f in REFLECTANCE_HZ]
     return Outcome(
         findings=[
             *_curve_findings(curves),
             *_passage_findings(passages),
             Finding("uniform targets: largest rms change by compensation",
                     max(row[2] for row in uniform), high=0.1, unit="px"),
-            *_reflectance_findings(seen),
+            *_reflectance_findings(measured),
         ],
         tables={
             "shift": _shift_table(curves),
@@ -75,13 +75,13 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "errors": DataTable(
                 ("frequency_hz", "from", "to", "median_error", "scatter", "stated_sigma",
                  "within_1_sigma", "within_2_sigma"),
-                [row for measured in seen for row in summarise(measured)],
+                [row for one in measured for row in summarise(one)],
             ),
         },
         figures={
             "steps": step_figure(curves, passages),
             "reflectance": reflectance_figure(
-                [m.truth for m in seen], [m.reflectance for m in seen], REFLECTANCE_HZ
+                [m.truth for m in measured], [m.reflectance for m in measured], REFLECTANCE_HZ
             ),
         },
         captions={
@@ -92,7 +92,7 @@ def run(effort: Effort, progress: Progress) -> Outcome:
             "reference.",
             "shift": "Shift at the line's centre",
             "passage": "Mean shift over the passage of a step from black to white",
-            "uniform": "What compensation does to uniform targets",
+            "uniform": "Change of uniform targets by compensation",
             "errors": "Relative error of the reflectance of single points",
         },
         remarks=_remarks(),
@@ -101,13 +101,14 @@ def run(effort: Effort, progress: Progress) -> Outcome:
 
 def _remarks() -> list[str]:
     return [
-        "The paper's linear extrapolation beyond 7.5 px depends wholly on its first two points; "
+        "The paper's linear extrapolation beyond 7.5 px depends on its first two points alone; "
         "here both laws are fitted to all contrasts.",
-        "Compensation needs profiles before and behind the step: it holds back as many as cross "
-        "the line's width, and takes the direction from the stage's motion. A line that is dark "
-        "as a whole gives no profile, so a uniform board surrounds the target.",
-        "Off the centre a step shifts by more than at it: where the black side is silent, only "
-        "the bright part of the footprint is seen, up to half its width off.",
+        "Compensation needs profiles before and behind the step: its delay is the number of "
+        "profiles within the line's width, and the direction is that of the stage's motion. "
+        "Without any lit column there is no profile, so a uniform board surrounds the target.",
+        "A step off the line's centre causes a larger shift than one at it: where the black side "
+        "has no events, only the bright part of the footprint is measured, up to half its width "
+        "off.",
     ]
 
 
@@ -120,18 +121,18 @@ def _curve(parameters: PixelParameters, frequency_hz: float, effort: Effort) -> 
     group = np.arange(after.size) // each
     place = np.arange(after.size) % each
     inner = (place >= _BORDER) & (place < each - _BORDER)
-    seen = []
+    shifts = []
     for choice in ("off", "on"):
         period, column, shift = _shifts(case, choice)
         here = (period == middle) & inner[column]
-        seen.append([shift[here & (group[column] == k)] for k in range(contrast.size)])
-    raw = np.array([part.mean() for part in seen[0]])
+        shifts.append([shift[here & (group[column] == k)] for k in range(contrast.size)])
+    raw = np.array([part.mean() for part in shifts[0]])
     return Curve(
         frequency_hz,
         contrast,
         raw,
-        np.array([part.std() for part in seen[0]]),
-        np.array([part.mean() for part in seen[1]]),
+        np.array([part.std() for part in shifts[0]]),
+        np.array([part.mean() for part in shifts[1]]),
         fit(contrast, raw),
     )
 
@@ -139,7 +140,7 @@ def _curve(parameters: PixelParameters, frequency_hz: float, effort: Effort) -> 
 def _shifts(
     case: Crossing, compensation: str
 ) -> tuple[NDArray[np.int64], NDArray[np.intp], NDArray[np.float64]]:
-    """Period, column and shift towards the new surface of the target's points."""
+    """Return period, column and shift towards the new surface of the target's points."""
     found, _ = case.reconstruct(reflectance_compensation=compensation, smoothing_half_width=0)
     column = found.column.astype(np.intp)
     target = case.target[column]
@@ -201,16 +202,16 @@ def _passage_findings(passages: list[Passage]) -> list[Finding]:
     ]  # fmt: skip
 
 
-def _reflectance_findings(seen: list[Measured]) -> list[Finding]:
+def _reflectance_findings(measured: list[Measured]) -> list[Finding]:
     findings = []
-    for measured in seen:
-        error, pull = measured.error, np.abs(measured.pull)
-        name = f"reflectance 0.1 to 1 at {measured.frequency_hz:g} Hz"
-        usable = measured.truth >= 0.1
+    for one in measured:
+        error, pull = one.error, np.abs(one.pull)
+        name = f"reflectance 0.1 to 1 at {one.frequency_hz:g} Hz"
+        usable = one.truth >= 0.1
         findings += [
             Finding(f"{name}: median size of the relative error",
                     float(np.median(np.abs(error[usable]))),
-                    high=ERROR_MAX[measured.frequency_hz]),
+                    high=ERROR_MAX[one.frequency_hz]),
             Finding(f"{name}: within the stated sigma",
                     float(np.mean(pull[usable] < 1.0)), 0.6, 0.8),
         ]  # fmt: skip

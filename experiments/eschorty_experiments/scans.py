@@ -46,7 +46,7 @@ NEAR_FACE_MM, FAR_FACE_MM = 1000.0, 2430.0
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One scan: what, with which build, at which modulation, over which stage travel."""
+    """One scan: its scene, build, modulation and stage travel."""
 
     name: str
     title: str
@@ -72,7 +72,7 @@ class Scanned:
 
 
 def cases(effort: Effort) -> list[Case]:
-    """List the scans; of those at 1 kHz a fast run has a strip of the leaves alone."""
+    """Return the scans; of those at 1 kHz a fast run has a strip of the leaves alone."""
     made = []
     for name, title, scene, build in (
         ("leaves", "leaves at 1.32 m", Leaves(), "config_3"),
@@ -118,8 +118,8 @@ def run(effort: Effort, progress: Progress) -> Outcome:
     )
     outcome.figures["leaf_levels"] = level_figure(residuals)
     outcome.captions["leaf_levels"] = (
-        "Points well inside leaves of the middle layer, by the level they lie on; dashed: the true "
-        "levels, 2.2 mm apart"
+        "Points well inside leaves of the middle layer, by their level; dashed: the true levels, "
+        "2.2 mm apart"
     )
     return outcome
 
@@ -264,21 +264,20 @@ def _separation_findings(label: str, steps: list[LevelStep]) -> list[Finding]:
 
 _REMARKS = (
     "The print places the faces at 2.43 m and, elsewhere, at about one metre. The final build "
-    "(Config 3) ends at 2.116 m; of the four builds only Config 2 sees 2.43 m, at row 705 of 719. "
-    "There the sensor's last row cuts the line's footprint, and a row estimated from the rest of "
+    "(Config 3) ends at 2.116 m; of the four builds only Config 2 covers 2.43 m, at row 705 of "
+    "719. There the sensor's last row cuts the line's footprint, and a row estimated from the rest of "
     "it is off by up to a few rows of 7 mm; at one metre nothing is cut.",
     "At 300 mm/s the stage moves 4.3 mm per period at 70 Hz and 0.3 mm at 1 kHz: the faster scan "
     "resolves outlines and veins along the stage, not finer ranges. Its error is the fixed pattern "
     "of the pixels' thresholds, which more periods do not average out. The stage takes 22.5 mm to "
     "reach its speed.",
-    "The distance of the 2.2 mm levels is good to about a quarter of a row (0.5 mm) and not "
-    "better: on flat leaves the line meets the pixel rows at one place, and whole rows join or "
-    "leave its footprint.",
-    "Where the range changes along the stage, points lie behind the motion: the face's error turns "
-    "its sign at the nose, with the slope.",
-    "The line is 5 mm thick along the stage at 1.32 m: within 3 mm of a rim it lies on both "
-    "leaves, or reaches one before the sheet's middle does. These points make the gross errors "
-    "and nearly all of the root mean square error. "
-    "Occlusion is not modelled: the camera sees whatever the laser sheet hits first.",
+    "The distance of the 2.2 mm levels is accurate to about a quarter of a row (0.5 mm): on flat "
+    "leaves the line crosses the pixel rows at one place, and its footprint changes by full rows.",
+    "Where the range changes along the stage, points lag behind the motion: the face's error "
+    "changes its sign at the nose, with the slope.",
+    "The line is 5 mm thick along the stage at 1.32 m: within 3 mm of a rim it is on both leaves, "
+    "or reaches one before the sheet's middle does. These points cause the gross errors and nearly "
+    "all of the root mean square error. Occlusion is not modelled: every surface that the laser "
+    "sheet hits first is visible to the camera.",
 )
 EXPERIMENT = Experiment("scans", "Fig. 8: leaves and a face at 300 mm/s", run)

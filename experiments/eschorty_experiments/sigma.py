@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCENES: dict[str, Scene] = {
-    # At an angle, so that the line meets the pixel rows in every way and not in a single one.
+    # At an angle, so that the line crosses the pixel rows at every phase and not at a single one.
     "plane": Plane(slope_column=0.1),
     **{name: named(name) for name in ("steps", "tilted", "sphere", "leaves", "face")},
 }
-# Modulation, stage speed, and the travel that gives enough profiles.
+# Modulation, stage speed, and a travel with enough profiles.
 SWEEPS = ((70.0, 100.0, 50.0), (300.0, 200.0, 30.0), (1000.0, 300.0, 24.0))
 START_MM = 40.0
 ONE_SIGMA, TWO_SIGMA = (0.64, 0.72), (0.93, 0.97)
@@ -46,7 +46,7 @@ THICKNESS_PX = 22.0
 BEND_MM, CONTRAST = 0.8, 1.15
 """Change of slope times distance, and of reflectance, that make an edge."""
 GATES_US = {"mean": 1000}
-"""Phase gate of the estimators that take every event of a column for the line's."""
+"""Phase gate of the estimators that use every event of a column."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class Ratios:
     mixed: NDArray[np.bool_]
 
     def within(self, sigmas: float, mixed: bool | None = False) -> float:
-        """Share of errors within so many sigmas: on surfaces, at edges (``True``) or of all."""
+        """Return the share of errors within ``sigmas``, at edges if ``mixed``, of all if ``None``."""
         ratio = self.ratio if mixed is None else self.ratio[self.mixed == mixed]
         return float(np.mean(ratio <= sigmas)) if ratio.size else math.nan
 
@@ -143,10 +143,10 @@ def _ratios(
 def _edges(
     recording: Recording, scene: Scene, reach_columns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Periods, and the columns whose points lie across an edge of the scene in each of them.
+    """Return the periods, and by period a mask of the columns on an edge of the scene.
 
-    An edge is a jump of the range or of the reflectance between places a sixth of the line's
-    thickness apart along the stage. Columns that are averaged with one on an edge count, too.
+    An edge is a jump of range or reflectance between places a sixth of the line's thickness apart
+    along the stage. Columns that smoothing averages with one on an edge count, too.
     """
     model = recording.calibration.model()
     truth = recording.truth
@@ -224,15 +224,15 @@ def _figure(pooled: list[Ratios]) -> Figure:
 
 _REMARKS = (
     "The bands are for points on surfaces, all scenes together. Where an edge of range or "
-    "reflectance lies within the line's thickness (or within that of a column averaged in), a "
-    "point mixes both sides; no statistic of its events tells that a line of full width is made of "
-    "two halves, and sigma, though raised where the footprint is narrow or jumps, is too small for "
+    "reflectance is within the line's thickness (or within that of a column averaged in), a point "
+    "mixes both sides; no statistic of its events distinguishes a line of full width from two "
+    "halves, and sigma, though raised where the footprint is narrow or jumps, is too small for "
     "many of them. The tables give their share and their coverage, and that of all points.",
     "On a single scene the share differs: much of the error repeats from period to period, so a "
     "flat target shows the error of a few rows only.",
-    "mean takes every event of a column for the line's and is shown with a phase gate of 1 ms. "
-    "Without it most of its error is that of one to three stray events per column, which sigma "
-    "knows: the share within two sigma is then above 98 %.",
+    "mean uses every event of a column and is shown with a phase gate of 1 ms. Without it most of "
+    "its error is due to one to three background events per column, which sigma covers: the share "
+    "within two sigma is then above 98 %.",
 )
 
 EXPERIMENT = Experiment("sigma", "Coverage of the reported sigma", run)

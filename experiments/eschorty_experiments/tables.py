@@ -1,4 +1,4 @@
-"""Tables 1 and 2 of the paper, computed from its equations, beside what it prints."""
+"""Tables 1 and 2 of the paper, computed from its equations, beside the printed values."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def run(effort: Effort, progress: Progress) -> Outcome:
         },
         remarks=[
             "The package uses row centres 0 to 719 and k = f / sin θ unrounded. The print mixes "
-            "rounded and unrounded k, and row 719 with row 720; each printed range comes back "
-            "under the convention stated in the column far_row.",
+            "rounded and unrounded k, and row 719 with row 720; each printed range is reproduced "
+            "with the convention stated in the column far_row.",
             "Config 3 prints kk' = -896502 mm px. Its k' with k = 24.06 mm gives -896520, and no "
             "convention found gives the print; its ranges are right.",
             "Table 2 prints a range step 2.5 times finer than Eq. 4 at 2.5 m: the numbers are "
@@ -149,7 +149,7 @@ def _table_1_findings(made: dict[str, Design]) -> list[Finding]:
                 high=0.005, unit="deg"),
         Finding("Table 1: largest difference of kk' with k = 24.06 mm, Config 3 apart",
                 max(product.values()), high=1.0, unit="mm px"),
-        Finding("Table 1: kk' of Config 3 against its print, a slip of the print", off, 17.0, 20.0,
+        Finding("Table 1: kk' of Config 3 against its print, a misprint", off, 17.0, 20.0,
                 "mm px"),
     ]  # fmt: skip
 
@@ -203,7 +203,7 @@ def _table_2_findings(made: dict[str, Design]) -> list[Finding]:
     return [
         Finding("Table 2: depth sampling read as mm per metre, largest difference to the print",
                 apart, high=0.05, unit="mm per m"),
-        Finding("Table 2: range step at 2.5 m over the print, a slip of the print", coarser,
+        Finding("Table 2: range step at 2.5 m over the print, a misprint", coarser,
                 2.4, 2.6),
         Finding("Table 2: column pitch against 200 µrad", final.column_pitch_rad * 1e6,
                 198.0, 202.0, "µrad"),

@@ -57,10 +57,11 @@ def run(effort: Effort, progress: Progress) -> Outcome:
     measured: list[Measured] = []
     for k, variant in enumerate(todo):
         progress(0.1 + 0.85 * k / len(todo), variant.label)
-        measure(variant, streams[0], 1, False)  # compiled kernels are loaded before they are timed
+        # The kernels are compiled or loaded before they are timed.
+        measure(variant, streams[0], 1, False)
         for stream in streams:
-            remember = (stream.scene_name, stream.background_share) == MEMORY_STREAM
-            measured.append(measure(variant, stream, effort.choose(3, 1), remember))
+            with_memory = (stream.scene_name, stream.background_share) == MEMORY_STREAM
+            measured.append(measure(variant, stream, effort.choose(3, 1), with_memory))
     summaries = [
         summary([one for one in measured if one.variant == variant], share)
         for variant in todo
@@ -84,19 +85,19 @@ def run(effort: Effort, progress: Progress) -> Outcome:
 
 def _captions(effort: Effort) -> dict[str, str]:
     share = f"{100 * TYPICAL:g} %"
-    what = (
+    runs = (
         f"{', '.join(SCENES)}; {FREQUENCY_HZ:g} Hz, {SPEED_MM_S:g} mm/s; background as a share of "
         "all events"
     )
     return {
-        "changes": f"One setting changed from the default at a time ({what}). CPU time of one "
-        f"thread from EVT3 bytes to ranges at {share} background, and how often faster than the "
-        "baseline; peak memory is what Python and numpy allocate (tracemalloc). RMSE is that of "
-        f"all points; gross: more than {GROSS_PX:g} rows off, or where the scene holds nothing",
-        "precision": "Where float32 would do and where not",
+        "changes": f"One setting changed from the default at a time ({runs}). CPU time of one "
+        f"thread from EVT3 bytes to ranges at {share} background, and its ratio to that of the "
+        "baseline; peak memory is that allocated by Python and numpy (tracemalloc). RMSE is that "
+        f"of all points; gross: more than {GROSS_PX:g} rows off, or without a surface in the scene",
+        "precision": "Quantities for which float32 suffices or not",
         "summary": "Every setting at every background, the three scenes together",
         "runs": "Every setting on every scene and background",
-        "pareto": f"Time against error ({what}). Black line and filled marks: no setting is both "
+        "pareto": f"Time against error ({runs}). Black line and filled marks: no setting is both "
         "faster and more exact",
     }
 
@@ -123,8 +124,8 @@ def _findings(summaries: Sequence[Summary]) -> list[Finding]:
         )
         for share, high in zip(BACKGROUND_SHARES, (1.1, 0.3, 0.2), strict=True)
     ]
-    # Filters need to know the camera's delays or its noise; wider smoothing always wins on
-    # surfaces this flat, and detail pays for it.
+    # Filters depend on the camera's delays or noise; wider smoothing always reduces the error on
+    # surfaces this flat, at the cost of detail.
     least_mm = min(
         one.errors.rmse_mm
         for one in summaries
@@ -159,10 +160,10 @@ def _remarks(summaries: Sequence[Summary], precision: DataTable) -> list[str]:
         f"against {plain.ns_per_event:.0f} ns and {plain.errors.rmse_mm:.2f} mm of the paper's "
         f"method in plain numpy; at {100 * worst:g} % background "
         f"{chosen[worst].errors.rmse_mm:.2f} mm against {base[worst].errors.rmse_mm:.2f} mm. It "
-        "needs nothing to be known about the camera.",
+        "needs no parameters of the camera.",
         f"The phase gate ({GATE_US} us) would bring {gated[TYPICAL].errors.rmse_mm:.2f} and, at "
-        f"{100 * worst:g} %, {gated[worst].errors.rmse_mm:.2f} mm and costs nothing, as there is "
-        "less to estimate from. It is not the default: how late a real sensor's events come "
+        f"{100 * worst:g} %, {gated[worst].errors.rmse_mm:.2f} mm at no cost, as fewer events are "
+        "left for the estimator. It is not the default: the delay of a real sensor's events "
         "depends on its biases, a window that is too short loses the line, and at 1 kHz it covers "
         "the period.",
         f"Smoothing over {max(SMOOTHING)} columns on either side lowers the 95th percentile of the "
@@ -173,12 +174,12 @@ def _remarks(summaries: Sequence[Summary], precision: DataTable) -> list[str]:
         f"{100 * TYPICAL:g} % background: "
         + "; ".join(at[index].variant.label for index in front)
         + ".",
-        "What is left of the RMSE without background comes from rims: the line, 5 mm thick along "
-        "the stage, lies on two surfaces there, or a profile straddles them; away from rims the "
+        "The remaining RMSE without background is due to rims: the line, 5 mm thick along the "
+        "stage, is on two surfaces there, or a profile straddles them; away from rims the "
         f"default's RMSE is {typical.errors.away_from_rims().rmse_mm:.2f} mm.",
         "Events stay integers until a column's sums are complete (exact), times are int64 "
         "microseconds: float32 would fail for both. Range and position are float64, where float32 "
-        f"would do: of {column_ns:.0f} ns per column and profile the range equation takes "
+        f"would suffice: of {column_ns:.0f} ns per column and profile the range equation takes "
         f"{range_ns:.1f} ns. The published cloud is float32.",
     ]
 
