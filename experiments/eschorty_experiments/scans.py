@@ -265,8 +265,8 @@ def _separation_findings(label: str, steps: list[LevelStep]) -> list[Finding]:
 _REMARKS = (
     "The print places the faces at 2.43 m and, elsewhere, at about one metre. The final build "
     "(Config 3) ends at 2.116 m; of the four builds only Config 2 covers 2.43 m, at row 705 of "
-    "719. There the sensor's last row cuts the line's footprint, and a row estimated from the rest of "
-    "it is off by up to a few rows of 7 mm; at one metre nothing is cut.",
+    "719. There the sensor's last row cuts the line's footprint, and a row estimated from the rest "
+    "of it is off by up to a few rows of 7 mm; at one metre nothing is cut.",
     "At 300 mm/s the stage moves 4.3 mm per period at 70 Hz and 0.3 mm at 1 kHz: the faster scan "
     "resolves outlines and veins along the stage, not finer ranges. Its error is the fixed pattern "
     "of the pixels' thresholds, which more periods do not average out. The stage takes 22.5 mm to "

@@ -60,7 +60,7 @@ class Ratios:
     mixed: NDArray[np.bool_]
 
     def within(self, sigmas: float, mixed: bool | None = False) -> float:
-        """Return the share of errors within ``sigmas``, at edges if ``mixed``, of all if ``None``."""
+        """Return the share of errors within ``sigmas``, at edges or not; of all with ``None``."""
         ratio = self.ratio if mixed is None else self.ratio[self.mixed == mixed]
         return float(np.mean(ratio <= sigmas)) if ratio.size else math.nan
 
