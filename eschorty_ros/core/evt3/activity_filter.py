@@ -17,7 +17,7 @@ from numba import int32, int64, typeof, types, uint8, uint16, uint64
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, event_arrays, first_fall
+from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, event_arrays, _first_fall
 
 _COLUMN_BITS = 3
 _ROW_BITS = 2
@@ -102,7 +102,7 @@ class ActivityFilter:
         columns = exact("x", events.x, np.uint16, size)
         rows = exact("y", events.y, np.uint16, size)
         polarities = exact("p", events.p, np.uint8, size)
-        fall = first_fall(t_us, self._newest_us)
+        fall = _first_fall(t_us, self._newest_us)
         if fall >= 0:
             raise ArgumentError(f"t[{fall}] is {t_us[fall]} us; sort the events by time")
         if len(self._buffers[0]) < size + 1:

@@ -188,7 +188,9 @@ class Decoder:
     @property
     def counters(self) -> Counters:
         """Counts since construction or ``reset``."""
-        return Counters(*self._counts.item(), len(self._odd))
+        counts = dict(zip(_COUNTS, self._counts.item(), strict=True))
+        counts["odd_byte"] = len(self._odd)
+        return Counters(**counts)
 
     @property
     def time_us(self) -> int | None:

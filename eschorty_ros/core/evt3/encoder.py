@@ -10,7 +10,7 @@ from eschorty_ros.core.base.arrays import integer, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import words as w3
-from eschorty_ros.core.evt3.events import EventArrays, first_fall
+from eschorty_ros.core.evt3.events import EventArrays, _first_fall
 
 _TRIGGER = np.uint16(w3.EXT_TRIGGER << 12)
 _DROP = np.uint16(w3.OTHERS << 12 | w3.DROPPED_EVENTS)
@@ -156,7 +156,7 @@ class Encoder:
         return words[:n].tobytes()
 
     def _refuse_fall(self, name: str, times: NDArray[np.int64]) -> None:
-        fall = first_fall(times, self._state.t_us)
+        fall = _first_fall(times, self._state.t_us)
         if fall >= 0:
             before = times[fall - 1] if fall else self._state.t_us
             raise ArgumentError(

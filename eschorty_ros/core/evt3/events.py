@@ -76,7 +76,7 @@ EVENT_ARRAYS = types.NamedTuple((int64[::1], uint16[::1], uint16[::1], uint8[::1
 
 
 @kernel(int64(types.Array(int64, 1, "C", readonly=True), int64))
-def first_fall(t, last):
+def _first_fall(t, last):
     """Return the index of the first time below its predecessor (``last`` for the first), or -1."""
     for k in range(t.size):
         if t[np.uintp(k)] < last:
