@@ -17,7 +17,7 @@ from numba import int32, int64, typeof, types, uint8, uint16, uint64
 from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, event_arrays, _first_fall
+from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, _first_fall, event_arrays
 
 _COLUMN_BITS = 3
 _ROW_BITS = 2
