@@ -1,4 +1,4 @@
-"""The emulated carriage: trapezoids, limits, homing, and the pulses on its way."""
+"""The emulated carriage: trapezoids, limits, homing, and position pulses."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Axis:
     on_plan : callable
         Called with every new motion.
     sampled_pulses : bool
-        Whether pulses begin at the controller's next cycle of 102.4 us only.
+        Pulses begin at the controller's next cycle of 102.4 us only.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Axis:
 
     @property
     def plan(self) -> MotionPlan:
-        """The motion under way, or the last one."""
+        """Return the motion under way, or the last one."""
         return self._plans[-1]
 
     def position_mm(self, at_ns: int) -> float:
@@ -95,7 +95,7 @@ class Axis:
         )
 
     def moving(self, at_ns: int) -> bool:
-        """Return whether the motion is not over."""
+        """Return whether the motion has not ended."""
         return at_ns < self.plan.end_ns
 
     def move(self, at_ns: int, target_mm: float, speed: float, acceleration: float) -> None:

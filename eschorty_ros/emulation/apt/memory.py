@@ -22,7 +22,7 @@ class Memory:
     ----------
     scale : Scale
     rack : bool
-        Whether the trigger output is a rack's, which has messages of its own.
+        True for a rack, whose trigger output has messages of its own.
     """
 
     def __init__(self, scale: Scale, rack: bool) -> None:

@@ -16,7 +16,7 @@ from eschorty_ros.emulation.apt.memory import SETTINGS, Memory
 from eschorty_ros.emulation.apt.wire import Disturbance, Wire
 from eschorty_ros.hardware.stage import apt_messages as apt
 
-# Status messages without a keep-alive after which it sends no more.
+# Status messages sent after the last keep-alive.
 _UNACKNOWLEDGED_MAX = 50
 
 
@@ -34,17 +34,17 @@ class AptModel:
     travel_mm : tuple of float
         Hard ends of the carriage.
     power_up_mm : float
-        Where the carriage stands at power-up; the encoder reads 0 there.
+        Position of the carriage at power-up; the encoder reads 0 there.
     speed_max_mm_s, acceleration_max_mm_s2 : float
-        What the stage data report and the controller keeps to.
+        Limits that the stage data report and the controller applies.
     late_ns : callable, optional
         Extra delay of each frame to the host, as a USB adapter adds.
     on_plan : callable, optional
         Called with every new motion, in the clock's time.
     sampled_pulses : bool
-        Whether trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
+        Trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
     seed : int
-        Of drawn disturbances.
+        Seed of random disturbances.
 
     Attributes
     ----------

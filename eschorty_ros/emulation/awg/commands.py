@@ -43,7 +43,7 @@ class ChannelState:
         self.load_ohm = load_ohm
 
     def set_levels(self, high_v: float, low_v: float) -> None:
-        """Set levels that lie in range and in order, inside the clamp; ignore others."""
+        """Set levels that are in range, in order and inside the clamp; ignore others."""
         if self.limit:
             high_v, low_v = self._clamped(high_v), self._clamped(low_v)
         bound = LEVEL_LIMIT_V * _divided(self.load_ohm)

@@ -22,11 +22,11 @@ class AwgFaults:
     pending_clears : int
         CHECK_CLEAR replies "pending" this often.
     no_clear : bool
-        INITIATE_CLEAR stalls: the request is not known.
+        INITIATE_CLEAR stalls, as an unsupported request does.
     ignored : set of str
         Paths (long form, such as ``BASE:FREQuency``) whose settings have no effect.
     changed : dict
-        Path to the text that is set instead of what was asked.
+        Path to the text that is set instead of the requested one.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A UTG900E-like waveform generator on an emulated USB bus, with the ways it fails.
+"""A UTG900E-like waveform generator on an emulated USB bus, with its failures.
 
 Like the family it replies without a newline, never answers a request where no reply is due, locks
 the front panel at any command until ``:SYSTem:LOCK OFF``, silently ignores a value out of range,
@@ -53,25 +53,25 @@ class AwgModel(EmulatedUsbDevice):
     clock_ns : callable
         Clock of ``on_change``, ns.
     log_path : path, optional
-        Gets a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and whenever output 1 is switched,
-        before the command is answered: the instrument's own evidence.
+        File for a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and at each switch of output 1,
+        before the command is answered.
     serial : str
     wait : callable
-        How a read waits, see ``EmulatedUsbDevice``.
+        As for ``EmulatedUsbDevice``.
 
     Attributes
     ----------
     channels : list of ChannelState
     locked : bool
-        Whether the front panel is locked.
+        True while the front panel is locked.
     faults : AwgFaults
     errors : deque of str or None
-        The error queue; ``None`` as the family has none.
+        The error queue; ``None`` by default, because the family has none.
     commands : deque of str
         The last 4096 commands received, in order.
     on_change : callable or None
-        ``on_change(since_ns, lit, modulation)`` whenever light or its modulation change; a rising
-        edge lies at ``since_ns``.
+        ``on_change(since_ns, lit, modulation)`` at each change of the light or its modulation;
+        ``since_ns`` is the time of a rising edge.
     """
 
     def __init__(
@@ -112,17 +112,17 @@ class AwgModel(EmulatedUsbDevice):
 
     @property
     def output(self) -> bool:
-        """Whether output 1 is switched on."""
+        """Return whether output 1 is switched on."""
         return self.channels[0].output
 
     @property
     def lit(self) -> bool:
-        """Whether output 1 reaches the level at which the laser is on."""
+        """Return whether output 1 reaches the level at which the laser is on."""
         state = self.channels[0]
         return state.output and max(state.high_v, state.low_v) >= THRESHOLD_V
 
     def power_up(self) -> None:
-        """Start: outputs off, settings of the maker, panel free."""
+        """Start: outputs off, factory settings, panel unlocked."""
         super().power_up()
         self._reset_settings()
 
@@ -164,7 +164,7 @@ class AwgModel(EmulatedUsbDevice):
         data: bytes | int,
         timeout_ms: int,
     ) -> bytes | int:
-        """Answer INITIATE_CLEAR and CHECK_CLEAR, and the requests that every device knows."""
+        """Answer INITIATE_CLEAR and CHECK_CLEAR, and the standard requests."""
         if request_type == _CLASS_INTERFACE_IN and request == 5 and not self.faults.no_clear:
             self._message = b""
             self._replies.clear()
@@ -227,7 +227,7 @@ class AwgModel(EmulatedUsbDevice):
     def _channel(self, found: re.Match[str]) -> ChannelState:
         return self.channels[int(found[1] or 1) - 1]
 
-    def _answer(self, tag: int, wanted: int) -> None:
+    def _answer(self, tag: int, requested: int) -> None:
         """Send the reply that is due, if there is one, in one transfer."""
         faults = self.faults
         if not self._replies or faults.take("late_replies"):
@@ -236,7 +236,7 @@ class AwgModel(EmulatedUsbDevice):
             self._replies.popleft()
             return
         reply = self._replies.popleft()
-        most = min(wanted, faults.transfer_bytes or wanted)
+        most = min(requested, faults.transfer_bytes or requested)
         part, rest = reply[:most], reply[most:]
         if rest:
             self._replies.appendleft(rest)

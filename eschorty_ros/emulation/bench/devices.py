@@ -34,7 +34,7 @@ class BenchSettings:
     background_hz : float
         Background events of one pixel.
     trigger : {"none", "laser", "stage"}
-        What is wired to the camera's trigger input.
+        Output that is wired to the camera's trigger input.
     imperfections : Imperfections
     laser_log : str
         File with one line per change of the generator's output; empty for none.

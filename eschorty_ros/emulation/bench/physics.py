@@ -1,4 +1,4 @@
-"""The physics between the emulated devices: laser and stage light the scene, the sensor sees it.
+"""Physics between the emulated devices: laser and stage light the scene, the sensor measures it.
 
 Laser and stage act in bench time, int64 nanoseconds of the bench's clock. The sensor has a clock of
 its own, which starts at 0 with every start of the stream and may run fast or slow. The world is
@@ -46,7 +46,7 @@ class Imperfections:
     usb_jitter_ms : float
         Largest delay of the camera's bytes, uniformly distributed from 0.
     missing_edges : float
-        Share of the trigger edges that the camera does not see.
+        Share of the trigger edges that the camera misses.
     seed : int
         Seed of jitter and missing edges.
 
@@ -96,11 +96,11 @@ class _Control:
 
 
 class Physics:
-    """Scene, laser and stage as the sensor sees them; the source of the camera's bytes.
+    """Scene, laser and stage before the sensor; the source of the camera's bytes.
 
     A caller that makes a device act holds ``lock`` from reading the bench's clock until it has
     called ``set_laser``, ``set_stage`` or ``set_sensor``, and calls :meth:`collect_pulses` before:
-    every change is then known before the world reaches it. The camera calls ``read``, ``start``
+    every change is then set before the world reaches its time. The camera calls ``read``, ``start``
     and ``stop``.
 
     Parameters
@@ -111,7 +111,7 @@ class Physics:
         The bench's clock.
     imperfections : Imperfections
     trigger : {"none", "laser", "stage"}
-        What is wired to the camera's trigger input.
+        Output that is wired to the camera's trigger input.
     pulses : Pulses, optional
         The stage's trigger output.
 
@@ -121,7 +121,7 @@ class Physics:
     late_changes : int
         Changes set after the world had passed their time.
     edges, edges_missed : int
-        Trigger edges on the wire, and those of them that the camera does not see.
+        Trigger edges on the wire, and those of them that the camera misses.
 
     Raises
     ------
@@ -164,7 +164,7 @@ class Physics:
         self._running = threading.Event()
 
     def set_laser(self, since_ns: int, on: bool, modulation: Modulation | None) -> None:
-        """Set the laser's output from ``since_ns`` on, where a rising edge lies."""
+        """Set the laser's output from ``since_ns`` on, the time of a rising edge."""
         with self.lock:
             self._light = _Light(since_ns, on, modulation)
             self._changes.append(self._light)
@@ -205,7 +205,7 @@ class Physics:
             self._zero_ns = self._collected_ns = self.clock_ns()
             self._world = world
             if self._trigger == "laser":
-                world.trigger_input = lambda a, b: self._seen(world.laser_edges(a, b))
+                world.trigger_input = lambda a, b: self._received(world.laser_edges(a, b))
             elif self._trigger == "stage":
                 world.trigger_input = self._stage_trigger
             self._apply_light(world, self._light)
@@ -297,16 +297,16 @@ class Physics:
         while self._stage_edges and self._sensor_us(self._stage_edges[0][0]) < end_us:
             t_ns, rising = self._stage_edges.popleft()
             edges.append((max(self._sensor_us(t_ns), begin_us), rising))
-        return self._seen(edges)
+        return self._received(edges)
 
-    def _seen(self, edges: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
+    def _received(self, edges: list[tuple[int, bool]]) -> list[tuple[int, bool]]:
         """Return the edges without those that the camera misses."""
-        seen = [
+        received = [
             edge for edge in edges if self._chance_of_edge() >= self._imperfections.missing_edges
         ]
         self.edges += len(edges)
-        self.edges_missed += len(edges) - len(seen)
-        return seen
+        self.edges_missed += len(edges) - len(received)
+        return received
 
     def _chance_of_edge(self) -> float:
         return self._edge_chance.random() if self._imperfections.missing_edges else 1.0

@@ -31,7 +31,7 @@ from eschorty_ros.simulation.world import BACKGROUND_HZ
 _LOCK_FILE = "lock"
 _SWITCH_S = 5e-4
 _POLL_S = 0.1
-_LINGER_S = 3.0
+_CLIENTS_END_S = 3.0
 
 
 @contextlib.contextmanager
@@ -113,7 +113,7 @@ def serve(folder: Path, settings: BenchSettings) -> None:
             )
             termination.wait()
             # Ctrl-C reaches the nodes, too, which need their devices while they end.
-            end_s = time.monotonic() + _LINGER_S
+            end_s = time.monotonic() + _CLIENTS_END_S
             while usb.clients and time.monotonic() < end_s:
                 time.sleep(_POLL_S)
 
@@ -178,11 +178,11 @@ def command(
     usb_jitter: float,
     laser_log: Path | None,
 ) -> None:
-    """Emulate camera, generator and stage at the far ends of their cables.
+    """Emulate camera, generator and stage at the level of USB transfers and serial bytes.
 
     FOLDER gets a Unix socket for the USB bus (usb.sock), a serial port of the stage (stage) and,
-    when both exist, the file ready. Without FOLDER it is the one in which nodes with driver
-    "fake" look: one for each user and ROS_DOMAIN_ID.
+    when both exist, the file ready. Without FOLDER it is the one that nodes with driver
+    "fake" use: one for each user and ROS_DOMAIN_ID.
 
     The drivers on it are those of the real devices. It ends with Ctrl-C, SIGTERM, or with the
     process that started it; connected clients get 3 s to close.

@@ -28,11 +28,11 @@ class SerialModel(Protocol):
         """Receive bytes from the host."""
 
     def step(self) -> bytes:
-        """Advance to the present; returns the bytes for the host."""
+        """Advance to the present; return the bytes for the host."""
 
 
 class PtyPort:
-    """Serves a model on a pseudo-terminal, under a fixed link to its changing name.
+    """Serves a model on a pseudo-terminal, with a fixed link to its varying name.
 
     While the model is ``gone`` there is no port, and an open one hangs up, as with an unplugged
     USB adapter.
@@ -106,7 +106,7 @@ class PtyPort:
                 if self._model.gone:
                     self._unplug()
                     self._ending.wait(_TICK_S)
-                    # The model goes on in time and may be plugged in again.
+                    # The model's time passes, and it may be plugged in again.
                     with self._lock:
                         self._model.step()
                     continue

@@ -243,7 +243,7 @@ class EmulatedUsbDevice:
         data: bytes | int,
         timeout_ms: int,
     ) -> bytes | int:
-        """Answer a control request: bytes for IN (``data`` = bytes wanted), a count for OUT.
+        """Answer a control request: bytes for IN (``data`` = bytes requested), a count for OUT.
 
         The base answers string descriptors and stalls on anything else.
         """

@@ -158,11 +158,11 @@ class _Session:
             self._backend.close_device(self._handle)
 
     def _list(self) -> bytes:
-        seen = [
+        entries = [
             {"bus": h.bus, "address": h.address, "identity": asdict(h.identity)}
             for h in self._backend.enumerate_devices()
         ]
-        return json.dumps(seen).encode()
+        return json.dumps(entries).encode()
 
     def _open(self, address: int) -> bytes:
         for handle in self._backend.enumerate_devices():

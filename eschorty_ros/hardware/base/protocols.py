@@ -94,7 +94,7 @@ class EventSource(Protocol):
         """Set one bias, an offset from the factory trim; returns the offset read back.
 
         Raises ``ArgumentError`` for an unknown bias or an offset outside its range,
-        ``DeviceError`` when the camera is not open or keeps another value.
+        ``DeviceError`` when the camera is not open or reads back another value.
         """
 
     def filters_out(self, frequency_hz: float) -> bool:
@@ -123,7 +123,7 @@ class LaserReadback:
     """Output and settings as the generator reports them.
 
     ``phase_epoch_ns`` is the time of one rising edge, ``None`` where the generator does not report
-    its phase. ``reason`` is why the output is off or unknown, where the driver knows it.
+    its phase. ``reason`` names the cause of an output that is off or unknown, ``""`` without one.
     ``warnings`` are all oddities since opening that are no failure, ``counters`` go to diagnostics.
     """
 
@@ -189,10 +189,10 @@ class LinearStage(Protocol):
 
     @property
     def healthy(self) -> bool:
-        """Whether the stage answers and nothing has failed; never waits."""
+        """Return whether the stage answers and nothing has failed; never waits."""
 
     def home(self) -> None:
-        """Start homing; ``state().homed`` tells when it is done."""
+        """Start homing; ``state().homed`` is true at its end."""
 
     def move_to(self, position_mm: float, speed_mm_s: float) -> None:
         """Start an absolute move; raises ``DeviceError`` outside travel, too fast or not homed."""
@@ -201,13 +201,13 @@ class LinearStage(Protocol):
         """Profiled stop; idempotent."""
 
     def state(self, t_ns: int | None = None) -> StageState:
-        """Position, velocity, time and flags; by default at the newest time that is known.
+        """Return position, velocity, time and flags, by default at the newest time known.
 
         Raises ``DeviceError`` when the stage has failed.
         """
 
     def statistics(self) -> dict[str, float]:
-        """Counters for diagnostics, by name with unit."""
+        """Return counters for diagnostics, by name with unit."""
 
     def close(self) -> None:
         """Stop and release; idempotent."""

@@ -10,11 +10,11 @@ _STATES = {"T": "stopped", "t": "stopped by a debugger", "Z": "dead", "X": "dead
 
 
 class StallMeter:
-    """Measures the stalls of this process by how late a loop's turns are.
+    """Measures the stalls of this process by the delay of a loop's turns.
 
-    A machine that stands still (it swaps, or is a virtual one that is not run) makes every received
+    A machine that stalls (it swaps, or is a virtual one that is not run) makes every received
     heartbeat old at once. A watchdog excludes that time, and compares ages as of ``measured_s``: a
-    stall may begin after a measurement. A process that dies is noticed by other means.
+    stall may begin after a measurement. The end of another process is noticed by other means.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _KINDS: dict[int, tuple[type[DeviceError], str]] = {
     errno.ENXIO: (DeviceGoneError, "the device is gone; check cable and power, then reconnect"),
     errno.ETIMEDOUT: (DeviceTimeoutError, "no answer in time; check that the device is on"),
     errno.EPIPE: (DeviceStallError, "the device stalled the transfer"),
-    errno.EOVERFLOW: (DeviceError, "more data than asked for; the transfer is lost"),
+    errno.EOVERFLOW: (DeviceError, "more data than requested; the transfer is lost"),
     errno.EIO: (DeviceError, "transfer failed; check cable and hub"),
     errno.EACCES: (
         DeviceError,
@@ -115,7 +115,7 @@ def find_device(
     matches : callable
         May read descriptors only: the device is not open yet.
     serial : str
-        Serial string, upper or lower case; ``""`` takes the only match.
+        Serial string, upper or lower case; ``""`` for the only match.
 
     Raises
     ------
@@ -127,14 +127,14 @@ def find_device(
     try:
         found = list(usb.core.find(find_all=True, backend=backend, custom_match=matches))
         if serial:
-            found, seen = _with_serial(found, serial, name)
+            found, others = _with_serial(found, serial, name)
         else:
-            seen = []
+            others = []
     except usb.core.USBError as error:
         raise translate(error, f"{name}: looking for it on the bus") from error
     if not found:
         which = f" with serial {serial}" if serial else ""
-        there = f"; there is {', '.join(seen)}" if seen else ""
+        there = f"; there is {', '.join(others)}" if others else ""
         raise DeviceGoneError(
             f"{name}: no such device{which} on the bus{there}; check cable, power and serial"
         )
@@ -158,15 +158,15 @@ def _with_serial(
     devices: list[usb.core.Device], serial: str, name: str
 ) -> tuple[list[usb.core.Device], list[str]]:
     """Return the devices with that serial, and the serials of all others."""
-    kept, seen = [], []
+    kept, others = [], []
     for device in devices:
         text = _serial(device, name)
         if text.lower() == serial.lower():
             kept.append(device)
         else:
-            seen.append(text or f"one without serial at {_place(device)}")
+            others.append(text or f"one without serial at {_place(device)}")
             usb.util.dispose_resources(device)
-    return kept, seen
+    return kept, others
 
 
 def _serial(device: usb.core.Device, name: str) -> str:
@@ -202,7 +202,7 @@ def claim(device: usb.core.Device, interface: int, name: str) -> bool:
 
 
 def release(device: usb.core.Device, interface: int, *, reattach: bool) -> None:
-    """Release the interface, reattach the kernel driver if asked, and close; never raises."""
+    """Release the interface, reattach the kernel driver if ``reattach``, and close; never raises."""
     with suppress(usb.core.USBError):
         usb.util.release_interface(device, interface)
     if reattach:

@@ -81,7 +81,7 @@ class BiasBank:
         ArgumentError
             For an unknown name or an offset outside the range.
         DeviceError
-            When the camera keeps another value than was written.
+            When the camera reads back another value than was written.
         """
         info = check_offset(name, offset, self._wide)
         dac = min(max(self.factory[name] + offset, 0), _DAC)

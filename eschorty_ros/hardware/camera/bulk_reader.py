@@ -88,7 +88,7 @@ class SyncReader:
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """Read one transfer."""
         try:
-            # libusb takes 0 ms as unlimited.
+            # For libusb 0 ms is unlimited.
             count = self._device.read(self._endpoint, self._buffer, max(int(timeout_s * 1e3), 1))
         except usb.core.USBError as error:
             failure = translate(error, _NAME)
@@ -255,7 +255,7 @@ class AsyncReader:
         """Collect a finished transfer; runs in the thread that handles libusb's events."""
         library, done = self._library, transfer.contents
         status = done.status
-        # Data after a failed transfer lies behind a gap that is not marked yet.
+        # Data after a failed transfer follows a gap that is not marked yet.
         if done.actual_length and self._failure is None:
             data = ctypes.string_at(done.buffer, done.actual_length)
             self._received.append((data, self._clock_ns()))

@@ -78,7 +78,7 @@ class CameraUsb:
     device : usb.core.Device
     endpoints : Endpoints
     slow : bool
-        Whether the link is slower than 5 Gbit/s.
+        True when the link is slower than 5 Gbit/s.
     """
 
     def __init__(self, device: usb.core.Device) -> None:
@@ -150,7 +150,7 @@ def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
     """
     if not serial:
         return CameraUsb(bus.find_device(backend, name=NAME, matches=_is_camera))
-    seen: list[str] = []
+    others: list[str] = []
     try:
         found = list(usb.core.find(find_all=True, backend=backend, custom_match=_is_camera))
     except usb.core.USBError as error:
@@ -159,24 +159,24 @@ def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
         try:
             camera = CameraUsb(_find(backend, place))
         except DeviceError as error:
-            seen.append(str(error))
+            others.append(str(error))
             continue
         try:
             its_serial = read_serial(treuzell.Treuzell(camera))
         except EschortyError as error:
             camera.close()
-            seen.append(str(error))
+            others.append(str(error))
             continue
         if _same_serial(its_serial, serial):
             return camera
         camera.close()
-        seen.append(its_serial)
-    if not seen:
+        others.append(its_serial)
+    if not others:
         raise DeviceGoneError(
             f"{NAME}: none with serial {serial} on the bus; check cable, power and serial"
         )
     raise DeviceGoneError(
-        f"{NAME}: none with serial {serial} can be opened, but there is {', '.join(seen)}; "
+        f"{NAME}: none with serial {serial} can be opened, but there is {', '.join(others)}; "
         "check cable, power and serial"
     )
 

@@ -31,11 +31,11 @@ class Connection:
     backend : usb.backend.IBackend
     clock_ns : callable
     serial : str
-        ``""`` takes the only camera there is; after the first opening only that one is taken.
+        ``""`` for the only camera. After the first opening only the same camera is opened again.
     settings : CameraSettings
         Written in every new session.
     attempts_max : int
-        How often a lost camera is searched for.
+        Searches for a lost camera.
     sleep : callable
         Waits some seconds; raises :class:`EndedError` when the stream ends.
     settle : callable
@@ -48,7 +48,7 @@ class Connection:
     identity : DeviceIdentity
     settings : CameraSettings
     loss : str
-        Why the session was lost, one line; empty while there is one.
+        Reason of the loss, one line; empty while there is a session.
     losses, reconnects, attempts : int
     """
 

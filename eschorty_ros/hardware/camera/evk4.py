@@ -43,10 +43,10 @@ class Evk4:
     clock_ns : callable
         Clock of the arrival times.
     serial : str
-        Hex serial; ``""`` takes the only camera there is; only that one is opened again.
+        Hex serial, ``""`` for the only camera. After a loss only the same camera is opened again.
     settings : CameraSettings, optional
     reconnect_attempts : int
-        How often a lost camera is searched for: after 0.5 s, then with waits doubling up to 8 s.
+        Searches for a lost camera: after 0.5 s, then with waits doubling up to 8 s.
     queue_bytes : int
         Bytes that may wait to be read; more is dropped, counted and reported as a gap.
     sleep : callable, optional
@@ -211,7 +211,7 @@ class Evk4:
         ArgumentError
             For an unknown bias or an offset outside its range.
         DeviceError
-            When the camera is not open or keeps another value.
+            When the camera is not open or reads back another value.
         """
         settings = self._connection.settings.with_bias(name, offset)
         kept = self._connection.require(name).set_bias(name, offset)
@@ -296,7 +296,7 @@ class Evk4:
             return True
         if not data:
             return failed_before
-        self._health.note_alive()
+        self._health.note_streaming()
         self._queue.put(data, arrival_ns)
         return False
 
@@ -304,7 +304,7 @@ class Evk4:
         self._connection.drop(error)
         self.on_loss(self._connection.loss)
         self._connection.reopen(self._restart)
-        self._health.note_alive()
+        self._health.note_streaming()
 
     def _restart(self, session: Session) -> None:
         self._queue.mark_restart()

@@ -1,4 +1,4 @@
-"""Health of a streaming camera: whether it streams while no events come, and its temperature."""
+"""Health of a streaming camera: its state while no events come, and its temperature."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class HealthMonitor:
         self._session = session
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._alive_s = time.monotonic()
-        self._asked_s: float | None = None
+        self._last_streaming_s = time.monotonic()
+        self._requested_s: float | None = None
         self._failure: DeviceError | None = None
 
     def start(self) -> None:
         """Start polling."""
         self._ending.clear()
-        self.note_alive()
+        self.note_streaming()
         self._thread = threading.Thread(target=self._run, name="EVK4 health", daemon=True)
         self._thread.start()
 
@@ -63,12 +63,12 @@ class HealthMonitor:
 
         A request that a busy host sends late does not count against the camera.
         """
-        asked_s = self._asked_s
-        return asked_s is None or time.monotonic() - asked_s < _ANSWER_TIMEOUT_S
+        requested_s = self._requested_s
+        return requested_s is None or time.monotonic() - requested_s < _ANSWER_TIMEOUT_S
 
-    def note_alive(self) -> None:
+    def note_streaming(self) -> None:
         """Record that the camera sent events or was opened."""
-        self._alive_s = time.monotonic()
+        self._last_streaming_s = time.monotonic()
         self._failure = None
 
     def raise_failure(self) -> None:
@@ -78,14 +78,14 @@ class HealthMonitor:
             raise failure
 
     def _check_streaming(self) -> None:
-        """Ask a camera without events whether it streams: in the dark it sends none."""
+        """Request the state of a camera without events: without light it sends none."""
         session = self._session()
         if session is None:
             return
-        self._asked_s = time.monotonic()
+        self._requested_s = time.monotonic()
         try:
             if session.is_streaming():
-                self._alive_s = time.monotonic()
+                self._last_streaming_s = time.monotonic()
                 return
             failure = DeviceError(
                 "camera: it has stopped streaming by itself (reset or power dip); check its power"
@@ -94,8 +94,8 @@ class HealthMonitor:
             self.failures += 1
             failure = error
         finally:
-            self._asked_s = None
-        # The answer says nothing about a camera that was opened in the meantime.
+            self._requested_s = None
+        # The answer does not hold for a camera that was opened in the meantime.
         if self._session() is session:
             self._failure = failure
 
@@ -114,7 +114,7 @@ class HealthMonitor:
         measured_s = -math.inf
         while not self._ending.wait(_TICK_S):
             now_s = time.monotonic()
-            if now_s - self._alive_s > _QUIET_S:
+            if now_s - self._last_streaming_s > _QUIET_S:
                 self._check_streaming()
             elif now_s - measured_s > _TEMPERATURE_EVERY_S:
                 measured_s = now_s

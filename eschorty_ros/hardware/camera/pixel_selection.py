@@ -49,9 +49,9 @@ def windows_of(flat: Sequence[int]) -> tuple[Window, ...]:
 
 
 def set_windows(registers: Registers, windows: Sequence[Window]) -> None:
-    """Keep the pixels whose column and row lie in a window; all of them without windows."""
-    for first, wanted in zip((_COLUMNS, _ROWS), _lines(windows), strict=True):
-        for index, word in enumerate(_mask_words(wanted)):
+    """Keep the pixels whose column and row are inside a window; all of them without windows."""
+    for first, kept in zip((_COLUMNS, _ROWS), _lines(windows), strict=True):
+        for index, word in enumerate(_mask_words(kept)):
             registers.write(first + 4 * index, word)
     mask = _ENABLE | _SHADOW | _INSIDE | _PIXELS_ON
     update(registers, _CONTROL, mask, mask if windows else mask & ~_ENABLE)
@@ -90,11 +90,11 @@ def _lines(windows: Sequence[Window]) -> tuple[NDArray[np.bool_], NDArray[np.boo
     return columns, rows
 
 
-def _mask_words(wanted: NDArray[np.bool_]) -> list[int]:
+def _mask_words(kept: NDArray[np.bool_]) -> list[int]:
     """Return the words of a mask in which 1 switches a line off; lines past the last are off."""
-    padded = np.ones(-(-wanted.size // 32) * 32, dtype=bool)
-    padded[: wanted.size] = ~wanted
-    if wanted.all():
+    padded = np.ones(-(-kept.size // 32) * 32, dtype=bool)
+    padded[: kept.size] = ~kept
+    if kept.all():
         padded[:] = False
     packed = np.packbits(padded, bitorder="little")
     return [int(word) for word in packed.view("<u4")]

@@ -30,7 +30,7 @@ class Session:
     ----------
     backend : usb.backend.IBackend
     serial : str
-        Hex serial number; ``""`` takes the only camera there is.
+        Hex serial number, ``""`` for the only camera.
     settings : CameraSettings
     clock_ns : callable
         Clock of the arrival times.
@@ -50,7 +50,7 @@ class Session:
     reader : BulkReader
         For one thread.
     streaming : bool
-        Whether ``start`` was called last.
+        True from ``start`` to ``stop_sensor``.
 
     Raises
     ------

@@ -75,7 +75,7 @@ def apply_settings(
     ArgumentError
         For a value outside its range.
     DeviceError
-        When the camera does not answer or keeps another value.
+        When the camera does not answer or reads back another value.
     """
     for name, offset in settings.biases.items():
         biases.write(name, offset)

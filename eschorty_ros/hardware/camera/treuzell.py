@@ -63,7 +63,7 @@ def answer_payload(property_id: int, frame: bytes) -> bytes:
     answered, size = _HEADER.unpack_from(frame)
     if size != len(frame) - _HEADER.size:
         raise FrameError(
-            f"camera: answer to {property_id:X} says {size} payload bytes and brings "
+            f"camera: answer to {property_id:X} announces {size} payload bytes and has "
             f"{len(frame) - _HEADER.size}; the request is sent again once"
         )
     payload = frame[_HEADER.size :]

@@ -24,7 +24,7 @@ _PORT_ERRORS = (OSError, TypeError, ValueError)
 
 
 class SerialPort(Protocol):
-    """What the link uses of a pyserial port."""
+    """The part of a pyserial port that the link uses."""
 
     timeout: float | None
 
@@ -70,7 +70,7 @@ class AptLink:
     now_ns : callable
         Steady clock.
     wait : callable
-        How to wait for an answer; without threads it has to make time pass.
+        Waits for an answer; without threads it has to advance the time.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class AptLink:
             thread.start()
 
     def call_every(self, period_s: float, action: Callable[[], None]) -> None:
-        """Let the writer call ``action`` now and then every ``period_s``."""
+        """Let the writer call ``action`` at once and then every ``period_s``."""
         with self._changed:
             self._timers.append(_Timer(round(period_s * 1e9), action, self.now_ns()))
             self._changed.notify_all()
@@ -130,7 +130,7 @@ class AptLink:
             When the port fails or is closed.
         """
         self._check_open()
-        # The writer holds the lock for one frame at most. Should it hang, two frames may mix:
+        # The writer holds the lock for one frame at most. If it hangs, two frames may mix, which is
         # better than no stop.
         held = self._port_lock.acquire(timeout=_STOP_LOCK_S)
         try:
@@ -196,7 +196,7 @@ class AptLink:
         return condition()
 
     def receive(self, data: bytes) -> None:
-        """Handle bytes that have just come; without any, drop what stays incomplete."""
+        """Handle bytes just received; with none, drop a frame that stays incomplete."""
         now_ns = self.now_ns()
         for frame in self.framer.feed(data, now_ns):
             self._on_frame(frame, now_ns)

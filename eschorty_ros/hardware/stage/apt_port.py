@@ -19,7 +19,7 @@ BAUD = 115_200
 # First digits of the USB serial numbers of the controllers that move a DDS220.
 PREFIXES = {"kbd101": ("28",), "bbd30x": ("103",)}
 _SETTLE_S = 0.05
-# Long, as a stall of the host is no dead port; frames are a few bytes and never wait on a live one.
+# Long: a stall of the host is no failure of the port. Frames are a few bytes and never wait.
 _WRITE_S = 2.0
 
 
@@ -56,16 +56,16 @@ def find_port(controller: str, serial_number: str = "") -> str:
     ports = [port for port in list_ports.comports() if port.serial_number]
     if serial_number:
         fitting = [port for port in ports if port.serial_number == serial_number]
-        wanted = f"with USB serial number {serial_number}"
+        which = f"with USB serial number {serial_number}"
     else:
         fitting = [
             port for port in ports if str(port.serial_number).startswith(PREFIXES[controller])
         ]
-        wanted = f"of a {controller}"
+        which = f"of a {controller}"
     if not fitting:
         found = ", ".join(f"{port.device} ({port.serial_number})" for port in ports) or "none"
         raise DeviceGoneError(
-            f"stage: no serial port {wanted}; USB serial ports found: {found}; check power and "
+            f"stage: no serial port {which}; USB serial ports found: {found}; check power and "
             "cable, or give the parameter port"
         )
     if len(fitting) > 1:

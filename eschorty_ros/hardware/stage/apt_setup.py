@@ -1,7 +1,7 @@
-"""What is read from a stage controller and written to it at each connection.
+"""Settings of a stage controller, written and read back at each connection.
 
-Settings of these controllers are volatile and other programs rewrite them, so all are written at
-every connection, and read back where the controller answers.
+They are volatile and other programs rewrite them, so all are written at every connection, and read
+back where the controller answers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CONTROLLERS = ("kbd101", "bbd30x")
 _ANSWER_S = 0.3
 _ATTEMPTS = 3
 _PULSE_US = 500
-# More passes than any session makes.
+# Larger than the number of passes of any session.
 _CYCLES = 1_000_000
 _STEPS_BOTH = 0x0F
 _OUTPUT = 1
@@ -28,7 +28,7 @@ _ARM, _DISARM = 1, 2
 
 @dataclass(frozen=True, slots=True)
 class AptSettings:
-    """How the stage is connected and what it may do.
+    """Connection and limits of the stage.
 
     Parameters
     ----------
@@ -77,13 +77,13 @@ class AptSettings:
 
     @property
     def address(self) -> int:
-        """Where motion commands go."""
+        """Address of motion commands."""
         return apt.SINGLE_UNIT if self.controller == "kbd101" else apt.bay_address(self.bay)
 
 
 @dataclass(frozen=True, slots=True)
 class AxisData:
-    """What the controller reports of itself and its stage, within the settings' caps."""
+    """Data of the controller and its stage, within the settings' caps."""
 
     identity: DeviceIdentity
     scale: apt.Scale
@@ -124,7 +124,7 @@ class AptSetup:
         self._link.send(apt.pack(name, self._settings.address, **values))
 
     def read_axis(self) -> AxisData:
-        """Return what controller and stage are.
+        """Return the data of controller and stage.
 
         Raises
         ------
@@ -180,23 +180,23 @@ class AptSetup:
         Raises
         ------
         DeviceError
-            When the controller keeps others.
+            When the controller reads back other values.
         """
-        wanted = {
+        requested = {
             "acceleration": axis.scale.acceleration(axis.acceleration_mm_s2),
             "velocity": axis.scale.velocity(speed_mm_s),
         }
-        self.send("set_velocity", minimum=0, **wanted)
+        self.send("set_velocity", minimum=0, **requested)
         answer = self.request("request_velocity", "velocity")
-        for name, value in wanted.items():
+        for name, value in requested.items():
             if answer.integer(name) != value:
                 raise DeviceError(
                     f"stage: the controller keeps {name} {answer.integer(name)} instead of "
                     f"{value}; lower speed or acceleration, and close other programs that use it"
                 )
         return (
-            wanted["velocity"] / axis.scale.velocity_unit,
-            wanted["acceleration"] / axis.scale.acceleration_unit,
+            requested["velocity"] / axis.scale.velocity_unit,
+            requested["acceleration"] / axis.scale.acceleration_unit,
         )
 
     def write_trigger(self, axis: AxisData) -> PulseTrain | None:
@@ -205,7 +205,7 @@ class AptSetup:
         Raises
         ------
         DeviceError
-            When the interval does not fit or the controller keeps another pattern.
+            When the interval does not fit or the controller reads back another pattern.
         """
         scale, (low, high) = axis.scale, axis.travel_mm
         interval = scale.position(self._settings.trigger_interval_mm)

@@ -55,12 +55,12 @@ def open_stage(
 
 
 class AptStage:
-    """Linear stage over APT; positions lie ``lag_s`` in the past, where readings surround them.
+    """Linear stage over APT; its positions are those of ``lag_s`` ago, between two readings.
 
     Parameters
     ----------
     make_link : callable
-        Makes a link, given what to call for frames and for a lost port.
+        Makes a link from its callbacks for a frame and for a lost port.
     clock_ns : callable
         Clock of ``state().t_ns``.
     settings : AptSettings
@@ -82,7 +82,7 @@ class AptStage:
         self._closed = False
         # Both counters show a stop and an order that cross, on either side.
         self._stops = self._orders = 0
-        # Frames may come at once; they wait for the tracker.
+        # Frames that come at once wait for the tracker.
         with self._lock:
             self._link = make_link(self._on_frame, self._on_lost)
             self._tracker = Tracker(self, self._link.now_ns, clock_ns)
@@ -192,7 +192,7 @@ class AptStage:
 
     @property
     def healthy(self) -> bool:
-        """Whether status messages come and nothing has failed."""
+        """True while status messages come and nothing has failed."""
         return (
             self._tracker.failure is None
             and not self._closed
@@ -285,7 +285,7 @@ class AptStage:
             self._link.write(apt.pack("request_status", self._settings.address))
 
     def _check_health(self) -> None:
-        # The writer must not block: it also keeps the controller's watchdog alive.
+        # The writer must not block: it also sends the keep-alive of the controller's watchdog.
         if not self._lock.acquire(timeout=_HEALTH_S):
             return
         try:

@@ -20,7 +20,7 @@ _CRITICAL = apt.HOMED | apt.ENABLED | apt.FAULTS | apt.LIMITS
 
 
 class Plausibility(Enum):
-    """What a status message shows; all but ``REPEAT`` and ``CONTRADICTORY`` are used."""
+    """Plausibility of a status message; all but ``REPEAT`` and ``CONTRADICTORY`` are used."""
 
     NORMAL = auto()
     REPEAT = auto()
@@ -35,7 +35,7 @@ class Plausibility(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """One status message: position, bits, and when it can have been taken (ns)."""
+    """One status message: position, bits, and the interval in which it was taken (ns)."""
 
     position_mm: float
     bits: int
@@ -44,7 +44,7 @@ class Status:
 
     @property
     def not_before_ns(self) -> int:
-        """Time before which it was not taken, also where its request is unknown."""
+        """Earliest time at which it can have been taken, also when its request is unknown."""
         return self.latest_ns - LATE_NS if self.earliest_ns is None else self.earliest_ns
 
     @property
@@ -68,13 +68,13 @@ class StatusChecks:
         self._implausible: Status | None = None
 
     def reset(self) -> None:
-        """Use the next message whatever it holds."""
+        """Accept the next message without a check."""
         self._last = self._implausible = None
 
     def check(
         self, status: Status, expected_mm: tuple[float, float] | None, speed_mm_s: float
     ) -> Plausibility:
-        """Return what one message shows.
+        """Return the plausibility of one message.
 
         Parameters
         ----------

@@ -32,7 +32,7 @@ _AGE_CHECKS_MIN = 20
 
 
 class Kind(Enum):
-    """What was ordered."""
+    """Kind of an ordered motion."""
 
     HOME = "homing"
     MOVE = "move"
@@ -40,7 +40,7 @@ class Kind(Enum):
 
 
 class Outcome(Enum):
-    """What has become of a motion."""
+    """State of an ordered motion as of a status message."""
 
     GOING = auto()
     ENDED = auto()
@@ -51,7 +51,7 @@ class Outcome(Enum):
 
 
 class Actions(Protocol):
-    """What the tracker has done about what the status messages show."""
+    """Actions that the tracker requests because of a status message."""
 
     def request_status(self) -> None:
         """Request another status message."""
@@ -118,7 +118,7 @@ class Tracker:
 
     @property
     def homing(self) -> bool:
-        """Whether the axis is on its way to its reference."""
+        """True while the axis moves to its reference."""
         return self.motion is not None and self.motion.kind is Kind.HOME
 
     def has(self, bits: int) -> bool:
@@ -159,8 +159,8 @@ class Tracker:
         until_ns, status = self.fit.until_ns, self.status
         assert until_ns is not None
         assert status is not None
-        wanted_ns = self._clock_ns() - lag_ns if t_ns is None else t_ns
-        t_ns = min(max(wanted_ns, self._known_from_ns), until_ns)
+        requested_ns = self._clock_ns() - lag_ns if t_ns is None else t_ns
+        t_ns = min(max(requested_ns, self._known_from_ns), until_ns)
         position, velocity = (float(value) for value in self.fit.state(t_ns))
         flags = apt.decode_bits(status.bits)
         if self.age_ns > WARN_AGE_NS:
@@ -344,7 +344,7 @@ class Motion:
         return (self.target_mm > self.start_mm) - (self.target_mm < self.start_mm)
 
     def stop(self) -> None:
-        """Expect it to end anywhere."""
+        """Expect the motion to end anywhere."""
         self.kind, self._resting = Kind.STOP, 0
 
     def update(
@@ -352,7 +352,7 @@ class Motion:
     ) -> Outcome:
         """Return the outcome as of a status message and the one before it.
 
-        ``offset_ns`` is what the statuses' clock is ahead of the steady one. A status that is
+        ``offset_ns`` is the lead of the statuses' clock over the steady one. A status that is
         received late, after a stall of the host, shows nothing of the time since it was taken.
         """
         not_before_ns = status.not_before_ns - offset_ns
