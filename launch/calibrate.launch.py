@@ -15,7 +15,7 @@ from eschorty_ros.nodes.ros.launching import (
     node,
     number,
     text,
-    truth,
+    boolean,
 )
 from launch import LaunchDescription
 
@@ -24,7 +24,7 @@ ARGUMENTS = (
     PARAMETERS,
     ("scene", "posts", "what stands on an emulated bench: a scene's name or a mesh", None),
     ("calibration", "config_3", "optical build as designed: a name in config/ or a file", None),
-    ("as_built", "config_3_as_built", "build that an emulated bench really has", None),
+    ("as_built", "config_3_as_built", "build of the emulated bench", None),
     PIXELS,
     TRIGGER,
     ("frequency", "70.0", "laser modulation, Hz, 16 to 20000", None),
@@ -45,7 +45,7 @@ def generate_launch_description():
         distances=text("distances"),
         method=text("method"),
         capture_time=number("capture_time"),
-        auto_calibrate=truth("auto_calibrate"),
+        auto_calibrate=boolean("auto_calibrate"),
     )
     nodes = [node(name, table) for name, table in parameters.items()]
     emulated = bench(scene="scene", calibration="as_built", pixels="pixels", trigger="trigger")

@@ -19,7 +19,7 @@ from eschorty_ros.nodes.ros.launching import (
     node,
     number,
     rviz,
-    truth,
+    boolean,
 )
 from launch import LaunchDescription
 
@@ -50,7 +50,7 @@ def nodes():
     parameters = {
         **instrument(),
         "scanner": {
-            "auto_scan": truth("auto_scan"),
+            "auto_scan": boolean("auto_scan"),
             "start": number("start"),
             "stop": number("stop"),
             "speed": number("speed"),

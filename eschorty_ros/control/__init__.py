@@ -1,1 +1,1 @@
-"""What a scan and a calibration do step by step, and when the laser may be on. No ROS."""
+"""The steps of a scan and of a calibration, and the conditions of laser light. No ROS."""

@@ -17,10 +17,10 @@ _SETTLE_MM_S = 100.0
 
 
 class CaptureInstrument(Instrument, Protocol):
-    """The same for a capture, which lasts for a time."""
+    """Instrument for a capture, which lasts for a given time."""
 
     def hold(self, duration_s: float) -> None:
-        """Wait until the reconstruction has passed so much sensor time."""
+        """Wait until the reconstruction has passed this much sensor time."""
 
 
 def check_request(request: CaptureRequest) -> None:
@@ -74,7 +74,7 @@ def run_capture(
     sweep = request.sweep
     try:
         instrument.report("preparing")
-        # First, because it is refused while a scan is under way.
+        # First, because it fails while a scan is under way.
         begin()
         collecting = True
         instrument.check_nodes()

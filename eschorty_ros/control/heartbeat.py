@@ -1,7 +1,7 @@
 """Heartbeats: the text that identifies the sender, and when a device's health stops them.
 
 The text is ``<place> <pid>``, and ``<place> <pid> stopped`` in the last ones. The place is the same
-for two processes that see each other's process ids.
+for two processes of the same process id space.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _STOPPED = "stopped"
 CHECK_S = 0.02
 PERIOD_S = 0.1
 LAST_HEARTBEATS = 3
-# Drivers report a device as silent after longer times than this, and a device that runs is read
-# again within so many checks.
+# Shorter than the time after which a driver reports a device without answers; a running device is
+# read again within this many checks.
 STALL_S = 0.3
 RECOVERY_CHECKS = 10
 
@@ -48,12 +48,12 @@ def heartbeat_text(*, stopped: bool) -> str:
 
 
 def read_heartbeat(text: str) -> tuple[Sender | None, bool]:
-    """Return a heartbeat's sender (``None`` for another text) and whether it reports a stop."""
+    """Return a heartbeat's sender, ``None`` for any other text, and whether it reports a stop."""
     match text.split():
-        case [where, number] if number.isdecimal():
-            return Sender(where, int(number)), False
-        case [where, number, word] if number.isdecimal() and word == _STOPPED:
-            return Sender(where, int(number)), True
+        case [sender_place, number] if number.isdecimal():
+            return Sender(sender_place, int(number)), False
+        case [sender_place, number, state] if number.isdecimal() and state == _STOPPED:
+            return Sender(sender_place, int(number)), True
         case _:
             return None, False
 
@@ -67,7 +67,7 @@ class HeartbeatSchedule:
     Attributes
     ----------
     healthy : bool
-        Whether the last heartbeat reported a healthy device.
+        True when the last heartbeat reported a healthy device.
     """
 
     def __init__(self) -> None:

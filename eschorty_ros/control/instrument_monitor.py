@@ -1,4 +1,4 @@
-"""The newest state of laser, stage and reconstruction, and which of them has stopped reporting."""
+"""Newest status of laser, stage and reconstruction, with checks of its age."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class LaserStatus:
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionStatus:
-    """How far the reconstruction has come, ROS time in ns, and its totals since its start."""
+    """Progress of the reconstruction, ROS time in ns, and its totals since its start."""
 
     processed_until_ns: int
     events_per_second: float
@@ -43,7 +43,7 @@ class InstrumentMonitor:
     Parameters
     ----------
     camera_present : callable
-        Whether anything publishes events.
+        Returns whether a node publishes events.
 
     Attributes
     ----------
@@ -81,12 +81,12 @@ class InstrumentMonitor:
 
     @property
     def output(self) -> int | None:
-        """Output the laser reads back, ``None`` before its first status."""
+        """Return the output that the laser reads back, ``None`` before its first status."""
         return self.laser.output if self.laser is not None else None
 
     @property
     def stage_reports(self) -> bool:
-        """Whether odometry is fresh."""
+        """Return whether odometry is fresh."""
         return _age_s(self._stage_s) < _STALE_S
 
     def restart_progress(self) -> None:
@@ -101,7 +101,7 @@ class InstrumentMonitor:
     def check_progress(self, timeout_s: float) -> None:
         """Raise ``ScanFailure`` when the reconstruction made no progress for ``timeout_s``."""
         if _age_s(self._advanced_s) > timeout_s:
-            raise ScanFailure(f"{self.why_no_progress()} for {timeout_s:g} s")
+            raise ScanFailure(f"{self.cause_of_no_progress()} for {timeout_s:g} s")
 
     def check_laser(self) -> None:
         """Raise ``ScanFailure`` when the laser does not report or is not on."""
@@ -110,8 +110,8 @@ class InstrumentMonitor:
         if self.laser.output != LaserOutput.ON:
             raise ScanFailure(f"laser: went off: {self.laser.reason}")
 
-    def why_no_progress(self) -> str:
-        """Name the component that keeps the reconstruction from advancing."""
+    def cause_of_no_progress(self) -> str:
+        """Return the component without which the reconstruction does not advance."""
         if _age_s(self._reconstruction_s) > _STALE_S:
             return "reconstruction: it does not report"
         if not self._camera_present():

@@ -21,12 +21,12 @@ class PacedWaiting:
     Parameters
     ----------
     name : str
-        Of the program that waits, for messages.
+        Name of the program that waits, for messages.
     monitor : InstrumentMonitor
     now_ns : callable
         The clock that stamps the events.
     running : callable
-        Whether the program goes on.
+        Returns whether the program continues.
     events_timeout_s : float
         Longest time without progress of the reconstruction while watching.
     """
@@ -94,7 +94,7 @@ class PacedWaiting:
             self.monitor.check_progress(no_progress_s)
 
     def hold(self, duration_s: float) -> None:
-        """Wait until the reconstruction has passed so much sensor time from now on."""
+        """Wait until the reconstruction has passed this much sensor time from now on."""
         target_ns = self._now_ns() + round(duration_s * 1e9)
         self.monitor.restart_progress()
         while self.monitor.until_ns < target_ns:

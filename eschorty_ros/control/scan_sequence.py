@@ -14,7 +14,7 @@ from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 
 
 class ScanFailure(EschortyError):  # noqa: N818 - reported like the other failures
-    """A scan that cannot go on; the message begins with the component that failed."""
+    """A scan that cannot continue; the message begins with the component that failed."""
 
 
 class ScanCanceled(Exception):  # noqa: N818 - a request, not an error
@@ -22,7 +22,7 @@ class ScanCanceled(Exception):  # noqa: N818 - a request, not an error
 
 
 class End(Enum):
-    """How a scan ended."""
+    """End of a sequence."""
 
     SUCCEEDED = "succeeded"
     CANCELED = "canceled"
@@ -67,13 +67,13 @@ class ScanSummary:
 
 @dataclass(slots=True)
 class Outcome:
-    """How a sequence ended, and why when it did not succeed."""
+    """End of a sequence, with the reason when it did not succeed."""
 
     end: End = End.ABORTED
     message: str = ""
 
     def attempt(self, step: Callable[[], None]) -> None:
-        """Run a step of the way out; if it fails, so does the sequence. The first reason stays."""
+        """Run a step of the way out; the sequence fails with it, for the first reason that came."""
         try:
             step()
         except EschortyError as error:
@@ -83,7 +83,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class ScanOutcome(Outcome):
-    """The same with the summary of the assembled scan."""
+    """Outcome of a scan, with the summary of the assembled points."""
 
     summary: ScanSummary = field(default_factory=ScanSummary)
 
@@ -98,10 +98,10 @@ class Instrument(Protocol):
         """Raise ``ScanFailure`` that names the component that does not answer."""
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
-        """Set what is not 0; raise ``ScanFailure`` with the laser's reason."""
+        """Set the values that are not 0; raise ``ScanFailure`` with the laser's reason."""
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
-        """Move and wait until the stage is there."""
+        """Move and wait for the end of the motion."""
 
     def stop_stage(self) -> None:
         """End a move under way and wait until the stage rests."""
@@ -113,7 +113,7 @@ class Instrument(Protocol):
         """Disable; return when the output reads back off. The heartbeat ends in any case."""
 
     def watch(self, enabled: bool) -> None:
-        """From here on every tick raises ``ScanFailure`` when light or events stop, or no more."""
+        """Switch the check at every tick, which raises ``ScanFailure`` when light or events stop."""
 
     def shield(self) -> None:
         """From here on no tick raises ``ScanCanceled``."""
@@ -126,7 +126,7 @@ class Instrument(Protocol):
 
 
 class ScanInstrument(Instrument, Protocol):
-    """The same for a scan, which the reconstruction collects."""
+    """Instrument for a scan, whose points the reconstruction collects."""
 
     def begin_scan(self, request: ScanRequest) -> None:
         """Start to collect points."""
@@ -158,7 +158,7 @@ def check_request(request: ScanRequest, limits: ScanLimits) -> None:
 
 
 def check_laser(frequency_hz: float, duty: float) -> None:
-    """Raise ``ArgumentError`` unless the laser can be set so; 0 keeps its setting."""
+    """Raise ``ArgumentError`` unless frequency and duty are 0 or in range; 0 keeps the setting."""
     if frequency_hz != 0.0 and not FREQUENCY_MIN_HZ <= frequency_hz <= FREQUENCY_MAX_HZ:
         raise ArgumentError(
             f"frequency is {frequency_hz:g} Hz; choose {FREQUENCY_MIN_HZ:g} to "
@@ -171,7 +171,7 @@ def check_laser(frequency_hz: float, duty: float) -> None:
 
 
 def sweep_ends_mm(request: ScanRequest, limits: ScanLimits) -> tuple[float, float]:
-    """Return where the sweep begins and ends, within the travel.
+    """Return start and end of the sweep, within the travel.
 
     Speed is constant from start to stop if the travel leaves room for the run-up.
     """
@@ -248,7 +248,7 @@ def _finish(
     if not collecting:
         return
     instrument.report("finishing")
-    # After a failure the last events are kept, but there is no long wait for a dead camera.
+    # After a failure the last events are kept, but there is no long wait for a camera that may have failed.
     timeout_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
     outcome.attempt(lambda: instrument.drain(timeout_s))
 

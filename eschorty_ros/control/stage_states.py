@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 
-# A stall of up to so many periods is filled.
+# A stall of up to this many periods is filled.
 FILL_MAX = 200
-# A newest time further back than this comes of a clock that was set.
+# A newest time further back than this is that of a clock that was set back.
 _CLOCK_BACK_NS = 100_000_000
 
 

@@ -66,7 +66,7 @@ class Findings:
     rejected : tuple of str
         Posts and targets without a match, with the reason.
     residual_px : ndarray of float64
-        Of the targets about a fit of k' and b'; empty below two targets.
+        Residuals of the targets in a fit of k' and b'; empty below two targets.
     """
 
     targets: Targets | None = None
@@ -76,7 +76,7 @@ class Findings:
 
 
 class Capture(Protocol):
-    """A collection of events and profiles; one thread fills it, others search copies."""
+    """Events and profiles of a calibration; one thread fills it, others search copies."""
 
     frame: AggregateFrame
     packets_lost: int
@@ -177,23 +177,23 @@ class SweepCapture(_Frame):
         return Findings(targets, 1, rejected, _residuals(targets, self._nominal))
 
 
-def enough_targets(findings: Findings, wanted: int) -> Targets:
+def enough_targets(findings: Findings, expected: int) -> Targets:
     """Return the targets found.
 
     Raises
     ------
     FitError
-        For less than three, or than ``wanted`` if that is less; gives the first reasons.
+        For less than three, or than ``expected`` if that is less; gives the first reasons.
     """
     targets = findings.targets
     found = len(targets) if targets is not None else 0
-    if targets is not None and found >= min(_TARGETS_LEAST, wanted):
+    if targets is not None and found >= min(_TARGETS_LEAST, expected):
         return targets
     reasons = list(findings.rejected[:_REASONS_SHOWN])
     if len(findings.rejected) > _REASONS_SHOWN:
         reasons.append(f"and {len(findings.rejected) - _REASONS_SHOWN} more")
     raise FitError(
-        f"{found} of {wanted} targets found among {findings.posts} posts; " + "; ".join(reasons)
+        f"{found} of {expected} targets found among {findings.posts} posts; " + "; ".join(reasons)
     )
 
 

@@ -46,13 +46,13 @@ class JobQueue:
         """Queue a bulk job; return ``False`` and count it when the queue is full."""
         return self._append(job, True)
 
-    def run(self, job: Job, timeout_s: float, alive: Callable[[], bool]) -> tuple[bool, str]:
-        """Queue a small job and wait for its end, at most while ``alive()``.
+    def run(self, job: Job, timeout_s: float, running: Callable[[], bool]) -> tuple[bool, str]:
+        """Queue a small job and wait for its end, at most while ``running()``.
 
         Returns
         -------
         bool, str
-            Whether it succeeded, and otherwise the reason.
+            Success, and the reason of a failure.
         """
         answered = threading.Event()
         refusal: list[str] = []
@@ -68,7 +68,7 @@ class JobQueue:
         self.post(guarded)
         end_s = time.monotonic() + timeout_s
         while not answered.wait(min(_POLL_S, timeout_s)):
-            if not alive():
+            if not running():
                 return False, "the node was shut down"
             if time.monotonic() > end_s:
                 return False, f"the reconstruction did not answer within {timeout_s:g} s"

@@ -37,7 +37,7 @@ class PacketStream:
 
     The decoder counts time from the last wrap of the stream's 24-bit time before it started. The
     packets' stamps give the number of wraps of a stream that is joined later than its first
-    packet, or goes on after more than half a wrap without packets.
+    packet, or continues after more than half a wrap without packets.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class PacketStream:
     clock_restarts : int
         Restarts of the clock because stamps or sensor times went back.
     announcement_expected : bool
-        Whether packets wait for an announcement of the camera's zero.
+        True while packets wait for an announcement of the camera's zero.
     """
 
     def __init__(
@@ -97,24 +97,24 @@ class PacketStream:
 
     @property
     def held(self) -> int:
-        """Packets that wait for clock or modulation."""
+        """Return the number of packets that wait for clock or modulation."""
         return len(self._held)
 
     @property
     def waits_for(self) -> str:
-        """What the held packets wait for, ``""`` when for nothing."""
+        """Return the missing input that packets are held for, ``""`` when none is missing."""
         if self._laser is None:
             return "modulation"
         return "camera clock" if self._epoch is None else ""
 
     @property
     def epoch(self) -> SensorEpoch | None:
-        """The stream's epoch, ``None`` while its clock is unknown."""
+        """Return the stream's epoch, ``None`` while its clock is unknown."""
         return self._epoch
 
     @property
     def processed_until_ns(self) -> int | None:
-        """ROS time up to which the stream has been reconstructed."""
+        """Return the ROS time up to which the stream has been reconstructed."""
         # Also read by other threads than the one that processes.
         reconstructor, epoch = self._reconstructor, self._epoch
         newest_us = reconstructor.time_us if reconstructor is not None else None
@@ -125,7 +125,7 @@ class PacketStream:
 
     @property
     def counters(self) -> Counter[str]:
-        """Counters of all reconstructors of the stream, summed by name."""
+        """Return the counters of all reconstructors of the stream, summed by name."""
         total, reconstructor = Counter(self._retired), self._reconstructor
         if reconstructor is not None:
             total.update(reconstructor.counters)
@@ -277,12 +277,12 @@ class PacketStream:
         self._epoch.edges.add(edges_us + shift_us, kinds)
 
     def _missed_wraps(self, packet: Packet, high_us: int | None) -> int:
-        """Count the wraps before this packet that a new decoder has not seen."""
+        """Return the number of wraps before this packet that a new decoder has not decoded."""
         assert self._epoch is not None
         clock = self._epoch.clock
         if packet.seq == 0 or clock.line is None or high_us is None:
             return 0
-        # In a stream that goes on, the newest time is closer to this packet than a stamp.
+        # In a stream that continues, the newest time is closer to this packet than a stamp.
         known_ns = self._last_stamp_ns if self._next_seq == packet.seq else packet.stamp_ns
         return max(round((clock.to_us(known_ns) - high_us) / WRAP_US), 0)
 

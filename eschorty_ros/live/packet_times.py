@@ -1,4 +1,4 @@
-"""Event packets and the sensor time they begin with."""
+"""Event packets and the sensor time at their beginning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WRAP_US = 1 << 24
 _WORDS_SEARCHED = 8192
 # A stream without losses skips less of its own time than this between two packets.
 _STEP_US = 100_000
-# A packet at most so many numbers back that is stamped no later was overtaken in transit.
+# A packet at most this many numbers back that is stamped no later was overtaken in transit.
 _OVERTAKEN = 16
 
 

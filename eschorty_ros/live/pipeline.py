@@ -32,17 +32,17 @@ class ScanReport:
 
     @property
     def message(self) -> str:
-        """The losses, or why a scan without points is empty; ``""`` when nothing was lost."""
+        """Return the losses, or the cause of an empty scan; ``""`` when nothing was lost."""
         notes = []
         if self.points_without_stage:
             notes.append(f"{self.points_without_stage} points had no stage position")
         if self.points_over_limit:
             notes.append(f"{self.points_over_limit} points were over the scan's limit")
         if not notes and not len(self.scan.points):
-            notes.append(self._why_empty())
+            notes.append(self._cause_of_empty())
         return "; ".join(notes)
 
-    def _why_empty(self) -> str:
+    def _cause_of_empty(self) -> str:
         if not self.events:
             return "no points: no events came; look at the camera, its lens cap and the laser"
         if not self.points_outside:
@@ -51,8 +51,8 @@ class ScanReport:
                 "laser's frequency, at the focus and at what the line falls on"
             )
         return (
-            f"no points: all {self.points_outside} lie outside start to stop; events and stage "
-            "positions are not of one time: look at the camera's and the stage's clock"
+            f"no points: all {self.points_outside} are outside start to stop; the times of events and "
+            "stage positions differ: check the clocks of camera and stage"
         )
 
 
@@ -90,11 +90,11 @@ class Pipeline:
         self.capture: Capture | None = None
         self._fresh: list[TimedProfiles] = []
         self._buffer: ScanBuffer | None = None
-        self._at_begin: tuple[int, int, int, int] = (0, 0, 0, 0)
+        self._losses_at_begin: tuple[int, int, int, int] = (0, 0, 0, 0)
 
     @property
     def scan_id(self) -> str:
-        """Identifier of the scan being collected, ``""`` without one."""
+        """Return the identifier of the scan being collected, ``""`` without one."""
         return self._buffer.scan_id if self._buffer is not None else ""
 
     def add_packet(self, packet: Packet, now_s: float) -> None:
@@ -155,7 +155,7 @@ class Pipeline:
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
-        self._at_begin = self._losses()
+        self._losses_at_begin = self._losses()
 
     def set_capture(self, capture: Capture | None) -> None:
         """Start to feed a calibration's capture, or stop with ``None``.
@@ -196,7 +196,7 @@ class Pipeline:
         buffer, self._buffer = self._buffer, None
         self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
-        events, lost, dropped, without = np.subtract(self._losses(), self._at_begin).tolist()
+        events, lost, dropped, without = np.subtract(self._losses(), self._losses_at_begin).tolist()
         return ScanReport(
             scan, events, lost, dropped, without, buffer.points_outside, buffer.points_over_limit
         )
@@ -216,7 +216,7 @@ class Pipeline:
             return part
         t_ns, edge_ns = part.sensor.to_ns()
         stage_mm = self.placer.track.position_mm(t_ns // NS_PER_US)
-        # The odometry is bounded: points from before its begin stay in their place.
+        # The odometry is bounded: points before its first sample keep their position.
         known = np.isfinite(stage_mm)
         stage_mm = np.where(known, stage_mm, part.stage_mm)
         points = part.points.copy()

@@ -15,7 +15,7 @@ _PACKET_SPAN_US = 10_000
 
 @dataclass(frozen=True, slots=True)
 class TimedPacket:
-    """Bytes of the stream with the sensor time (us) read before and after them."""
+    """Bytes of the stream with the sensor time (us) before and after them."""
 
     data: bytes
     from_us: int

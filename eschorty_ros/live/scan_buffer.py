@@ -56,9 +56,9 @@ class AssembledScan:
 
 
 class ScanBuffer:
-    """Points whose stage position lies between two limits.
+    """Points whose stage position is between two limits.
 
-    Points whose place is not final are all kept until the end.
+    Points whose position is not final are all kept until the end.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class ScanBuffer:
     ) -> AssembledScan:
         """Return all kept points as one cloud, which may be empty.
 
-        ``placed_again`` returns points in their final place.
+        ``placed_again`` returns points at their final position.
         """
         if placed_again is not None:
             self._parts = [self._inside(placed_again(part)) for part in self._parts]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.clocks import EdgeClock, PulseTrain, SensorClock, StageTrack
 from eschorty_ros.core.reconstruction import Profiles
 
-_UNSEEN_US = -(1 << 62)
+_NEVER_US = -(1 << 62)
 _PULSES_MISSING = 30
 
 
@@ -21,14 +21,14 @@ class SensorEpoch:
     ----------
     clock : SensorClock
     pulses : PulseTrain or None
-        Where the stage gives pulses to the camera's trigger input, if it is wired to the stage.
+        Pulses of the stage, ``None`` when they are not wired to the camera's trigger input.
 
     Attributes
     ----------
     clock : SensorClock
     edges : EdgeClock
     edges_missing : bool
-        Whether the stage has passed many pulses since the last edge that fits.
+        True after 30 pulses without an edge that fits.
     """
 
     def __init__(self, clock: SensorClock, pulses: PulseTrain | None = None) -> None:
@@ -40,7 +40,7 @@ class SensorEpoch:
 
     @property
     def expects_edges(self) -> bool:
-        """Whether the clock is fitted to edges of the stage."""
+        """Return whether the clock is fitted to edges of the stage."""
         return self.edges.pulses is not None and not self.clock.exact
 
     def set_pulses(self, pulses: PulseTrain | None) -> None:
@@ -71,11 +71,11 @@ class SensorEpoch:
         self.edges_missing = self._passed_mm > _PULSES_MISSING * self.edges.pulses.interval_mm
 
     def covered(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which sensor times lie before the last fitted edge; all without edges."""
+        """Return a mask of the sensor times before the last fitted edge; all without edges."""
         if not self.expects_edges:
             return np.ones(t_us.shape, dtype=bool)
         until_us = self.edges.until_us
-        return t_us <= (_UNSEEN_US if until_us is None else until_us)
+        return t_us <= (_NEVER_US if until_us is None else until_us)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class TimedProfiles:
 
     @classmethod
     def within(cls, epoch: SensorEpoch, profiles: Profiles, shift_us: int) -> TimedProfiles:
-        """Make profiles from some whose times are ``shift_us`` less than the epoch's."""
+        """Return timed profiles; ``shift_us`` is added to their times for the epoch's."""
         sensor = SensorTimes(epoch, profiles.t_us + shift_us, profiles.edge_us + shift_us)
         return cls(profiles, *sensor.to_ns(), None if epoch.clock.exact else sensor)
 
@@ -134,7 +134,7 @@ class TimedProfiles:
         return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.min()))
 
     def covered(self) -> NDArray[np.bool_]:
-        """Return which points' times are as good as they will be while the stage moves."""
+        """Return a mask of the points whose times are covered by edges, all without edges."""
         if self.sensor is None:
             return np.ones(len(self.t_ns), dtype=bool)
         return self.sensor.epoch.covered(self.sensor.t_us)

@@ -1,4 +1,4 @@
-"""Profiles wait here until the stage's position at their time is known."""
+"""Placement of profiles by the stage's position at their time, which may arrive later."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EDGE_WAIT_S = 0.3
 class StagePlacer:
     """Joins profiles and stage positions by time; interpolates, never extrapolates.
 
-    A profile's ROS times are computed when its position is known, by the clock as it is then.
+    A profile's ROS times are computed when its position is known, by the clock of that time.
     Where edges of the stage are expected, a profile waits until edges cover its time.
 
     Parameters
@@ -54,7 +54,7 @@ class StagePlacer:
 
     @property
     def late_samples(self) -> int:
-        """Stage samples left out because they were not later than the one before."""
+        """Return the number of stage samples left out: not later than the one before."""
         return self._late_before + self.track.dropped
 
     def set_gap(self, gap_s: float) -> None:
@@ -85,12 +85,12 @@ class StagePlacer:
     def ready(self, now_s: float) -> list[tuple[TimedProfiles, NDArray[np.float64]]]:
         """Return the profiles whose positions (mm, float64) are known, oldest first."""
         placed = []
-        still: deque[tuple[float, TimedProfiles]] = deque()
+        left: deque[tuple[float, TimedProfiles]] = deque()
         last_us = self.track.last_us
         for arrived_s, waiting in self._waiting:
             expired = now_s - arrived_s > self.timeout_s
             if not expired and (last_us is None or waiting.earliest_ns() // NS_PER_US > last_us):
-                still.append((arrived_s, waiting))
+                left.append((arrived_s, waiting))
                 continue
             timed = waiting.retimed()
             t_us = timed.t_ns // NS_PER_US
@@ -100,7 +100,7 @@ class StagePlacer:
             if expired:
                 self.points_without_stage += int(np.count_nonzero(early))
             elif early.any():
-                still.append((arrived_s, timed.select(early)))
+                left.append((arrived_s, timed.select(early)))
             if early.all():
                 continue
             position_mm = self.track.position_mm(t_us)
@@ -108,6 +108,6 @@ class StagePlacer:
             self.points_without_stage += int(np.count_nonzero(~early & ~known))
             if known.any():
                 placed.append((timed.select(known), position_mm[known]))
-        self._waiting = still
-        self.waiting = sum(len(timed.profiles) for _, timed in still)
+        self._waiting = left
+        self.waiting = sum(len(timed.profiles) for _, timed in left)
         return placed

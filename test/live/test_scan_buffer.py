@@ -67,7 +67,7 @@ def test_points_outside_the_limits_are_counted():
         (5, 100, 0, 3, ""),
         (0, 0, 0, 0, "no points: no events came"),
         (0, 100, 0, 0, "no points: nothing blinks with the laser in 100 events"),
-        (0, 100, 0, 3, "no points: all 3 lie outside start to stop"),
+        (0, 100, 0, 3, "no points: all 3 are outside start to stop"),
         (0, 100, 7, 3, "7 points had no stage position"),
     ],
 )

@@ -15,7 +15,7 @@ from typing import Any
 
 from short_folder import short_folder
 
-from eschorty_ros.emulation.awg.model import AwgModel, truth
+from eschorty_ros.emulation.awg.model import AwgModel, read_output_log
 from eschorty_ros.emulation.bus import UsbServer
 
 
@@ -52,7 +52,7 @@ class AwgProcess:
 
     def outputs(self) -> list[str]:
         """ON and OFF as the generator logged them."""
-        return [output for _, output in truth(self.log)]
+        return [output for _, output in read_output_log(self.log)]
 
     def lit(self) -> bool:
         """Whether the output is on now."""
@@ -64,7 +64,7 @@ class AwgProcess:
         while self.lit():
             assert time.monotonic() < end_s, f"still on after {deadline_s:g} s"
             time.sleep(0.005)
-        return (truth(self.log)[-1][0] - since_ns) * 1e-9
+        return (read_output_log(self.log)[-1][0] - since_ns) * 1e-9
 
     def _end(self) -> None:
         self._process.kill()

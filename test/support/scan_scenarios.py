@@ -20,7 +20,7 @@ from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import POINT_DTYPE
-from eschorty_ros.emulation.awg.model import truth
+from eschorty_ros.emulation.awg.model import read_output_log
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
@@ -143,7 +143,7 @@ class Bench:
 
         A scan also holds points that the background makes without light, at any stage position.
         """
-        on_ns, off_ns = (t_ns for t_ns, _ in truth(self._laser_log)[-2:])
+        on_ns, off_ns = (t_ns for t_ns, _ in read_output_log(self._laser_log)[-2:])
         begun_ns = ns_from_stamp(self.clouds[-1].header.stamp) - ros_minus_steady_ns()
         t_s = points["t"] + 1e-9 * (begun_ns - on_ns)
         lit_s = 1e-9 * (off_ns - on_ns)
@@ -152,7 +152,7 @@ class Bench:
 
     def output_lines(self) -> list[str]:
         """ON and OFF in the order of the emulator's own log."""
-        return [output for _, output in truth(self._laser_log)]
+        return [output for _, output in read_output_log(self._laser_log)]
 
     def assert_off_and_at_rest(self) -> None:
         """Laser off by the emulator's own log and by the node; stage not moving."""

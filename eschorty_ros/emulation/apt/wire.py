@@ -1,4 +1,4 @@
-"""A serial line in emulated time: when bytes arrive, and how they are disturbed on the way."""
+"""A serial line in emulated time: arrival times of bytes, and their disturbances."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Wire:
         self._sent.append((self._delivered_ns, data))
 
     def receive(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return what has arrived by ``now_ns``: time and bytes, in order."""
+        """Return the data that has arrived by ``now_ns``: time and bytes, in order."""
         arrived = []
         while self._sent and self._sent[0][0] <= now_ns:
             arrived.append(self._sent.popleft())
@@ -51,7 +51,7 @@ class Disturbance:
     flips : int
         Frames still to get one bit of their payload flipped.
     flip_bit : int or None
-        Which bit of the payload; ``None`` draws one.
+        Index of that bit in the payload; ``None`` for a random one.
     repeats : int
         Frames still to be sent twice.
     """

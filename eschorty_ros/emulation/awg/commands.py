@@ -60,7 +60,7 @@ def _divided(load_ohm: float) -> float:
 
 @dataclass(frozen=True)
 class Command:
-    """One setting: its path, and how a parameter sets it and a reply shows it."""
+    """One setting: its path, and the functions that set it and that return its reply."""
 
     path: str
     put: Callable[[ChannelState, str], None]

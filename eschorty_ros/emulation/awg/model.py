@@ -270,7 +270,7 @@ class AwgModel(EmulatedUsbDevice):
         return Modulation(frequency_hz, 1.0 - duty if state.inversion else duty, waveform)
 
 
-def truth(log_path: str | Path) -> list[tuple[int, str]]:
+def read_output_log(log_path: str | Path) -> list[tuple[int, str]]:
     """Return the lines of a log: monotonic ns and ON or OFF, in order."""
     lines = Path(log_path).read_text(encoding="ascii").splitlines()
     return [(int(t_ns), state) for t_ns, state in (line.split() for line in lines)]

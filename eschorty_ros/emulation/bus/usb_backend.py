@@ -49,7 +49,7 @@ class Handle:
         self.address = device.address
         self.closed = False
 
-    def live(self) -> EmulatedUsbDevice:
+    def require(self) -> EmulatedUsbDevice:
         """Return the device; raises when it was closed, unplugged or plugged in again."""
         if self.closed or self.device.gone or self.device.address != self.address:
             raise UsbFault(errno.ENODEV)
@@ -74,7 +74,7 @@ class EmulatedBackend(DescriptorBackend):
 
     def open_device(self, dev: Handle) -> Handle:
         """Open; EACCES when the device is ``denied``."""
-        device = self._run(dev.live)
+        device = self._run(dev.require)
         if device.denied:
             raise_usb_error(errno.EACCES)
         return Handle(device)
@@ -86,11 +86,11 @@ class EmulatedBackend(DescriptorBackend):
 
     def set_configuration(self, dev_handle: Handle, config_value: int) -> None:
         """Accept the only configuration."""
-        self._run(dev_handle.live)
+        self._run(dev_handle.require)
 
     def get_configuration(self, dev_handle: Handle) -> int:
         """Return the only configuration."""
-        self._run(dev_handle.live)
+        self._run(dev_handle.require)
         return 1
 
     def set_interface_altsetting(self, dev_handle: Handle, intf: int, altsetting: int) -> None:
@@ -101,7 +101,7 @@ class EmulatedBackend(DescriptorBackend):
 
     def claim_interface(self, dev_handle: Handle, intf: int) -> None:
         """Claim; EBUSY while a kernel driver or another handle holds it."""
-        device = self._run(dev_handle.live)
+        device = self._run(dev_handle.require)
         with device.mutex:
             if device.kernel_driver or device.claims.get(intf, dev_handle) is not dev_handle:
                 raise_usb_error(errno.EBUSY)
@@ -147,7 +147,7 @@ class EmulatedBackend(DescriptorBackend):
         """Run a control request; returns the bytes sent or received."""
 
         def transfer() -> bytes | int:
-            device = dev_handle.live()
+            device = dev_handle.require()
             device.before_transfer(0, timeout)
             to_host = bmRequestType & DIRECTION_IN
             with device.mutex:
@@ -165,37 +165,37 @@ class EmulatedBackend(DescriptorBackend):
 
     def clear_halt(self, dev_handle: Handle, ep: int) -> None:
         """Clear a stall."""
-        device = self._run(dev_handle.live)
+        device = self._run(dev_handle.require)
         with device.mutex:
             device.clear_halt(ep)
 
     def reset_device(self, dev_handle: Handle) -> None:
         """Reset the device; its address stays."""
-        device = self._run(dev_handle.live)
+        device = self._run(dev_handle.require)
         with device.mutex:
             device.reset()
 
     def is_kernel_driver_active(self, dev_handle: Handle, intf: int) -> bool:
         """Return whether a kernel driver holds the interface."""
-        return bool(self._run(dev_handle.live).kernel_driver)
+        return bool(self._run(dev_handle.require).kernel_driver)
 
     def detach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
         """Detach the kernel driver from the interface."""
-        device = self._run(dev_handle.live)
+        device = self._run(dev_handle.require)
         if not device.kernel_driver:
             raise_usb_error(errno.ENOENT)
         device.detached_driver, device.kernel_driver = device.kernel_driver, None
 
     def attach_kernel_driver(self, dev_handle: Handle, intf: int) -> None:
         """Attach the detached kernel driver again."""
-        device = self._run(dev_handle.live)
+        device = self._run(dev_handle.require)
         if not device.detached_driver:
             raise_usb_error(errno.ENOENT)
         device.kernel_driver, device.detached_driver = device.detached_driver, None
 
     def _owned(self, handle: Handle, interface: int) -> EmulatedUsbDevice:
         """Return the device; raises when another handle claimed the interface."""
-        device = self._run(handle.live)
+        device = self._run(handle.require)
         if device.claims.get(interface, handle) is not handle:
             raise_usb_error(errno.EBUSY)
         return device

@@ -1,4 +1,4 @@
-"""A USB device in memory: identity, endpoints, and the ways a real one fails.
+"""A USB device in memory: identity, endpoints, and the failures of a real one.
 
 Transfers follow the rules of the bus: data travels in packets of ``wMaxPacketSize``, a short or
 empty packet ends a transfer, a time-out loses the packets that had arrived, a packet larger than
@@ -148,7 +148,7 @@ class EmulatedUsbDevice:
     ----------
     identity : UsbIdentity
     wait : callable
-        How a read waits for data: ``wait(condition, seconds)``, False on a time-out. With
+        Waits for data: ``wait(condition, seconds)``, False on a time-out. With
         ``lambda *_: False`` every wait times out at once, for tests without sleeps.
 
     Attributes
@@ -279,7 +279,7 @@ class EmulatedUsbDevice:
             pipe.clear()
 
     def check(self, endpoint: int) -> None:
-        """Raise the fault that keeps ``endpoint`` from working."""
+        """Raise the fault of a device or endpoint that cannot transfer."""
         if self._gone:
             raise UsbFault(errno.ENODEV)
         if endpoint in self.stalled:

@@ -25,7 +25,7 @@ from eschorty_ros.emulation.bus.usb_wire import (
     send_request,
 )
 
-_GRACE_S = 20.0
+_ANSWER_TIMEOUT_S = 20.0
 """After this, a stopped or overloaded server counts as an unplugged device."""
 
 
@@ -36,7 +36,7 @@ class _Link:
         self._lock = threading.Lock()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            self._socket.settimeout(_GRACE_S)
+            self._socket.settimeout(_ANSWER_TIMEOUT_S)
             self._socket.connect(path)
         except OSError:
             self._socket.close()
@@ -54,7 +54,9 @@ class _Link:
         """Return the answer to a request, or its length when it is received ``into`` a buffer."""
         with self._lock:
             try:
-                self._socket.settimeout(timeout_ms / 1e3 + _GRACE_S if timeout_ms else None)
+                self._socket.settimeout(
+                    timeout_ms / 1e3 + _ANSWER_TIMEOUT_S if timeout_ms else None
+                )
                 send_request(self._socket, op, numbers, data)
                 code, size = receive_answer(self._socket)
                 view = memoryview(bytearray(size)) if into is None else into[:size]
@@ -81,7 +83,7 @@ class _Link:
         self._socket.close()
 
 
-class _Seen:
+class _ListedDevice:
     """A device as the server listed it."""
 
     def __init__(self, entry: dict[str, Any]):
@@ -154,7 +156,7 @@ class RemoteBackend(DescriptorBackend):
     def __init__(self, path: str):
         self._path = path
 
-    def enumerate_devices(self) -> list[_Seen]:
+    def enumerate_devices(self) -> list[_ListedDevice]:
         """List the devices on the server's bus."""
         try:
             link = _Link(self._path)
@@ -165,11 +167,11 @@ class RemoteBackend(DescriptorBackend):
                 f"USB socket {self._path}: {error.strerror or error}; check the path"
             ) from error
         try:
-            return [_Seen(entry) for entry in json.loads(link.call(Op.LIST))]
+            return [_ListedDevice(entry) for entry in json.loads(link.call(Op.LIST))]
         finally:
             link.close()
 
-    def open_device(self, dev: _Seen) -> _RemoteHandle:
+    def open_device(self, dev: _ListedDevice) -> _RemoteHandle:
         """Open the device."""
         try:
             return _RemoteHandle(self._path, dev.address)

@@ -1,7 +1,7 @@
 """An emulated bus for other processes: a server on a Unix socket.
 
 Every opened device has one link without transfers. When that link ends, also because the client's
-process died, the claim is freed and pending reads end, as in the kernel. Transfers have links of
+process ended, the claim is freed and pending reads end, as in the kernel. Transfers have links of
 their own, one per endpoint, so that a waiting read delays no other request.
 """
 
@@ -39,7 +39,7 @@ class UsbServer:
     Parameters
     ----------
     path : path
-        Path of the socket; a socket left by a dead server is replaced.
+        Path of the socket; a socket left by an earlier server is replaced.
     models : callable
         Returns the devices on the bus.
 
@@ -82,7 +82,7 @@ class UsbServer:
         return len(self._links)
 
     def close(self) -> None:
-        """Stop serving; clients then find their devices unplugged."""
+        """Stop serving; the devices of the clients are then unplugged."""
         self._closed = True
         self._path.unlink(missing_ok=True)
         for link in (self._listener, *tuple(self._links)):

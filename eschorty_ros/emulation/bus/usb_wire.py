@@ -44,7 +44,7 @@ NUMBERS = {
     Op.DETACH_KERNEL_DRIVER: 1,
     Op.ATTACH_KERNEL_DRIVER: 1,
 }
-"""How many numbers an operation takes that is only forwarded to the backend."""
+"""Count of numbers of each operation that is only forwarded to the backend."""
 
 
 Request = tuple[Op, tuple[int, int, int, int], bytearray]

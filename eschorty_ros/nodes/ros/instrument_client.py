@@ -108,7 +108,7 @@ class InstrumentClient(PacedWaiting):
         named = {text.split(":")[0]: text for text in reversed(absent) if isinstance(text, str)}
         if absent and not named:
             # Only the events are missing, for a reason that the monitor finds.
-            return self.monitor.why_no_progress()
+            return self.monitor.cause_of_no_progress()
         return "; ".join(reversed(named.values()))
 
     def _needed(self, begun_ns: int) -> list[tuple[Callable[[], bool], str | Callable[[], str]]]:
@@ -122,7 +122,7 @@ class InstrumentClient(PacedWaiting):
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
             (lambda: self.monitor.at_rest, "stage: another move does not end"),
             (lambda: self.monitor.laser is not None, "laser: no state"),
-            (lambda: self.monitor.until_ns > begun_ns, self.monitor.why_no_progress),
+            (lambda: self.monitor.until_ns > begun_ns, self.monitor.cause_of_no_progress),
         ]
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:

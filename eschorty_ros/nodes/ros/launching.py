@@ -74,7 +74,7 @@ def text(name: str) -> Any:
     return ParameterValue(LaunchConfiguration(name), value_type=str)
 
 
-def truth(name: str) -> Any:
+def boolean(name: str) -> Any:
     """Return the value of an argument that is true or false."""
     return ParameterValue(LaunchConfiguration(name), value_type=bool)
 

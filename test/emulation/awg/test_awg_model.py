@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
+from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, read_output_log
 from eschorty_ros.emulation.bus import UsbFault
 
 Exchange = Callable[[str], str]
@@ -117,7 +117,7 @@ def test_every_change_is_logged_and_reported_once(tmp_path: Path) -> None:
         ("BASE:FREQuency", "70"), ("BASE:HIGH", "1"), ("OUTPut", "OFF"),
     ):  # fmt: skip
         assert model.touch(path, text)
-    lines = truth(log)
+    lines = read_output_log(log)
     assert [state for _, state in lines] == ["OFF", "ON", "OFF"]
     assert [t_ns for t_ns, _ in lines] == sorted(t_ns for t_ns, _ in lines)
     # Sine to square while off, on, 70 Hz, and a level too low for light.

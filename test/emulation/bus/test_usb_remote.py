@@ -129,7 +129,7 @@ def test_a_read_that_the_server_leaves_unanswered_loses_the_device(folder, opene
         device.write(OUT, b"x")
         assert device.read(IN, 64).tobytes() == b"x"
         with monkeypatch.context() as patch:
-            patch.setattr(usb_remote, "_GRACE_S", 0.01)
+            patch.setattr(usb_remote, "_ANSWER_TIMEOUT_S", 0.01)
             with pytest.raises(usb.core.USBError) as caught:
                 device.read(IN, 64, timeout=1)
         assert caught.value.errno == errno.ENODEV

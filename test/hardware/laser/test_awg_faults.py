@@ -11,7 +11,7 @@ from awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, truth
+from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, read_output_log
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser import awg
 
@@ -29,7 +29,7 @@ def bench(log: Path, monkeypatch: pytest.MonkeyPatch) -> AwgBench:
 
 
 def states(log: Path) -> list[str]:
-    return [state for _, state in truth(log)]
+    return [state for _, state in read_output_log(log)]
 
 
 @pytest.mark.fault("USB unplugged")

@@ -14,7 +14,7 @@ from awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import ENDPOINT_OUT, truth
+from eschorty_ros.emulation.awg.model import ENDPOINT_OUT, read_output_log
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser.awg import AwgLaser, open_laser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
@@ -26,7 +26,7 @@ def bench(tmp_path: Path) -> AwgBench:
 
 
 def states(tmp_path: Path) -> list[str]:
-    return [state for _, state in truth(tmp_path / "laser.log")]
+    return [state for _, state in read_output_log(tmp_path / "laser.log")]
 
 
 def sets(bench: AwgBench) -> list[str]:

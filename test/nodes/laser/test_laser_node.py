@@ -19,7 +19,7 @@ from ros_process import NodeProcess, Observer, ros_minus_steady_ns, stamped_afte
 from std_msgs.msg import Bool, Header
 
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
-from eschorty_ros.emulation.awg.model import truth
+from eschorty_ros.emulation.awg.model import read_output_log
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
 
@@ -60,7 +60,7 @@ class Bench(LaserBench):
 
     def switched_ns(self) -> list[int]:
         """Times at which the last light began and ended, CLOCK_MONOTONIC."""
-        return [t_ns for t_ns, _ in truth(self.awg.log)[-2:]]
+        return [t_ns for t_ns, _ in read_output_log(self.awg.log)[-2:]]
 
     def switch_on(self) -> None:
         """Heartbeat, arm, enable, in the order in which a client does it."""
