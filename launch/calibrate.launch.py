@@ -10,12 +10,12 @@ from eschorty_ros.nodes.ros.launching import (
     PIXELS,
     TRIGGER,
     bench,
+    boolean,
     declare,
     instrument,
     node,
     number,
     text,
-    boolean,
 )
 from launch import LaunchDescription
 

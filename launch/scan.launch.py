@@ -14,12 +14,12 @@ from eschorty_ros.nodes.ros.launching import (
     PIXELS,
     TRIGGER,
     bench,
+    boolean,
     declare,
     instrument,
     node,
     number,
     rviz,
-    boolean,
 )
 from launch import LaunchDescription
 

@@ -17,7 +17,7 @@ COMMANDS = {
     "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
     "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
     "view": "Draw a cloud, or open it in a window.",
-    "info": "Show what a file or recording holds.",
+    "info": "Show the content of a file or recording.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",
 }
@@ -36,7 +36,7 @@ class LazyGroup(click.Group):
     """Imports a command's module when the command runs, so that ``--help`` answers at once."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the command names in the order a newcomer needs them."""
+        """Return the command names in the order of first use."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -75,7 +75,7 @@ class LazyGroup(click.Group):
 def _unusable(error: OSError) -> str:
     """Return one line that names the file and the reason."""
     if error.filename is None:
-        return f"cannot go on: {error.strerror or error}; check disk and output"
+        return f"cannot continue: {error.strerror or error}; check disk and output"
     return f"cannot use {error.filename}: {error.strerror}; check the path"
 
 
@@ -84,7 +84,7 @@ def _unusable(error: OSError) -> str:
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 def main() -> None:
-    """Event-based Scheimpflug LiDAR: simulate, scan, reconstruct, look.
+    """Event-based Scheimpflug LiDAR: simulate, scan, reconstruct, view.
 
     A camera on a tilted sensor plane watches a modulated laser line while a stage carries it past
     the scene; every modulation period becomes one profile of 3D points. Ranges are along the

@@ -79,7 +79,7 @@ _BLOCKS = 8
     "--prior",
     multiple=True,
     metavar="NAME=SIGMA",
-    help="How far a parameter may lie from the design, one sigma; none for no prior.",
+    help="Deviation of a parameter from the design, one sigma; none for no prior.",
 )
 @click.option(
     "--robust/--no-robust",
@@ -104,7 +104,7 @@ _BLOCKS = 8
     "--as-built",
     default="config_3_as_built",
     show_default=True,
-    help="With --fake: the build that the simulated world really has.",
+    help="With --fake: the build of the simulated world.",
 )
 def command(
     sources: tuple[Path, ...],
@@ -132,7 +132,7 @@ def command(
     \b
     targets.csv   row,range_mm[,row_sigma][,range_sigma_mm][,column]
                   [,width_px,size_mm][,spacing_px,spacing_mm][,label]
-      row         where the target appears, px; row_sigma its error
+      row         row of the target, px; row_sigma its error
       range_mm    range along the laser sheet from the mechanical datum
       width_px    columns a target of size_mm covers; two sizes or more, because light blooms
       spacing_px  columns between the centres of two marks spacing_mm apart
@@ -141,7 +141,7 @@ def command(
     A recording   --distances: posts at these ranges, at least two, sizes helpful; a CSV file
                   has range_mm[,range_sigma_mm][,size_mm][,column][,row][,label]
                   --moving: a flat target that the stage moves along the range; give sweeps
-                forth and back, because a moving line is seen late
+                forth and back, because a moving line is measured late
 
     \b
     Verdicts
@@ -265,7 +265,7 @@ def _recorded(
         click.echo(f"left out: {line}")
     if match.targets is None:
         raise FitError(
-            f"--distances is {distances}; no post lies there; check the ranges and --nominal"
+            f"--distances is {distances}; no post is there; check the ranges and --nominal"
         )
     return match.targets
 

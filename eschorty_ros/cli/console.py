@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Report = Callable[[float, str], None]
-"""Called with the share done (0 to 1) and a few words."""
+"""Called with the share done (0 to 1) and a short text."""
 
 
 @contextmanager

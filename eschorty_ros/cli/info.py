@@ -15,7 +15,7 @@ PEAK_WINDOW_US = 10_000
 @click.command("info")
 @click.argument("path", type=click.Path(exists=True, path_type=Path))
 def command(path: Path) -> None:
-    """Show what PATH holds: a .raw file, a .pcd or .ply cloud, or a recording folder.
+    """Show the content of PATH: a .raw file, a .pcd or .ply cloud, or a recording folder.
 
     \b
     Examples:

@@ -42,7 +42,7 @@ def command(out: Path, only: tuple[str, ...], fast: bool, seed: int) -> None:
     """Rerun the experiments and write a page of figures, tables and findings.
 
     Opens in any browser: DIR/index.html, with a PNG per figure and a CSV per table beside it.
-    Each finding is a number with the band it must lie in. Needs no ROS.
+    Each finding is a number with the band it must be in. Needs no ROS.
 
     The page is written again after every experiment, so one that is interrupted (Ctrl-C) keeps
     what is done. When an experiment fails the others still run; the page shows where it failed.

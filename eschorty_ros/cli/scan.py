@@ -47,11 +47,10 @@ def command(
     """Scan a scene with camera, laser, stage, reconstruction and scanner nodes.
 
     The nodes run in this process over ordinary ROS 2 topics, their drivers at devices that another
-    process emulates around a simulated scene, or with --hardware at real ones: --scene, --pixels
-    and --seed mean nothing then. Written are
-    scan.pcd (the cloud, metres, in eschorty_base) and scan.png (depth map, 3-D view, and of a
-    simulated scene the error map); its error is printed, too. The noise depends on when things
-    happen, so two runs differ slightly.
+    process emulates around a simulated scene, or with --hardware at real ones, without --scene,
+    --pixels and --seed. Written are scan.pcd (the cloud, metres, in eschorty_base) and scan.png
+    (depth map, 3-D view, and of a simulated scene the error map); the error of a simulated scene
+    is printed, too. The noise depends on timing, so two runs differ slightly.
 
     \b
     Examples:

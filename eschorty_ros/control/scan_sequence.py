@@ -113,7 +113,7 @@ class Instrument(Protocol):
         """Disable; return when the output reads back off. The heartbeat ends in any case."""
 
     def watch(self, enabled: bool) -> None:
-        """Switch the check at every tick, which raises ``ScanFailure`` when light or events stop."""
+        """Switch the check of light and events, which raises ``ScanFailure`` at a tick."""
 
     def shield(self) -> None:
         """From here on no tick raises ``ScanCanceled``."""
@@ -248,7 +248,7 @@ def _finish(
     if not collecting:
         return
     instrument.report("finishing")
-    # After a failure the last events are kept, but there is no long wait for a camera that may have failed.
+    # After a failure the last events are kept, without a long wait for a camera that may be lost.
     timeout_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
     outcome.attempt(lambda: instrument.drain(timeout_s))
 

@@ -202,7 +202,7 @@ def claim(device: usb.core.Device, interface: int, name: str) -> bool:
 
 
 def release(device: usb.core.Device, interface: int, *, reattach: bool) -> None:
-    """Release the interface, reattach the kernel driver if ``reattach``, and close; never raises."""
+    """Release the interface, reattach the kernel driver if requested, close; never raises."""
     with suppress(usb.core.USBError):
         usb.util.release_interface(device, interface)
     if reattach:

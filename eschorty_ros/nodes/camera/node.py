@@ -112,7 +112,7 @@ class CameraNode(DeviceNode):
             self.parameters["event_message_size_threshold"],
         )
         source.start()
-        # One event per thread: a hung thread must not resume when the next one starts.
+        # One flag per thread: a hung thread must not resume when the next one starts.
         ending = self._ending = threading.Event()
         self._thread = threading.Thread(
             target=self._stream, args=(source, ending), name="camera stream", daemon=True
@@ -142,8 +142,8 @@ class CameraNode(DeviceNode):
     def healthy(self) -> bool:
         """Return whether the stream runs and the camera answers."""
         thread, source = self._thread, self._source
-        alive = thread is not None and thread.is_alive() and not self._ending.is_set()
-        return alive and source is not None and source.healthy
+        running = thread is not None and thread.is_alive() and not self._ending.is_set()
+        return running and source is not None and source.healthy
 
     @property
     def words(self) -> WordCounter:

@@ -64,7 +64,7 @@ class PacketPublisher:
         self._packetizer = Packetizer(age_ns, size_bytes)
 
     def push(self, chunk: EventChunk | None, now_ns: int) -> None:
-        """Publish the packets that are due; ``None`` stands for a wait without data."""
+        """Publish the packets that are due; ``None`` is a wait without data."""
         if chunk is None:
             self._publish(self._packetizer.push(b"", now_ns))
             return

@@ -47,9 +47,9 @@ _BIAS_TABLE = tuple(
 )
 
 EVK4_TABLE = (
-    Param("serial", "", "serial number of the camera (hex); empty: the only one there is"),
+    Param("serial", "", "serial number of the camera (hex); empty: the only one"),
     Param("backend", "libusb", "USB backend: libusb, or module:callable[?argument]"),
-    Param("reconnect_attempts", 6, "times a lost camera is looked for; 0: it fails", "", 0, 1000),
+    Param("reconnect_attempts", 6, "searches for a lost camera before the node fails", "", 0, 1000),
     Param("bias_file", "", "file of biases, read at start where a bias_* is 0; save_biases writes"),
     Param(
         "bias_range",
@@ -73,12 +73,21 @@ EVK4_TABLE = (
         choices=("na", "disabled", "enabled"),
     ),
     Param("erc_rate", 100_000_000, "rate beyond which it drops", "events/s", 5_000, ERC_RATE_MAX),
-    Param("roi", _FULL_FRAME, "x, y, width, height per window; columns and rows multiply", "px"),
+    Param(
+        "roi",
+        _FULL_FRAME,
+        "x, y, width, height per window; windows act as the product of their columns and rows",
+        "px",
+    ),
     Param("hot_pixels", "", "pixels to mask, at most 64: 'x,y x,y'"),
     Param("trail_filter", False, "filter of trailing events" + _IGNORED),
     Param("trail_filter_type", "trail", "kind of that filter", choices=TRAIL_TYPES),
     Param(
-        "trail_filter_threshold", 10_000, "its time, in steps of 1 ms", "us", *TRAIL_THRESHOLD_US
+        "trail_filter_threshold",
+        10_000,
+        "threshold of that filter, in steps of 1 ms",
+        "us",
+        *TRAIL_THRESHOLD_US,
     ),
     Param(
         "trigger_in_mode",

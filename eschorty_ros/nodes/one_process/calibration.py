@@ -32,7 +32,7 @@ class CalibrationJob:
     targets : tuple of KnownTarget
         The known targets of the scene.
     folder : str
-        Where the calibration is written.
+        Folder for the calibration.
     calibration, as_built : str
         The build as designed, and that of the simulated world.
     """
@@ -57,7 +57,7 @@ class CalibrationResult:
     ----------
     success : bool
     message : str
-        Why it failed, ``""`` on success.
+        Reason of a failure, ``""`` on success.
     calibration : Calibration or None
         As read back from ``file``.
     file : str

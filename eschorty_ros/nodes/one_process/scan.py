@@ -45,7 +45,7 @@ class ScanJob:
 
     @property
     def sweep_s(self) -> float:
-        """Time between start and stop at the scan's speed."""
+        """Return the time between start and stop at the scan's speed."""
         return abs(self.stop_mm - self.start_mm) / self.speed_mm_s
 
 
@@ -110,9 +110,9 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
 
 
 def _cloud_points(cloud: PointCloud2) -> NDArray[np.void]:
-    seen = points_from_message(cloud)
-    names = seen.dtype.names or ()
-    points = np.empty(len(seen), REFLECTANCE_DTYPE if "reflectance" in names else POINT_DTYPE)
+    received = points_from_message(cloud)
+    names = received.dtype.names or ()
+    points = np.empty(len(received), REFLECTANCE_DTYPE if "reflectance" in names else POINT_DTYPE)
     for name in points.dtype.names or ():
-        points[name] = seen[name]
+        points[name] = received[name]
     return points

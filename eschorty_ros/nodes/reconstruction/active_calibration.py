@@ -37,7 +37,7 @@ class ActiveCalibration:
     file : str
         Its file.
     folder : str
-        Where calibrations are written; ``""``: ``eschorty`` in ROS's home.
+        Folder for calibrations; ``""``: ``eschorty`` in ROS's home.
     use : callable
         Changes the calibration in use, or raises an ``EschortyError`` and changes nothing.
     """

@@ -90,7 +90,7 @@ def active_message(calibration: Calibration, file: str, stamp_ns: int) -> Active
 
 
 def fill_result(result: Calibrate.Result, report: CalibrationReport, file: str) -> None:
-    """Put a fit into the action's result."""
+    """Fill the action's result from a fit."""
     calibration, targets = report.calibration, report.targets.select(report.used)
     names = calibration.parameters_fitted or ()
     result.calibration_id = calibration.id or ""

@@ -53,7 +53,7 @@ class Calibrator:
         The reconstruction node.
     active : ActiveCalibration
     in_worker : callable
-        Runs a job in the reconstruction's worker; returns whether it succeeded, and why not.
+        Runs a job in the reconstruction's worker; returns success and the reason of a failure.
     set_capture : callable
         Sets the capture to feed, or ``None``; called in the worker. Raises an ``EschortyError``
         when that is refused.
@@ -198,7 +198,7 @@ class _Feedback:
         self._in_worker = in_worker
         self._begun_s = self._sent_s = self._searched_s = time.monotonic()
         self._message = Calibrate.Feedback()
-        # In another thread than the sequence, which keeps up the laser's heartbeat.
+        # In another thread than the sequence, which has to tick for the laser's heartbeat.
         self._search = threading.Thread(target=self._find, daemon=True)
 
     def send(self, phase: str) -> None:

@@ -114,7 +114,7 @@ class ReconstructionNode(Node):
             self._pipeline,
             (packets, odometry),
             self._in_worker,
-            self._alive,
+            self._running,
             self.parameters["stage_timeout"],
             self._outputs.scan,
         )
@@ -181,11 +181,11 @@ class ReconstructionNode(Node):
             self._tf.publish(TFMessage(transforms=[carriage]))
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
-        """Run ``job`` after the queued ones; return whether it succeeded, and why not."""
-        return self._jobs.run(job, timeout_s, self._alive)
+        """Run ``job`` after the queued ones; return whether it succeeded, and the reason if not."""
+        return self._jobs.run(job, timeout_s, self._running)
 
-    def _alive(self) -> bool:
-        """Return whether the worker runs: not after a signal, when the exit must not wait."""
+    def _running(self) -> bool:
+        """Return whether the worker runs; after a signal it does not."""
         return not self._closing.is_set() and self.context.ok()
 
     def _use_calibration(self, calibration: Calibration) -> None:
@@ -209,7 +209,7 @@ class ReconstructionNode(Node):
                 self._step()
             except Exception:
                 # After a signal the context is invalid.
-                if not self._alive():
+                if not self._running():
                     return
                 self._reports.faults += 1
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)

@@ -12,7 +12,7 @@ from eschorty_ros.nodes.ros.parameters import Param
 
 TABLE = (
     Param("calibration", "config_3", "calibration: a name in config/ or a file's path"),
-    Param("frequency", 0.0, "modulation frequency; 0 takes the laser node's settings", "Hz",
+    Param("frequency", 0.0, "modulation frequency; 0: the laser node's settings", "Hz",
           0.0, FREQUENCY_MAX_HZ, dynamic=True),
     Param("duty", 0.5, "duty where frequency is given", "", 0.001, 0.999, dynamic=True),
     Param("waveform", "square", "waveform where frequency is given",
@@ -27,12 +27,11 @@ TABLE = (
     Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
     Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
-    Param("calibration_folder", "", "where calibrations are written; empty: eschorty in ROS's "
-          "home"),
-    Param("auto_calibrate", False, "calibrate once as soon as the other nodes are there"),
+    Param("calibration_folder", "", "folder for calibrations; empty: eschorty in ROS's home"),
+    Param("auto_calibrate", False, "calibrate once as soon as the other nodes are ready"),
     Param("distances", "posts", "auto_calibrate: targets, a file's name in config/ or a path"),
-    Param("method", "joint", "auto_calibrate: how it is fitted", choices=METHODS),
-    Param("capture_time", 1.0, "auto_calibrate: how long the targets are lit", "s",
+    Param("method", "joint", "auto_calibrate: method of the fit", choices=METHODS),
+    Param("capture_time", 1.0, "auto_calibrate: time of light on the targets", "s",
           1e-3, CAPTURE_MAX_S),
     Param("node_timeout", 60.0, "calibration: longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "calibration: longest wait for an answer", "s", 0.1, 60.0),

@@ -15,7 +15,7 @@ from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 
 class Reports:
-    """Reads a pipeline that another thread runs: the numbers of one report need not be of one time.
+    """State and diagnostics of a pipeline that another thread runs; numbers may differ in time.
 
     Attributes
     ----------

@@ -32,8 +32,8 @@ class ScanServices:
     sources : sequence of Subscription
         Subscriptions that a scan needs publishers of.
     in_worker : callable
-        Runs a job in the worker; returns whether it succeeded, and why not.
-    alive : callable
+        Runs a job in the worker; returns whether it succeeded, and the reason of a failure.
+    running : callable
         Returns whether the worker runs.
     stage_timeout_s : float
         Longest wait of points for the stage after the end.
@@ -47,12 +47,12 @@ class ScanServices:
         pipeline: Pipeline,
         sources: Sequence[Subscription],
         in_worker: Callable[[Callable[[], None]], tuple[bool, str]],
-        alive: Callable[[], bool],
+        running: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
     ) -> None:
         self._node, self._pipeline, self._sources = node, pipeline, sources
-        self._in_worker, self._alive = in_worker, alive
+        self._in_worker, self._running = in_worker, running
         self._timeout_s = stage_timeout_s + _ASSEMBLE_S
         self._publish = publish
         self._ended: Callable[[ScanReport], None] | None = None
@@ -65,7 +65,7 @@ class ScanServices:
             node.create_service(kind, name, callback, callback_group=group)
 
     def finish(self) -> None:
-        """Publish an ended scan once all its points have their place; called in the worker."""
+        """Publish an ended scan once all its points are placed; called in the worker."""
         # Profiles that arrive later come from the background, without light.
         if self._ended is not None and not self._pipeline.placer.holds(self._ended_s):
             ended, self._ended = self._ended, None
@@ -78,7 +78,7 @@ class ScanServices:
         # After the answer every message sent must arrive.
         missing = self._unconnected()
         deadline_s = time.monotonic() + _CONNECT_S
-        while missing and time.monotonic() < deadline_s and self._alive():
+        while missing and time.monotonic() < deadline_s and self._running():
             time.sleep(0.02)
             missing = self._unconnected()
         if missing:
@@ -131,6 +131,6 @@ class ScanServices:
         """Wait for the worker's event; after a signal it may not come."""
         end_s = time.monotonic() + self._timeout_s
         while not event.wait(0.1):
-            if time.monotonic() > end_s or not self._alive():
+            if time.monotonic() > end_s or not self._running():
                 return event.is_set()
         return True

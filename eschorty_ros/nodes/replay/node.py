@@ -38,7 +38,7 @@ from eschorty_ros.srv import BeginScan, EndScan
 TABLE = (
     Param("recording", "", "recording folder"),
     Param("rate", 1.0, "speed against real time; 0 is as fast as possible", "", 0.0, 1e6),
-    Param("timeout", 30.0, "longest wait for the reconstruction, and for it to go on", "s",
+    Param("timeout", 30.0, "longest wait for the reconstruction and for its progress", "s",
           0.1, 3600.0),
 )  # fmt: skip
 
@@ -160,7 +160,7 @@ class ReplayNode(Node):
         for end in self.get_subscriptions_info_by_topic(self._events.topic_name):
             if end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
                 self.get_logger().warning(
-                    f"{end.node_name} takes camera/events best effort and may lose packets"
+                    f"{end.node_name} subscribes to camera/events best effort and may lose packets"
                 )
 
     def _publish_clock_and_laser(self) -> None:

@@ -1,1 +1,1 @@
-"""What the nodes share."""
+"""Shared parts of the nodes."""

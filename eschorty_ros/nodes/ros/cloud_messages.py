@@ -90,7 +90,7 @@ def points_from_message(message: PointCloud2) -> NDArray[Any]:
 def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
     """Return an assembled scan's points in the layout of a live cloud, ``t`` from ``stamp_ns``.
 
-    All of ``t_ns`` lies within ``LIVE_SPAN_NS`` after ``stamp_ns``.
+    All of ``t_ns`` must be within ``LIVE_SPAN_NS`` after ``stamp_ns``.
     """
     live = np.empty(len(scan_points), live_dtype(scan_points.dtype))
     for name in scan_points.dtype.names or ():

@@ -18,8 +18,8 @@ class Heartbeat:
     """Publishes a ``std_msgs/Header`` every 0.1 s for as long as ``healthy()`` is true.
 
     The header's ``frame_id`` identifies the process (see ``control.heartbeat``), so that a laser
-    node on the same host sees it die. In a thread of its own, so that a busy executor does not look
-    like a dead device; it ends with the node's context.
+    node on the same host detects its end. It runs in a thread of its own, because a busy executor
+    is no failure of the device; it ends with the node's context.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Heartbeat:
     topic : str
         ``camera/heartbeat`` or the like.
     healthy : callable
-        Whether the device does what it should, right now; called in the thread, must not wait.
+        Returns whether the device works now; called in the thread, must not wait.
     """
 
     def __init__(self, node: Node, topic: str, healthy: Callable[[], bool]) -> None:
@@ -39,7 +39,7 @@ class Heartbeat:
 
     @property
     def healthy(self) -> bool:
-        """Whether the last heartbeat reported a healthy device."""
+        """Return whether the last heartbeat reported a healthy device."""
         return self._schedule.healthy
 
     def _run(self) -> None:

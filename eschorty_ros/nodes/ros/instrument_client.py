@@ -34,10 +34,10 @@ from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.srv import BeginScan, EndScan
 
-# The heartbeat stops when the sequence has not ticked for so long.
+# The heartbeat stops when the sequence has not ticked for this long.
 _TICK_LIMIT_S = 1.0
-# In the laser's refusals for want of a heartbeat.
-_BEAT = "/heartbeat"
+# Part of the laser's reason when a heartbeat is missing.
+_HEARTBEAT = "/heartbeat"
 _ASSEMBLE_S = 60.0
 
 
@@ -48,9 +48,9 @@ class InstrumentClient(PacedWaiting):
     ----------
     node : rclpy.node.Node
     node_timeout_s, service_timeout_s, events_timeout_s : float
-        Longest wait for the nodes to appear, for an answer, and for the events to go on.
+        Longest wait for the nodes to appear, for an answer, and for the events to continue.
     services : mapping of str to service type
-        What else is needed, by name.
+        Further services that a sequence needs, by name.
     """
 
     def __init__(
@@ -83,15 +83,15 @@ class InstrumentClient(PacedWaiting):
         self._stage = ActionClient(node, MoveStage, "stage/move", callback_group=group)
         self._node_timeout_s = node_timeout_s
         self._service_timeout_s = service_timeout_s
-        self._beating = False
-        self._heartbeat = Heartbeat(node, CLIENT_HEARTBEAT, self._wants_light)
+        self._heartbeat_on = False
+        self._heartbeat = Heartbeat(node, CLIENT_HEARTBEAT, self._light_requested)
         self._sent: Any = None
 
     def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
         """Reset for a new sequence; both callables are used at every tick."""
 
         def guarded(phase: str) -> None:
-            with self._living_context():
+            with self._shutdown_as_failure():
                 feedback(phase)
 
         super().prepare(canceled, guarded)
@@ -99,12 +99,12 @@ class InstrumentClient(PacedWaiting):
     def check_nodes(self) -> None:
         """See ``Instrument``."""
         begun_ns = self.monitor.until_ns
-        for there, failure in self._needed(begun_ns):
-            self.wait(there, self._node_timeout_s, failure)
+        for holds, failure in self._needed(begun_ns):
+            self.wait(holds, self._node_timeout_s, failure)
 
     def missing(self) -> str:
-        """Return what is missing, one item of each node; ``""`` when a sequence can begin."""
-        absent = [failure for there, failure in self._needed(0) if not there()]
+        """Return the missing conditions, one of each node; ``""`` when a sequence can begin."""
+        absent = [failure for holds, failure in self._needed(0) if not holds()]
         named = {text.split(":")[0]: text for text in reversed(absent) if isinstance(text, str)}
         if absent and not named:
             # Only the events are missing, for a reason that the monitor finds.
@@ -112,13 +112,13 @@ class InstrumentClient(PacedWaiting):
         return "; ".join(reversed(named.values()))
 
     def _needed(self, begun_ns: int) -> list[tuple[Callable[[], bool], str | Callable[[], str]]]:
-        """List what a sequence needs, in order, each with the failure without it."""
+        """Return the conditions of a sequence in order, each with the failure without it."""
         servers = (
             *((name, client.service_is_ready) for name, client in self._clients.items()),
             ("stage/move", self._stage.server_is_ready),
         )
         return [
-            *((there, f"{what.split('/')[0]}: no {what}") for what, there in servers),
+            *((ready, f"{name.split('/')[0]}: no {name}") for name, ready in servers),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
             (lambda: self.monitor.at_rest, "stage: another move does not end"),
             (lambda: self.monitor.laser is not None, "laser: no state"),
@@ -127,15 +127,15 @@ class InstrumentClient(PacedWaiting):
 
     def configure_laser(self, frequency_hz: float, duty: float) -> None:
         """See ``Instrument``."""
-        wanted = {
+        requested = {
             name: float(value)
             for name, value in (("frequency", frequency_hz), ("duty", duty))
             if value
         }
-        if not wanted:
+        if not requested:
             return
         messages = [Parameter(name, value=value).to_parameter_msg()
-                    for name, value in wanted.items()]  # fmt: skip
+                    for name, value in requested.items()]  # fmt: skip
         answer = self._call("laser/set_parameters", SetParameters.Request(parameters=messages))
         for result in answer.results:
             if not result.successful:
@@ -146,10 +146,10 @@ class InstrumentClient(PacedWaiting):
             if laser is None:
                 return False
             read = {"frequency": laser.frequency_hz, "duty": laser.duty}
-            return all(abs(read[name] - value) <= 1e-3 * value for name, value in wanted.items())
+            return all(abs(read[name] - value) <= 1e-3 * value for name, value in requested.items())
 
         self.wait(applied, self._service_timeout_s,
-                  f"laser: its state does not show {wanted}")  # fmt: skip
+                  f"laser: its state does not show {requested}")  # fmt: skip
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
         """See ``Instrument``."""
@@ -180,7 +180,7 @@ class InstrumentClient(PacedWaiting):
         handle = self._answer(sent, "stage/move")
         if not handle.accepted:
             return
-        with self._living_context():
+        with self._shutdown_as_failure():
             ended = handle.cancel_goal_async(), handle.get_result_async()
         for future in ended:
             self._answer(future, "stage/move")
@@ -188,13 +188,13 @@ class InstrumentClient(PacedWaiting):
     def laser_on(self) -> None:
         """See ``Instrument``."""
         self.tick()
-        self._beating = True
+        self._heartbeat_on = True
         self.wait(lambda: self._heartbeat.healthy, self._service_timeout_s,
                   "laser: no heartbeat of its own")  # fmt: skip
         ends_s = time.monotonic() + self._service_timeout_s
         while refusal := self._arm_and_enable():
             # The heartbeats of a camera and a stage that have just started come soon.
-            if _BEAT not in refusal or time.monotonic() > ends_s:
+            if _HEARTBEAT not in refusal or time.monotonic() > ends_s:
                 raise ScanFailure(f"laser: {refusal}")
             self.tick()
         self.wait(lambda: self.monitor.output == LaserOutput.ON, self._service_timeout_s,
@@ -214,7 +214,7 @@ class InstrumentClient(PacedWaiting):
     def laser_off(self) -> None:
         """See ``Instrument``."""
         try:
-            if self._beating:
+            if self._heartbeat_on:
                 answer = self._call("laser/enable", SetBool.Request(data=False))
                 if not answer.success:
                     raise ScanFailure(f"laser: {answer.message}")
@@ -222,11 +222,11 @@ class InstrumentClient(PacedWaiting):
                           self._service_timeout_s,
                           "laser: its output does not read back off")  # fmt: skip
         finally:
-            # Without it the laser switches itself off, should the call have failed.
-            self._beating = False
+            # Without it the laser switches itself off, also when the call has failed.
+            self._heartbeat_on = False
 
-    def _wants_light(self) -> bool:
-        return self._beating and self.ticked_within(_TICK_LIMIT_S)
+    def _light_requested(self) -> bool:
+        return self._heartbeat_on and self.ticked_within(_TICK_LIMIT_S)
 
     def _answer(self, future: Any, name: str) -> Any:
         self.wait(
@@ -239,7 +239,7 @@ class InstrumentClient(PacedWaiting):
         call = RepeatedCall(self._clients[name], request, again=once_within_s is None)
 
         def answered() -> bool:
-            with self._living_context():
+            with self._shutdown_as_failure():
                 return call.done()
 
         timeout_s = once_within_s or self._service_timeout_s
@@ -247,7 +247,7 @@ class InstrumentClient(PacedWaiting):
         return call.result()
 
     @contextlib.contextmanager
-    def _living_context(self) -> Iterator[None]:
+    def _shutdown_as_failure(self) -> Iterator[None]:
         """Turn the errors of a context that a signal has ended into a ``ScanFailure``."""
         try:
             yield
@@ -258,7 +258,7 @@ class InstrumentClient(PacedWaiting):
 
 
 class ScanClient(InstrumentClient):
-    """The same with the reconstruction's services; arguments as those of ``InstrumentClient``."""
+    """Instrument client with the reconstruction's services; arguments as its base's."""
 
     def __init__(
         self,

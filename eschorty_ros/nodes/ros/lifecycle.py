@@ -44,9 +44,9 @@ class DeviceNode(LifecycleNode):
     Attributes
     ----------
     failure : str
-        What failed last, empty after a successful configure.
+        The last failure, empty after a successful configure.
     waiting : str
-        Why the node cannot start yet and when it retries, ``""`` when it does not wait.
+        The reason for waiting and the time of the next attempt, ``""`` when it does not wait.
     """
 
     def __init__(
@@ -89,12 +89,12 @@ class DeviceNode(LifecycleNode):
 
     @property
     def state_label(self) -> str:
-        """Lifecycle state, e.g. ``active``."""
+        """Return the lifecycle state, e.g. ``active``."""
         return str(self._state_machine.current_state[1])
 
     @property
     def active(self) -> bool:
-        """Whether the node is active."""
+        """Return whether the node is active."""
         return self.state_label == "active"
 
     def safe_state(self) -> None:

@@ -14,12 +14,12 @@ STATE_HISTORY = 100
 
 
 def events() -> QoSProfile:
-    """Raw event packets: best effort, deep queue, as metavision_driver publishes them."""
+    """Return the profile of raw event packets: best effort, deep, as metavision_driver's."""
     return _profile(EVENT_DEPTH, ReliabilityPolicy.BEST_EFFORT)
 
 
 def latched(depth: int = 1) -> QoSProfile:
-    """State that a late joiner still receives: reliable, transient local.
+    """Return the profile of a state that a late joiner still receives: reliable, transient local.
 
     ``depth`` is 1 where only the newest message counts, ``STATE_HISTORY`` where no change may be
     lost, such as the laser's state.
@@ -28,17 +28,17 @@ def latched(depth: int = 1) -> QoSProfile:
 
 
 def stream(depth: int = STREAM_DEPTH) -> QoSProfile:
-    """Messages that must all reach the present subscribers: reliable, volatile."""
+    """Return the profile of messages that must reach all subscribers: reliable, volatile."""
     return _profile(depth, ReliabilityPolicy.RELIABLE)
 
 
 def heartbeat() -> QoSProfile:
-    """Heartbeats: only the newest counts, and none is repeated."""
+    """Return the profile of heartbeats: only the newest counts, and none is repeated."""
     return _profile(1, ReliabilityPolicy.BEST_EFFORT)
 
 
 def overridable() -> QoSOverridingOptions:
-    """History, depth and reliability settable by the parameters ``qos_overrides.<topic>...``."""
+    """Return the options that ``qos_overrides.<topic>...`` can set: history, depth, reliability."""
     return QoSOverridingOptions.with_default_policies()
 
 

@@ -12,7 +12,7 @@ _RESEND_S = 2.0
 class RepeatedCall:
     """A request that is sent by ``done`` and, with ``again``, repeated every 2 s.
 
-    A server that has just discovered the client's node may not know yet where to send its answer.
+    A server may receive a request before it has discovered the receiver of its answer.
     A repeated request may be carried out twice.
     """
 

@@ -94,7 +94,7 @@ def turn(executor: Executor) -> None:
     """Run one turn of a spin loop."""
     executor.spin_once(timeout_sec=0.1)
     # While a callback runs, rclpy 9 polls for the next of its group without a pause and would
-    # take the interpreter from the other threads.
+    # hold the interpreter's lock.
     time.sleep(_PAUSE_S)
 
 

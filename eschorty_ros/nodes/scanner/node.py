@@ -35,7 +35,7 @@ from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.spin import run, unless_shut_down
 
 TABLE = (
-    Param("auto_scan", False, "do one scan as soon as the other nodes are there"),
+    Param("auto_scan", False, "do one scan as soon as the other nodes are ready"),
     Param("start", 0.01, "auto_scan: stage position where the sweep begins", "m", -1.0, 1.0),
     Param("stop", 0.06, "auto_scan: stage position where it ends", "m", -1.0, 1.0),
     Param("speed", 0.05, "auto_scan: stage speed", "m/s", 1e-6, 1.0),
@@ -45,14 +45,14 @@ TABLE = (
     Param("travel_min", 0.0, "lower end of the stage's travel", "m", -1.0, 1.0),
     Param("travel_max", 0.22, "upper end of the stage's travel", "m", -1.0, 1.0),
     Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),
-    Param("acceleration", 2.0, "the stage's, from which the run-up follows", "m/s^2", 1e-3, 100.0),
+    Param("acceleration", 2.0, "acceleration of the stage, for the run-up", "m/s^2", 1e-3, 100.0),
     Param("approach_speed", 0.1, "speed towards the start", "m/s", 1e-6, 1.0),
     # A machine's first run compiles for some 20 s before the nodes answer.
     Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
     Param("events_timeout", 3.0, "longest pause of the events while the laser is on", "s",
           0.1, 60.0),
-    Param("drain_timeout", 10.0, "longest standstill of the reconstruction after the sweep", "s",
+    Param("drain_timeout", 10.0, "longest pause of the reconstruction after the sweep", "s",
           0.1, 600.0),
 )  # fmt: skip
 
@@ -126,14 +126,14 @@ class ScannerNode(Node):
             self._one_scan.release()
 
     def _scan(self, goal: Any) -> Any:
-        asked = goal.request
+        values = goal.request
         request = ScanRequest(
             scan_id=time.strftime("scan-%Y%m%d-%H%M%S-", time.gmtime()) + f"{self._scans + 1}",
-            start_mm=mm_from_m(asked.start),
-            stop_mm=mm_from_m(asked.stop),
-            speed_mm_s=mm_from_m(asked.speed),
-            frequency_hz=float(asked.frequency),
-            duty=float(asked.duty),
+            start_mm=mm_from_m(values.start),
+            stop_mm=mm_from_m(values.stop),
+            speed_mm_s=mm_from_m(values.speed),
+            frequency_hz=float(values.frequency),
+            duty=float(values.duty),
         )
         try:
             check_request(request, self._limits)

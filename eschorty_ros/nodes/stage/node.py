@@ -29,7 +29,7 @@ from eschorty_ros.nodes.stage.parameters import DRIVER_TABLE, make_stage
 
 _FEEDBACK_PERIOD_S = 0.05
 _POLL_S = 0.01
-# More than a DDS heartbeat of 3 s holds, so that lost messages can be repeated.
+# Longer than the 3 s between two heartbeats of DDS, so that lost messages can be repeated.
 _ODOM_DEPTH = 2000
 
 TABLE = (
@@ -39,7 +39,7 @@ TABLE = (
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
     Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
     Param("home_timeout", 60.0, "longest time for homing", "s", 1.0, 600.0),
-    Param("base_frame", "eschorty_base", "frame the stage stands in"),
+    Param("base_frame", "eschorty_base", "frame of the stage's base"),
     Param("stage_frame", "eschorty_stage", "frame of the carriage"),
 )
 

@@ -13,8 +13,12 @@ from eschorty_ros.nodes.ros.drivers import ClockNs
 from eschorty_ros.nodes.ros.parameters import Param
 
 DRIVER_TABLE = (
-    Param("port", "", "serial port or pyserial URL of the stage controller; empty finds it"),
-    Param("serial", "", "USB serial number of the stage controller; empty takes the only one"),
+    Param(
+        "port",
+        "",
+        "serial port or pyserial URL of the controller; empty: found by its serial",
+    ),
+    Param("serial", "", "USB serial number of the stage controller; empty: the only one"),
     Param("controller", "kbd101", "stage controller", choices=CONTROLLERS),
     Param("bay", 1, "bay of the rack, from 1", "", 1, 10),
     Param("speed_max", 0.25, "cap on the speed the controller reports", "m/s", 0.001, 1.0),
@@ -24,7 +28,7 @@ DRIVER_TABLE = (
     Param("homing_speed", 0.025, "speed of homing", "m/s", 0.001, 0.1),
     Param("poll_rate", 50.0, "rate of status requests", "Hz", 5.0, 200.0),
     Param("trigger_interval", 0.002, "distance of pulses for the camera; 0 = none", "m", 0.0, 0.1),
-    Param("trigger_port", 1, "output of the controller that gives the pulses", "", 1, 3),
+    Param("trigger_port", 1, "output of the controller for the pulses", "", 1, 3),
 )
 
 
