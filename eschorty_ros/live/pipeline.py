@@ -51,8 +51,8 @@ class ScanReport:
                 "laser's frequency, at the focus and at what the line falls on"
             )
         return (
-            f"no points: all {self.points_outside} are outside start to stop; check that the stamps of "
-            "camera and stage are of the same clock"
+            f"no points: all {self.points_outside} are outside start to stop; check that the "
+            "stamps of camera and stage are of the same clock"
         )
 
 
