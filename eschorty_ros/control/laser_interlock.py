@@ -61,7 +61,7 @@ class LaserInterlock:
 
     @property
     def contact_open(self) -> bool:
-        """Whether the contact is reported open, or its last report of being closed has expired."""
+        """Return whether the contact is reported open, or its report of closed has expired."""
         return self._reported_open or self._now_s() - self._closed_s > self._contact_timeout_s
 
     @property
@@ -162,5 +162,5 @@ class LaserInterlock:
 
 def _remedy(topic: str) -> str:
     if topic == CLIENT_HEARTBEAT:
-        return "publish it while light is wanted"
+        return "publish it while light is requested"
     return f"look at the {topic.partition('/')[0]} node, or take it out of the parameter watch"

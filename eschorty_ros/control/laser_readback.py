@@ -1,4 +1,4 @@
-"""What was requested of the laser, what its generator reads back, and how the two differ."""
+"""The requested state of the laser, its read-back, and the difference of the two."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LaserStatus:
 
 
 class LaserRecord:
-    """What was requested of a generator and what it read back last; takes no lock.
+    """The requested state of a generator and its last read-back; without a lock.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class LaserRecord:
 
     @property
     def status(self) -> LaserStatus | None:
-        """What is known now, ``None`` before the first read-back."""
+        """The last read-back, ``None`` before the first."""
         readback = self.readback
         return None if readback is None else LaserStatus(self.requested, readback, self.reason)
 
@@ -89,20 +89,21 @@ class LaserRecord:
         if readback.output in (self.requested, LaserOutput.UNKNOWN):
             return ""
         why = f" ({readback.reason})" if readback.reason else ""
-        return f"output reads back {readback.output.name}, asked {self.requested.name}{why}"
+        return f"output reads back {readback.output.name}, requested {self.requested.name}{why}"
 
     def _modulation_difference(self, readback: LaserReadback) -> str:
-        asked, found = self.modulation, readback.modulation
-        if asked is None:
+        request, found = self.modulation, readback.modulation
+        if request is None:
             return ""
-        if not math.isclose(found.frequency_hz, asked.frequency_hz, rel_tol=FREQUENCY_TOLERANCE):
+        if not math.isclose(found.frequency_hz, request.frequency_hz, rel_tol=FREQUENCY_TOLERANCE):
             return (
-                f"frequency reads back {found.frequency_hz:g} Hz, asked {asked.frequency_hz:g} Hz"
+                f"frequency reads back {found.frequency_hz:g} Hz, "
+                f"requested {request.frequency_hz:g} Hz"
             )
-        if abs(found.duty - asked.duty) > DUTY_TOLERANCE:
-            return f"duty reads back {found.duty:g}, asked {asked.duty:g}"
-        if found.waveform != asked.waveform:
-            return f"waveform reads back {found.waveform}, asked {asked.waveform}"
+        if abs(found.duty - request.duty) > DUTY_TOLERANCE:
+            return f"duty reads back {found.duty:g}, requested {request.duty:g}"
+        if found.waveform != request.waveform:
+            return f"waveform reads back {found.waveform}, requested {request.waveform}"
         return ""
 
 

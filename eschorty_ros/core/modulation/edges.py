@@ -1,4 +1,4 @@
-"""Where modulation periods begin: exact edge times, re-anchored by triggers."""
+"""Edges at which modulation periods begin: exact times, re-anchored by triggers."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class EdgeSchedule:
 
     @property
     def triggered(self) -> bool:
-        """Whether triggers set the edges."""
+        """Return whether triggers set the edges."""
         return self._state.triggered
 
     @property

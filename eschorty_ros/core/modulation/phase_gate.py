@@ -15,7 +15,7 @@ from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.core.modulation.modulation import Modulation
 
 LEAD_US = 200
-"""How long before the edge the window opens: an estimated edge lies behind the first events."""
+"""Opening of the window before the edge: an estimated edge comes after the first events."""
 
 GATE_MAX_US = 100_000
 

@@ -244,7 +244,7 @@ class Reconstructor:
 
     @property
     def phase_missing(self) -> bool:
-        """Whether a flush found no phase and cut from the first event's time on."""
+        """Return whether a flush found no phase and cut from the first event's time on."""
         return self._periods.lock.missing
 
     @property

@@ -23,7 +23,7 @@ from eschorty_ros.hardware.laser.awg_channel import (
     LIGHT_SETTINGS,
     NAME,
     AwgChannel,
-    wanted_settings,
+    requested_settings,
 )
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
@@ -106,14 +106,14 @@ class AwgLaser:
             When the generator fails, or reads back something else; its output is off then.
         """
         with self._command():
-            wanted = wanted_settings(self._settings, self._profile, modulation)
+            requested = requested_settings(self._settings, self._profile, modulation)
             lit = self._output is LaserOutput.ON
             with self._disabled_on_failure():
                 self._ready = False
                 self._disable(keep_armed=True)
                 self._identify()
                 channel = self._channel
-                channel.apply(wanted)
+                channel.apply(requested)
                 channel.unlock()
                 self._modulation, self._ready = modulation, True
                 if lit:

@@ -18,10 +18,12 @@ from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 NAME = "laser generator"
 LIGHT_SETTINGS = ("waveform", "frequency", "high", "low", "duty")
 Result = TypeVar("Result")
-Wanted = dict[str, Value]
+Requested = dict[str, Value]
 
 
-def wanted_settings(settings: AwgSettings, profile: AwgProfile, modulation: Modulation) -> Wanted:
+def requested_settings(
+    settings: AwgSettings, profile: AwgProfile, modulation: Modulation
+) -> Requested:
     """Return every setting of a lit output, in the order in which it is safe to make them.
 
     The load is first, since it changes what a volt means; then the clamp, before any level.
@@ -35,7 +37,7 @@ def wanted_settings(settings: AwgSettings, profile: AwgProfile, modulation: Modu
         raise ArgumentError(
             f"waveform is {modulation.waveform!r}; the generator has {', '.join(profile.waveforms)}"
         )
-    wanted: Wanted = {
+    requested: Requested = {
         "load": settings.load_ohm,
         "limit_lower": 0.0,
         "limit_upper": settings.high_max_v,
@@ -48,14 +50,14 @@ def wanted_settings(settings: AwgSettings, profile: AwgProfile, modulation: Modu
         "low": settings.low_v,
     }
     if modulation.waveform in profile.duty_waveforms:
-        wanted["duty"] = modulation.duty * 100.0
+        requested["duty"] = modulation.duty * 100.0
     elif modulation.duty != 0.5:
         raise ArgumentError(
             f"duty is {modulation.duty:g}; waveform {modulation.waveform} has none but 0.5"
         )
-    for name, value in wanted.items():
+    for name, value in requested.items():
         profile.settings[name].check(name, value)
-    return wanted
+    return requested
 
 
 class AwgChannel:
@@ -91,7 +93,7 @@ class AwgChannel:
         self._scpi = Scpi(link, profile, refuse_void, counters)
         self._settings = settings
         self._profile = profile
-        self._wanted: Wanted = {}
+        self._requested: Requested = {}
         self._lowered = False
         self._no_replies = False
         self._warn = warn
@@ -108,7 +110,7 @@ class AwgChannel:
 
     @property
     def reads_back(self) -> bool:
-        """Whether settings are read back."""
+        """Return whether settings are read back."""
         return self._settings.readback != "off" and not self._no_replies
 
     def identify(self) -> DeviceIdentity:
@@ -128,25 +130,25 @@ class AwgChannel:
             f"{parts[0]} {parts[1]}".strip(), parts[2] or self.link.serial, parts[3]
         )
 
-    def apply(self, wanted: Wanted) -> None:
+    def apply(self, requested: Requested) -> None:
         """Make every setting of a disabled output; raises ``DeviceError`` unless all read back."""
-        self._wanted = dict(wanted)
-        for name, value in wanted.items():
+        self._requested = dict(requested)
+        for name, value in requested.items():
             if name == "high":
-                self._set_levels(float(value), float(wanted["low"]))
+                self._set_levels(float(value), float(requested["low"]))
             elif name != "low":
                 self._set(name, value)
         self.verify()
 
     def raise_levels(self) -> None:
         """Restore the levels that ``disable`` lowered; raises ``DeviceError``."""
-        if self._lowered and "high" in self._wanted:
-            self._set_levels(float(self._wanted["high"]), float(self._wanted["low"]))
+        if self._lowered and "high" in self._requested:
+            self._set_levels(float(self._requested["high"]), float(self._requested["low"]))
 
     def verify(self, names: tuple[str, ...] = ()) -> None:
         """Read settings back, by default all; raises ``DeviceError`` that names what differs."""
         wrong = []
-        for name, value in self._wanted.items():
+        for name, value in self._requested.items():
             if names and name not in names:
                 continue
             found = self._get(name, self._settings.channel)

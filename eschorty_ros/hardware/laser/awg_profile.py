@@ -76,16 +76,16 @@ class Setting(Schema):
             raise ValueError("only {channel} can be filled in") from None
         return value
 
-    def agrees(self, wanted: Value, found: Value) -> bool:
+    def agrees(self, requested: Value, found: Value) -> bool:
         """Return whether a read-back agrees with what was set."""
         if self.kind == "number":
-            allowed = self.tolerance + self.tolerance_share * abs(float(wanted))
-            return abs(float(found) - float(wanted)) <= allowed
+            allowed = self.tolerance + self.tolerance_share * abs(float(requested))
+            return abs(float(found) - float(requested)) <= allowed
         if self.kind == "keyword":
             # SCPI keywords have a long form and a short one, which is its capitals.
-            short = "".join(letter for letter in str(wanted) if not letter.islower())
-            return str(found).upper() in (str(wanted).upper(), short)
-        return bool(wanted) == bool(found)
+            short = "".join(letter for letter in str(requested) if not letter.islower())
+            return str(found).upper() in (str(requested).upper(), short)
+        return bool(requested) == bool(found)
 
     def check(self, name: str, value: Value) -> None:
         """Refuse a number outside the instrument's bounds with ``ArgumentError``."""

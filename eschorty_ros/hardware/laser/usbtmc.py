@@ -24,7 +24,7 @@ REPLY_LIMIT = 65_536
 _HEADER = struct.Struct("<BBBBIB3x")
 _MESSAGE_OUT, _REQUEST_IN, _REPLY_IN = 1, 2, 2
 _END_OF_MESSAGE = 0x01
-_ASKED_AT_ONCE = 4096
+_REQUEST_MAX_BYTES = 4096
 _INITIATE_CLEAR, _CHECK_CLEAR = 5, 6
 _CLASS_INTERFACE_IN = 0xA1
 _STATUS_SUCCESS, _STATUS_PENDING = 0x01, 0x02
@@ -172,7 +172,7 @@ class UsbTmc:
         The first packet is read alone: its header holds the size, and a reply of full packets that
         no empty packet follows would block a larger read until the time-out.
         """
-        header = _HEADER.pack(*self._tags(_REQUEST_IN), 0, _ASKED_AT_ONCE, 0)
+        header = _HEADER.pack(*self._tags(_REQUEST_IN), 0, _REQUEST_MAX_BYTES, 0)
         self._send(header, "asking for a reply")
         # An empty packet may still end the previous transfer.
         data = self._receive(self._packet) or self._receive(self._packet)
@@ -195,9 +195,9 @@ class UsbTmc:
         if (kind, tag, inverse) != (_REPLY_IN, self._tag, self._tag ^ 0xFF):
             wrong = "tag" if kind == _REPLY_IN else f"message id, {kind},"
             raise DeviceError(f"{self._name}: a reply header has the wrong {wrong} for its request")
-        if size > _ASKED_AT_ONCE:
+        if size > _REQUEST_MAX_BYTES:
             raise DeviceError(
-                f"{self._name}: a reply announced {size} bytes where {_ASKED_AT_ONCE} were asked"
+                f"{self._name}: a reply announced {size} bytes, {_REQUEST_MAX_BYTES} were requested"
             )
         return size, bool(attributes & _END_OF_MESSAGE)
 

@@ -1,4 +1,4 @@
-"""A laser whose generator belongs to a guard process, so that it goes off if this process dies."""
+"""A laser whose generator belongs to a guard process, so that it goes off if this process ends."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class GuardedLaser:
                 self.close()
             raise
         self.identity = DeviceIdentity(**identity)
-        # Loaded now: after the death of the guard there is no time for it.
+        # Loaded now: after the end of the guard there is no time for it.
         self._open_directly = maker(make, settings)
         self._opened = True
 
@@ -171,7 +171,7 @@ class GuardedLaser:
         self._closing = True
         try:
             if self._opened:
-                # Before the guard is dismissed: until then its death is made up for.
+                # Before the guard ends: until then this process replaces a guard that fails.
                 self.disable()
             self._dismissed = True
             if not self._lost:

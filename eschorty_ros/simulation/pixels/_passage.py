@@ -1,4 +1,4 @@
-"""When a comparator fires early because of noise.
+"""Early firing of a comparator because of noise.
 
 Noise at the follower's output is a Gaussian process of correlation time ``tau_f``. It is never
 drawn: a pixel whose signal is ``g`` standard deviations from a level passes it at the rate

@@ -51,7 +51,7 @@ _AT_REST = 0.1
 
 
 class Model(NamedTuple):
-    """What all pixels share, times in us; the tables are those of the noise."""
+    """Constants of all pixels, times in us; the tables are those of the noise."""
 
     omega_per_us: float
     follower_us: float

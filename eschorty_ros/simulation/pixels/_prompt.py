@@ -1,4 +1,4 @@
-"""When a signal that starts from rest passes a level: looked up, not summed.
+"""Time at which a signal that starts from rest passes a level: looked up, not summed.
 
 From rest photoreceptor and follower go one way, ``y = s1 + (s0 - s1) phi(t / tau_p)`` with
 ``phi(x) = (exp(-x) - rho exp(-x / rho)) / (1 - rho)`` and ``rho = tau_f / tau_p``. A table holds

@@ -1,4 +1,4 @@
-"""How events leave the sensor: row by row, at a limited rate."""
+"""The sensor's readout: events row by row, at a limited rate."""
 
 from eschorty_ros.simulation.readout.readout import EventRate, Readout, ReadoutParameters
 

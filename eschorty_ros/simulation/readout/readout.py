@@ -1,4 +1,4 @@
-"""How events leave the sensor: row by row, and at a limited rate when one is set."""
+"""The sensor's readout: events row by row, and at a limited rate when one is set."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ReadoutParameters:
 
 
 class ReadOut(NamedTuple):
-    """What left the sensor.
+    """The events that left the sensor.
 
     Attributes
     ----------

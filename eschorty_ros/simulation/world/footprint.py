@@ -1,4 +1,4 @@
-"""Where the laser line's thickness lies on a scene: one patch per column, two across an edge."""
+"""The laser line's thickness on a scene: one patch per column, two across an edge."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes import Scene
 
 _SAMPLES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-"""Where the scene is sampled across the line, in half widths of the footprint."""
+"""Samples of the scene across the line, in half widths of the footprint."""
 _CENTRE = 2
 _FINE = 32
 """Parts into which the stretch between two samples is cut to find an edge."""

@@ -1,4 +1,4 @@
-"""What the laser, the stage and the sensor are set to, over sensor time."""
+"""Settings of laser, stage and sensor over sensor time."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ class Timeline(Generic[Setting]):
 
 
 class LaserTimeline:
-    """When the laser is lit; dark before the first setting."""
+    """The laser's light over time; off before the first setting."""
 
     def __init__(self) -> None:
         self._gates: Timeline[Gate | None] = Timeline()
@@ -214,7 +214,7 @@ class LaserTimeline:
 
 
 class StageTimeline:
-    """Where the stage is; at 0 before the first plan."""
+    """The stage's position over time; 0 before the first plan."""
 
     def __init__(self) -> None:
         self._plans: Timeline[tuple[MotionPlan, int, Fraction]] = Timeline()
