@@ -1,8 +1,8 @@
-"""How fast is EVT3 decoding, beside other decoders, on noise and on a laser line?
+"""Speed of EVT3 decoding against other decoders, on noise and on a laser line.
 
 Run ``python benchmark/decode.py`` after ``pip install -r benchmark/requirements.txt``. One
-thread, process CPU time, best of the repeats; the decoders take turns so that all see the same
-machine. ``correct`` compares the count and plain and position-weighted sums with the events
+thread, process CPU time, best of the repeats; the decoders alternate, so that all run under the
+same load. ``correct`` compares the count and plain and position-weighted sums with the events
 that were encoded.
 
 ``sparse`` is uniform noise at 10 Mev/s (ADDR_X words only), ``line`` a four-row laser line in
@@ -39,7 +39,7 @@ Batch = tuple[Any, Any, Any, Any]
 
 
 def pieces(path: Path) -> list[bytes]:
-    """The stream in memory, cut as a driver cuts it."""
+    """Return the stream in memory, in pieces as from a driver."""
     return list(RawReader(path).chunks(PIECE_BYTES))
 
 
@@ -70,7 +70,7 @@ def rust_evt3(data: list[bytes]) -> Iterator[Batch]:
 
 
 def evutils_native(data: list[bytes]) -> Iterator[Batch]:
-    """The ``evutils`` C parser on reused buffers; it needs the words it left over again."""
+    """The ``evutils`` C parser on reused buffers; unused words are passed again."""
     from evutils.io._native_core import EventSoABuffers, TriggerSoABuffers
     from evutils.io._native_evt import Evt3Input, Evt3Parser
 
@@ -100,7 +100,7 @@ def expelliarmus_chunks(path: Path) -> Iterator[Batch]:
 
 
 def sums(batches: Iterator[Batch]) -> list[int]:
-    """Count, sums, and sums weighted by position (modulo 2**64)."""
+    """Return count, sums, and sums weighted by position (modulo 2**64)."""
     totals = [0] * 9
     with np.errstate(over="ignore"):
         for batch in batches:
@@ -114,7 +114,7 @@ def sums(batches: Iterator[Batch]) -> list[int]:
 
 
 def seconds(batches: Callable[[], Iterator[Batch]]) -> float:
-    """CPU time to drain."""
+    """Return the CPU time to exhaust the iterator."""
     began = time.process_time()
     for _ in batches():
         pass
@@ -122,7 +122,7 @@ def seconds(batches: Callable[[], Iterator[Batch]]) -> float:
 
 
 def cpu_name() -> str:
-    """The processor as the kernel names it."""
+    """Return the name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -131,7 +131,7 @@ def cpu_name() -> str:
 
 
 def version(package: str) -> str | None:
-    """Installed version, ``None`` when absent."""
+    """Return the installed version, ``None`` when absent."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -139,7 +139,7 @@ def version(package: str) -> str | None:
 
 
 def measure(name: str, events: Batch, path: Path, repeats: int) -> bool:
-    """Print the rows of one stream; returns whether ours is right and not the slowest."""
+    """Print the rows of one stream; return true when ours is right and the fastest."""
     with RawWriter(path) as writer:
         writer.write(evt3.Encoder().encode(*events))
     data = pieces(path)

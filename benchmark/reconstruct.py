@@ -57,12 +57,12 @@ def cpu_name() -> str:
 
 
 def simulated(modulation: Modulation, seconds: float) -> tuple[bytes, int]:
-    """Bytes and event count of a plane at 1.32 m, 1280 lit columns, 5 % background events."""
-    quiet = World(Plane(RANGE_MM), CALIBRATION, seed=SEED, background_hz=0.0)
-    quiet.set_laser(0, True, modulation)
-    quiet.advance(int(0.3e6))
-    signal_hz = quiet.events / 0.3
-    pixels = quiet.columns * quiet.rows
+    """Return bytes and event count of a plane at 1.32 m, 1280 lit columns, 5 % background."""
+    signal = World(Plane(RANGE_MM), CALIBRATION, seed=SEED, background_hz=0.0)
+    signal.set_laser(0, True, modulation)
+    signal.advance(int(0.3e6))
+    signal_hz = signal.events / 0.3
+    pixels = signal.columns * signal.rows
     background_hz = signal_hz * BACKGROUND_SHARE / (1 - BACKGROUND_SHARE) / pixels
     world = World(Plane(RANGE_MM), CALIBRATION, seed=SEED, background_hz=background_hz)
     world.set_laser(0, True, modulation)

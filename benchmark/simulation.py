@@ -1,8 +1,8 @@
-"""How fast is the simulated world? Events per second and real-time factor against lit columns.
+"""Speed of the simulated world: events per second and real-time factor against lit columns.
 
 Run: python benchmark/simulation.py [--seconds 0.5] [--repeats 3]
 One core; thread time, best of the repeats, the stage moving at 50 mm/s. Time grows with the events
-as the lit columns do; the first line, the whole sensor in the dark, is background activity alone.
+as the lit columns do; the first line, the full sensor without laser, is background activity alone.
 
 Measured on shared 2-core machines on several days, 640 columns or more: 4.4 to 5.8 Mev/s per core
 on the steps at 70 to 500 Hz (4.3 to 5.1 on surfaces that move within a lit phase), 2.9 to 3.6 at
@@ -39,7 +39,7 @@ CASES = [
 
 
 def run(scene: str, lit: int, frequency_hz: float, seconds: float) -> tuple[float, int, int]:
-    """Thread seconds, events and bytes; a dark run has all columns and no laser."""
+    """Return thread seconds, events and bytes; with ``lit`` 0 all columns without laser."""
     calibration = load_calibration("config_3").model_copy(
         update={"columns": lit or 1280, "principal_column": (lit or 1280) / 2 - 0.5}
     )

@@ -2,8 +2,8 @@
 
 Usage: python benchmark/stability.py [--write docs/numerics.md]
 
-Runs test/stability and prints, for each bound the tests assert, the largest error seen and the
-limit. With --write the table replaces the one between the markers in that file.
+Runs test/stability and prints the largest error and the limit of each bound that the tests assert.
+With --write the table replaces the one between the markers in that file.
 """
 
 from __future__ import annotations

@@ -26,14 +26,14 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     """Refuses a key given twice, of which plain YAML silently keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
+        keys: set[str] = set()
         scalars = (key for key, _ in node.value if isinstance(key, yaml.ScalarNode))
         for key_node in scalars:
-            if key_node.value in seen:
+            if key_node.value in keys:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key_node.value!r} appears twice", key_node.start_mark
                 )
-            seen.add(key_node.value)
+            keys.add(key_node.value)
         return super().construct_mapping(node, deep)
 
 
@@ -74,7 +74,7 @@ def validate(
     """
     if not isinstance(data, dict):
         raise error(
-            f"{where}: it holds {short(data)} instead of keys; write {', '.join(_required(schema))}"
+            f"{where}: it has {short(data)} instead of keys; write {', '.join(_required(schema))}"
         )
     try:
         return schema.model_validate(data)

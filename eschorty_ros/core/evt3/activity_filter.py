@@ -34,7 +34,7 @@ _WINDOW_MAX_US = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class FilterCounters:
-    """Events kept, removed for lack of support, and dropped for lying outside the sensor."""
+    """Events kept, removed for lack of support, and dropped because they are off the sensor."""
 
     kept: int = 0
     removed: int = 0

@@ -32,7 +32,7 @@ _TIME_HIGH_STEP_MAX = 100
 _NO_ROW = -1
 _NO_BASE = 1 << 20
 
-# Where the stream's time stands: no TIME_HIGH yet; none since a gap; known.
+# State of the stream's time: no TIME_HIGH yet; none since a gap; known.
 _NO_TIME, _AFTER_GAP, _RUNNING = range(3)
 
 
@@ -194,7 +194,7 @@ class Decoder:
 
     @property
     def time_us(self) -> int | None:
-        """Newest sensor time seen, also without events; ``None`` before the first TIME_HIGH."""
+        """Newest sensor time, also without events; ``None`` before the first TIME_HIGH."""
         if self._state.run == _NO_TIME:
             return None
         return int(self._state.t_us)
@@ -288,7 +288,7 @@ def _bounds(words):
 
 @kernel
 def _skip_to_time(words, c):
-    """Return the index of the first TIME_HIGH; count what lies before."""
+    """Return the index of the first TIME_HIGH; count the words and events before it."""
     i = np.uint64(0)
     while i < np.uint64(words.size) and words[i] >> 12 != w3.TIME_HIGH:
         lost = np.int64(_event_count(words[i]))
@@ -301,7 +301,7 @@ def _skip_to_time(words, c):
 
 @kernel
 def _jump(s, c, q):
-    """Take TIME_HIGH ``q`` by the half-range rule: further back than 2048 is a wrap."""
+    """Apply TIME_HIGH ``q`` by the half-range rule: further back than 2048 is a wrap."""
     step = q - s.high
     if step < -2048:
         step += 4096
@@ -432,7 +432,7 @@ def _vector(mask, bits, s, c, out, n):
         c.vectors_past_width += 1
         c.events_past_width += dropped
     c.events_dropped += dropped
-    # Bounded, so that no stream can walk the base into _NO_BASE.
+    # Bounded, so that no stream can advance the base to _NO_BASE.
     s.base = base if base >= _NO_BASE else min(base + np.int64(bits), np.int64(4096))
     return n
 

@@ -1,4 +1,4 @@
-"""Edges at which modulation periods begin: exact times, re-anchored by triggers."""
+"""Beginnings of modulation periods: exact edge times, re-anchored by triggers."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _Period(NamedTuple):
 class EdgeSchedule:
     """Rising edges of one modulation, in order, each decided exactly once.
 
-    Edge ``k`` after an anchor lies at ``anchor + round(k / f)`` with the quotient exact (Python
+    Edge ``k`` after an anchor is at ``anchor + round(k / f)`` with the quotient exact (Python
     integers to jump, an integer remainder to step), so no error grows with time or index.
 
     Parameters
@@ -63,7 +63,7 @@ class EdgeSchedule:
     Attributes
     ----------
     anchored : bool
-        Whether the phase is fixed.
+        True when the phase is fixed.
     safe_us : int
         Time before which events can be assigned to periods.
     periods_jumped : int
@@ -72,7 +72,7 @@ class EdgeSchedule:
     Notes
     -----
     A rising trigger within a quarter of a period of the predicted edge replaces it and becomes the
-    new anchor. Where a trigger is missing the prediction stands, but only after that quarter has
+    new anchor. Where a trigger is missing the prediction is used, but only after that quarter has
     passed. Triggers elsewhere are counted as spurious, unless three edges in a row went missing:
     then the next trigger sets a new phase. Events are never assigned to a period before its limits
     are certain, so the result does not depend on when data arrive.
@@ -102,7 +102,7 @@ class EdgeSchedule:
 
     @property
     def triggered(self) -> bool:
-        """Return whether triggers set the edges."""
+        """True when triggers set the edges."""
         return self._state.triggered
 
     @property
@@ -140,7 +140,7 @@ class EdgeSchedule:
         if target_us - self.last_us <= _JUMP_PERIODS * self._period:
             return
         every, state, counts = self._parts.every, self._state, self._counts
-        # The edge of the profile that holds the target is still to come.
+        # The edge of the target's profile has not been returned yet.
         skipped = self._step_at(target_us) - 1 - every - state.step
         skipped -= skipped % every
         if skipped <= 0:
@@ -248,7 +248,7 @@ def _schedule(state, counts, period, triggers_us, watermark_us, edges_us, indice
             anchor_us = edge_us
             missed = step = at_us = remainder = 0
             if not locked and edge_us - last_us < tolerance_us:
-                # The edge just predicted was this one: later edges count from the trigger.
+                # The edge predicted last was this one: later edges count from the trigger.
                 continue
         elif deadline_us < watermark_us:
             edge_us = predicted_us

@@ -25,8 +25,8 @@ class PhaseEstimate:
     Attributes
     ----------
     edge_us : int
-        Sensor time of a rising edge within the window's first period, as the earliest events
-        after it show it: late by the pixels' shortest latency.
+        Sensor time of a rising edge within the window's first period, from the earliest events
+        after it: late by the pixels' shortest latency.
     strength : float
         Vector strength of all events, 0 to 1 (ON events against the rising edge, OFF events
         against the falling one).
@@ -34,7 +34,7 @@ class PhaseEstimate:
         Strength squared times the number of events; exponential with mean 1 for unmodulated
         events.
     found : bool
-        Whether the window is modulated by the Rayleigh test.
+        True when the window is modulated by the Rayleigh test.
     """
 
     edge_us: int
@@ -110,7 +110,7 @@ def _burst_begin(phase: NDArray[np.float64]) -> float:
 
 
 class Window(NamedTuple):
-    """Leading events of a stream that one estimate is made from."""
+    """Leading events of a stream for one estimate."""
 
     size: int
     end_us: int
@@ -121,8 +121,8 @@ def estimation_window(
 ) -> Window | None:
     """Return the first estimation window of ``t_us``, ``None`` while it is still open.
 
-    A window is the fewest times ``WINDOW_PERIODS`` periods from the first event on that hold
-    ``WINDOW_EVENTS`` events. It depends on the events alone, not on when they arrived.
+    A window begins at the first event; it is the least multiple of ``WINDOW_PERIODS`` periods with
+    ``WINDOW_EVENTS`` events. It depends on the events alone, not on the time of their arrival.
     """
     if t_us.size < WINDOW_EVENTS:
         return None

@@ -1,7 +1,8 @@
 """Phase gate: an event is kept only soon after the laser edge that can cause it.
 
-ON events follow rising edges and OFF events falling ones; background is spread evenly. Of
-background of both polarities a share of (LEAD_US + gate) / period is left, 8 % at 70 Hz with 1 ms.
+ON events follow rising edges and OFF events falling ones; background is spread evenly. The gate
+keeps a share of (LEAD_US + gate) / period of the background of both polarities, 8 % at 70 Hz with
+1 ms.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from eschorty_ros.core.base.numbers import integer
 from eschorty_ros.core.modulation.modulation import Modulation
 
 LEAD_US = 200
-"""Opening of the window before the edge: an estimated edge comes after the first events."""
+"""Time from opening to edge: an estimated edge is later than the first events."""
 
 GATE_MAX_US = 100_000
 
@@ -28,8 +29,8 @@ class PhaseGate(NamedTuple):
     period_us, frequency_mhz : float
         Length of the period and its reciprocal.
     on_lead_us, off_lead_us : float
-        Added to the time since the rising edge, they give the time since the window of ON and of
-        OFF events opened.
+        Time since the opening of the window of ON and of OFF events minus that since the rising
+        edge.
     length_us : float
         Length of a window; 0 is no gate.
     """
@@ -49,12 +50,12 @@ def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
     modulation : Modulation
         A sine has no edges and is not gated.
     gate_us : int
-        How long after each edge events are kept, 0 to 100 000 us; 0 is no gate.
+        Time after each edge in which events are kept, 0 to 100 000 us; 0 is no gate.
 
     Returns
     -------
     PhaseGate
-        No gate where the windows cover the whole period.
+        No gate where the windows cover the period.
 
     Raises
     ------
@@ -72,7 +73,7 @@ def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
 
 @kernel
 def _outside(dt_us, polarity, gate):
-    """Return whether ``dt_us`` after a rising edge lies outside the window of its polarity."""
+    """Return true when ``dt_us`` after a rising edge is outside the window of its polarity."""
     late_us = dt_us + (gate.on_lead_us if polarity else gate.off_lead_us)
     late_us -= gate.period_us * np.floor(late_us * gate.frequency_mhz)
     return late_us >= gate.length_us

@@ -29,7 +29,7 @@ _AGREEMENT = 0.0625
 
 
 class PhaseLock:
-    """Anchors an ``EdgeSchedule`` and, where the phase was estimated, keeps it on the events.
+    """Anchors an ``EdgeSchedule`` and, where the phase was estimated, tracks it by the events.
 
     A generator and a sensor with clocks of their own drift apart: 100 ppm are a period of 1 kHz
     after 10 s. So the phase is estimated again for every block of periods, from the block's first
@@ -52,7 +52,7 @@ class PhaseLock:
     estimate : PhaseEstimate or None
         The first one.
     missing : bool
-        Whether the stream ended without a phase; periods count from the first event then.
+        True when the stream ended without a phase; periods then count from the first event.
     refused : int
         Events dropped because they waited too long for a phase.
     """
@@ -132,7 +132,6 @@ class PhaseLock:
         if self._block_end_us is None or t_us < self._block_end_us:
             self.schedule.jump(t_us)
         elif self._count == 0:
-            # Blocks without events change nothing.
             self.schedule.jump(t_us)
             self._block_end_us = self.schedule.middle_after(self._block)
 

@@ -35,9 +35,9 @@ class DesignTable:
     range_mm : ndarray
         Range from the mechanical datum.
     row : ndarray
-        Where it appears, px; may lie off the sensor, see ``in_view``.
+        Its row, px; may be off the sensor, see ``in_view``.
     in_view : ndarray of bool
-        Whether the row is on the sensor.
+        True where the row is on the sensor.
     magnification : ndarray
         Image size over object size.
     range_per_row_mm : ndarray
@@ -47,7 +47,7 @@ class DesignTable:
     lateral_pitch_mm : ndarray
         Distance of neighbouring columns along the laser line.
     swath_mm : ndarray
-        Length of laser line that all columns see.
+        Length of the laser line over all columns.
     """
 
     range_mm: Array
@@ -174,7 +174,7 @@ def design(
         Exactly one: tilt of the sensor, or the distance from lens centre to Scheimpflug line
         that implies it.
     b_prime_px, near_mm : float
-        Exactly one: the row offset, or the range that row 0 shall see.
+        Exactly one: the row offset, or the range at row 0.
     b_mm : float
         Mechanical datum to front focal line.
     pixel_um, columns, rows
@@ -236,7 +236,7 @@ def design_for_ranges(
     columns: int = COLUMNS,
     rows: int = ROWS,
 ) -> Design:
-    """Return the build that sees ``near_mm`` at row 0 and ``far_mm`` at the last row (Eq. 2).
+    """Return the build with ``near_mm`` at row 0 and ``far_mm`` at the last row (Eq. 2).
 
     The two ranges fix ``K`` and ``b'``; the lens fixes ``k``, so ``k'`` and the sensor tilt
     follow. Parameters as in :func:`design`.

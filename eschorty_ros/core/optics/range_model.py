@@ -152,7 +152,7 @@ class RangeModel:
         if not self.b_prime_px <= -POLE_MARGIN_PX:
             raise ArgumentError(
                 f"b_prime_px is {self.b_prime_px!r}; choose {-POLE_MARGIN_PX:g} or less, "
-                "so that row 0 lies in front of the pole"
+                "so that row 0 is in front of the pole"
             )
         if not 0.0 < number("theta_deg", self.theta_deg) <= 90.0:
             raise ArgumentError(f"theta_deg is {self.theta_deg!r}; choose above 0 and up to 90")
@@ -164,7 +164,7 @@ class RangeModel:
             )
         if not -math.inf < self.product_mm_px < 0.0:
             raise ArgumentError(
-                f"k_mm is {self.k_mm!r} and k_prime_px {self.k_prime_px!r}; their product leaves "
+                f"k_mm is {self.k_mm!r} and k_prime_px {self.k_prime_px!r}; their product exceeds "
                 "the range of numbers, choose lengths of a real lens"
             )
 
@@ -194,7 +194,7 @@ class RangeModel:
     def range_mm(self, row: ArrayLike, column: ArrayLike | None = None) -> Array:
         """Return the range along the sheet from the mechanical datum, mm (Eq. 2 inverted).
 
-        ``row`` may lie off the sensor; ``column`` is the principal one by default. They broadcast.
+        ``row`` may be off the sensor; ``column`` is the principal one by default. They broadcast.
         NaN within 1 px of the pole and behind it (``row + b' > -1``).
         """
         return np.asarray(self.product_mm_px / self._image_px(row, column) - self.b_mm)
@@ -253,7 +253,7 @@ class RangeModel:
             return np.asarray(slope * depth)
 
     def rows_per_mm_off_sheet(self, range_mm: ArrayLike) -> Array:
-        """Return by how many rows a point 1 mm beside the light sheet appears nearer, px per mm.
+        """Return the rows by which a point 1 mm beside the light sheet appears nearer, px per mm.
 
         The chief ray through a lens whose object plane is the sheet and whose image plane is the
         sensor: with depth ``R~ = R + b``, ``z = f + R~ sin(theta)`` along the optical axis and

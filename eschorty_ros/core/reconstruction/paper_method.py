@@ -3,7 +3,7 @@
 Nothing is compiled, from the bytes on. Per window: accumulate all events in a frame of columns by
 rows, take each column's mean row as the line and its standard deviation as the confidence, and
 turn rows into ranges with Eq. 2. No phase gate, no outlier rejection, no streaming: background
-anywhere in a column pulls its mean.
+anywhere in a column biases its mean.
 """
 
 from __future__ import annotations

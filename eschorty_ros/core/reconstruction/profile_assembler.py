@@ -92,7 +92,7 @@ class _Memory(NamedTuple):
 
 
 class _Progress(NamedTuple):
-    """First event and first edge that are left."""
+    """First event and first edge not processed yet."""
 
     event: int
     edge: int
@@ -111,13 +111,13 @@ class ProfileAssembler:
     Raises
     ------
     ArgumentError
-        When the sensor has more rows than an event's packed form can hold.
+        When the sensor has more rows than the packed form of an event.
     """
 
     def __init__(self, settings: Settings, model: RangeModel) -> None:
         if model.rows > ROW_LAST + 1:
             raise ArgumentError(
-                f"rows is {model.rows}; the reconstruction takes {ROW_LAST + 1} at most"
+                f"rows is {model.rows}; the reconstruction supports {ROW_LAST + 1} at most"
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
@@ -159,7 +159,7 @@ class ProfileAssembler:
         Returns
         -------
         int
-            First edge that is left.
+            First edge not processed yet.
         """
         arrays = EventArrays(*events)
         progress = _Progress(0, first_edge)
@@ -174,7 +174,7 @@ class ProfileAssembler:
             self._collect()
 
     def close(self) -> None:
-        """Close the open period if it holds events; it stays open for further ones."""
+        """Close the open period if it has events; it stays open for further ones."""
         if self._state["status"] == _FILLED:
             none = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
             again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
@@ -242,8 +242,8 @@ def _adapted_half(half, sums, half_max):
     """Return the half width for the next period: 1.3 x the width of this one's rows, averaged."""
     if sums.freedom < _WIDTH_MIN_DOF:
         return half
-    wanted = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
-    return np.int64(min(max(np.rint(0.5 * (half + wanted)), _HALF_MIN), half_max))
+    measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
+    return np.int64(min(max(np.rint(0.5 * (half + measured)), _HALF_MIN), half_max))
 
 
 @kernel
@@ -287,7 +287,7 @@ def _close(memory, state, counters):
 
 @kernel
 def _fill(events, first, limit_us, columns, rows, gate, state, counters):
-    """Sort the events before ``limit_us`` into the open period; returns the first left."""
+    """Sort the events before ``limit_us`` into the open period; return the index of the next."""
     if state.status == _CLOSED:
         i = first
         while i < events.t.size and events.t[i] < limit_us:
@@ -308,9 +308,8 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
 def _merge(events, edges, progress, drain, gate, memory, state, counters):
     """Merge events with edges from ``progress`` on.
 
-    A period is closed when an event reaches its end or, with ``drain``, when the events are
-    through. The result is short of all events and edges when the output has no room for another
-    profile.
+    A period is closed when an event reaches its end or, with ``drain``, after the last event.
+    Events and edges remain when the output has no room for another profile.
     """
     columns, rows = memory.columns, memory.estimator.rows
     rows_max = memory.output.row.size - memory.rows.row.size

@@ -126,9 +126,9 @@ class Profiles(LineRows):
     def from_rows(cls, rows: LineRows, model: RangeModel) -> Profiles:
         """Return ``rows`` with their ranges; those at the pole and behind it are left out."""
         range_mm = model.range_mm(rows.row, rows.column)
-        seen = np.isfinite(range_mm)
-        if not seen.all():
-            rows, range_mm = rows.select(seen), range_mm[seen]
+        known = np.isfinite(range_mm)
+        if not known.all():
+            rows, range_mm = rows.select(known), range_mm[known]
         sigma_mm = model.range_sigma_mm(rows.row, rows.sigma_row, rows.column)
         return cls(**rows._values(), range_mm=range_mm, sigma_mm=sigma_mm)
 

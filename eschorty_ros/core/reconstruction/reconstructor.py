@@ -23,7 +23,7 @@ from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 
 _PIECE_BYTES = 1 << 17
 _STAGE_EDGES_MAX = 1024
-"""Pieces with edges that are kept; without a call of ``take_stage_edges`` they would pile up."""
+"""Most pieces with edges that are kept until ``take_stage_edges`` is called."""
 
 
 class Reconstructor:
@@ -43,7 +43,7 @@ class Reconstructor:
     settings : Settings
     model : RangeModel
     modulation : Modulation
-        The one that data are cut by now.
+        The one in use.
     first_t_us, newest_t_us : int or None
         Sensor times of the first and the newest event.
 
@@ -98,7 +98,7 @@ class Reconstructor:
     def push(self, data: bytes | bytearray | memoryview) -> Profiles:
         """Return the profiles that the next bytes of the stream complete.
 
-        With ``reflectance_compensation`` the newest wait for those behind them.
+        With ``reflectance_compensation`` the newest are delayed until later ones are complete.
 
         Parameters
         ----------
@@ -177,7 +177,7 @@ class Reconstructor:
         return LineRows.concatenate([rows, self._compensator.flush()]) if last else rows
 
     def _with_ranges(self, rows: LineRows) -> Profiles:
-        """Return ``rows`` with their ranges, behind what a restart left."""
+        """Return ``rows`` with their ranges, after the profiles of a restart."""
         profiles = Profiles.from_rows(rows, self.model)
         self._counts["points"] += len(profiles)
         self._counts["points_beyond_pole"] += len(rows) - len(profiles)
@@ -206,7 +206,7 @@ class Reconstructor:
             self._counts["columns_compensated"] += compensator.columns_compensated
 
     def _begin(self, modulation: Modulation) -> None:
-        """Start with another modulation; counters and the decoder go on."""
+        """Start with another modulation; counters and the decoder are kept."""
         every = self.settings.periods_per_profile
         if modulation.period_us * (every + 1) >= TIME_LIMIT_US:
             raise ArgumentError(
@@ -219,7 +219,7 @@ class Reconstructor:
             self._compensator = StepCompensator(self.settings, self.model, modulation)
 
     def note_gap(self) -> None:
-        """Note that bytes were lost before the next ``push``: grid and sensor time go on."""
+        """Note that bytes were lost before the next ``push``; periods and sensor time are kept."""
         self._decoder.note_gap()
 
     def take_stage_edges(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
@@ -244,7 +244,7 @@ class Reconstructor:
 
     @property
     def phase_missing(self) -> bool:
-        """Return whether a flush found no phase and cut from the first event's time on."""
+        """True when a flush found no phase and cut from the first event's time on."""
         return self._periods.lock.missing
 
     @property

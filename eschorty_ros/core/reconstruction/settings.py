@@ -45,16 +45,16 @@ class Settings:
 
     Notes
     -----
-    The activity filter is off by default: ``mode_mean`` already leaves background out (on a
-    simulated plane the median error is the same with and without), and the filter takes more than
-    a third of the speed.
+    The activity filter is off by default: ``mode_mean`` already ignores background (on a simulated
+    plane the median error is the same with and without), and the filter costs more than a third of
+    the speed.
 
-    The phase gate is off by default as well: how late a real sensor's events come depends on its
+    The phase gate is off by default, too: the delay of a real sensor's events depends on its
     biases. 1000 us at 70 Hz and 600 us at 300 Hz keep the simulated sensor's events. Windows that
     cover the period, above about 1 kHz, remove nothing.
 
-    So is the compensation of reflectance steps: it needs the stage's speed, and it holds back as
-    many profiles as a step takes to cross the line.
+    The compensation of reflectance steps is off by default, since it needs the stage's speed and
+    delays profiles by the time that a step takes to cross the line.
 
     ``periods_per_profile`` is for frequencies at which a column gives fewer than ``events_min``
     events per period (above about 5 kHz).
@@ -80,7 +80,7 @@ class Settings:
     )
     trigger_source: str = _choice(
         "laser", TRIGGER_SOURCES,
-        "what is wired to the camera's trigger input: the laser cuts the periods, the stage's "
+        "device wired to the camera's trigger input: the laser cuts the periods, the stage's "
         "pulses set the clock (live only), none ignores the edges",
     )  # fmt: skip
     line_width_px: float = _number(
@@ -120,7 +120,7 @@ class Settings:
         "0 takes the median of each profile",
     )
     reflectance_compensation: str = _choice(
-        "off", SWITCH, "take out the shift of points at reflectance steps"
+        "off", SWITCH, "correct the shift of points at reflectance steps"
     )
     stage_speed_mm_s: float = _number(
         300.0,
@@ -135,11 +135,11 @@ class Settings:
     )
     sigma_floor_px: float = _number(
         SIGMA_FLOOR_PX, 0.0, 10.0, "px",
-        "part of a column's standard deviation that more events do not lessen",
+        "part of a column's standard deviation that more events do not reduce",
     )  # fmt: skip
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
-        "part of it that neighbouring columns share and smoothing does not lessen",
+        "part of it that neighbouring columns share and smoothing does not reduce",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -161,9 +161,9 @@ def _check(name: str, value: Any, default: Any, metadata: Any) -> None:
             )
         return
     low, high = metadata["range"]
-    whole = isinstance(default, int)
-    kind = "a whole number" if whole else "a number"
-    accepted = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
+    integral = isinstance(default, int)
+    kind = "a whole number" if integral else "a number"
+    accepted = isinstance(value, int if integral else (int, float)) and not isinstance(value, bool)
     if not accepted or not low <= value <= high:
         unit = f" {metadata['unit']}" if metadata["unit"] else ""
         raise ArgumentError(

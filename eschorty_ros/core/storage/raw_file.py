@@ -26,7 +26,7 @@ _REMEDY = "convert it to EVT3 or record again with format EVT3"
 class Header(Mapping[str, str]):
     """The header's keys and values as written, plus their meaning.
 
-    ``width``, ``height`` : sensor size in pixels (1280 x 720 when the file does not say).
+    ``width``, ``height`` : sensor size in pixels (1280 x 720 when the file has none).
     ``format`` : always ``"EVT3"``. ``size_bytes`` : offset of the first word.
     """
 
@@ -156,7 +156,7 @@ class RawReader:
             raise FormatError(f"{self.path} is {declared}, not EVT3; {_REMEDY}")
         if name and version and version != "3.0":
             raise FormatError(
-                f"{self.path} says format {name} and evt {version}; correct one of the two"
+                f"{self.path} has format {name} and evt {version}; correct one of the two"
             )
         sizes = []
         option = dict(part.split("=", 1) for part in options if "=" in part)
@@ -171,7 +171,7 @@ class RawReader:
         if len(set(sizes)) > 1:
             (width, height), (other_width, other_height) = sizes
             raise FormatError(
-                f"{self.path} says {width}x{height} in format and {other_width}x{other_height} in "
+                f"{self.path} has {width}x{height} in format and {other_width}x{other_height} in "
                 "geometry; correct one of the two"
             )
         return sizes[0]
@@ -204,7 +204,7 @@ class RawWriter:
     Raises
     ------
     ArgumentError
-        When a value cannot stand in a header.
+        When a value is not allowed in a header.
     FormatError
         When the file cannot be written.
     """
@@ -250,7 +250,7 @@ class RawWriter:
             raise FormatError(f"{self.path}: {error.strerror or error}; choose another") from error
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append bytes of the stream; raises ``FormatError`` when the disk refuses."""
+        """Append bytes of the stream; raises ``FormatError`` when they cannot be written."""
         view = byte_view("data", data)
         try:
             self._file.write(view)

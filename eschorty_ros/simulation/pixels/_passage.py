@@ -3,8 +3,8 @@
 Noise at the follower's output is a Gaussian process of correlation time ``tau_f``. It is never
 drawn: a pixel whose signal is ``g`` standard deviations from a level passes it at the rate
 ``r(g)``, and while the gap shrinks from ``g1`` to ``g2`` also with the probability that the present
-noise reaches across; both come from a table (``noise_table``). The event is where the rates summed
-up reach an exponential number drawn once per pixel and piece of signal.
+noise reaches across; both come from a table (``noise_table``). The event is at the time when the
+integrated rate reaches an exponential number drawn once per pixel and piece of signal.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.simulation.pixels._response import NOTHING, OFF, ON, UNKNOWN, _shares
 
 DECISION_US = 1.0
-"""The comparator decides once in so long: it does not see what noise does in between."""
+"""Interval of the comparator's decisions, us; noise in between has no effect."""
 
 GAP_MIN, GAP_MAX, GAP_STEPS = -4.0, 4.5, 64.0
 """Span of the noise table in standard deviations, and its entries per standard deviation."""
@@ -39,9 +39,9 @@ _DECAY = np.exp(-np.arange(int(_DECAY_STEPS * _DECAY_MAX) + 1) / _DECAY_STEPS)
 def noise_table(correlation_us: float) -> NDArray[np.float64]:
     """Return the risk of a passage against the gap between signal and level.
 
-    The noise is an Ornstein-Uhlenbeck process looked at every ``DECISION_US``. Its rate of
+    The noise is an Ornstein-Uhlenbeck process sampled every ``DECISION_US``. Its rate of
     first passages out of equilibrium is one over the mean first-passage time
-    ``sqrt(2 pi) integral_0^g exp(z^2/2) Phi(z) dz`` (in correlation times); discrete looks act
+    ``sqrt(2 pi) integral_0^g exp(z^2/2) Phi(z) dz`` (in correlation times); discrete samples act
     like a level higher by ``0.5826 sqrt(2 dt / tau)`` (Siegmund's correction). Below a gap of 1
     the rate joins on to ``1 - g``, exact at 0 and -1 (zeros of the Hermite polynomials).
 
@@ -83,7 +83,7 @@ def noise_table(correlation_us: float) -> NDArray[np.float64]:
 
 @kernel
 def _decay(x):
-    """Return ``exp(-x)`` of a positive number to 1e-6: enough for a sum of risks, and quicker."""
+    """Return ``exp(-x)`` of a positive number to 1e-6: faster, and enough for a sum of risks."""
     x = min(x, _DECAY_MAX)
     entry = np.int64(x * _DECAY_STEPS + 0.5)
     rest = x - entry * (1.0 / _DECAY_STEPS)
@@ -119,7 +119,7 @@ def _part(first, last, rest, cost):
 def _gap(value, per_level, noise, per_noise, sign):
     """Return the distance of y from a level in standard deviations, positive inside the band.
 
-    ``log(1 + x) / noise`` by its series: near the level it counts, far off it only has to grow.
+    ``log(1 + x) / noise`` by its series, which is accurate near the level and grows far from it.
     """
     x = sign * (value * per_level - 1.0)
     return x * (1.0 + x * (x * (1 / 3) - sign * 0.5)) * per_noise
@@ -127,10 +127,10 @@ def _gap(value, per_level, noise, per_noise, sign):
 
 @kernel(inline="always")
 def _start(signal, noise, from_us):
-    """Return where the summation begins and in which steps.
+    """Return the begin of the summation and its first step.
 
-    These are the two exponentials at ``from_us``, the first step and what is left of the
-    exponentials after it, and their second derivatives relative to themselves.
+    These are the two exponentials at ``from_us``, the step and the factors of the exponentials over
+    it, and their second derivatives relative to themselves.
     """
     settled, tau_us = signal.settled, signal.tau_us
     a, b, follower_us = _shares(signal)
@@ -144,7 +144,7 @@ def _start(signal, noise, from_us):
     scale = (settled + a + b) * noise
     room = 8.0 * _BEND * scale
     step_us = from_us
-    # As long again as the signal took to come near is mostly right and costs no exponentials.
+    # A step as long as the time before it is mostly right and needs no further exponentials.
     if not 0.0 < bend * from_us * from_us < room:
         step_us = min(math.sqrt(room / (bend + 1e-300)), 0.5 * tau_us)
         fade_a, fade_b = _decay(step_us * rate_a), _decay(step_us * rate_b)
@@ -157,8 +157,8 @@ def _noisy(signal, levels, middle, noise, table, from_us, until_us, budget):
 
     Sums up the risk from ``from_us`` on until it reaches ``budget``, in steps over which the gaps
     change at a nearly steady pace. A moving signal can pass the nearer level only, the one on
-    its side of ``middle``. Returns UNKNOWN when nothing happened up to ``until_us`` and the signal
-    still moves: call again later. The steps do not depend on ``until_us``.
+    its side of ``middle``. Returns UNKNOWN when there is no passage up to ``until_us`` and the
+    signal still moves: call again later. The steps do not depend on ``until_us``.
     """
     a, b, step_us, fade_a, fade_b, bend_a, bend_b = _start(signal, noise, from_us)
     settled = signal.settled

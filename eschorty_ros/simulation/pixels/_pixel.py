@@ -1,8 +1,8 @@
-"""One pixel over time: it is touched when its light changes or its own event is due.
+"""One pixel over time: it is updated when its light changes or its own event is due.
 
 A pixel is anchored at ``t``, the time its light last changed or its refractory period ended.
-Nothing else moves the anchor and every draw is a hash of pixel and time, so that a look at a pixel
-in between does not change what it does.
+Nothing else moves the anchor and every draw is a hash of pixel and time, so that its events do not
+depend on when else it is processed.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ PIXEL_DTYPE = np.dtype(
         ("u", "f8"),  # photoreceptor at the anchor
         ("y", "f8"),  # source follower at the anchor
         ("y_ref", "f8"),  # comparator reference
-        ("u_settled", "f8"),  # 1 / I: where both are heading
+        ("u_settled", "f8"),  # 1 / I: final value of both
         ("t", "f8"),  # anchor, us
-        ("t_next", "f8"),  # when something is due, us; state says what
+        ("t_next", "f8"),  # time of the next change, us; its kind is given by state
         ("on_factor", "f4"),  # exp(-theta_on)
         ("off_factor", "f4"),  # exp(theta_off)
         ("state", "i8"),
@@ -45,13 +45,13 @@ PIXEL_DTYPE = np.dtype(
 # States: OFF and ON = an event at t_next; WAITS = nothing before t_next; HELD = until t_next.
 WAITS, HELD = 2, 3
 FULL = -1.0
-"""In place of a time: the output has no room left."""
+"""Instead of a time: the output has no room left."""
 _AT_REST = 0.1
 """Lag of y behind u that counts as none, standard deviations of the noise."""
 
 
 class Model(NamedTuple):
-    """Constants of all pixels, times in us; the tables are those of the noise."""
+    """Parameters that all pixels share, times in us; the tables are those of the noise."""
 
     omega_per_us: float
     follower_us: float
@@ -77,7 +77,7 @@ def _mix(value):
 
 @kernel
 def _bits(t_us, column, row, seed, purpose):
-    """Return 64 random bits that belong to what a pixel does at a time."""
+    """Return 64 random bits for one purpose of a pixel at a time."""
     place = np.uint64((column << 12) | row) * np.uint64(0xD6E8FEB86659FD93)
     salt = np.uint64(purpose) * np.uint64(0xA0761D6478BD642F)
     return _mix((place ^ np.uint64(seed)) + salt + np.uint64(np.int64(t_us * 1024.0)))
@@ -111,11 +111,11 @@ def _levels(pixel, y_ref):
 
 @kernel
 def _live(pixels, column, begin, end, until_us, light, model, out, n):
-    """Let rows [begin, end) do what is due up to ``until_us``, then give them the light ``light``.
+    """Process rows [begin, end) up to ``until_us``, then set their light to ``light``.
 
-    An empty ``light`` leaves theirs as it is. Returns the number of events in ``out`` and the
-    earliest time something is due in these rows, ``FULL`` when the output did not suffice: call
-    again with more room.
+    An empty ``light`` leaves theirs unchanged. Returns the number of events in ``out`` and the
+    earliest time something is due in these rows, ``FULL`` when the output had no room: call again
+    with more.
     """
     omega, follower_us, noise = model.omega_per_us, model.follower_us, model.noise
     seed, risks = model.seed, model.risks
@@ -128,7 +128,7 @@ def _live(pixels, column, begin, end, until_us, light, model, out, n):
         if t_next > until_us and not relit:
             earliest = min(earliest, t_next)
             continue
-        # Locals: the compiler cannot know that ``out`` and the pixel do not overlap.
+        # Locals: the compiler cannot exclude that ``out`` and the pixel overlap.
         u, y, settled, t, y_ref = pixel.u, pixel.y, pixel.u_settled, pixel.t, pixel.y_ref
         levels = _levels(pixel, y_ref)
         state = pixel.state
@@ -197,8 +197,8 @@ def _live(pixels, column, begin, end, until_us, light, model, out, n):
 def _look_up(pixels, column, begin, end, model):
     """Look up the next event of the rows [begin, end) just lit that start from rest.
 
-    A pass of its own, since without branches on what a pixel does the processor works at
-    several pixels at once. Other rows are left to :func:`_live`.
+    A separate pass, since without branches on the pixel's state the processor overlaps several
+    pixels. Other rows are left to :func:`_live`.
     """
     omega, follower_us, noise = model.omega_per_us, model.follower_us, model.noise
     seed, ways, gaps = model.seed, model.ways, model.gaps
@@ -222,7 +222,7 @@ def _rebias(pixels, column, t_us, before, after):
     """Anchor the pixels of a column at ``t_us``, up to which they have been run.
 
     ``before`` and ``after`` are the models; the pixels' thresholds are the new ones already. The
-    next event is that of the new biases, and a dead time that has begun ends as it was to end.
+    next event is that of the new biases, and a refractory time under way keeps its length.
     Returns the rows [begin, end) with something due and the earliest time of it.
     """
     reach = math.exp(GAP_MAX * after.noise)

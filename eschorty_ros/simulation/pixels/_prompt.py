@@ -1,9 +1,9 @@
 """Time at which a signal that starts from rest passes a level: looked up, not summed.
 
-From rest photoreceptor and follower go one way, ``y = s1 + (s0 - s1) phi(t / tau_p)`` with
-``phi(x) = (exp(-x) - rho exp(-x / rho)) / (1 - rho)`` and ``rho = tau_f / tau_p``. A table holds
-its inverse. A second one holds the gap, in standard deviations of the noise, at which a pixel
-passes that draws a number between 0 and 1, for the pace at which its signal approaches.
+From rest photoreceptor and follower move in one direction, ``y = s1 + (s0 - s1) phi(t / tau_p)``
+with ``phi(x) = (exp(-x) - rho exp(-x / rho)) / (1 - rho)`` and ``rho = tau_f / tau_p``. A table is
+its inverse. A second one gives the gap, in standard deviations of the noise, at which a pixel that
+draws a number between 0 and 1 passes, for the pace at which its signal approaches.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ def way_times() -> NDArray[np.float32]:
         ``_LAG_MAX``; columns: square root of the part, 0 to ``_WAY_MAX``.
     """
     times = np.concatenate(([0.0], np.geomspace(1e-5, 6.0, 4000)))
-    wanted = (np.arange(_WAY_STEPS + 2) * (_WAY_MAX / _WAY_STEPS)) ** 2
+    parts = (np.arange(_WAY_STEPS + 2) * (_WAY_MAX / _WAY_STEPS)) ** 2
     ways = np.empty((_LAG_STEPS + 2, _WAY_STEPS + 2), dtype=np.float32)
     for k, row in enumerate(ways):
         rho = max((k * _LAG_MAX / _LAG_STEPS) ** 2, 1e-12)
         # 1 - phi without cancellation for short times.
         gone = (rho * np.expm1(-times / rho) - np.expm1(-times)) / (1.0 - rho)
-        row[:] = np.sqrt(np.interp(wanted, gone, times**2))
+        row[:] = np.sqrt(np.interp(parts, gone, times**2))
     ways.setflags(write=False)
     return ways
 
@@ -94,7 +94,7 @@ def _between(table, row, column):
 
 @kernel
 def _inside(index, end):
-    """Return ``index`` where it lies from 0 to below ``end``, else 0."""
+    """Return ``index`` where it is from 0 to below ``end``, else 0."""
     return index if 0.0 <= index < end else 0.0
 
 
@@ -127,7 +127,7 @@ def _prompt(signal, levels, noise, ways, gaps, draw):
         _inside(late, _WAY_STEPS),
         _inside(early, _WAY_STEPS),
     )
-    # No branch up to the last look at a table: with one, numba counts references to them.
+    # No branch before the last access to a table: with one, numba counts references to them.
     way_us = (_between(ways, lag, late) - _between(ways, lag, early)) * tau_us
     pace = abs(way_us) / (_EARLY - _LATE)
     share = _inside(pace / (pace + follower_us), 1.0)

@@ -1,4 +1,4 @@
-"""Photoreceptor and source follower in closed form, and when a comparator behind them fires.
+"""Photoreceptor and source follower in closed form, and the comparator behind them.
 
 Notation: with ``u = exp(-v) = 1 / x`` the photoreceptor under a constant relative photocurrent
 ``I`` follows ``u(t) = 1/I + (u0 - 1/I) exp(-omega0 I t)``. The follower's pole acts on ``u``, which
@@ -16,14 +16,14 @@ import numpy as np
 
 from eschorty_ros.core.base.kernel import kernel
 
-# An exponential this far gone is below half a unit in the last place of what it is added to.
+# After so many time constants an exponential is below half a unit in the last place of the sum.
 _SETTLED = 38.0
 
 ON, OFF, NOTHING, UNKNOWN = 1, 0, -1, -2
 
 
 class Signal(NamedTuple):
-    """Photoreceptor and follower of a pixel now, where both are heading, and how fast."""
+    """Photoreceptor and follower of a pixel now, their final value and time constants."""
 
     u: float
     y: float
@@ -44,7 +44,7 @@ def _shares(signal):
     """Return ``a`` and ``b`` of the follower's two exponentials, and the time constant of ``b``."""
     u, y, settled, tau_us, follower_us = signal
     apart = 1.0 - follower_us / tau_us
-    # Equal time constants have no such form; a part in a million apart they have, to 1e-6.
+    # Equal time constants have no such form; a difference of a part in a million suffices.
     if abs(apart) < 1e-6:
         apart, follower_us = 1e-6, tau_us * (1.0 - 1e-6)
     a = (u - settled) / apart
@@ -75,7 +75,7 @@ def _advanced(signal, t_us):
 
 @kernel
 def _fade(x):
-    """Return ``exp(-x)`` to 2e-6: enough where risks are summed up, and quicker."""
+    """Return ``exp(-x)`` to 2e-6: faster, and enough for sums of risks."""
     if not -0.5 < x < 0.5:
         return math.exp(-x)
     x = -x
@@ -145,7 +145,7 @@ def _noiseless(signal, levels):
 
 @kernel
 def _earliest_us(signal, t_us, levels, reach):
-    """Return a time before which nothing can happen: where y comes within ``reach`` of a level.
+    """Return a time before which no event is possible: y comes within ``reach`` of a level.
 
     ``inf`` when no level is near. ``reach`` is the largest gap of the noise table, as a factor.
     """
@@ -153,7 +153,7 @@ def _earliest_us(signal, t_us, levels, reach):
     on_near, off_near = levels.on * reach, levels.off / reach
     if min(u, y) <= on_near or max(u, y) >= off_near:
         return t_us
-    # Where y is ahead of u its lead only fades: the signal may as well start from y.
+    # Where y is ahead of u its lead only decays, so that the signal may start from y.
     if settled < on_near:
         way = min(u, y) - on_near
     elif settled > off_near:

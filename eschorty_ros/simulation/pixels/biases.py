@@ -1,8 +1,8 @@
 """The camera's bias settings as parameters of the pixel model.
 
-A model, not a measurement: the sensor's maker says which way each bias works and gives its range,
-not what it does in numbers. Each acts by a factor ``exp(bias / scale)``, so that 0 leaves the base
-as it is and the effect is monotone. The high-pass (``bias_hpf``) is not modelled.
+A model, not a measurement: the sensor's maker publishes direction and range of each bias, but no
+numbers of its effect. Each acts by a factor ``exp(bias / scale)``, so that 0 leaves the base
+unchanged and the effect is monotone. The high-pass (``bias_hpf``) is not modelled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LIMITS = {
     "fo": (-35, 55),
     "refr": (-20, 235),
 }
-"""Offsets the IMX636 takes."""
+"""Offsets that the IMX636 accepts."""
 
 THRESHOLD_SCALE = 120.0
 FOLLOWER_SCALE = 20.0
@@ -28,14 +28,14 @@ REFRACTORY_SCALE = -80.0
 
 @dataclass(frozen=True, slots=True)
 class Biases:
-    """Offsets from the factory setting, as the camera takes them.
+    """Offsets from the factory setting, in the camera's units.
 
     Parameters
     ----------
     diff_on, diff_off : int
         More raises the ON or OFF threshold: fewer events, a narrower line.
     fo : int
-        More widens the source follower: events come sooner, and more of them above some kHz.
+        More widens the source follower's band: events are earlier, and more above some kHz.
     refr : int
         More shortens the refractory time: more events above 500 Hz.
 
@@ -59,7 +59,7 @@ class Biases:
 
 
 def parameters_from_biases(base: PixelParameters, biases: Biases) -> PixelParameters:
-    """Parameters of the pixels of ``base`` under other biases."""
+    """Return the parameters of the pixels of ``base`` under other biases."""
     return replace(
         base,
         threshold_on=base.threshold_on * math.exp(biases.diff_on / THRESHOLD_SCALE),

@@ -52,9 +52,9 @@ class PixelParameters:
         ON events per second of any pixel, lit or not, from its reference leaking away. The 0.1 Hz
         of P* are left to the background activity, of which they are a part.
     hot_fraction : float
-        Share of pixels that fire all by themselves, ON and OFF alike, ...
+        Share of pixels that fire without light changes, ON and OFF alike.
     hot_hz : float
-        ... each so many times a second.
+        Events per second of each of them.
     latency_us, latency_jitter_us : float
         Mean and standard deviation from crossing to readout request; never below 1 us.
 
@@ -106,9 +106,9 @@ class PixelParameters:
 
     @property
     def least_contrast(self) -> float:
-        """Contrast that hardly ever makes an event; dimmer rows are not drawn.
+        """Contrast that causes an event with negligible probability; dimmer rows are not drawn.
 
-        Reaches a threshold four sigma of mismatch low with three sigma of noise, and in any case
+        It reaches a threshold four sigma of mismatch low with three sigma of noise, and at most
         60 % of it: a row that comes into the light must not be late for its first event.
         """
         lowest = min(self.threshold_on, self.threshold_off) * (1.0 - 4.0 * self.threshold_mismatch)

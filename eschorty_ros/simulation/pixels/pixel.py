@@ -87,8 +87,8 @@ class _Background(NamedTuple):
 class PixelArray:
     """All pixels of a sensor and their events that have not been taken.
 
-    Same seed, same events, however the calls to :meth:`run_until` are spaced. Memory is 64 bytes
-    per pixel; dark pixels cost no time.
+    Same seed, same events, for any spacing of the calls to :meth:`run_until`. Memory is 64 bytes
+    per pixel; unlit pixels cost no time.
 
     Parameters
     ----------
@@ -138,8 +138,8 @@ class PixelArray:
     def change(self, t_us: int, parameters: PixelParameters) -> None:
         """Use ``parameters`` from ``t_us`` on.
 
-        Light stays as it is until the next :meth:`relight`, hot pixels stay the same. A threshold
-        that falls below the present signal of a pixel makes an event at once.
+        The light is kept until the next :meth:`relight`, hot pixels stay the same. A threshold
+        that falls below the present signal of a pixel causes an event at once.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class PixelArray:
         _rebias_columns(self._sensor, float(t_us), before, self._model)
         rate = self._background.per_us
         if rate != rate_before:
-            # Background has no memory: the rest of the wait goes on at the new rate.
+            # A Poisson process has no memory: the rest of the interval is scaled to the new rate.
             left = (self._process.next_us - t_us) * rate_before if rate_before else 1.0
             self._process.next_us = t_us + left / rate if rate else np.inf
 
@@ -176,7 +176,7 @@ class PixelArray:
             passage_gaps(risks, correlation_us),
         )
         self._draw_thresholds()
-        # Leaks of dark pixels come at random times too: each has its own phase and rate.
+        # Leaks of unlit pixels are at random times, too: each has its own phase and rate.
         hot_hz = p.hot_hz * self._hot.size
         both_hz = self._background_hz * self.columns * self.rows + hot_hz
         total_hz = both_hz + p.leak_hz * self.columns * self.rows
@@ -207,8 +207,8 @@ class PixelArray:
             Must not fall from call to call.
         columns : ndarray of int64, shape (n,)
         line_row, reflectance : ndarray of float64, shape (n,) or (n, patches)
-            A row that is NaN or a reflectance of 0 leaves the column dark. With several patches
-            the footprint is made of parts that lie on different surfaces.
+            A row that is NaN or a reflectance of 0 leaves the column unlit. With several patches
+            the footprint has parts on different surfaces.
         low_row, high_row : ndarray of float64, same shape, optional
             Rows between which a patch is lit (edges between rows, so ``y - 0.5`` to ``y + 0.5``
             is one row); the complete footprint when left out.
@@ -226,8 +226,7 @@ class PixelArray:
         for k, (values, otherwise) in enumerate(
             ((line_row, 0.0), (reflectance, 0.0), (low_row, -np.inf), (high_row, np.inf))
         ):
-            wanted = otherwise if values is None else values.reshape(patches.shape[:2])
-            patches[:, :, k] = wanted
+            patches[:, :, k] = otherwise if values is None else values.reshape(patches.shape[:2])
         patches[:, :, 1] *= self.parameters.amplitude
         line = _Line(columns, patches)
         begin = 0
@@ -240,7 +239,7 @@ class PixelArray:
                 self._grow()
 
     def run_until(self, t_us: int) -> None:
-        """Let the pixels and the background activity do what is due up to ``t_us``."""
+        """Process the pixels and the background activity up to ``t_us``."""
         begin = 0
         while begin < self.columns:
             begin, self._count = _run_columns(
@@ -280,7 +279,7 @@ class PixelArray:
         self._keys = np.concatenate((self._keys, np.empty_like(self._keys)))
 
     def _draw_thresholds(self) -> None:
-        """Give every pixel its thresholds; its mismatch is always the same."""
+        """Set the thresholds of every pixel; its mismatch is always the same."""
         p = self.parameters
         rng = np.random.default_rng(self._draws)
         for name, threshold, sign in (
@@ -400,7 +399,7 @@ def _relight(sensor, line, begin, optics, model, t_us, out, n):
 
 @kernel
 def _run_columns(sensor, begin, until_us, model, out, n):
-    """Let the pixels of the columns from ``begin`` on do what is due up to ``until_us``.
+    """Process the pixels of the columns from ``begin`` on up to ``until_us``.
 
     Stops where the output does not suffice; returns the next column and the number of events.
     """

@@ -1,4 +1,4 @@
-"""The sensor's readout: events row by row, at a limited rate."""
+"""Readout of the sensor: row by row, at a limited rate."""
 
 from eschorty_ros.simulation.readout.readout import EventRate, Readout, ReadoutParameters
 

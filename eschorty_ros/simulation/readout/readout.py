@@ -1,4 +1,4 @@
-"""The sensor's readout: events row by row, and at a limited rate when one is set."""
+"""Readout of the sensor: row by row, and at a limited rate when one is set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel, record
 
 DROP_NOTE_US = 1000
-"""The sensor reports at most once in so long that its readout drops events."""
+"""Least time between two reports of the sensor that its readout drops events."""
 
 _STATE = (
     "row_ns",  # time the arbiter spends on one row
@@ -25,7 +25,7 @@ _STATE = (
     "dropped",  # events the arbiter had no room for
     "noted",  # last span of DROP_NOTE_US in which a drop was reported, -1 for none
     "period",  # of the rate control, -1 for none begun
-    "came",  # events that came to it in this period
+    "came",  # events that reached it in this period
     "passed",  # events that it let through in this period
     "cut",  # events it dropped
 )
@@ -85,7 +85,7 @@ class ReadoutParameters:
 
 
 class ReadOut(NamedTuple):
-    """The events that left the sensor.
+    """Events that left the sensor, and its reports.
 
     Attributes
     ----------
@@ -128,8 +128,9 @@ class Readout:
     """The row arbiter: rows queue in the order of their requests and are read out completely.
 
     All events of a row that wait when its turn comes share the time of the readout; two requests
-    of one pixel by then are read as one event, which ``merged`` counts. Behind it stands the
-    event-rate control, off until :meth:`limit`. The events do not depend on how calls are spaced.
+    of one pixel by then are read as one event, which ``merged`` counts. The arbiter is followed by
+    the event-rate control, off until :meth:`limit`. The events do not depend on the spacing of
+    calls.
 
     Parameters
     ----------
@@ -196,7 +197,7 @@ class Readout:
         n = int(out.counts.keys)
         keys = out.keys[:n]
         keys.sort()
-        # Sorting and comparing is ten times as fast here as np.unique, which hashes.
+        # np.unique hashes and is ten times slower here.
         fresh = np.append(True, keys[1:] != keys[:-1])[:n]
         if not fresh.all():
             keys = keys[fresh]

@@ -1,4 +1,4 @@
-"""Surfaces that the laser sheet can hit: analytic surfaces and meshes by name."""
+"""Scenes for the laser sheet: analytic surfaces and meshes by name."""
 
 from eschorty_ros.simulation.scenes.face import EAR_OFF_MM, Face
 from eschorty_ros.simulation.scenes.leaves import LEVELS, SEPARATION_MM, Leaves

@@ -48,14 +48,14 @@ _BUMPS = (
 
 @dataclass(frozen=True)
 class Face:
-    """A face looking at the sensor, upright along the laser line, nothing behind it.
+    """A face towards the sensor, upright along the laser line, nothing behind it.
 
     Parameters
     ----------
     centre_mm : float
         Range of the head's front before nose and chin, which are nearer.
     centre_stage_mm : float
-        Stage position of the nose; the ears lie 90 mm on either side.
+        Stage position of the nose; the ears are 90 mm to either side.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class Face:
         ):
             aside = np.abs(across[:, 0])
             rows = np.flatnonzero((aside >= rows_of[0]) & (aside <= rows_of[1]))
-            # Hits lie behind the front and so further from the axis than the ray is at the front.
+            # A hit is behind the front, so further from the axis than the ray at the front.
             cols = np.flatnonzero(np.abs(slope[0]) * depth_mm <= columns_of)
             if rows.size == 0 or cols.size == 0:
                 continue
@@ -117,7 +117,7 @@ def _bell(at: Array, centre: float, half_width: float) -> Array:
 
 
 def _head_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the height of the head towards the sensor, and where there is a head."""
+    """Return the height of the head towards the sensor, and a mask of the head."""
     jaw = 1.0 - 0.22 / (1.0 + np.exp((up + 55.0) / 14.0))
     squared = (across / (HEAD_HALF_WIDTH_MM * jaw)) ** 2 + (up / HEAD_HALF_HEIGHT_MM) ** 2
     height = -HEAD_DEPTH_MM * np.minimum(squared, 1.5) ** 1.3
@@ -131,7 +131,7 @@ def _head_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _ear_mm(across: Array, up: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the height of the ears, flat shells with a rim, and where there are ears."""
+    """Return the height of the ears, flat shells with a rim, and a mask of the ears."""
     aside = np.abs(across) - EAR_OFF_MM
     squared = (aside / _EAR_HALF_MM[0]) ** 2 + ((up - _EAR_LINE_MM) / _EAR_HALF_MM[1]) ** 2
     rim = 4.0 * np.exp(-(((squared - 0.75) / 0.25) ** 2))
@@ -146,7 +146,7 @@ def _solve(
 ) -> tuple[Array, Array]:
     """Return depth and height where ``x = depth - height(across, slope x)``, by secants.
 
-    Rays lie within 7 degrees of the x axis, so that ``x -> depth - height`` shrinks every error
+    Rays are within 7 degrees of the x axis, so that ``x -> depth - height`` shrinks every error
     about fivefold even at the head's rim, and the secants leave less than 1 um.
     """
     before = np.broadcast_to(np.float64(depth_mm), (across.size, slope.size))

@@ -36,7 +36,7 @@ Value = float | Array
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One leaf, or as arrays the leaf of each ray: where its blade is, its heading and shape.
+    """One leaf, or as arrays the leaf of each ray: position of its blade, its heading and shape.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Leaf:
     fullness : float
         Below 1 the blade is widest near the stalk.
     lobes, lobe_depth : float
-        Number of lobes on either side and how deep they are cut, 0 to 1.
+        Number of lobes on either side and the depth of their cuts, 0 to 1.
     albedo : float
     """
 
@@ -85,12 +85,12 @@ class Leaf:
         return along, dy * self.heading_line - dz * self.heading_stage
 
     def near(self, along: Array, across: Array) -> NDArray[np.bool_]:
-        """Return whether a point is within the box around blade and petiole, or 1 mm beside it."""
+        """Return a mask of points within the box around blade and petiole, 1 mm beside included."""
         within = (along > -_PETIOLE_SHARE * self.length_mm - 1.0) & (along < self.length_mm + 1.0)
         return np.asarray(within & (np.abs(across) < self.half_width_mm + 1.0))
 
     def covers(self, along: Array, across: Array) -> NDArray[np.bool_]:
-        """Return whether blade or petiole is there."""
+        """Return a mask of points on blade or petiole."""
         distance = np.abs(across)
         u = np.clip(along / self.length_mm, 0.0, 1.0)
         # Lobes lean towards the tip as the side veins do.
@@ -194,11 +194,11 @@ class Leaves:
     def leaf_index(
         self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel
     ) -> NDArray[np.intp]:
-        """Return the index into ``leaves`` of what every ray hits, -1 for nothing; shape (n, m)."""
+        """Return the index in ``leaves`` of every ray's hit, -1 for none; shape (n, m)."""
         return self._hits(stage_mm, columns, model)[1]
 
     def curvature_mm(self, stage_mm: ArrayLike, line_mm: ArrayLike) -> Array:
-        """Return how far leaves bend away from their level; the arguments broadcast."""
+        """Return the leaves' deviation from their level, mm; the arguments broadcast."""
         y = (np.asarray(stage_mm, dtype=np.float64) - _CENTRE_STAGE_MM) / 100.0
         z = np.asarray(line_mm, dtype=np.float64) / 165.0
         return np.asarray(1.5 * y * y + 1.5 * z * z + 1.5 * y * z - 1.0)
@@ -236,10 +236,10 @@ class Leaves:
     def _meet(
         self, leaf: Leaf, y: Array, z: Array, slope: Array, b_mm: float
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return where each ray meets its leaf's surface, and whether the leaf extends to there.
+        """Return the range at which each ray meets its leaf's surface, and a mask of real hits.
 
-        The surface is nearly flat: a step of ``x = surface(y, slope (x + b))`` leaves less than a
-        twentieth of the error, and two of them less than 2 um.
+        The surface is nearly flat: a step of ``x = surface(y, slope (x + b))`` reduces the error to
+        less than a twentieth, and two of them to less than 2 um.
         """
         x = leaf.depth_mm + self.curvature_mm(y, z)
         for _ in range(_SOLVE_STEPS):

@@ -17,7 +17,7 @@ from eschorty_ros.simulation.scenes.scene import Array, UniformReflectance, shee
 class Mesh(UniformReflectance):
     """Triangles in metres in ``eschorty_base`` (x = range, y = stage, z = laser line).
 
-    Open3D casts in float32: hits are good to about 1 um at 1 m.
+    Open3D casts in float32: hits are accurate to about 1 um at 1 m.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Mesh(UniformReflectance):
     def __init__(self, vertices_m: ArrayLike, triangles: ArrayLike, name: str = "mesh") -> None:
         faces: NDArray[np.uint32] = np.ascontiguousarray(triangles, dtype=np.uint32)
         if faces.size == 0:
-            raise FormatError(f"{name} holds no triangles; give a triangle mesh in metres")
+            raise FormatError(f"{name} has no triangles; give a triangle mesh in metres")
         o3d = load_open3d("a mesh scene")
         self._tensor: Any = o3d.core.Tensor
         self._caster: Any = o3d.t.geometry.RaycastingScene()

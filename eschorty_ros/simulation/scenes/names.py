@@ -1,4 +1,4 @@
-"""Scenes, what the laser sheet can hit, by name."""
+"""Scenes by name."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def named(name_or_mesh_path: str | Path) -> Scene:
     ArgumentError
         When the argument is neither a name nor an existing file.
     FormatError
-        When the file holds no triangles.
+        When the file has no triangles.
     EschortyError
         When Open3D, needed for meshes, is not installed.
     """

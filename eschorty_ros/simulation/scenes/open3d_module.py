@@ -23,7 +23,7 @@ def load_open3d(purpose: str) -> ModuleType:
         When it does not import.
     """
     with contextlib.suppress(ImportError, OSError):
-        # Open3D links libusb-1.0, which a bare machine lacks; this package brings one along.
+        # Open3D links libusb-1.0, which a bare machine lacks; this package contains one.
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)

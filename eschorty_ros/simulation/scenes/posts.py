@@ -14,7 +14,7 @@ from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes.scene import UniformReflectance, sheet
 
 RANGES_MM = (820.0, 960.0, 1110.0, 1270.0, 1440.0, 1610.0, 1770.0, 1910.0, 2050.0)
-"""A third of them in the far third of what the third build sees."""
+"""A third of them is in the far third of the third build's ranges."""
 SLIM_MM, WIDE_MM = 12.7, 25.4
 _SLIM_WITHIN_MM = 1000.0
 _FAN_SLOPE = 0.0287
@@ -29,7 +29,7 @@ class Post:
     range_mm : float
         Of its front.
     line_mm : float
-        Where its middle lies along the laser line (z).
+        Position of its middle along the laser line (z).
     size_mm : float
         Width of a flat post, diameter of a round one.
     round : bool
@@ -66,7 +66,7 @@ class Post:
         return np.asarray(constant / (half_linear + root) - model.b_mm)
 
     def columns(self, model: RangeModel) -> tuple[float, float]:
-        """Return the columns (fractional) between which the post is seen."""
+        """Return the columns (fractional) between which the post appears."""
         depth = self.range_mm + model.b_mm
         if self.round:
             radius = 0.5 * self.size_mm

@@ -1,6 +1,6 @@
-"""The interface of a scene, and what scenes share.
+"""The interface of a scene, and common parts of scenes.
 
-All scenes live in ``eschorty_base``: x is the range, y the stage direction, z the laser line.
+All scenes are in ``eschorty_base``: x is the range, y the stage direction, z the laser line.
 At stage position ``s`` the sheet is a fan of rays from ``(-b, s, 0)`` with the direction
 ``(1, 0, column_slope)``, so the range of a hit is its x coordinate.
 """

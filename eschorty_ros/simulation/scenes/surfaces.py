@@ -25,7 +25,7 @@ class Plane(UniformReflectance):
     pivot_mm: float = 0.0
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Return ranges as a :class:`Scene`; NaN for rays that run away from the plane."""
+        """Return ranges as a :class:`Scene`; NaN for rays that do not meet the plane."""
         y, slope = sheet(stage_mm, columns, model)
         facing = 1.0 - self.slope_column * slope
         at_axis = self.centre_mm + model.b_mm + self.slope_stage * (y - self.pivot_mm)
@@ -38,11 +38,11 @@ class Plane(UniformReflectance):
 class Steps(UniformReflectance):
     """Flat levels on a grid of equal column bands and stage bands.
 
-    A tile lies at ``base_mm + column_levels_mm[i] + stage_levels_mm[j]``; the first and last
+    A tile is at ``base_mm + column_levels_mm[i] + stage_levels_mm[j]``; the first and last
     stage band have no end. Walls between column bands run along the rays, so that no tile
     hides another. The default spans 207 mm around 1.32 m with steps from 2 to 102 mm. Between
     10 and 110 mm the stage crosses one large step: the laser line is 7 mm thick there, to
-    where it fades, and lies on both levels for as long.
+    its faint ends, and is on both levels over these 7 mm.
     """
 
     base_mm: float = 1320.0

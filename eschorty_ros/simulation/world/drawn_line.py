@@ -14,7 +14,7 @@ _REFLECTANCE_STEP = 0.01
 
 
 class DrawnLine:
-    """The line as it lies on the pixels.
+    """The line as drawn on the pixels.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ class DrawnLine:
         self._was_split = np.zeros(model.columns, dtype=bool)
 
     def redraw(self) -> None:
-        """Draw every column the next time, as pixels with other thresholds need it."""
+        """Draw every column the next time, which is necessary after a change of thresholds."""
         self._row[:] = np.nan
         self._position_mm = np.nan
 
     def draw(self, t_us: int, position_mm: float, level: float) -> None:
-        """Draw the line where it falls at a stage position, with the laser at ``level``."""
+        """Draw the line on the scene at a stage position, with the laser at ``level``."""
         if level != self._level:
             self.redraw()
             self._level = level

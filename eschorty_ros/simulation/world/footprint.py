@@ -15,7 +15,7 @@ _SAMPLES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Samples of the scene across the line, in half widths of the footprint."""
 _CENTRE = 2
 _FINE = 32
-"""Parts into which the stretch between two samples is cut to find an edge."""
+"""Parts into which the interval between two samples is divided to find an edge."""
 _ROW_JUMP = 0.25
 _REFLECTANCE_JUMP = 0.02
 
@@ -31,7 +31,7 @@ class Footprint:
     split : int64, shape (n,)
         Columns across whose footprint an edge runs.
     patch_row, patch_reflectance, low_row, high_row : float64, shape (n, 2)
-        The two patches of each of these columns, as :meth:`PixelArray.relight` takes them.
+        The two patches of each of these columns, arguments of :meth:`PixelArray.relight`.
     """
 
     row: Array
@@ -46,9 +46,9 @@ class Footprint:
 def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float) -> Footprint:
     """Return the line on the scene across its thickness.
 
-    Rows ``d`` above the line's centre see the scene ``d / rows_per_mm_off_sheet`` behind the
-    sheet. Only a jump of range or reflectance makes a second patch; of a smooth surface the range
-    in the middle of the line counts.
+    Rows ``d`` above the line's centre image the scene ``d / rows_per_mm_off_sheet`` behind the
+    sheet. Only a jump of range or reflectance makes a second patch; for a smooth surface the range
+    in the middle of the line is used.
 
     Parameters
     ----------
@@ -60,9 +60,9 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     """
     columns = np.arange(model.columns)
     at_middle = scene.range_mm(np.array([stage_mm]), columns, model)
-    seen = at_middle[np.isfinite(at_middle)]
+    hit = at_middle[np.isfinite(at_middle)]
     # Where the middle hits nothing the scene may begin beside it, at an unknown range.
-    nearest_mm = float(seen.max()) if seen.size else float(model.range_mm(model.rows / 2))
+    nearest_mm = float(hit.max()) if hit.size else float(model.range_mm(model.rows / 2))
     half_mm = half_rows / float(model.rows_per_mm_off_sheet(nearest_mm))
     stages = stage_mm + _SAMPLES * half_mm
     range_mm = scene.range_mm(stages, columns, model)
@@ -90,7 +90,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     border = patch_row - edge_mm[:, np.newaxis] * per_mm
     ahead = (edge_mm > 0.0)[:, np.newaxis]
     middle = np.array([True, False])
-    # What lies ahead of the edge (+y) appears below it.
+    # The surface ahead of the edge (+y) is below it on the sensor.
     below = ahead != middle
     dark = np.isnan(patch_row)
     return Footprint(
@@ -105,7 +105,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
 
 
 def _jumps(row: Array, reflectance: Array) -> NDArray[np.bool_]:
-    """Return where neighbouring samples (first axis) differ, shape one shorter."""
+    """Return a mask of differing neighbours along the first axis, one shorter than the samples."""
     lit = np.isfinite(row)
     with np.errstate(invalid="ignore"):
         far = np.abs(np.diff(row, axis=0)) > _ROW_JUMP
@@ -119,7 +119,7 @@ def _edges(
 ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     """Return edges between two samples: mm ahead of the middle, row, reflectance, column.
 
-    Columns whose surface only slopes are left out.
+    Columns with a slope instead of an edge are left out.
     """
     stages = np.linspace(stretch[0], stretch[1], _FINE + 1)
     range_mm = scene.range_mm(stages, columns, model)
@@ -134,7 +134,7 @@ def _edges(
         np.where(lit[1:] != lit[:-1], np.inf, 0.0),
     )
     at = np.argmax(size, axis=0)
-    # A slope spreads over all parts; of an edge one part holds at least half.
+    # A slope is spread over all parts; of an edge one part has at least half.
     total = np.where(np.isfinite(size), size, 0.0).sum(axis=0)
     largest = size[at, each]
     sharp = (largest > 1.0) & (largest >= 0.5 * total)

@@ -71,8 +71,8 @@ def simulate_line(
     reflectance : float or array_like, shape (columns,)
         0 to 1.
     edge_offset_rows : float or array_like, shape (columns,), optional
-        Puts a reflectance step into the footprint: rows more than this above ``line_row`` (at
-        higher row numbers) see ``reflectance_above``. The row an edge lies in sees a mixture.
+        Position of a reflectance step in the footprint: rows more than this above ``line_row`` (at
+        higher row numbers) have ``reflectance_above``. The row of the edge has a mixture.
     reflectance_above : float or array_like, shape (columns,), optional
         0 to 1; given if and only if ``edge_offset_rows`` is.
     background_hz : float
@@ -82,7 +82,7 @@ def simulate_line(
     rows : int
         Height of the sensor, at most 1024.
     readout : ReadoutParameters, optional
-        Left out, every event leaves the sensor at its request.
+        By default every event leaves the sensor at its request.
 
     Raises
     ------

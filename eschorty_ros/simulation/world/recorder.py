@@ -106,7 +106,7 @@ def simulate_recording(
                 raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
                 if progress is not None:
                     progress(world.now_us, end_us)
-        # One sample past the end: the last events must lie between two samples.
+        # One sample past the end: the last events must be between two samples.
         t_us = np.arange(0, end_us + 2 * _STAGE_STEP_US, _STAGE_STEP_US, dtype=np.int64)
         write_stage_csv(folder / STAGE_FILE, t_us, move.state(t_us * 1000)[0])
         write_laser_yaml(folder / LASER_FILE, wave)

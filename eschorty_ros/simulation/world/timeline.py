@@ -1,4 +1,4 @@
-"""Settings of laser, stage and sensor over sensor time."""
+"""Settings of the laser, the stage and the sensor over sensor time."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Gate:
         return max(self.rise_us(index) + 1, min(fall, self.rise_us(index + 1) - 1))
 
     def index(self, t_us: int) -> int:
-        """Return the index of the period that holds ``t_us``."""
+        """Return the index of the period of ``t_us``."""
         numerator, denominator = self._period
         index = (t_us - self._origin_us) * denominator // numerator
         while self.rise_us(index) > t_us:
@@ -78,7 +78,7 @@ class Gate:
         return index
 
     def high(self, t_us: int) -> bool:
-        """Return whether the gate's signal is high at ``t_us``: from a rising to a falling edge."""
+        """Return true when the gate's signal is high at ``t_us``: from rising to falling edge."""
         return self._flank(t_us)[2]
 
     def flank_us(self, t_us: int) -> int:
@@ -106,7 +106,7 @@ class Gate:
         return begin_us - (-(step + 1) * length_us) // steps
 
     def _flank(self, t_us: int) -> tuple[int, int, bool]:
-        """Return begin and end of the half-period that holds ``t_us``, and whether it is lit."""
+        """Return begin and end of the half-period of ``t_us``, and true when it is lit."""
         index = self.index(t_us)
         fall = self.fall_us(index)
         if t_us < fall:
@@ -115,7 +115,7 @@ class Gate:
 
 
 def _round_ratio(numerator: int, denominator: int) -> int:
-    """Nearest integer to a ratio, halves to even, as ``round`` of a Fraction."""
+    """Return the integer nearest to a ratio, halves to even, as ``round`` of a Fraction."""
     quotient, rest = divmod(numerator, denominator)
     up = 2 * rest > denominator or (2 * rest == denominator and quotient % 2 == 1)
     return quotient + up
@@ -129,13 +129,13 @@ class Timeline(Generic[Setting]):
         self._settings: list[Setting] = []
 
     def add(self, t_us: int, setting: Setting) -> None:
-        """Hold ``setting`` from ``t_us`` on; replaces what was set for later times."""
+        """Use ``setting`` from ``t_us`` on; replaces settings of later times."""
         keep = bisect_left(self._times, t_us)
         self._times[keep:] = [t_us]
         self._settings[keep:] = [setting]
 
     def at(self, t_us: int) -> Setting | None:
-        """Return the setting that holds at ``t_us``."""
+        """Return the setting at ``t_us``, ``None`` before the first."""
         k = bisect_right(self._times, t_us)
         return self._settings[k - 1] if k else None
 
@@ -164,7 +164,7 @@ class LaserTimeline:
         modulation: Modulation | None,
         clock_rate: Fraction = Fraction(1),
     ) -> None:
-        """Switch from ``t_us`` on; replaces what was set for later times.
+        """Switch from ``t_us`` on; replaces settings of later times.
 
         Raises
         ------
@@ -181,14 +181,14 @@ class LaserTimeline:
         return 0.0 if gate is None else gate.level(t_us)
 
     def rises(self, t_us: int) -> bool:
-        """Return whether ``t_us`` is a rising edge."""
+        """Return true when ``t_us`` is a rising edge."""
         gate = self._gates.at(t_us)
         return gate is not None and gate.rise_us(gate.index(t_us)) == t_us
 
     def edges(self, begin_us: int, end_us: int) -> list[tuple[int, bool]]:
         """Return the edges of the gate's signal from ``begin_us`` to before ``end_us``.
 
-        Each is its time and whether it rises.
+        Each is its time and true for a rising one.
         """
         found: list[tuple[int, bool]] = []
         t_us, high = begin_us - 1, self._high(begin_us - 1)

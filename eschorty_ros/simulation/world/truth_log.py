@@ -1,4 +1,4 @@
-"""The true ranges: when the line was lit and where the stage stood then."""
+"""The true ranges, from the lit phases and the stage positions at their middle."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TruthLog:
         self._phases: deque[tuple[int, float]] = deque(maxlen=_PHASES_KEPT)
 
     def add(self, middle_us: int, stage_mm: float) -> None:
-        """Note a lit phase by its middle; the last million are kept."""
+        """Add a lit phase by its middle; the last million are kept."""
         self._phases.append((middle_us, stage_mm))
 
     def table(self) -> NDArray[np.void]:

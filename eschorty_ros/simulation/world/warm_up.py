@@ -13,8 +13,8 @@ from eschorty_ros.simulation.world.world import World
 def warm_up(calibration: Calibration) -> None:
     """Simulate a millisecond of a lit plane, with a change of biases, in a world of its own.
 
-    The first run on a machine compiles for some seconds; later runs load what that left in
-    numba's cache. Without it a simulated camera stops for seconds at its first light.
+    The first run on a machine compiles for some seconds; later runs load numba's cache. Without it
+    a simulated camera stops for seconds at its first light.
     """
     world = World(named("plane"), calibration)
     world.set_laser(0, True, Modulation(1000.0, on_edge_us=0))

@@ -49,8 +49,8 @@ _TIME_HIGH_US = 4_096
 class World:
     """A camera in front of a scene, with laser and stage.
 
-    The bytes depend on scene, calibration, parameters, seed and on what laser and stage do, never
-    on how calls to :meth:`advance` are spaced.
+    The bytes depend on scene, calibration, parameters, seed and the settings of laser and stage,
+    not on the spacing of calls to :meth:`advance`.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class World:
     Attributes
     ----------
     trigger_input : EdgeSource or None
-        What is wired to the camera's trigger input; called once for every stretch of time.
+        Source of edges at the camera's trigger input; called once for every piece of time.
     """
 
     def __init__(
@@ -122,9 +122,9 @@ class World:
         modulation: Modulation | None = None,
         clock_rate: Fraction = Fraction(1),
     ) -> None:
-        """Switch the laser from ``t_us`` on; ``modulation.on_edge_us`` places the wave.
+        """Switch the laser from ``t_us`` on; ``modulation.on_edge_us`` sets the phase.
 
-        Replaces what was set for later times. ``clock_rate`` is the sensor time that passes per
+        Replaces settings of later times. ``clock_rate`` is the sensor time that passes per
         unit of the generator's time.
 
         Raises
@@ -158,7 +158,7 @@ class World:
         self._stage.set(start_us, plan, zero_ns, clock_rate)
 
     def set_sensor(self, t_us: int, control: SensorControl) -> None:
-        """Run the sensor under ``control`` from ``t_us`` on; replaces what was set for later.
+        """Run the sensor under ``control`` from ``t_us`` on; replaces settings of later times.
 
         Raises
         ------
@@ -182,7 +182,7 @@ class World:
         Raises
         ------
         ArgumentError
-            When ``until_us`` lies before what has been simulated.
+            When ``until_us`` has been simulated already.
         """
         self._refuse_past("until_us", until_us)
         parts = []
@@ -208,7 +208,7 @@ class World:
                     rate_counts=periods,
                 )
             )
-            # Only multiples of TIME_HIGH: the bytes must not depend on how calls are spaced.
+            # Only multiples of TIME_HIGH: the bytes must not depend on the spacing of calls.
             step_us = end_us - end_us % _TIME_HIGH_US
             if step_us > (self._encoder.time_us or 0):
                 parts.append(self._encoder.advance(step_us))
@@ -262,7 +262,7 @@ class World:
                 self._remove(t_us)
 
     def _draw(self, t_us: int, level: float) -> None:
-        """Draw the line where it falls on the scene now."""
+        """Draw the line on the scene at the present stage position."""
         position_mm, velocity_mm_s = self._stage.state(t_us)
         if self._lit_since_us is None:
             self._lit_since_us = t_us
@@ -271,14 +271,14 @@ class World:
         self._step_us = t_us + int(min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US))
 
     def _remove(self, t_us: int) -> None:
-        """Remove the line and note the phase that ends here."""
+        """Remove the line and log the phase that ends here."""
         self._line.remove(t_us)
         self._close_phase(t_us)
         self._lit_since_us = None
         self._step_us = None
 
     def _close_phase(self, t_us: int) -> None:
-        """Note the lit phase that ends here."""
+        """Log the lit phase that ends here."""
         middle_us = ((self._lit_since_us or 0) + t_us) // 2
         self._truth.add(middle_us, self._stage.state(middle_us)[0])
         self._lit_since_us = t_us
