@@ -60,7 +60,7 @@ def test_targets_become_a_calibration_and_a_page(targets_csv, tmp_path):
     # Names may wrap after an underscore.
     text = html_check.text(page).replace("_ ", "_")
     for part in (made.id, "joint", "8 used of 9", "width_bias_px", "prior dominates b_mm",
-                 "lies", "sigma from the curve of the others", "Magnification"):  # fmt: skip
+                 "sigma from the curve of the others", "Magnification"):  # fmt: skip
         assert part in text, part
     assert page.read_text().count("data:image/png;base64,") == 4
 
