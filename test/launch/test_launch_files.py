@@ -77,7 +77,7 @@ def configurations(tree):
         if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
             continue
         name = node.func.id
-        if name in ("LaunchConfiguration", "number", "text", "truth"):
+        if name in ("LaunchConfiguration", "number", "text", "boolean"):
             used |= {value.value for value in node.args if isinstance(value, ast.Constant)}
         elif name in FUNCTIONS:
             used |= configurations(FUNCTIONS[name])
