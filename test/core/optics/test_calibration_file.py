@@ -171,8 +171,8 @@ def test_faults_name_file_key_value_and_remedy(
 @pytest.mark.parametrize(
     ("content", "part"),
     [
-        (b"", "holds None"),
-        (b"- 1\n- 2\n", r"holds \[1, 2\]"),
+        (b"", "has None instead of keys"),
+        (b"- 1\n- 2\n", r"has \[1, 2\] instead of keys"),
         (b"name: [1\n", "line 2"),
         (b"name: a\nname: b\n", "line 2: key 'name' appears twice"),
         (b"name: !!python/object:os.system {}\n", "line 1"),
