@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import groupby
+from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +15,8 @@ from eschorty_ros.core.evt3 import words as w3
 Words = NDArray[np.uint16]
 
 _VECTOR_BITS = 12
+_WAITING_PACKETS = 8
+_JOINED_BYTES = 96 << 10
 
 
 class SensorSource(Protocol):
@@ -110,7 +114,10 @@ class PixelMask:
 
 
 class Packetiser:
-    """Cuts a word stream where sensor time passes a multiple of the packet period."""
+    """Cuts a word stream where sensor time passes a multiple of the packet period.
+
+    Packets that wait for a host which reads late are joined, so that it catches up.
+    """
 
     def __init__(self) -> None:
         self._pending: list[Words] = []
@@ -127,7 +134,7 @@ class Packetiser:
             begin = cut
         if begin < len(words):
             self._pending.append(words[begin:])
-        return [packet for packet in packets if packet]
+        return _joined([packet for packet in packets if packet])
 
     def flush(self) -> bytes:
         """Return the incomplete packet."""
@@ -160,6 +167,17 @@ class Packetiser:
         """Keep a TIME_HIGH with the TIME_LOW that follows it."""
         follows = (cuts > 0) & (kinds[cuts - 1] == w3.TIME_HIGH)
         return cuts - follows
+
+
+def _joined(packets: list[bytes]) -> list[bytes]:
+    """Join the packets that wait, up to the size of a transfer."""
+    if len(packets) < _WAITING_PACKETS:
+        return packets
+    ends = np.cumsum([len(packet) for packet in packets])
+    return [
+        b"".join(packet for _, packet in group)
+        for _, group in groupby(zip(ends // _JOINED_BYTES, packets, strict=True), itemgetter(0))
+    ]
 
 
 def without_triggers(data: bytes) -> bytes:

@@ -199,6 +199,19 @@ def test_packets_end_where_sensor_time_passes_the_period():
         host.data()
 
 
+def test_packets_that_wait_for_a_late_host_are_joined():
+    stream = [
+        word for t in range(0, 900_000, 100) for word in (0x8000 | t >> 12, 0x6000 | t & 0xFFF)
+    ]
+    host = Host(Words(stream * 8))
+    host.run("init", "start")
+    transfers = [host.data() for _ in range(3)]
+    assert all(len(data) > 64 << 10 for data in transfers)
+    assert (
+        b"".join(transfers) == np.asarray(stream * 8, "<u2").tobytes()[: sum(map(len, transfers))]
+    )
+
+
 def test_a_packet_of_whole_usb_packets_ends_with_an_empty_one():
     full = [0x8000, 0x6001, *[0x0001] * 510]
     host = Host(Words(full, [0x8001, 0x6000]))

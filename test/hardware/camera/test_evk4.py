@@ -175,10 +175,13 @@ def test_a_scene_without_events_is_no_failure() -> None:
 def test_bytes_dropped_by_a_full_queue_are_counted_and_marked() -> None:
     with CameraBench(queue_bytes=400) as bench:
         bench.streaming()
-        bench.source.give(200)
-        wait_until(
-            lambda: bench.count("dropped_bytes") + bench.count("queue_bytes") == 1600, "every byte"
-        )
+        size = 0
+        for _ in range(40):
+            size += len(bench.source.give(5))
+            wait_until(
+                lambda size=size: bench.count("dropped_bytes") + bench.count("queue_bytes") == size,
+                "bytes",
+            )
         assert bench.count("dropped_bytes") >= 1200
         kept = b""
         while chunk := bench.camera.read(0.0):
