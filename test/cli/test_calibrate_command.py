@@ -1,7 +1,5 @@
 """`eschorty calibrate`: from targets and recordings to a file and a page."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

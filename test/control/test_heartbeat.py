@@ -1,7 +1,5 @@
 """When a node's heartbeat is due, and when it reports that its device stopped."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 
@@ -32,14 +30,14 @@ def stops(
     return [check for check, text in texts.items() if text and read_heartbeat(text)[1]]
 
 
-def test_heartbeats_are_due_at_their_period() -> None:
+def test_heartbeats_are_due_at_their_period():
     schedule = HeartbeatSchedule()
     quarter_s = 1.01 * PERIOD_S / 4.0
     sent = [n for n in range(100) if schedule.check(True, 0.0, n * quarter_s)]
     assert sent == list(range(0, 100, 4))
 
 
-def test_device_that_fails_is_reported_at_once_and_three_times() -> None:
+def test_device_that_fails_is_reported_at_once_and_three_times():
     reported = stops(lambda check: check < 10, 100)
     assert reported[0] == 10
     assert len(reported) == LAST_HEARTBEATS
@@ -54,13 +52,11 @@ def test_device_that_fails_is_reported_at_once_and_three_times() -> None:
     ],
     ids=["read again in time", "not read again", "failed before the stall"],
 )
-def test_device_has_time_to_recover_from_a_stall_of_this_process(
-    healthy: Callable[[int], bool], stall_at: int, first: int | None
-) -> None:
+def test_device_has_time_to_recover_from_a_stall_of_this_process(healthy, stall_at, first):
     assert (stops(healthy, 40, stall_at, 0.6) or [None])[0] == first
 
 
-def test_texts_are_read_back() -> None:
+def test_texts_are_read_back():
     own = Sender(place(), os.getpid())
     assert read_heartbeat(heartbeat_text(stopped=False)) == (own, False)
     assert read_heartbeat(heartbeat_text(stopped=True)) == (own, True)

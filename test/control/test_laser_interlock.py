@@ -1,7 +1,5 @@
 """When the laser may be on: arming, contact, heartbeats, longest time on."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -52,7 +50,7 @@ def light(interlock: LaserInterlock, text: str = "") -> None:
     assert interlock.trip_reason() is None
 
 
-def test_refusals_name_what_is_missing(interlock: LaserInterlock, clock: Clock) -> None:
+def test_refusals_name_what_is_missing(interlock, clock):
     assert "not armed" in str(interlock.refusal())
     interlock.arm()
     assert "no laser/heartbeat" in str(interlock.refusal())
@@ -66,7 +64,7 @@ def test_refusals_name_what_is_missing(interlock: LaserInterlock, clock: Clock) 
     assert "expired after 10 s" in str(interlock.refusal())
 
 
-def test_required_contact_is_open_unless_it_is_reported_closed_repeatedly(clock: Clock) -> None:
+def test_required_contact_is_open_unless_it_is_reported_closed_repeatedly(clock):
     interlock = LaserInterlock(10.0, 60.0, {}, contact_timeout_s=1.0, now_s=clock)
     interlock.arm()
     assert "interlock open" in str(interlock.refusal())
@@ -83,7 +81,7 @@ def test_required_contact_is_open_unless_it_is_reported_closed_repeatedly(clock:
     assert "interlock open" in str(interlock.trip_reason())
 
 
-def test_each_heartbeat_is_stale_at_its_own_age(interlock: LaserInterlock, clock: Clock) -> None:
+def test_each_heartbeat_is_stale_at_its_own_age(interlock, clock):
     light(interlock)
     clock.now_s += 0.99
     assert interlock.trip_reason() is None
@@ -96,7 +94,7 @@ def test_each_heartbeat_is_stale_at_its_own_age(interlock: LaserInterlock, clock
     assert "camera/heartbeat older than 2 s" in str(interlock.trip_reason())
 
 
-def test_time_on_is_bounded(interlock: LaserInterlock, clock: Clock) -> None:
+def test_time_on_is_bounded(interlock, clock):
     light(interlock)
     for _ in range(601):
         clock.now_s += 1.0
@@ -111,20 +109,18 @@ def test_time_on_is_bounded(interlock: LaserInterlock, clock: Clock) -> None:
 @pytest.mark.parametrize(
     ("number", "what"), [(signal.SIGKILL, "is dead"), (signal.SIGSTOP, "is stopped")]
 )
-def test_death_of_a_sender_on_this_host_is_noticed(
-    interlock: LaserInterlock, sender: subprocess.Popen[bytes], number: int, what: str
-) -> None:
+def test_death_of_a_sender_on_this_host_is_noticed(interlock, sender, number, what):
     light(interlock, f"{place()} {sender.pid}")
     sender.send_signal(number)
     os.waitid(os.P_PID, sender.pid, os.WEXITED | os.WSTOPPED | os.WNOWAIT)
     assert f"process {sender.pid} {what}" in str(interlock.trip_reason())
 
 
-def test_sender_on_another_host_is_trusted_until_its_timeout(interlock: LaserInterlock) -> None:
+def test_sender_on_another_host_is_trusted_until_its_timeout(interlock):
     light(interlock, "elsewhere/1 999999999")
 
 
-def test_reported_stop_trips_unless_it_is_of_another_sender(interlock: LaserInterlock) -> None:
+def test_reported_stop_trips_unless_it_is_of_another_sender(interlock):
     light(interlock, heartbeat_text(stopped=False))
     interlock.receive_heartbeat(CLIENT_HEARTBEAT, "elsewhere/1 17 stopped")
     assert interlock.trip_reason() is None
@@ -134,7 +130,7 @@ def test_reported_stop_trips_unless_it_is_of_another_sender(interlock: LaserInte
     assert interlock.trip_reason() is None
 
 
-def test_stall_of_this_process_ages_no_heartbeat(interlock: LaserInterlock, clock: Clock) -> None:
+def test_stall_of_this_process_ages_no_heartbeat(interlock, clock):
     light(interlock)
     clock.now_s += 0.7
     interlock.receive_heartbeat(CAMERA)
@@ -150,9 +146,7 @@ def test_stall_of_this_process_ages_no_heartbeat(interlock: LaserInterlock, cloc
     assert "laser/heartbeat older than 1 s" in str(interlock.trip_reason())
 
 
-def test_stall_that_begins_after_its_measurement_ages_no_heartbeat_either(
-    interlock: LaserInterlock, clock: Clock
-) -> None:
+def test_stall_that_begins_after_its_measurement_ages_no_heartbeat_either(interlock, clock):
     light(interlock)
     measured_s = clock.now_s
     clock.now_s += 5.0
@@ -161,9 +155,7 @@ def test_stall_that_begins_after_its_measurement_ages_no_heartbeat_either(
     assert interlock.trip_reason(clock.now_s) is None
 
 
-def test_stall_of_this_process_does_not_extend_the_time_on(
-    interlock: LaserInterlock, clock: Clock
-) -> None:
+def test_stall_of_this_process_does_not_extend_the_time_on(interlock, clock):
     light(interlock)
     clock.now_s += 601.0
     interlock.exclude_stall(601.0)

@@ -1,7 +1,5 @@
 """Commands, disabling and the generator's answers that cross each other."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -68,7 +66,7 @@ def in_thread(step: Callable[[], None], failures: list[str]) -> threading.Thread
     return thread
 
 
-def test_enabled_twice_it_stays_on(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
+def test_enabled_twice_it_stays_on(supervisor, laser):
     supervisor.arm()
     supervisor.enable()
     supervisor.enable()
@@ -76,7 +74,7 @@ def test_enabled_twice_it_stays_on(supervisor: LaserSupervisor, laser: HeldLaser
     assert laser.enablings == 1
 
 
-def test_arming_does_not_outlive_disabling(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
+def test_arming_does_not_outlive_disabling(supervisor, laser):
     laser.hold = "arm"
     failures: list[str] = []
     arming = in_thread(supervisor.arm, failures)
@@ -90,9 +88,7 @@ def test_arming_does_not_outlive_disabling(supervisor: LaserSupervisor, laser: H
     assert laser.enablings == 0
 
 
-def test_commands_that_waited_while_it_was_disabled_are_void(
-    supervisor: LaserSupervisor, laser: HeldLaser
-) -> None:
+def test_commands_that_waited_while_it_was_disabled_are_void(supervisor, laser):
     laser.hold = "configure"
     supervisor._commands = turns = Turns()  # type: ignore[assignment]
     failures: list[str] = []
@@ -126,8 +122,8 @@ class Interrupted(HeldLaser):
 
 
 def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(
-    supervisor: LaserSupervisor,
-) -> None:
+    supervisor,
+):
     laser = Interrupted()
     supervisor.close()
     supervisor.open(laser, Modulation(70.0))
@@ -143,7 +139,7 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(
     assert status.reason == "interlock open"
 
 
-def test_stall_of_this_process_leaves_light_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stall_of_this_process_leaves_light_on(monkeypatch):
     clock = StallClock(monkeypatch)
     laser = HeldLaser()
     interlock = LaserInterlock(10.0, 600.0, {CLIENT_HEARTBEAT: 1.0}, now_s=clock.monotonic)
@@ -172,7 +168,7 @@ def test_stall_of_this_process_leaves_light_on(monkeypatch: pytest.MonkeyPatch) 
         supervisor.close()
 
 
-def test_opened_again_it_is_watched_once(supervisor: LaserSupervisor, laser: HeldLaser) -> None:
+def test_opened_again_it_is_watched_once(supervisor, laser):
     laser.hold = "readback"
     assert laser.reached.wait(DEADLINE_S)
     supervisor.close()

@@ -1,7 +1,5 @@
 """Errors of a scan, and the leaf levels' distance, from clouds whose errors are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

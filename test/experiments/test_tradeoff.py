@@ -1,7 +1,5 @@
 """Speed against error: what is compared, the front, and the README's table of it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A moving line through packets, odometry and edges: how far a point lies from where it was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from line_events import line_events

@@ -1,7 +1,5 @@
 """What the hard cases share: a bound that is asserted and recorded in one go."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """What targets determine, and what they do not."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import mpmath

@@ -1,7 +1,5 @@
 """Columns that are short, constant, hot, tied or cut by the sensor's edge."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import mpmath

@@ -1,7 +1,5 @@
 """What no column estimator may depend on: place, direction, order and number of copies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -5,8 +5,6 @@ the packages. Arguments that are objects of the package itself (a calibration, a
 range model) are checked by the type checker, not here.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import warnings

@@ -1,7 +1,5 @@
 """Hard case 26: streams no camera would send end in counted events, never in an exception."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Every hard case of docs/numerics.md has a test, and every test its line there."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Hard case 25: photoreceptor and follower for steps far shorter and far longer than they take."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

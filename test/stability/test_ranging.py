@@ -1,7 +1,5 @@
 """Hard cases 1, 2, 3, 17, 18 and 19: the range equation near its limits."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Hard cases 7, 8, 9, 10, 20 and 21: clocks that wrap, run for decades, or come out of order."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 

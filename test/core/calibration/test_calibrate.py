@@ -1,7 +1,5 @@
 """Calibration reports: verdicts, diagnostics, refusals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a calibration must reach on synthetic posts, whose truth is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A target that the stage moves along the range: every profile is one more known range."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

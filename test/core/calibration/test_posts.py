@@ -1,7 +1,5 @@
 """From events to targets: posts found in a frame, and matched to what is known of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Targets: what is accepted, what is refused, and joining them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

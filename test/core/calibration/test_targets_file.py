@@ -1,7 +1,5 @@
 """Targets and distances from CSV files."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

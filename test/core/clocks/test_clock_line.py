@@ -1,7 +1,5 @@
 """Two clocks as a straight line in whole numbers."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from math import floor
 

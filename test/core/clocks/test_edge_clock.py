@@ -1,7 +1,5 @@
 """Edges that come in one by one, before the odometry that covers them."""
 
-from __future__ import annotations
-
 import numpy as np
 from stage_pulses import PULSES, StagePulses
 

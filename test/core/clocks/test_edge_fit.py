@@ -1,7 +1,5 @@
 """Pulses at known positions give offset and drift of the sensor's clock."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from stage_pulses import EPOCH_NS, PULSES, SEED, StagePulses

@@ -1,7 +1,5 @@
 """Offset and drift from arrivals that are late by any time, but never early."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Motion plans: limits kept, target hit, the end at rest for every time after it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -34,9 +32,7 @@ def sample(plan: MotionPlan, count: int = 400) -> np.ndarray:
 @example(0, 0.0, 37.68659446263427, 500.0, 1.0)
 @example(0, 5.0, 5.0, 10.0, 10.0)
 @example(0, 0.0, 1e-300, 10.0, 10.0)
-def test_moves_hit_the_target_within_their_limits(
-    start_ns: int, position: float, target: float, speed: float, acceleration: float
-) -> None:
+def test_moves_hit_the_target_within_their_limits(start_ns, position, target, speed, acceleration):
     plan = plan_move(start_ns, position, target, speed, acceleration)
     t_ns = sample(plan)
     x, v = plan.state(t_ns)
@@ -52,7 +48,7 @@ def test_moves_hit_the_target_within_their_limits(
 
 @settings(derandomize=True, max_examples=200, deadline=None)
 @given(moves)
-def test_from_the_end_on_the_stage_rests_in_one_place(plan: MotionPlan) -> None:
+def test_from_the_end_on_the_stage_rests_in_one_place(plan):
     after = plan.end_ns + np.array([0, 1, 2, 10**6, 10**12])
     x, v = plan.state(after)
     assert set(x.tolist()) == {plan.end_mm}
@@ -64,7 +60,7 @@ def test_from_the_end_on_the_stage_rests_in_one_place(plan: MotionPlan) -> None:
 
 @settings(derandomize=True, max_examples=100, deadline=None)
 @given(moves)
-def test_velocity_is_the_derivative_of_position(plan: MotionPlan) -> None:
+def test_velocity_is_the_derivative_of_position(plan):
     t_ns = np.arange(plan.start_ns, plan.end_ns + 1, max((plan.end_ns - plan.start_ns) // 500, 1))
     x, v = plan.state(t_ns)
     steepest = max((abs(a) for a in plan.accelerations_mm_s2), default=0.0)
@@ -74,7 +70,7 @@ def test_velocity_is_the_derivative_of_position(plan: MotionPlan) -> None:
     assert np.all(error <= 0.25 * steepest * dt * dt + 1e-6 * dt * np.abs(v).max() + 1e-9)
 
 
-def test_a_scan_at_300_mm_s() -> None:
+def test_a_scan_at_300_mm_s():
     plan = plan_move(EPOCH_NS, 10.0, 160.0, 300.0, 3000.0)
     assert plan.durations_s == pytest.approx((0.1, 0.4, 0.1))
     x, v = plan.state(EPOCH_NS + np.array([50, 100, 300, 500, 600]) * 1_000_000)
@@ -82,7 +78,7 @@ def test_a_scan_at_300_mm_s() -> None:
     np.testing.assert_allclose(v, [150.0, 300.0, 300.0, 300.0, 0.0], atol=1e-9)
 
 
-def test_a_short_move_is_a_triangle_and_no_move_is_none() -> None:
+def test_a_short_move_is_a_triangle_and_no_move_is_none():
     plan = plan_move(0, 0.0, -1.0, 300.0, 100.0)
     assert plan.durations_s == pytest.approx((0.1, 0.0, 0.1), abs=1e-15)
     assert float(plan.state(100_000_000)[1]) == pytest.approx(-10.0)
@@ -92,9 +88,7 @@ def test_a_short_move_is_a_triangle_and_no_move_is_none() -> None:
 
 @settings(derandomize=True, max_examples=200, deadline=None)
 @given(moves, st.floats(-0.1, 1.2), st.floats(10.0, 1e4))
-def test_a_stop_is_continuous_and_as_short_as_stated(
-    plan: MotionPlan, share: float, deceleration: float
-) -> None:
+def test_a_stop_is_continuous_and_as_short_as_stated(plan, share, deceleration):
     at_ns = plan.start_ns + round(share * (plan.end_ns - plan.start_ns))
     x, v = (float(value) for value in plan.state(at_ns))
     stop = plan_stop(plan, at_ns, deceleration)
@@ -108,7 +102,7 @@ def test_a_stop_is_continuous_and_as_short_as_stated(
     assert np.all(speeds * v >= 0.0)
 
 
-def test_state_keeps_shape_and_is_the_same_for_scalars_and_arrays() -> None:
+def test_state_keeps_shape_and_is_the_same_for_scalars_and_arrays():
     plan = plan_move(EPOCH_NS, 0.0, 100.0, 50.0, 500.0)
     t_ns = (EPOCH_NS + np.arange(12) * 150_000_000).reshape(3, 4)
     x, v = plan.state(t_ns)
@@ -119,7 +113,7 @@ def test_state_keeps_shape_and_is_the_same_for_scalars_and_arrays() -> None:
         assert (float(one_x), float(one_v)) == (x[index], v[index])
 
 
-def test_a_plan_without_pieces_rests() -> None:
+def test_a_plan_without_pieces_rests():
     x, v = MotionPlan(5, 12.5).state([0, 5, 10**18])
     assert (x.tolist(), v.tolist()) == ([12.5] * 3, [0.0] * 3)
 
@@ -136,12 +130,12 @@ def test_a_plan_without_pieces_rests() -> None:
         ((0, math.inf, 1.0, 1.0, 1.0), "position_mm is inf"),
     ],
 )
-def test_impossible_moves_are_refused(values: tuple[float, ...], part: str) -> None:
+def test_impossible_moves_are_refused(values, part):
     with pytest.raises(ArgumentError, match=part):
         plan_move(*values)  # type: ignore[arg-type]
 
 
-def test_impossible_plans_are_refused() -> None:
+def test_impossible_plans_are_refused():
     with pytest.raises(ArgumentError, match="one acceleration per duration"):
         MotionPlan(0, 0.0, 0.0, (1.0,), ())
     with pytest.raises(ArgumentError, match="durations_s"):

@@ -1,7 +1,5 @@
 """Encoder readings to motion: 20 um at 300 mm/s from readings that arrive late."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

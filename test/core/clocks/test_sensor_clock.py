@@ -1,7 +1,5 @@
 """The sensor's clock against ROS time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Stage positions at sensor times."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -20,12 +18,12 @@ def track(*samples: tuple[int, float], max_gap_us: int | None = None) -> StageTr
     return stage
 
 
-def test_samples_are_returned_as_the_decimal_they_were() -> None:
+def test_samples_are_returned_as_the_decimal_they_were():
     stage = track((5, 123.456789), (10, -0.000001), (11, 220.0))
     assert stage.position_mm([5, 10, 11]).tolist() == [123.456789, -1e-6, 220.0]
 
 
-def test_samples_that_go_back_are_dropped_and_counted() -> None:
+def test_samples_that_go_back_are_dropped_and_counted():
     stage = track((100, 1.0))
     stage.append([90, 100, 200, 150, 200, 300], [9.0, 9.0, 2.0, 9.0, 9.0, 3.0])
     assert stage.dropped == 4
@@ -33,7 +31,7 @@ def test_samples_that_go_back_are_dropped_and_counted() -> None:
     np.testing.assert_array_equal(stage.position_mm([100, 150, 250]), [1.0, 1.5, 2.5])
 
 
-def test_forgetting_keeps_what_later_queries_need() -> None:
+def test_forgetting_keeps_what_later_queries_need():
     stage = StageTrack()
     for t_us in range(0, 20_000, 10):
         stage.append(t_us, t_us * 1e-3)
@@ -55,9 +53,7 @@ def test_forgetting_keeps_what_later_queries_need() -> None:
     st.lists(st.tuples(st.integers(-1000, 1000), st.floats(-100, 100)), max_size=600),
     st.integers(1, 600),
 )
-def test_one_by_one_and_in_blocks_are_the_same(
-    samples: list[tuple[int, float]], block: int
-) -> None:
+def test_one_by_one_and_in_blocks_are_the_same(samples, block):
     one, blocks = StageTrack(50), StageTrack(50)
     for t_us, position_mm in samples:
         one.append(t_us, position_mm)
@@ -70,7 +66,7 @@ def test_one_by_one_and_in_blocks_are_the_same(
     assert one.dropped + len(one) == len(samples)
 
 
-def test_positions_stay_between_their_samples() -> None:
+def test_positions_stay_between_their_samples():
     rng = np.random.default_rng(11)
     t_us = EPOCH_US + np.cumsum(rng.integers(1, 5000, 300))
     position = rng.uniform(0.0, 220.0, 300)
@@ -91,12 +87,12 @@ def test_positions_stay_between_their_samples() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e10])
-def test_positions_that_are_not_finite_or_too_far_are_refused(bad: float) -> None:
+def test_positions_that_are_not_finite_or_too_far_are_refused(bad):
     with pytest.raises(ArgumentError, match="position_mm is"):
         StageTrack().append(0, bad)
 
 
-def test_wrong_arguments_are_refused() -> None:
+def test_wrong_arguments_are_refused():
     with pytest.raises(ArgumentError, match="integers"):
         StageTrack().append(0.5, 1.0)
     with pytest.raises(ArgumentError, match="integers"):
@@ -107,7 +103,7 @@ def test_wrong_arguments_are_refused() -> None:
         StageTrack(0)
 
 
-def test_quantisation_is_to_the_nanometre() -> None:
+def test_quantisation_is_to_the_nanometre():
     assert quantise_nm([0.0000004, 0.0000006, -1.5, 199.9999999]).tolist() == [
         0, 1, -1_500_000, 200_000_000,
     ]  # fmt: skip

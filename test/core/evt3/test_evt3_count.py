@@ -1,7 +1,5 @@
 """Counting words agrees with decoding them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from eschorty_ros.core.evt3 import Decoder, WordCounter

@@ -1,7 +1,5 @@
 """EVT3 decoding: known answers, time rules, grammar, an independent oracle, any split."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from dataclasses import asdict

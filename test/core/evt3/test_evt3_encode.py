@@ -1,7 +1,5 @@
 """EVT3 encoding: what goes in comes back, in as few words as the format allows."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Activity filter: keeps the laser line, removes what stands alone, however the stream is cut."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

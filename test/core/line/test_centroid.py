@@ -1,7 +1,5 @@
 """Column estimators against known rows, their bounds and their symmetries."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize

@@ -1,7 +1,5 @@
 """Relative reflectance from width and counts against the truth of a simulated line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from reconstructing import reconstruct

@@ -1,7 +1,5 @@
 """Two surfaces in one column: which returns are reported, in which order, and their smoothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from line_events import encoded, line_events

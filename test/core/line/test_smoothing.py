@@ -1,7 +1,5 @@
 """Smoothing keeps slopes, steps and dark columns as they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from line_events import encoded

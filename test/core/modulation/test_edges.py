@@ -1,7 +1,5 @@
 """Edges are exact for any time, follow triggers, and are found in the events."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,9 +1,6 @@
 """The laser's modulation: accepted ranges and edges that never drift."""
 
-from __future__ import annotations
-
 from fractions import Fraction
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -21,16 +18,14 @@ EPOCH_US = 1_760_000_000_000_000
     st.integers(-(10**10), 10**10),
     st.integers(-EPOCH_US, EPOCH_US),
 )
-def test_edges_are_the_exact_multiples_to_the_nearest_microsecond(
-    frequency_hz: float, index: int, on_edge_us: int
-) -> None:
+def test_edges_are_the_exact_multiples_to_the_nearest_microsecond(frequency_hz, index, on_edge_us):
     edge = Modulation(frequency_hz, on_edge_us=on_edge_us).edge_us(index)
     assert isinstance(edge, int)
     exact = on_edge_us + index * 10**6 / Fraction(frequency_hz)
     assert abs(edge - exact) <= Fraction(1, 2)
 
 
-def test_a_day_of_70_hz_does_not_drift() -> None:
+def test_a_day_of_70_hz_does_not_drift():
     modulation = Modulation(70.0, on_edge_us=EPOCH_US)
     assert modulation.edge_us(70 * 86_400) - EPOCH_US == 86_400_000_000
     assert modulation.edge_us(0) == EPOCH_US
@@ -40,7 +35,7 @@ def test_a_day_of_70_hz_does_not_drift() -> None:
 
 @pytest.mark.parametrize("frequency_hz", [FREQUENCY_MIN_HZ, 69.99731, FREQUENCY_MAX_HZ])
 @pytest.mark.parametrize("waveform", WAVEFORMS)
-def test_limits_are_included(frequency_hz: float, waveform: str) -> None:
+def test_limits_are_included(frequency_hz, waveform):
     modulation = Modulation(frequency_hz, 0.01, waveform)
     assert modulation.on_edge_us is None
     with pytest.raises(ArgumentError, match="on_edge_us is None"):
@@ -59,10 +54,10 @@ def test_limits_are_included(frequency_hz: float, waveform: str) -> None:
         ({"frequency_hz": 70.0, "waveform": "saw"}, "square, sine"),
     ],
 )
-def test_values_outside_are_refused_by_name(values: dict[str, Any], part: str) -> None:
+def test_values_outside_are_refused_by_name(values, part):
     with pytest.raises(ArgumentError, match=part):
         Modulation(**values)
 
 
-def test_equal_settings_are_equal_and_usable_as_keys() -> None:
+def test_equal_settings_are_equal_and_usable_as_keys():
     assert {Modulation(70.0), Modulation(70.0, 0.5, "square")} == {Modulation(70.0)}

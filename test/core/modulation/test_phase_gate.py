@@ -1,7 +1,5 @@
 """Phase gate: what it keeps of a simulated line, what it leaves of the background, its counts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

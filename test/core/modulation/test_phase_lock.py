@@ -1,7 +1,5 @@
 """An unknown phase is found, and tracked while the generator's clock drifts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from reconstructing import reconstruct

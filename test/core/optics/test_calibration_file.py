@@ -1,7 +1,5 @@
 """Calibration files: the four builds, round trips, and faults named in one line."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -49,7 +47,7 @@ def fitted() -> Calibration:
 
 
 @pytest.mark.parametrize("build", BUILDS)
-def test_shipped_builds_carry_the_printed_numbers(build: str) -> None:
+def test_shipped_builds_carry_the_printed_numbers(build):
     c = load_calibration(build)
     assert (c.theta_prime_deg, c.k_prime_px, c.b_prime_px) == PRINTED[build]
     assert (c.name, c.focal_length_mm, c.f_number, c.theta_deg) == (build, 24.0, 2.0, 85.87)
@@ -62,13 +60,13 @@ def test_shipped_builds_carry_the_printed_numbers(build: str) -> None:
     )  # fmt: skip
 
 
-def test_a_given_k_is_taken_as_it_is() -> None:
+def test_a_given_k_is_taken_as_it_is():
     assert fitted().object_scale_mm == 24.1
     assert fitted().model().k_mm == 24.1
 
 
 @pytest.mark.parametrize("make", [lambda: load_calibration("config_3"), fitted])
-def test_saving_and_loading_gives_the_same(tmp_path: Path, make: Any) -> None:
+def test_saving_and_loading_gives_the_same(tmp_path, make):
     file = tmp_path / "calibration.yaml"
     save_calibration(make(), file)
     assert load_calibration(file) == make()
@@ -77,7 +75,7 @@ def test_saving_and_loading_gives_the_same(tmp_path: Path, make: Any) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [file.name]
 
 
-def test_numbers_survive_to_the_last_bit(tmp_path: Path) -> None:
+def test_numbers_survive_to_the_last_bit(tmp_path):
     odd = fitted().model_copy(
         update={"k_prime_px": -37261.86 * (1 + 2**-52), "b_mm": 1e-7 / 3, "residual_rms_px": 1e22}
     )
@@ -85,7 +83,7 @@ def test_numbers_survive_to_the_last_bit(tmp_path: Path) -> None:
     assert load_calibration(tmp_path / "c.yaml") == odd
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     file = tmp_path / "c.yaml"
     save_calibration(load_calibration("config_1"), file)
 
@@ -99,14 +97,14 @@ def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: Any) -> 
     assert [entry.name for entry in tmp_path.iterdir()] == [file.name]
 
 
-def test_whole_numbers_and_dates_are_read_as_meant(tmp_path: Path) -> None:
+def test_whole_numbers_and_dates_are_read_as_meant(tmp_path):
     text = yaml.safe_dump({**keys(), "focal_length_mm": 24, "b_mm": 0}) + "date: 2025-11-02\n"
     (tmp_path / "c.yaml").write_text(text)
     c = load_calibration(tmp_path / "c.yaml")
     assert (c.focal_length_mm, c.b_mm, c.date) == (24.0, 0.0, "2025-11-02")
 
 
-def test_a_calibration_cannot_be_changed_in_place() -> None:
+def test_a_calibration_cannot_be_changed_in_place():
     with pytest.raises(ValidationError, match="frozen"):
         load_calibration("nominal").b_mm = 1.0  # type: ignore[misc]
 
@@ -153,9 +151,7 @@ WITHOUT = object()
         ({"parameters_fitted": ["zoom"]}, ["parameters_fitted", "'zoom'", "k_prime_px"]),
     ],
 )
-def test_faults_name_file_key_value_and_remedy(
-    tmp_path: Path, change: dict[str, Any], parts: list[str]
-) -> None:
+def test_faults_name_file_key_value_and_remedy(tmp_path, change, parts):
     data = {key: value for key, value in {**keys(), **change}.items() if value is not WITHOUT}
     file = tmp_path / "broken.yaml"
     file.write_text(yaml.safe_dump(data))
@@ -182,7 +178,7 @@ def test_faults_name_file_key_value_and_remedy(
         (b"? [a, b]\n: 1\n", "correct the YAML|no such key"),
     ],
 )
-def test_a_file_that_is_no_calibration_is_named(tmp_path: Path, content: bytes, part: str) -> None:
+def test_a_file_that_is_no_calibration_is_named(tmp_path, content, part):
     file = tmp_path / "broken.yaml"
     file.write_bytes(content)
     with pytest.raises(CalibrationError, match=part) as caught:
@@ -191,7 +187,7 @@ def test_a_file_that_is_no_calibration_is_named(tmp_path: Path, content: bytes, 
     assert "broken.yaml" in str(caught.value)
 
 
-def test_unknown_names_and_paths_are_named(tmp_path: Path) -> None:
+def test_unknown_names_and_paths_are_named(tmp_path):
     with pytest.raises(CalibrationError, match=r"'config_9'.*nominal, config_1"):
         load_calibration("config_9")
     with pytest.raises(CalibrationError, match=r"cannot read .*absent\.yaml"):
@@ -202,7 +198,7 @@ def test_unknown_names_and_paths_are_named(tmp_path: Path) -> None:
         load_calibration("")
 
 
-def test_a_file_that_holds_an_unknown_name_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_holds_an_unknown_name_is_refused(tmp_path):
     (tmp_path / "c.yaml").write_text("config_9\n")
     with pytest.raises(CalibrationError, match="'config_9'"):
         load_calibration(tmp_path / "c.yaml")
@@ -217,9 +213,7 @@ def test_a_file_that_holds_an_unknown_name_is_refused(tmp_path: Path) -> None:
         ("tree", "tree/config"),
     ],
 )
-def test_names_are_found_where_colcon_pip_and_git_put_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, site: str, config: str
-) -> None:
+def test_names_are_found_where_colcon_pip_and_git_put_them(tmp_path, monkeypatch, site, config):
     installed = tmp_path / site / "eschorty_ros" / "core" / "base" / "files.py"
     (tmp_path / config).mkdir(parents=True)
     shutil.copy(ROOT / "config" / "config_2.yaml", tmp_path / config / "shop_floor.yaml")
@@ -227,7 +221,7 @@ def test_names_are_found_where_colcon_pip_and_git_put_them(
     assert load_calibration("shop_floor").name == "config_2"
 
 
-def test_reading_a_calibration_needs_no_ros_and_no_compiler() -> None:
+def test_reading_a_calibration_needs_no_ros_and_no_compiler():
     code = (
         "import sys, eschorty_ros.core.storage, eschorty_ros.core.optics as r;"
         "r.load_calibration('nominal');"
@@ -250,9 +244,7 @@ def test_reading_a_calibration_needs_no_ros_and_no_compiler() -> None:
         ({"roi_px": (0, 100, 1280, 400)}, r"roi_px .* \(0, 100, 1280, 400\) .* None"),
     ],
 )
-def test_a_calibration_of_another_instrument_is_refused_by_name(
-    change: dict[str, Any], words: str
-) -> None:
+def test_a_calibration_of_another_instrument_is_refused_by_name(change, words):
     active = load_calibration("config_3")
     refuse_other_instrument(load_calibration("config_3_as_built"), active)
     with pytest.raises(CalibrationError, match=words):
@@ -261,6 +253,6 @@ def test_a_calibration_of_another_instrument_is_refused_by_name(
 
 @pytest.mark.parametrize("window", [(0, 0, 1281, 720), (-1, 0, 10, 10), (0, 700, 10, 30),
                                     (0, 0, 0, 10)])  # fmt: skip
-def test_a_window_off_the_sensor_is_refused(window: tuple[int, ...]) -> None:
+def test_a_window_off_the_sensor_is_refused(window):
     with pytest.raises(ValueError, match="roi_px"):
         Calibration.model_validate(keys() | {"roi_px": window})

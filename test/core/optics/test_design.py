@@ -1,7 +1,5 @@
 """Design numbers of the paper's builds, and the way back from wanted ranges to tilts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Range equation against the paper's Table 1, 50-digit arithmetic and the pole."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 

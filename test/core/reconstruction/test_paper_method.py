@@ -1,7 +1,5 @@
 """The paper's method agrees with the streaming `mean`; background is why it is no default."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from line_events import encoded, line_events

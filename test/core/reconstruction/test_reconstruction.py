@@ -1,7 +1,5 @@
 """Bytes to profiles: rows against the truth, splits, phase, scenes and counters."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reflectance steps that cross the line: shift with and without compensation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,5 @@
 """Clouds go through both file forms unchanged; other programs read them too."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -39,7 +36,7 @@ def open3d() -> ModuleType:
         pytest.skip(str(error))
 
 
-def test_point_layout() -> None:
+def test_point_layout():
     assert POINT_DTYPE.names == ("x", "y", "z", "intensity", "sigma", "t", "column")
     assert POINT_DTYPE.itemsize == 30
     assert [POINT_DTYPE[name].str for name in POINT_DTYPE.names] == ["<f4"] * 5 + ["<f8", "<u2"]
@@ -47,7 +44,7 @@ def test_point_layout() -> None:
 
 @pytest.mark.parametrize("extension", [*EXTENSIONS, ".PCD"])
 @pytest.mark.parametrize("count", [0, 1, 10_000])
-def test_round_trip_is_bit_exact(tmp_path: Path, extension: str, count: int) -> None:
+def test_round_trip_is_bit_exact(tmp_path, extension, count):
     file = tmp_path / f"cloud{extension}"
     write_cloud(file, cloud(count))
     back = read_cloud(str(file))
@@ -58,7 +55,7 @@ def test_round_trip_is_bit_exact(tmp_path: Path, extension: str, count: int) -> 
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_nan_and_strided_points_survive(tmp_path: Path, extension: str) -> None:
+def test_nan_and_strided_points_survive(tmp_path, extension):
     points = cloud(20)
     points["x"][3] = np.nan
     points["sigma"][4] = np.inf
@@ -67,7 +64,7 @@ def test_nan_and_strided_points_survive(tmp_path: Path, extension: str) -> None:
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_open3d_sees_the_same_points(tmp_path: Path, extension: str, open3d: ModuleType) -> None:
+def test_open3d_sees_the_same_points(tmp_path, extension, open3d):
     file = tmp_path / f"cloud{extension}"
     points = cloud(1000)
     write_cloud(file, points)
@@ -84,7 +81,7 @@ def test_open3d_sees_the_same_points(tmp_path: Path, extension: str, open3d: Mod
         assert np.array_equal(tensor["column"].numpy().ravel(), points["column"])
 
 
-def test_headers_as_written(tmp_path: Path) -> None:
+def test_headers_as_written(tmp_path):
     write_cloud(tmp_path / "c.pcd", cloud(2))
     write_cloud(tmp_path / "c.ply", cloud(2))
     assert (tmp_path / "c.pcd").read_bytes()[:-60].decode() == (
@@ -100,7 +97,7 @@ def test_headers_as_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_truncated_or_longer_files_are_refused(tmp_path: Path, extension: str) -> None:
+def test_truncated_or_longer_files_are_refused(tmp_path, extension):
     file = tmp_path / f"c{extension}"
     write_cloud(file, cloud(5))
     complete = file.read_bytes()
@@ -126,7 +123,7 @@ def test_truncated_or_longer_files_are_refused(tmp_path: Path, extension: str) -
         (b"WIDTH 5", b"WIDTH 6"),
     ],
 )
-def test_other_layouts_are_refused(tmp_path: Path, extension: str, old: bytes, new: bytes) -> None:
+def test_other_layouts_are_refused(tmp_path, extension, old, new):
     file = tmp_path / f"c{extension}"
     write_cloud(file, cloud(5))
     data = file.read_bytes()
@@ -141,8 +138,8 @@ def test_other_layouts_are_refused(tmp_path: Path, extension: str, old: bytes, n
 @settings(derandomize=True, max_examples=200, deadline=None)
 @given(st.sampled_from(EXTENSIONS), st.binary(max_size=200), st.integers(0, 400))
 def test_random_damage_never_ends_in_anything_but_a_stated_failure(
-    tmp_path_factory: pytest.TempPathFactory, extension: str, noise: bytes, at: int
-) -> None:
+    tmp_path_factory, extension, noise, at
+):
     file = tmp_path_factory.mktemp("noise") / f"c{extension}"
     write_cloud(file, cloud(3))
     data = bytearray(file.read_bytes())
@@ -155,9 +152,7 @@ def test_random_damage_never_ends_in_anything_but_a_stated_failure(
     assert points.dtype == POINT_DTYPE
 
 
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     file = tmp_path / "c.pcd"
     write_cloud(file, cloud(3))
 
@@ -171,7 +166,7 @@ def test_a_failed_write_leaves_the_old_file(
     assert [entry.name for entry in tmp_path.iterdir()] == ["c.pcd"]
 
 
-def test_missing_files_and_other_extensions_are_named(tmp_path: Path) -> None:
+def test_missing_files_and_other_extensions_are_named(tmp_path):
     with pytest.raises(FormatError, match=r"cannot read .*gone\.pcd"):
         read_cloud(tmp_path / "gone.pcd")
     with pytest.raises(ArgumentError, match=r"\.xyz"):

@@ -1,7 +1,5 @@
 """RAW files: old and new headers, damage that is named, files written for every reader."""
 
-from __future__ import annotations
-
 import datetime
 import sys
 from pathlib import Path

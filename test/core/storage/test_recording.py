@@ -1,7 +1,5 @@
 """Recording folders: what is written is read back, what is wrong is named in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -35,7 +33,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_complete_folder(folder: Path) -> None:
+def test_a_complete_folder(folder):
     recording = load_recording(str(folder))
     assert recording.path == folder
     assert recording.events_path == folder / "events.raw"
@@ -47,7 +45,7 @@ def test_a_complete_folder(folder: Path) -> None:
     assert np.isnan(recording.stage.position_mm([-1, 3001])).all()
 
 
-def test_layout_of_the_written_files(folder: Path) -> None:
+def test_layout_of_the_written_files(folder):
     assert (folder / "stage.csv").read_text() == (
         "t_us,position_mm\n0,0.000000\n1000,0.050000\n3000,0.150000\n"
     )
@@ -60,7 +58,7 @@ def test_layout_of_the_written_files(folder: Path) -> None:
     )
 
 
-def test_truth_is_read_on_first_use(folder: Path) -> None:
+def test_truth_is_read_on_first_use(folder):
     recording = load_recording(folder)
     write_truth_csv(folder / "truth.csv", [EPOCH_US + 1], [640], [1320.123456])
     truth = recording.truth
@@ -70,7 +68,7 @@ def test_truth_is_read_on_first_use(folder: Path) -> None:
     assert recording.truth is truth
 
 
-def test_large_truth_survives_chunked_writing(folder: Path) -> None:
+def test_large_truth_survives_chunked_writing(folder):
     count = 70_001
     t_us = EPOCH_US + np.arange(count)
     write_truth_csv(folder / "truth.csv", t_us, np.arange(count) % 1280, np.full(count, 900.5))
@@ -80,7 +78,7 @@ def test_large_truth_survives_chunked_writing(folder: Path) -> None:
     assert np.array_equal(truth["column"], np.arange(count) % 1280)
 
 
-def test_empty_truth_is_an_empty_table(folder: Path) -> None:
+def test_empty_truth_is_an_empty_table(folder):
     write_truth_csv(folder / "truth.csv", [], [], [])
     truth = load_recording(folder).truth
     assert truth is not None
@@ -89,9 +87,7 @@ def test_empty_truth_is_an_empty_table(folder: Path) -> None:
 
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.lists(st.floats(-1e5, 1e5), min_size=1, max_size=30))
-def test_positions_through_text_and_through_ros_metres_are_identical(
-    tmp_path_factory: pytest.TempPathFactory, positions: list[float]
-) -> None:
+def test_positions_through_text_and_through_ros_metres_are_identical(tmp_path_factory, positions):
     file = tmp_path_factory.mktemp("text") / "stage.csv"
     t_us = EPOCH_US + 10 * np.arange(len(positions))
     write_stage_csv(file, t_us, positions)
@@ -104,20 +100,20 @@ def test_positions_through_text_and_through_ros_metres_are_identical(
 
 
 @pytest.mark.parametrize("on_edge_us", [None, 0, -5, EPOCH_US])
-def test_laser_round_trip(tmp_path: Path, on_edge_us: int | None) -> None:
+def test_laser_round_trip(tmp_path, on_edge_us):
     modulation = Modulation(69.99731, 0.3, "sine", on_edge_us)
     write_laser_yaml(tmp_path / "laser.yaml", modulation)
     assert read_laser_yaml(tmp_path / "laser.yaml") == modulation
 
 
-def test_spaces_blank_lines_and_windows_endings_are_fine(folder: Path) -> None:
+def test_spaces_blank_lines_and_windows_endings_are_fine(folder):
     (folder / "stage.csv").write_bytes(
         b"\xef\xbb\xbft_us, position_mm\r\n0, 1.5\r\n\r\n9,2\r\n\r\n"
     )
     assert load_recording(folder).stage_samples.tolist() == [(0, 1.5), (9, 2.0)]
 
 
-def test_calibration_may_be_a_bare_name(folder: Path) -> None:
+def test_calibration_may_be_a_bare_name(folder):
     (folder / "calibration.yaml").write_text("config_1\n")
     assert load_recording(folder).calibration == load_calibration("config_1")
 
@@ -168,9 +164,7 @@ LASER = "frequency_hz: 70.0\nduty: 0.5\nwaveform: square\n"
         (edit("calibration.yaml", "name: x\n"), ["calibration.yaml", "is missing"]),
     ],
 )
-def test_damage_is_named_in_one_line(
-    folder: Path, damage: Callable[[Path], None], parts: list[str]
-) -> None:
+def test_damage_is_named_in_one_line(folder, damage, parts):
     damage(folder)
     with pytest.raises(EschortyError) as caught:
         load_recording(folder)
@@ -189,20 +183,20 @@ def test_damage_is_named_in_one_line(
         ("t_us,column\n", "line 1"),
     ],
 )
-def test_damaged_truth_is_named(folder: Path, text: str, part: str) -> None:
+def test_damaged_truth_is_named(folder, text, part):
     (folder / "truth.csv").write_text(text)
     recording = load_recording(folder)
     with pytest.raises(FormatError, match=part):
         _ = recording.truth
 
 
-def test_binary_in_place_of_text_is_named(folder: Path) -> None:
+def test_binary_in_place_of_text_is_named(folder):
     (folder / "stage.csv").write_bytes(bytes(range(256)))
     with pytest.raises(FormatError, match=r"stage\.csv.*not text"):
         load_recording(folder)
 
 
-def test_writers_refuse_what_readers_would(tmp_path: Path) -> None:
+def test_writers_refuse_what_readers_would(tmp_path):
     file = tmp_path / "x.csv"
     with pytest.raises(ArgumentError, match="from 5 to 5"):
         write_stage_csv(file, [5, 5], [1.0, 2.0])

@@ -1,7 +1,5 @@
 """What biases do is monotone, in the direction the sensor's maker gives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """When a noisy pixel passes its threshold: looked up, against the risk summed in fine steps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -33,9 +31,7 @@ def summed(u: float, settled: float, follower_us: float, noise: float, dt_us: fl
 @pytest.mark.parametrize("light", [6.5, 3.6, 1.8])
 @pytest.mark.parametrize(("follower_us", "noise"), [(7.96, 0.04), (4.8, 0.01)])
 @pytest.mark.parametrize("rising", [True, False])
-def test_time_of_the_passage_agrees_with_the_summed_risk(
-    light: float, follower_us: float, noise: float, rising: bool
-) -> None:
+def test_time_of_the_passage_agrees_with_the_summed_risk(light, follower_us, noise, rising):
     u, settled = (1.0, 1.0 / light) if rising else (1.0 / light, 1.0)
     gaps = passage_gaps(noise_table(follower_us), follower_us)
     levels = Levels(u * math.exp(-THRESHOLD), u * math.exp(THRESHOLD))
@@ -49,7 +45,7 @@ def test_time_of_the_passage_agrees_with_the_summed_risk(
     assert t_us.std() == pytest.approx(wanted.std(), rel=0.1)
 
 
-def test_levels_the_signal_hardly_reaches_are_not_looked_up() -> None:
+def test_levels_the_signal_hardly_reaches_are_not_looked_up():
     gaps = passage_gaps(noise_table(8.0), 8.0)
     for light in (1.0, 1.05, 1.29):
         signal = Signal(1.0, 1.0, 1.0 / light, TAU_DARK_US / light, 8.0)

@@ -1,7 +1,5 @@
 """The pixel model against its closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pixel model with noise: against a finely stepped reference, and the regimes of the paper."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Named parameter sets."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The row arbiter, its limits, and what the stream says of losses."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenes: where the rays of the laser sheet hit."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Posts: where they are seen, and that they hide what is behind them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The leaf collage and the face: depths, separations, and that every hit lies on its surface."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

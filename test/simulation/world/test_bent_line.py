@@ -1,7 +1,5 @@
 """Roll and smile of the laser line, from the simulated world through the reconstruction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

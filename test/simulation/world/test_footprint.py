@@ -1,7 +1,5 @@
 """The line's thickness on edges of a scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The line bench: a resting line on independent columns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

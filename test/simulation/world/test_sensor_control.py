@@ -1,7 +1,5 @@
 """Biases and event rate of a world that runs: what changes, when, and what goes on."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 
@@ -53,7 +51,7 @@ def controlled(preset_name: str = "paper") -> World:
     return made
 
 
-def test_factory_settings_change_nothing() -> None:
+def test_factory_settings_change_nothing():
     controlled_world = world()
     controlled_world.set_sensor(0, SensorControl())
     controlled_world.set_sensor(30_001, SensorControl())
@@ -61,7 +59,7 @@ def test_factory_settings_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("preset_name", ["paper", "noisy", "ideal"])
-def test_bytes_do_not_depend_on_how_time_is_cut(preset_name: str) -> None:
+def test_bytes_do_not_depend_on_how_time_is_cut(preset_name):
     print(f"seed {SEED}")
     uncut = controlled(preset_name)
     expected = uncut.advance(140_000)
@@ -75,7 +73,7 @@ def test_bytes_do_not_depend_on_how_time_is_cut(preset_name: str) -> None:
         assert b"".join(parts) == expected
 
 
-def test_nothing_changes_before_its_time() -> None:
+def test_nothing_changes_before_its_time():
     changed, plain = world(), world()
     changed.set_sensor(50_000, SensorControl(Biases(diff_on=100)))
     assert changed.advance(50_000) == plain.advance(50_000)
@@ -93,9 +91,7 @@ def test_nothing_changes_before_its_time() -> None:
         (Biases(refr=120), 2000.0),
     ],
 )
-def test_a_changed_world_becomes_one_that_was_always_so(
-    biases: Biases, frequency_hz: float
-) -> None:
+def test_a_changed_world_becomes_one_that_was_always_so(biases, frequency_hz):
     print(f"seed {SEED}")
     span_us = round(100e6 / frequency_hz)
     before, always, changed = world(frequency_hz), world(frequency_hz), world(frequency_hz)
@@ -113,7 +109,7 @@ def test_a_changed_world_becomes_one_that_was_always_so(
     assert back[1] == pytest.approx(back[0], rel=0.01)
 
 
-def test_a_threshold_lowered_below_what_a_pixel_has_seen_fires_at_once() -> None:
+def test_a_threshold_lowered_below_what_a_pixel_has_seen_fires_at_once():
     quiet = PixelParameters(threshold_mismatch=0.0, noise=0.0, latency_jitter_us=0.0)
     pixels = PixelArray(1, 9, quiet, SEED)
     every, row = np.arange(1), np.array([4.0])
@@ -129,7 +125,7 @@ def test_a_threshold_lowered_below_what_a_pixel_has_seen_fires_at_once() -> None
     assert 4 in (keys >> 12 & 0x3FF)
 
 
-def test_a_dead_time_that_has_begun_ends_when_it_was_to_end() -> None:
+def test_a_dead_time_that_has_begun_ends_when_it_was_to_end():
     quiet = PixelParameters(threshold_mismatch=0.0, noise=0.0, latency_jitter_us=0.0)
     every, row, full = np.arange(1), np.array([0.0]), np.array([1.0])
 
@@ -146,7 +142,7 @@ def test_a_dead_time_that_has_begun_ends_when_it_was_to_end() -> None:
     assert second_event_us(changed=True) == second_event_us(changed=False)
 
 
-def test_leaks_go_on_at_the_new_rate() -> None:
+def test_leaks_go_on_at_the_new_rate():
     print(f"seed {SEED}")
     pixels = PixelArray(200, 100, PixelParameters(leak_hz=20.0), SEED)
     for until_us, rate_hz in ((1_000_000, 20.0), (2_000_000, 5.0)):
@@ -156,7 +152,7 @@ def test_leaks_go_on_at_the_new_rate() -> None:
         assert abs(count - 20_000 * rate_hz) < 4 * np.sqrt(20_000 * rate_hz)
 
 
-def test_the_past_is_refused_and_the_future_can_be_replaced() -> None:
+def test_the_past_is_refused_and_the_future_can_be_replaced():
     changed, plain = world(), world()
     changed.set_sensor(30_000, SensorControl(Biases(diff_on=100)))
     changed.set_sensor(20_000, SensorControl())
@@ -165,7 +161,7 @@ def test_the_past_is_refused_and_the_future_can_be_replaced() -> None:
         changed.set_sensor(59_999, SensorControl())
 
 
-def test_streams_stay_complete() -> None:
+def test_streams_stay_complete():
     made = controlled()
     decoder = Decoder(64, 720)
     events = decoder.decode(made.advance(140_000))

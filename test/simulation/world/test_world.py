@@ -1,7 +1,5 @@
 """The simulated world: bytes against truth."""
 
-from __future__ import annotations
-
 import random
 from fractions import Fraction
 
