@@ -43,20 +43,12 @@ def test_limits_are_included(frequency_hz, waveform):
 
 
 @pytest.mark.parametrize(
-    ("values", "part"),
-    [
-        ({"frequency_hz": 15.9}, "frequency_hz is 15.9"),
-        ({"frequency_hz": 20_001.0}, "16 to 20000 Hz"),
-        ({"frequency_hz": float("nan")}, "frequency_hz is nan"),
-        ({"frequency_hz": 70.0, "duty": 0.0}, "duty is 0.0"),
-        ({"frequency_hz": 70.0, "duty": 1.0}, "duty is 1.0"),
-        ({"frequency_hz": 70.0, "duty": float("nan")}, "duty is nan"),
-        ({"frequency_hz": 70.0, "waveform": "saw"}, "square, sine"),
-    ],
+    ("frequency_hz", "waveform", "choice"),
+    [(20_001.0, "square", "16 to 20000 Hz"), (70.0, "saw", "square, sine")],
 )
-def test_values_outside_are_refused_by_name(values, part):
-    with pytest.raises(ArgumentError, match=part):
-        Modulation(**values)
+def test_values_outside_are_refused_with_the_choice(frequency_hz, waveform, choice):
+    with pytest.raises(ArgumentError, match=choice):
+        Modulation(frequency_hz, waveform=waveform)
 
 
 def test_equal_settings_are_equal_and_usable_as_keys():

