@@ -31,15 +31,19 @@ def run(*arguments):
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
-def without_ros(*arguments):
+def without_ros(*arguments, **environment):
     """The command in a process of its own in which no ROS package can be imported."""
     return subprocess.run(
-        [sys.executable, "-c", NO_ROS, *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+        [sys.executable, "-c", NO_ROS, *map(str, arguments)], cwd=ROOT, capture_output=True,
+        env=os.environ | environment, text=True, timeout=300,
+    )  # fmt: skip
+
+
+def test_without_ros_a_scan_is_one_line_that_gives_the_remedy():
+    done = without_ros("scan")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "make scan" in done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -136,11 +140,7 @@ def test_an_unwritable_output_is_refused_before_the_work(monkeypatch, recording,
 
 
 def test_a_terminal_without_a_degree_sign_still_gets_its_table():
-    done = subprocess.run(
-        [sys.executable, "-c", NO_ROS, "design"],
-        cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, text=True,
-        timeout=300,
-    )  # fmt: skip
+    done = without_ros("design", PYTHONIOENCODING="ascii")
     assert done.returncode == 0, done.stderr
     assert "sheet" in done.stdout
 
@@ -163,14 +163,9 @@ def test_simulate_then_reconstruct_without_ros(recording):
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert list(facts) == [
-        "events",
-        "dropped_events",
-        "profiles",
-        "points",
-        "seconds",
-        "events_per_second",
+        "events", "dropped_events", "profiles", "points", "seconds", "events_per_second",
         "sigma_median_m",
-    ]
+    ]  # fmt: skip
     points = read_cloud(recording / "cloud.pcd")
     assert facts["points"] == len(points) > 0
     assert facts["profiles"] >= 11  # 8 mm at 50 mm/s and 70 Hz

@@ -1,14 +1,12 @@
 """`eschorty scan` over real DDS: cloud, picture, figures; the laser is off however it ends."""
 
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from expected_scan import assert_accurate
-from logged_command import DEADLINE_S, ROOT, LoggedCommand
+from logged_command import LoggedCommand
 
 from eschorty_ros.cli import INTERRUPTED, main
 from eschorty_ros.core.base.errors import DeviceError
@@ -16,6 +14,9 @@ from eschorty_ros.core.storage import POINT_DTYPE, read_cloud
 from eschorty_ros.report.accuracy import Sweep
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.cli.scan import finish
+from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
 
 
 def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
@@ -68,33 +69,7 @@ def test_an_unknown_name_is_one_line_before_any_node_starts(tmp_path, option, va
     assert not out.exists()
 
 
-def test_without_ros_one_line_gives_the_remedy():
-    blocked = """
-import sys
-class Blocked:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] == "rclpy":
-            raise ImportError("No module named 'rclpy'")
-sys.meta_path.insert(0, Blocked())
-from eschorty_ros.cli import main
-main(prog_name="eschorty")
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", blocked, "scan"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-    )
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "make scan" in done.stderr
-
-
 def test_a_scan_without_points_is_no_success(tmp_path):
-    from eschorty_ros.cli.scan import finish
-    from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
-
     request = ScanJob("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper")
     points = np.empty(0, POINT_DTYPE)
     with pytest.raises(DeviceError, match="no points: no events came"):
@@ -103,9 +78,6 @@ def test_a_scan_without_points_is_no_success(tmp_path):
 
 
 def test_what_a_scan_lost_is_printed(tmp_path, capsys):
-    from eschorty_ros.cli.scan import finish
-    from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
-
     request = ScanJob("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper", hardware={})
     points = np.zeros(4, POINT_DTYPE)
     points["x"] = points["t"] = points["y"] = points["column"] = [1, 2, 3, 4]

@@ -14,18 +14,15 @@ from eschorty_ros.live.packet_times import WRAP_US, Packet, first_time_high_us, 
 
 ZERO_NS = 1_700_000_000_123_456_789
 EDGE_US = 1000
-PERIODS = 8
 CALIBRATION = load_calibration("config_3")
 MODULATION = Modulation(70.0)
 
 
-def line(seed=3, offset_us=0):
+def line(seed=3, offset_us=0, triggers_us=None):
     """Bytes of 8 periods of a flat line at row 300, times shifted by ``offset_us``."""
     rng = np.random.default_rng(seed)
-    t, x, y, p = line_events(
-        rng, lambda k, c: np.full(len(c), 300.0), periods=PERIODS, edge_us=EDGE_US
-    )
-    return encoded((t + offset_us, x, y, p))
+    t, x, y, p = line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=8, edge_us=EDGE_US)
+    return encoded((t + offset_us, x, y, p), triggers_us)
 
 
 def packets(data, size=60_000, seq=0, stamp_ns=ZERO_NS):
@@ -42,6 +39,10 @@ def stream(settings=None):
 
 def joined(parts):
     return Profiles.concatenate([part.profiles for part in parts])
+
+
+def times_ns(parts):
+    return np.concatenate([part.t_ns for part in parts])
 
 
 def plain(data, on_edge_us=EDGE_US):
@@ -68,11 +69,9 @@ def test_exact_clock_gives_the_plain_result_in_ros_time():
     data = line()
     expected = plain(data)
     parts = run(announced(), packets(data))
-    seen = joined(parts)
     for name in ("edge_us", "t_us", "column", "row", "events"):
-        np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name))
-    t_ns = np.concatenate([part.t_ns for part in parts])
-    np.testing.assert_array_equal(t_ns, expected.t_us * 1000 + ZERO_NS)
+        np.testing.assert_array_equal(getattr(joined(parts), name), getattr(expected, name))
+    np.testing.assert_array_equal(times_ns(parts), expected.t_us * 1000 + ZERO_NS)
 
 
 def test_packets_are_held_until_clock_and_modulation_are_known():
@@ -92,9 +91,8 @@ def test_packets_are_held_until_clock_and_modulation_are_known():
 
 
 def test_held_packets_are_bounded_and_the_rest_counts_as_lost():
-    data = line()
     subject = PacketStream(CALIBRATION, Settings(), clock_timeout_s=1.0, held_max=2)
-    items = packets(data, size=20_000)
+    items = packets(line(), size=20_000)
     for packet in items[:6]:
         subject.add(packet, 0.0)
     subject.announce_zero(ZERO_NS)
@@ -106,10 +104,9 @@ def test_held_packets_are_bounded_and_the_rest_counts_as_lost():
 
 
 def test_without_an_announcement_the_stamps_serve_and_the_phase_comes_from_the_events():
-    data = line()
     subject = stream()
     subject.set_laser(MODULATION, ZERO_NS + 777_000)
-    items = [Packet(i, ZERO_NS + 5_000_000, p.data) for i, p in enumerate(packets(data))]
+    items = [Packet(p.seq, ZERO_NS + 5_000_000, p.data) for p in packets(line())]
     subject.add(items[0], 0.0)
     assert subject.process(0.5) == []
     parts = run(subject, items[1:], now_s=1.1)
@@ -139,15 +136,13 @@ def test_gap_in_seq_is_counted_and_later_periods_are_the_plain_ones():
 @pytest.mark.parametrize("wraps", [1, 5])
 def test_a_stream_joined_late_is_brought_to_the_announced_zero(wraps):
     shift_us = wraps * WRAP_US
-    data = line()
     stamp_ns = ZERO_NS + shift_us * 1000 + 40_000_000
-    parts = run(announced(), packets(data, seq=1000, stamp_ns=stamp_ns))
-    t_ns = np.concatenate([part.t_ns for part in parts])
+    parts = run(announced(), packets(line(), seq=1000, stamp_ns=stamp_ns))
     edges_ns = np.unique(np.concatenate([part.edge_ns for part in parts]))
     index = np.rint((edges_ns - ZERO_NS) * 1e-9 * 70.0 - EDGE_US * 7e-5)
     on_grid = ZERO_NS + EDGE_US * 1000 + np.rint(index * 1e9 / 70.0)
     assert np.abs(edges_ns - on_grid).max() <= 1000
-    assert ZERO_NS + shift_us * 1000 <= t_ns.min()
+    assert ZERO_NS + shift_us * 1000 <= times_ns(parts).min()
 
 
 def test_camera_restart_begins_anew_with_its_new_clock():
@@ -165,8 +160,7 @@ def test_camera_restart_begins_anew_with_its_new_clock():
     assert subject.restarts == 1
     assert subject.packets_lost == 0
     np.testing.assert_array_equal(joined(second).row, joined(first).row)
-    shift_ns = np.concatenate([p.t_ns for p in second]) - np.concatenate([p.t_ns for p in first])
-    assert np.unique(shift_ns).tolist() == [30_000_000_000]
+    assert np.unique(times_ns(second) - times_ns(first)).tolist() == [30_000_000_000]
     assert subject.counters["points"] == len(joined(first)) + len(joined(second))
 
 
@@ -285,8 +279,7 @@ def test_a_time_low_that_the_sensor_takes_back_does_not_move_the_clock():
 
 def test_points_move_with_the_clock_until_they_are_placed():
     subject = unannounced()
-    data = line()
-    late = [Packet(p.seq, p.stamp_ns + 3_000_000_000, p.data) for p in sent(data)]
+    late = [Packet(p.seq, p.stamp_ns + 3_000_000_000, p.data) for p in sent(line())]
     parts = run(subject, late)
     before_ns = parts[0].t_ns.copy()
     prompt = sent(line(offset_us=3_000_000), seq=len(late))
@@ -313,17 +306,10 @@ def test_a_clock_set_back_begins_anew_and_leaves_old_points_alone():
 @pytest.mark.parametrize("source", ["laser", "stage", "none"])
 def test_edges_at_the_trigger_input_go_where_they_are_wired_to(source):
     """Edges every 7 ms are no laser of 70 Hz."""
-    t, x, y, p = line_events(
-        np.random.default_rng(3),
-        lambda k, c: np.full(len(c), 300.0),
-        periods=PERIODS,
-        edge_us=EDGE_US,
-    )
     edges = np.arange(2000, 110_000, 7000)
-    data = encoded((t, x, y, p), edges)
     subject = unannounced(trigger_source=source)
     subject.set_pulses(PulseTrain(0.0, 2.0, 100))
-    run(subject, packets(data))
+    run(subject, packets(line(triggers_us=edges)))
     triggered = subject.counters["triggers_used"] + subject.counters["triggers_spurious"]
     assert (triggered > 0) == (source == "laser")
     assert len(subject.epoch.edges) == (edges.size if source == "stage" else 0)
@@ -331,20 +317,14 @@ def test_edges_at_the_trigger_input_go_where_they_are_wired_to(source):
 
 def test_the_phase_is_found_again_when_the_laser_is_switched_on():
     period_us = 1e6 / 70
-    later_us = round(EDGE_US + 40.37 * period_us)
-    rng = np.random.default_rng(3)
-    both = [
-        line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=PERIODS, edge_us=edge)
-        for edge in (EDGE_US, later_us)
-    ]
-    first, second = (encoded(events) for events in both)
+    later_us = round(40.37 * period_us)
     subject = unannounced()
     subject.set_laser(MODULATION, None, 1)
-    run(subject, sent(first))
+    run(subject, sent(line()))
     subject.set_laser(MODULATION, None, None)
     subject.set_laser(MODULATION, None, 2)
-    edges = np.unique(joined(run(subject, sent(second, seq=100))).edge_us)
-    off = (edges - later_us) / period_us
+    second = run(subject, sent(line(seed=4, offset_us=later_us), seq=100))
+    off = (np.unique(joined(second).edge_us) - EDGE_US - later_us) / period_us
     assert np.abs(off - np.rint(off)).max() < 0.02
 
 
