@@ -22,18 +22,19 @@ def laser() -> Iterator[HeldLaser]:
     made.go.set()
 
 
+def opened(laser: HeldLaser, interlock: LaserInterlock) -> LaserSupervisor:
+    made = LaserSupervisor(
+        interlock, running=lambda: True, publish=lambda status: None, alarm=print, log=print,
+        readback_period_s=0.02,
+    )  # fmt: skip
+    interlock.receive_heartbeat()
+    made.open(laser, Modulation(70.0))
+    return made
+
+
 @pytest.fixture
 def supervisor(laser: HeldLaser) -> Iterator[LaserSupervisor]:
-    made = LaserSupervisor(
-        LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}),
-        running=lambda: True,
-        publish=lambda status: None,
-        alarm=print,
-        log=print,
-        readback_period_s=0.02,
-    )
-    made.interlock.receive_heartbeat()
-    made.open(laser, Modulation(70.0))
+    made = opened(laser, LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}))
     yield made
     laser.go.set()
     made.close()
@@ -134,25 +135,14 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(
     supervisor.trip("interlock open")
     enabling.join()
     assert failures == ["switched off meanwhile"]
-    status = supervisor.status()
-    assert status is not None
-    assert status.reason == "interlock open"
+    assert supervisor.status().reason == "interlock open"
 
 
 def test_stall_of_this_process_leaves_light_on(monkeypatch):
     clock = StallClock(monkeypatch)
     laser = HeldLaser()
     interlock = LaserInterlock(10.0, 600.0, {CLIENT_HEARTBEAT: 1.0}, now_s=clock.monotonic)
-    supervisor = LaserSupervisor(
-        interlock,
-        running=lambda: True,
-        publish=lambda status: None,
-        alarm=print,
-        log=print,
-        readback_period_s=0.02,
-    )
-    interlock.receive_heartbeat()
-    supervisor.open(laser, Modulation(70.0))
+    supervisor = opened(laser, interlock)
     try:
         supervisor.arm()
         supervisor.enable()
@@ -161,9 +151,7 @@ def test_stall_of_this_process_leaves_light_on(monkeypatch):
         for _ in range(22):
             clock.advance(0.05)
         assert not laser.lit
-        status = supervisor.status()
-        assert status is not None
-        assert "laser/heartbeat older than 1 s" in status.reason
+        assert "laser/heartbeat older than 1 s" in supervisor.status().reason
     finally:
         supervisor.close()
 

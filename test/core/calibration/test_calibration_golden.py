@@ -40,15 +40,8 @@ def rms(values):
 
 def noiseless(truth: RangeModel) -> Targets:
     near, far = truth.range_limits_mm
-    ranges = np.linspace(1.01 * near, 0.99 * far, 9)
-    return see(
-        np.random.default_rng(SEED),
-        ranges,
-        truth=truth,
-        size_mm=TWO_SIZES_MM,
-        noise=0.0,
-        bloom_px=4,
-    )
+    ranges, rng = np.linspace(1.01 * near, 0.99 * far, 9), np.random.default_rng(SEED)
+    return see(rng, ranges, truth=truth, size_mm=TWO_SIZES_MM, noise=0.0, bloom_px=4)
 
 
 @pytest.mark.parametrize("build", BUILDS)
@@ -133,11 +126,8 @@ def test_stated_intervals_cover_the_truth():
         found = fit(targets, DESIGN, JOINT, prior_sigma=priors(JOINT))
         sigma = np.sqrt(np.diag(found.covariance))[:4]
         error = [getattr(found.model, name) - drawn[name] for name in PARAMETERS]
-        pulls = [
-            *(error / sigma),
-            *(range_error_mm(found.model, truth) / found.range_sigma_mm(CHECK_MM)),
-        ]
-        inside.append(np.abs(pulls) < 1.959964)
+        of_ranges = range_error_mm(found.model, truth) / found.range_sigma_mm(CHECK_MM)
+        inside.append(np.abs([*(error / sigma), *of_ranges]) < 1.959964)
     coverage = np.mean(inside, axis=0)
     print(f"seed {SEED}: coverage of k, k', b, b' {coverage[:4]}, of ranges {coverage[4:]}")
     assert ((coverage >= 0.92) & (coverage <= 0.98)).all()
@@ -147,19 +137,20 @@ def test_intervals_of_the_papers_method_cover_too_and_so_does_rejection():
     rng = np.random.default_rng(SEED)
     truth = RangeModel(DESIGN.k_mm, -37100.0, 0.0, -1140.0)
     inside, robust, reduced = [], [], []
+
+    def covered(found):
+        pulls = range_error_mm(found.model, truth) / found.range_sigma_mm(CHECK_MM)
+        return np.abs(pulls) < 1.959964
+
     for index in range(500):
         targets = see(rng, truth=truth)
         found = fit(targets, DESIGN)
-        pulls = range_error_mm(found.model, truth) / found.range_sigma_mm(CHECK_MM)
-        inside.append(np.abs(pulls) < 1.959964)
+        inside.append(covered(found))
         reduced.append(found.reduced_chi_square)
         if index < 150:
-            report = calibrate(targets, NOMINAL, "paper", robust=True)
-            pulls = range_error_mm(report.fit.model, truth) / report.fit.range_sigma_mm(CHECK_MM)
-            robust.append(np.abs(pulls) < 1.959964)
-    print(
-        f"seed {SEED}: coverage {np.mean(inside, axis=0)}, with rejection {np.mean(robust, axis=0)}"
-    )
-    assert ((np.mean(inside, axis=0) >= 0.92) & (np.mean(inside, axis=0) <= 0.98)).all()
+            robust.append(covered(calibrate(targets, NOMINAL, "paper", robust=True).fit))
+    coverage = np.mean(inside, axis=0)
+    print(f"seed {SEED}: coverage {coverage}, with rejection {np.mean(robust, axis=0)}")
+    assert ((coverage >= 0.92) & (coverage <= 0.98)).all()
     assert np.mean(robust) >= 0.92
     assert np.mean(reduced) == pytest.approx(1.0, abs=0.07)

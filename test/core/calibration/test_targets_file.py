@@ -41,16 +41,10 @@ def test_every_column_in_any_order_with_gaps_and_comments(tmp_path):
 def test_written_targets_come_back_to_the_last_bit(tmp_path):
     nan = math.nan
     targets = Targets(
-        [53.1, 1.0 / 3.0],
-        [820.0, 2050.0000000000002],
-        [0.1, 0.3],
-        [0.0, 1e-9],
-        column=[nan, 639.5],
-        width_px=[nan, 154.2],
-        sigma_width_px=[nan, 0.4],
-        size_mm=[nan, 25.4],
-        labels=["near, left", "posts \u201cA\u201d"],
-    )
+        [53.1, 1.0 / 3.0], [820.0, 2050.0000000000002], [0.1, 0.3], [0.0, 1e-9],
+        column=[nan, 639.5], width_px=[nan, 154.2], sigma_width_px=[nan, 0.4],
+        size_mm=[nan, 25.4], labels=["near, left", "posts \u201cA\u201d"],
+    )  # fmt: skip
     write_targets(tmp_path / "targets.csv", targets)
     back = read_targets(tmp_path / "targets.csv")
     assert back.labels == targets.labels

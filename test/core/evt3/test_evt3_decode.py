@@ -29,18 +29,13 @@ def decoded(data: bytes) -> tuple[list, list, evt3.Counters]:
 
 
 def trigger_list(events: evt3.Events) -> list:
-    triggers = events.triggers
-    return list(
-        zip(triggers.t.tolist(), triggers.channel.tolist(), triggers.edge.tolist(), strict=True)
-    )
+    values = (getattr(events.triggers, name).tolist() for name in ("t", "channel", "edge"))
+    return list(zip(*values, strict=True))
 
 
 KNOWN = [
     ("8000 6064 002A 2805", [(100, 5, 42, 1)]),
-    (
-        "8000 6064 002A 3040 4801 4000 5080 4001",
-        [(100, x, 42, 0) for x in (64, 75, 95, 96)],
-    ),
+    ("8000 6064 002A 3040 4801 4000 5080 4001", [(100, x, 42, 0) for x in (64, 75, 95, 96)]),
     ("8000 6064 002A 3040 2805 4001", [(100, 5, 42, 1), (100, 64, 42, 0)]),
     (
         "8000 6064 002A 2805 6FFF 2806 8001 6003 2807",
@@ -92,12 +87,10 @@ def test_triggers_take_the_current_time() -> None:
 def test_others_and_sensor_drop_words() -> None:
     text = "8000 E016 F123 F456 7007 E014 F005 ED6A EED6 EED8 EEDA EEDA 6001"
     counters = decoded(words_of(text))[2]
-    assert counters.erc_events_out == 0x7456123
-    assert counters.erc_events_in == 5
-    assert counters.broken_continuations == 1
+    assert (counters.erc_events_out, counters.erc_events_in) == (0x7456123, 5)
     assert (counters.sensor_dropped_time_low, counters.sensor_dropped_time_high) == (1, 1)
-    assert counters.sensor_dropped_events == 2
-    assert counters.sensor_drop_words == 4
+    assert (counters.sensor_dropped_events, counters.sensor_drop_words) == (2, 4)
+    assert counters.broken_continuations == 1
 
 
 @pytest.mark.parametrize(
@@ -204,9 +197,7 @@ def test_random_words_equal_the_oracle(words: list[int]) -> None:
 @given(any_words(), st.lists(st.integers(0, 130), max_size=12))
 def test_any_split_gives_the_same(words: list[int], cuts: list[int]) -> None:
     data = np.array(words, dtype="<u2").tobytes()
-    decoder = evt3.Decoder()
-    events: list = []
-    triggers: list = []
+    decoder, events, triggers = evt3.Decoder(), [], []
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     for start, stop in pairwise(edges):
         part = decoder.decode(data[start:stop])
@@ -233,12 +224,10 @@ def test_random_bytes_stay_inside_the_buffers(data: bytes) -> None:
 
 
 def test_recording_like_stream() -> None:
-    seed = 41
-    print("seed", seed)
-    words = recording_like_words(np.random.default_rng(seed), 3000)
+    words = recording_like_words(np.random.default_rng(41), 3000)
     kinds = np.bincount(np.array(words) >> 12, minlength=16) / len(words)
     for kind, share in RECORDING_SHARES.items():
-        assert kinds[kind] == pytest.approx(share, rel=0.35)
+        assert kinds[kind] == pytest.approx(share, rel=0.35), "seed 41"
     assert_same_as_oracle(words)
     data = np.array(words, dtype="<u2")
     events = evt3.Decoder().decode(data.view(np.uint8))
@@ -266,9 +255,7 @@ def test_real_recording(chunk_bytes: int) -> None:
     assert int(events["p"].sum()) == 115_532
     assert (events["t"][0], events["t"][-1]) == (11_718_656, 11_727_457)
     assert int(events["t"].sum()) == 2_574_324_900_467
-    assert (
-        hashlib.sha256(events.tobytes()).hexdigest()
-        == "9bba5ca48301878102200069a89413a3240eaae3ff599d217f1c1a84d13fe7ba"
-    )
+    digest = hashlib.sha256(events.tobytes()).hexdigest()
+    assert digest == "9bba5ca48301878102200069a89413a3240eaae3ff599d217f1c1a84d13fe7ba"
     counters = decoder.counters
     assert (counters.events, counters.events_dropped, counters.triggers) == (219_596, 0, 0)

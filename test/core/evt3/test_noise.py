@@ -38,15 +38,12 @@ def simulated_line(rng: np.random.Generator, periods: int = 8) -> tuple[Events, 
             parts.append((t, x, row[x] + rng.normal(0, 20 / 2.355, x.size), polarity, True))
     total = sum(part[0].size for part in parts)
     n = int(total * 0.05 / 0.95)
-    parts.append(
-        (
-            rng.uniform(0, periods * period_us, n),
-            rng.integers(0, 1280, n),
-            rng.integers(0, 720, n),
-            1,
-            False,
-        )
+    t, x, y = (
+        rng.uniform(0, periods * period_us, n),
+        rng.integers(0, 1280, n),
+        rng.integers(0, 720, n),
     )
+    parts.append((t, x, y, 1, False))
     t, x, y = (np.concatenate([part[k] for part in parts]).astype(np.int64) for k in range(3))
     signal = np.concatenate([np.full(part[0].size, part[4]) for part in parts])
     order = np.argsort(t, kind="stable")

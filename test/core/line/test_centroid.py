@@ -125,12 +125,6 @@ def test_line_cut_by_the_sensor_is_not_biased(method, row):
     assert np.mean(np.abs(error) < 2 * found.sigma_row) > 0.95, f"seed {SEED}"
 
 
-def test_two_equal_separate_groups_are_ambiguous():
-    found = estimate([100, 100, 100, 600, 600, 600], [0, 6], line_width_px=5.0)
-    assert np.isnan(found.row[0])
-    assert found.ambiguous[0]
-
-
 def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
     line = np.arange(290, 311).repeat(2)
     sigma = {}

@@ -93,14 +93,9 @@ def test_phase_from_events(frequency, background):
     rng = np.random.default_rng(SEED)
     period = 1e6 / frequency
     t, _, _, p = line_events(
-        rng,
-        lambda k, c: np.full(c.shape, 300.0),
-        frequency_hz=frequency,
-        periods=6,
-        columns=200,
-        background=background,
-        edge_us=123_456,
-    )
+        rng, lambda k, c: np.full(c.shape, 300.0), frequency_hz=frequency, periods=6, columns=200,
+        background=background, edge_us=123_456,
+    )  # fmt: skip
     late = t >= 123_456 + 0.4 * period
     found = estimate_phase(t[late], p[late], Modulation(frequency))
     error = (found.edge_us - 123_456 + period / 2) % period - period / 2

@@ -62,7 +62,6 @@ def test_truth_is_read_on_first_use(folder):
     recording = load_recording(folder)
     write_truth_csv(folder / "truth.csv", [EPOCH_US + 1], [640], [1320.123456])
     truth = recording.truth
-    assert truth is not None
     assert truth.dtype == TRUTH_DTYPE
     assert truth.tolist() == [(EPOCH_US + 1, 640, 1320.123456)]
     assert recording.truth is truth
@@ -73,16 +72,13 @@ def test_large_truth_survives_chunked_writing(folder):
     t_us = EPOCH_US + np.arange(count)
     write_truth_csv(folder / "truth.csv", t_us, np.arange(count) % 1280, np.full(count, 900.5))
     truth = load_recording(folder).truth
-    assert truth is not None
     assert np.array_equal(truth["t_us"], t_us)
     assert np.array_equal(truth["column"], np.arange(count) % 1280)
 
 
 def test_empty_truth_is_an_empty_table(folder):
     write_truth_csv(folder / "truth.csv", [], [], [])
-    truth = load_recording(folder).truth
-    assert truth is not None
-    assert len(truth) == 0
+    assert len(load_recording(folder).truth) == 0
 
 
 @settings(derandomize=True, max_examples=60, deadline=None)
@@ -136,10 +132,7 @@ LASER = "frequency_hz: 70.0\nduty: 0.5\nwaveform: square\n"
         (remove("stage.csv"), ["stage.csv is missing"]),
         (remove("laser.yaml"), ["laser.yaml is missing"]),
         (remove("calibration.yaml"), ["calibration.yaml is missing"]),
-        (
-            edit("stage.csv", "time,pos\n0,1\n"),
-            ["stage.csv line 1", "time,pos", "t_us,position_mm"],
-        ),
+        (edit("stage.csv", "time,pos\n0,1\n"), ["line 1", "time,pos", "t_us,position_mm"]),
         (edit("stage.csv", "\n"), ["stage.csv line 1", "t_us,position_mm"]),
         (edit("stage.csv", "t_us,position_mm\n"), ["stage.csv", "no samples"]),
         (edit("stage.csv", "t_us,position_mm\n0,1\n\n5,2\n3,3\n"), ["line 5", "from 5 to 3"]),

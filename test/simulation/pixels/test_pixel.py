@@ -14,12 +14,9 @@ SEED = 7
 CENTRE = 40.0
 ROWS = 81
 CLEAN = {
-    "threshold_mismatch": 0.0,
-    "follower_hz": math.inf,
-    "noise": 0.0,
-    "latency_us": 0.0,
+    "threshold_mismatch": 0.0, "follower_hz": math.inf, "noise": 0.0, "latency_us": 0.0,
     "latency_jitter_us": 0.0,
-}
+}  # fmt: skip
 """Nothing but photoreceptor, comparator and refractory time."""
 
 
@@ -115,7 +112,7 @@ def test_line_is_20_rows_wide_and_gives_40_events_a_period() -> None:
 
 @pytest.mark.parametrize("frequency_hz", [500.0, 4000.0, 12_000.0])
 def test_rows_fire_where_the_closed_form_swing_exceeds_the_threshold(frequency_hz: float) -> None:
-    quick = PixelParameters(**{**CLEAN, "refractory_us": 1.0})
+    quick = PixelParameters(**CLEAN | {"refractory_us": 1.0})
     t, _, y, _ = flash(PixelArray(1, ROWS, quick, SEED), frequency_hz, 0.05)
     settled = t > 30_000
     fired = np.zeros(ROWS, dtype=bool)
@@ -138,21 +135,20 @@ def test_no_pixel_fires_within_its_refractory_time() -> None:
 
 
 def test_latency_has_the_promised_mean_and_jitter() -> None:
-    common = {**CLEAN, "latency_us": 100.0, "latency_jitter_us": 30.0}
-    t_late = flash(PixelArray(1280, ROWS, PixelParameters(**common), SEED), 70.0, 1 / 140)
-    prompt = PixelParameters(**CLEAN)
-    t_prompt = flash(PixelArray(1280, ROWS, prompt, SEED), 70.0, 1 / 140)
-    late = t_late[0][t_late[2] == 40]
+    def central_us(**latency: float) -> np.ndarray:
+        parameters = PixelParameters(**CLEAN | latency)
+        t, _, y, _ = flash(PixelArray(1280, ROWS, parameters, SEED), 70.0, 1 / 140)
+        return t[y == 40]
+
+    late = central_us(latency_us=100.0, latency_jitter_us=30.0) - central_us().mean() + 1.0
     assert late.size == 1280
-    late = late - t_prompt[0][t_prompt[2] == 40].mean() + 1.0
     assert late.mean() == pytest.approx(100.0, abs=3.0)
     assert late.std() == pytest.approx(30.0, abs=2.0)
 
 
 def test_row_position_is_found_between_rows() -> None:
-    offsets = np.linspace(0.0, 1.0, 21)
     error = []
-    for k, offset in enumerate(offsets):
+    for k, offset in enumerate(np.linspace(0.0, 1.0, 21)):
         # Other thresholds every time: they shift the line by a fixed pattern.
         pixels = PixelArray(64, ROWS, PixelParameters(), SEED + k)
         _, _, y, _ = flash(pixels, 70.0, 0.05, 40.0 + offset)
@@ -268,16 +264,9 @@ def test_output_grows_when_it_must() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("sigma_rows", 0.0),
-        ("threshold_on", -0.1),
-        ("amplitude", math.nan),
-        ("refractory_us", 0.5),
-        ("latency_us", -1.0),
-        ("noise", -0.1),
-        ("follower_hz", math.nan),
-    ],
-)
+    [("sigma_rows", 0.0), ("threshold_on", -0.1), ("amplitude", math.nan), ("refractory_us", 0.5),
+     ("latency_us", -1.0), ("noise", -0.1), ("follower_hz", math.nan)],
+)  # fmt: skip
 def test_impossible_parameters_are_refused(name: str, value: float) -> None:
     with pytest.raises(ArgumentError, match=name):
         PixelParameters(**{name: value})

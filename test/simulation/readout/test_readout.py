@@ -140,10 +140,15 @@ def test_a_full_readout_says_so_once_per_millisecond() -> None:
     assert out.size + readout.dropped + readout.merged == requests.size
 
 
-def test_a_limited_world_tells_in_its_stream_what_it_drops() -> None:
-    world = World(Plane(1320.0), SMALL, seed=SEED)
-    world.set_sensor(0, SensorControl(event_rate=EventRate(20, 200)))
+def lit_world(**options) -> World:
+    world = World(Plane(1320.0), SMALL, seed=SEED, **options)
     world.set_laser(0, True, Modulation(70.0, on_edge_us=0))
+    return world
+
+
+def test_a_limited_world_tells_in_its_stream_what_it_drops() -> None:
+    world = lit_world()
+    world.set_sensor(0, SensorControl(event_rate=EventRate(20, 200)))
     decoder = Decoder(96, 720)
     events = decoder.decode(world.advance(200_000))
     counters = decoder.counters
@@ -155,8 +160,7 @@ def test_a_limited_world_tells_in_its_stream_what_it_drops() -> None:
     assert counters.erc_events_out == world.events - open_period
     assert counters.erc_events_in - counters.erc_events_out == world.rate_dropped
     assert counters.sensor_drop_words == 0
-    free = World(Plane(1320.0), SMALL, seed=SEED)
-    free.set_laser(0, True, Modulation(70.0, on_edge_us=0))
+    free = lit_world()
     free.advance(200_000)
     assert free.rate_dropped == 0
     # Some of the last requests may still wait for their readout.
@@ -164,10 +168,7 @@ def test_a_limited_world_tells_in_its_stream_what_it_drops() -> None:
 
 
 def test_an_overloaded_world_says_so_in_its_stream() -> None:
-    world = World(
-        Plane(1320.0), SMALL, seed=SEED, readout=ReadoutParameters(100.0, waiting_max=200)
-    )
-    world.set_laser(0, True, Modulation(70.0, on_edge_us=0))
+    world = lit_world(readout=ReadoutParameters(100.0, waiting_max=200))
     decoder = Decoder(96, 720)
     events = decoder.decode(world.advance(200_000))
     assert world.dropped > 1000
@@ -176,15 +177,15 @@ def test_an_overloaded_world_says_so_in_its_stream() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("row_time_us", 0.0), ("row_time_us", np.nan), ("waiting_max", 0)],
+    ("make", "words"),
+    [
+        (lambda: ReadoutParameters(row_time_us=0.0), "row_time_us"),
+        (lambda: ReadoutParameters(row_time_us=np.nan), "row_time_us"),
+        (lambda: ReadoutParameters(waiting_max=0), "waiting_max"),
+        (lambda: EventRate(-1, 1), "events is -1"),
+        (lambda: EventRate(1, 0), "period_us is 0"),
+    ],
 )
-def test_impossible_readouts_are_refused(name: str, value: float) -> None:
-    with pytest.raises(ArgumentError, match=name):
-        ReadoutParameters(**{name: value})
-
-
-@pytest.mark.parametrize(("name", "value"), [("events", -1), ("period_us", 0)])
-def test_impossible_rates_are_refused(name: str, value: int) -> None:
-    with pytest.raises(ArgumentError, match=f"{name} is {value}"):
-        EventRate(**{"events": 1, "period_us": 1, name: value})
+def test_impossible_readouts_and_rates_are_refused(make, words) -> None:
+    with pytest.raises(ArgumentError, match=words):
+        make()

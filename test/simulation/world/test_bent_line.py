@@ -10,12 +10,7 @@ from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
 BENT = load_calibration("config_3").model_copy(
-    update={
-        "columns": 96,
-        "principal_column": 47.5,
-        "b_prime_1_px": -9.0,
-        "b_prime_2_px": 5.0,
-    }
+    update={"columns": 96, "principal_column": 47.5, "b_prime_1_px": -9.0, "b_prime_2_px": 5.0}
 )
 
 
