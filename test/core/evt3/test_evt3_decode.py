@@ -1,19 +1,15 @@
 """EVT3 decoding: known answers, time rules, grammar, an independent oracle, any split."""
 
 import hashlib
-import sys
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from evt3_oracle import SlowDecoder
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
-
-from evt3_oracle import SlowDecoder
 from streams import RECORDING_SHARES, recording_like_words, words_of
 
 from eschorty_ros.core import evt3

@@ -35,7 +35,7 @@ FIT: dict[str, Any] = {
 
 
 def keys() -> dict[str, Any]:
-    return yaml.safe_load((ROOT / "config" / "config_3.yaml").read_text())  # type: ignore[no-any-return]
+    return yaml.safe_load((ROOT / "config" / "config_3.yaml").read_text())
 
 
 def fitted() -> Calibration:
@@ -101,7 +101,7 @@ def test_whole_numbers_and_dates_are_read_as_meant(tmp_path):
 
 def test_a_calibration_cannot_be_changed_in_place():
     with pytest.raises(ValidationError, match="frozen"):
-        load_calibration("nominal").b_mm = 1.0  # type: ignore[misc]
+        load_calibration("nominal").b_mm = 1.0
 
 
 WITHOUT = object()

@@ -1,13 +1,9 @@
 """RAW files: old and new headers, damage that is named, files written for every reader."""
 
 import datetime
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
-
 from streams import words_of
 
 from eschorty_ros.core.base.errors import FormatError

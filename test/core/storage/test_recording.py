@@ -114,8 +114,8 @@ def test_calibration_may_be_a_bare_name(folder):
     assert load_recording(folder).calibration == load_calibration("config_1")
 
 
-def edit(name: str, text: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_text(text) and None  # type: ignore[func-returns-value]
+def edit(name: str, text: str) -> Callable[[Path], int]:
+    return lambda folder: (folder / name).write_text(text)
 
 
 def remove(name: str) -> Callable[[Path], None]:
