@@ -55,9 +55,8 @@ def test_posts_that_are_not_there_are_one_line_and_leave_an_old_file(tmp_path):
         code, stdout, stderr = command.end()
         assert code == 1, stderr
         assert stdout == ""
-        lines = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
-        assert len(lines) == 1
-        assert "0 of 3 targets found" in lines[0]
+        (line,) = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
+        assert "0 of 3 targets found" in line
         assert command.outputs()[-1] == "off"
     assert out.read_text() == "old"
 

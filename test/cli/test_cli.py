@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
+from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,6 +32,19 @@ def run(*arguments):
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
+def good(*arguments):
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def assert_fails_in_one_line(result, words):
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr.startswith("eschorty: ")
+    assert result.stderr.count("\n") == 1
+    assert words in result.stderr
+
+
 def without_ros(*arguments, **environment):
     """The command in a process of its own in which no ROS package can be imported."""
     return subprocess.run(
@@ -41,8 +55,7 @@ def without_ros(*arguments, **environment):
 
 def test_without_ros_a_scan_is_one_line_that_gives_the_remedy():
     done = without_ros("scan")
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
     assert "make scan" in done.stderr
 
 
@@ -68,10 +81,9 @@ def cloud(tmp_path):
 
 @pytest.mark.parametrize("arguments", [(), *((name,) for name in COMMANDS)])
 def test_help_teaches_by_example(arguments):
-    result = run(*arguments, "--help")
-    assert result.exit_code == 0
-    assert "Examples:" in result.output or "Example:" in result.output
-    assert "eschorty" in result.output
+    output = good(*arguments, "--help")
+    assert "Examples:" in output or "Example:" in output
+    assert "eschorty" in output
 
 
 def test_help_imports_nothing_heavy():
@@ -103,12 +115,7 @@ def test_wrong_usage_is_exit_code_2(arguments):
 
 
 def test_a_stated_failure_is_one_line_on_stderr_and_exit_code_1(tmp_path):
-    result = run("reconstruct", tmp_path)
-    assert result.exit_code == 1
-    assert result.stdout == ""
-    assert result.stderr.startswith("eschorty: ")
-    assert result.stderr.count("\n") == 1
-    assert "events.raw" in result.stderr
+    assert_fails_in_one_line(run("reconstruct", tmp_path), "events.raw")
 
 
 @pytest.mark.parametrize(
@@ -122,9 +129,7 @@ def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
 
     monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", refuse)
     result = run("info", cloud)
-    assert result.exit_code == 1
-    assert result.stderr.startswith("eschorty: cannot ")
-    assert result.stderr.count("\n") == 1
+    assert_fails_in_one_line(result, "eschorty: cannot ")
     assert str(error.strerror) in result.stderr
 
 
@@ -134,8 +139,7 @@ def test_an_unwritable_output_is_refused_before_the_work(monkeypatch, recording,
 
     monkeypatch.setattr("eschorty_ros.core.reconstruction.reconstruct_recording", work)
     result = run("reconstruct", recording, "--out", tmp_path / "missing" / "cloud.pcd")
-    assert result.exit_code == 1
-    assert "cannot write" in result.stderr
+    assert_fails_in_one_line(result, "cannot write")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -186,9 +190,7 @@ def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_pat
 
 
 def test_simulate_refuses_to_overwrite_a_recording(recording):
-    result = run("simulate", "--out", recording)
-    assert result.exit_code == 1
-    assert str(recording) in result.stderr
+    assert_fails_in_one_line(run("simulate", "--out", recording), str(recording))
 
 
 def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
@@ -200,53 +202,43 @@ def test_the_same_seed_gives_the_same_bytes(recording, tmp_path):
 
 
 def test_reconstruct_offers_every_setting(recording, tmp_path):
-    from eschorty_ros.core.reconstruction import Settings
-
-    text = run("reconstruct", "--help").output
+    text = good("reconstruct", "--help")
     for name in Settings.__dataclass_fields__:
         assert f"--{name.replace('_', '-')}" in text
     out = tmp_path / "cloud.ply"
-    result = run("reconstruct", recording, "--centroid", "median", "--out", out)
-    assert result.exit_code == 0, result.output
+    good("reconstruct", recording, "--centroid", "median", "--out", out)
     assert len(read_cloud(out)) > 0
-    assert run("reconstruct", recording, "--centroid", "guess").exit_code == 2
-    assert run("reconstruct", recording, "--events-min", "0").exit_code == 2
-    assert run("reconstruct", recording, "--out", tmp_path / "cloud.xyz").exit_code == 2
+    for bad in (("--centroid", "guess"), ("--events-min", 0), ("--out", tmp_path / "cloud.xyz")):
+        assert run("reconstruct", recording, *bad).exit_code == 2, bad
 
 
 def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
-    result = run("info", recording)
-    assert result.exit_code == 0, result.output
+    output = good("info", recording)
     for words in ("config_3", "70 Hz", "ranges", "events/s", "1280 x 720"):
-        assert words in result.output
-    assert "peak rate" in run("info", recording / "events.raw").output
+        assert words in output
+    assert "peak rate" in good("info", recording / "events.raw")
 
 
 def test_info_gives_the_bounds_of_a_cloud(cloud):
-    result = run("info", cloud)
-    assert result.exit_code == 0
-    assert "1320.000 to 1320.000 mm" in result.output
-    assert "0.700 mm" in result.output
+    output = good("info", cloud)
+    assert "1320.000 to 1320.000 mm" in output
+    assert "0.700 mm" in output
 
 
 def test_view_writes_a_picture(cloud, tmp_path):
-    result = run("view", cloud)
-    assert result.exit_code == 0, result.output
+    good("view", cloud)
     assert cloud.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
-    assert run("view", cloud, "--out", tmp_path / "flat.svg").exit_code == 0
+    good("view", cloud, "--out", tmp_path / "flat.svg")
     assert (tmp_path / "flat.svg").stat().st_size > 1000
 
 
 def test_design_prints_the_nominal_build_and_plots_it(tmp_path):
-    result = run("design", "--out", tmp_path / "design.png")
-    assert result.exit_code == 0, result.output
-    assert "810.5 to 2404.8 mm" in result.output
-    assert "mm/row" in result.output
+    output = good("design", "--out", tmp_path / "design.png")
+    assert "810.5 to 2404.8 mm" in output
+    assert "mm/row" in output
     assert (tmp_path / "design.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_design_finds_the_tilt_for_two_ranges():
-    result = run("design", "--near-mm", 784.6, "--far-mm", 2115.9)
-    assert result.exit_code == 0
-    assert "sensor -7.6" in result.output
+    assert "sensor -7.6" in good("design", "--near-mm", 784.6, "--far-mm", 2115.9)
     assert run("design", "--near-mm", 900, "--far-mm", 800).exit_code == 1

@@ -50,9 +50,8 @@ def test_a_sweep_that_the_scanner_refuses_is_one_line_and_exit_code_1(tmp_path, 
         code, stdout, stderr = command.end()
         assert code == 1, stderr
         assert stdout == ""
-        lines = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
-        assert len(lines) == 1
-        assert option.removeprefix("--") in lines[0]
+        (line,) = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
+        assert option.removeprefix("--") in line
         assert "Traceback" not in stderr
         assert "on" not in command.outputs()
 

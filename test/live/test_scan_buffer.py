@@ -16,8 +16,7 @@ T0_NS = 1_700_000_000_000_000_123
 
 def placed(stage_mm, edge_ns, columns, dtype=POINT_DTYPE):
     points = np.zeros(len(columns), dtype)
-    points["column"] = columns
-    points["sigma"] = 1e-3
+    points["column"], points["sigma"] = columns, 1e-3
     edges = np.asarray(edge_ns, dtype=np.int64)
     return PlacedPoints(points, edges + 10, edges, np.asarray(stage_mm, dtype=float))
 
@@ -25,6 +24,13 @@ def placed(stage_mm, edge_ns, columns, dtype=POINT_DTYPE):
 def timed(t_ns):
     t_ns = np.asarray(t_ns, dtype=np.int64)
     return TimedProfiles(blank_profiles(len(t_ns)), t_ns, t_ns)
+
+
+def following(samples_ms):
+    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
+    for t_ms, position_mm in samples_ms:
+        placer.add_stage(T0_NS + t_ms * 1_000_000, position_mm)
+    return placer
 
 
 def test_reflectance_asked_for_in_the_middle_of_a_scan_is_nan_before():
@@ -123,9 +129,7 @@ def test_profiles_of_the_background_after_the_end_keep_nobody_waiting():
 
 
 def test_a_gap_in_the_odometry_is_not_bridged():
-    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
-    placer.add_stage(T0_NS, 10.0)
-    placer.add_stage(T0_NS + 2_000_000_000, 12.0)
+    placer = following([(0, 10.0), (2000, 12.0)])
     placer.add_profiles(timed([T0_NS + 1_000_000_000]), 0.0)
     assert placer.ready(0.0) == []
     assert placer.points_without_stage == 1
@@ -134,13 +138,10 @@ def test_a_gap_in_the_odometry_is_not_bridged():
 @pytest.mark.parametrize("back_s", [1, 3600])
 def test_odometry_of_a_clock_set_back_places_by_itself_alone(back_s):
     """A recording played again or a host clock set back: old positions are wrong."""
-    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
-    for k in range(500):
-        placer.add_stage(T0_NS + k * 10_000_000, 0.1 * k)
-    again_ns = T0_NS + 4_990_000_000 - back_s * 1_000_000_000
-    for k in range(20):
-        placer.add_stage(again_ns + k * 10_000_000, 7.0)
-    placer.add_profiles(timed([again_ns + 55_000_000]), 0.0)
+    again_ms = 4_990 - back_s * 1000
+    again = [(again_ms + 10 * k, 7.0) for k in range(20)]
+    placer = following([(10 * k, 0.1 * k) for k in range(500)] + again)
+    placer.add_profiles(timed([T0_NS + (again_ms + 55) * 1_000_000]), 0.0)
     ((part, position_mm),) = placer.ready(0.0)
     assert position_mm.tolist() == [7.0]
     assert len(part.t_ns) == 1
@@ -148,9 +149,7 @@ def test_odometry_of_a_clock_set_back_places_by_itself_alone(back_s):
 
 
 def test_an_odometry_sample_a_little_late_is_left_out():
-    placer = StagePlacer(gap_s=0.5, timeout_s=1.0)
-    for t_ms, position_mm in ((0, 0.0), (10, 1.0), (9, 50.0), (20, 2.0)):
-        placer.add_stage(T0_NS + t_ms * 1_000_000, position_mm)
+    placer = following([(0, 0.0), (10, 1.0), (9, 50.0), (20, 2.0)])
     placer.add_profiles(timed([T0_NS + 15_000_000]), 0.0)
     ((_, position_mm),) = placer.ready(0.0)
     np.testing.assert_allclose(position_mm, [1.5])
