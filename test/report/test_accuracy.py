@@ -48,8 +48,7 @@ def test_exact_points_have_no_error_for_any_stage_direction(direction):
 def test_statistics_of_a_known_error():
     rng = np.random.default_rng(11)
     error = rng.normal(0.2, 0.5, 20_000)
-    points = cloud(error)
-    result = accuracy.measure(points, Wedge(), MODEL, SWEEP)
+    result = accuracy.measure(cloud(error), Wedge(), MODEL, SWEEP)
     assert (result.periods, result.points, result.completeness) == (20, 20_000, 1.0)
     assert result.error_median_mm == pytest.approx(np.median(np.abs(error)), abs=1e-3)
     assert result.error_p95_mm == pytest.approx(np.percentile(np.abs(error), 95), abs=1e-3)
@@ -67,8 +66,9 @@ def test_points_where_the_scene_is_empty_are_counted_not_measured():
     assert result.error_p95_mm < 2e-4
 
 
-def test_a_second_point_of_a_column_fills_no_gap():
+def test_a_missing_point_lowers_the_completeness_and_a_second_one_of_a_column_fills_no_gap():
     points = cloud(0.0)
+    assert accuracy.measure(points[::2], Wedge(), MODEL, SWEEP).completeness == 0.5
     points[100:200] = points[:100]
     assert accuracy.measure(points, Wedge(), MODEL, SWEEP).completeness == 0.995
 
@@ -83,13 +83,7 @@ def test_points_of_a_column_lit_for_part_of_a_period_complete_nothing_else():
             hidden = (np.atleast_1d(columns)[None, :] < 100) & ~late
             return np.where(hidden, np.nan, super().range_mm(stage_mm, columns, model))
 
-    points = cloud(0.0)
-    assert accuracy.measure(points, Corner(), MODEL, SWEEP).completeness <= 1.0
-
-
-def test_missing_points_lower_the_completeness():
-    points = cloud(0.0)[::2]
-    assert accuracy.measure(points, Wedge(), MODEL, SWEEP).completeness == 0.5
+    assert accuracy.measure(cloud(0.0), Corner(), MODEL, SWEEP).completeness <= 1.0
 
 
 def test_columns_out_of_the_sensors_view_are_not_expected():
@@ -104,8 +98,7 @@ def test_columns_out_of_the_sensors_view_are_not_expected():
 
 def test_an_empty_cloud_gives_nan_not_a_crash():
     result = accuracy.measure(np.empty(0, POINT_DTYPE), Wedge(), MODEL, SWEEP)
-    assert result.points == 0
-    assert result.completeness == 0.0
+    assert (result.points, result.completeness) == (0, 0.0)
     assert np.isnan(result.error_median_mm)
 
 
@@ -118,10 +111,9 @@ def test_a_stage_that_moves_within_the_sheet_is_refused():
 def test_periods_that_the_ends_cut_do_not_count(backwards):
     points = cloud(0.0)
     ends = (0.3 * PITCH_MM, 10.3 * PITCH_MM)
-    if backwards:
-        points["y"] *= -1.0
-        ends = (-ends[0], -ends[1])
-    sweep = accuracy.Sweep(*ends, 50.0, 70.0)
+    sign = -1.0 if backwards else 1.0
+    points["y"] *= sign
+    sweep = accuracy.Sweep(sign * ends[0], sign * ends[1], 50.0, 70.0)
     positions, number = accuracy.complete_periods(points, sweep)
     np.testing.assert_allclose(np.abs(positions), np.arange(1, 10) * PITCH_MM, atol=0.01)
     assert np.bincount(number[number >= 0]).tolist() == [1000] * 9

@@ -1,5 +1,7 @@
 """The pictures are written and show what they should."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -15,8 +17,7 @@ def step_cloud(lines=24, columns=320):
     true = 1300.0 + 40.0 * ((line > lines // 2) ^ (column > columns // 2))
     points = np.zeros(line.size, POINT_DTYPE)
     error = rng.normal(0.0, 1.0, line.size)
-    points["x"] = (true + error) * 1e-3
-    points["y"] = line * 0.7e-3
+    points["x"], points["y"] = (true + error) * 1e-3, line * 0.7e-3
     points["z"] = (column - columns / 2) * 0.26e-3
     points["t"] = line / 70.0 + rng.normal(0, 1e-4, line.size)
     points["column"], points["sigma"] = column, 1e-3
@@ -66,12 +67,11 @@ def test_labels_of_the_3d_view_are_inside_and_apart(change):
         assert edge.y0 <= box.y0 <= box.y1 <= edge.y1, name
     # Tick labels are upright; the names' boxes are those of slanted text and reach further.
     ticks = [k for k, name in enumerate(names) if "mm" not in name]
-    for k in ticks:
-        for other in ticks:
-            assert k == other or not boxes[k].overlaps(boxes[other]), (names[k], names[other])
+    for one, other in combinations(ticks, 2):
+        assert not boxes[one].overlaps(boxes[other]), (names[one], names[other])
 
 
-def test_without_truth_there_is_no_error_map(tmp_path):
+def test_without_truth_there_is_no_error_map():
     figure = figures.scan_figure(step_cloud()[0])
     assert "range error (mm)" not in {axes.get_ylabel() for axes in figure.axes}
 

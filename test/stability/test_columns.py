@@ -6,13 +6,13 @@ import mpmath
 import numpy as np
 import pytest
 from line_events import encoded
+from reconstructing import reconstruct
 
 from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.line import METHOD_ERRORS, METHODS, SIGMA_FLOOR_PX, estimate
 from eschorty_ros.core.line.truncation import _fit_truncated
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Reconstructor, Settings
+from eschorty_ros.core.reconstruction import Settings
 
 SEED = 20
 
@@ -98,17 +98,13 @@ def test_hot_pixel_in_a_stream_is_counted_not_wrapped():
     """Twice more events than 16 bits hold, on one pixel, within one period."""
     n = 140_000
     t = np.sort(np.random.default_rng(SEED).integers(1000, 60_000, n))
-    x, y = np.full(n, 640), np.full(n, 719)
-    data = encoded(sort_readout(t, x, y, np.ones(n, np.uint8)))
-    settings_ = Settings(smoothing_half_width=0)
-    reconstructor = Reconstructor(
-        load_calibration("config_3"), Modulation(16.0, on_edge_us=500), settings_
-    )
-    first, last = reconstructor.push(data), reconstructor.flush()
+    data = encoded(sort_readout(t, np.full(n, 640), np.full(n, 719), np.ones(n, np.uint8)))
+    wanted = Settings(smoothing_half_width=0)
+    found, reconstructor = reconstruct(data, Modulation(16.0, on_edge_us=500), wanted)
     counts = reconstructor.counters
-    assert (counts["events"], len(first) + len(last)) == (n, 1)
-    assert counts["events_over_column_limit"] == n - settings_.column_limit
-    assert (last.row[0], last.events[0]) == (719.0, settings_.column_limit)
+    assert (counts["events"], len(found)) == (n, 1)
+    assert counts["events_over_column_limit"] == n - wanted.column_limit
+    assert (found.row[0], found.events[0]) == (719.0, wanted.column_limit)
 
 
 @every_method

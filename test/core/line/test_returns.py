@@ -18,16 +18,13 @@ NEAR, FAR = 250.0, 420.0
 PERIODS, COLUMNS = 8, 200
 
 
-def two_surfaces(near_events=100.0, far_events=115.0, far=lambda c: c >= 0, slope=0.0):
+def two_surfaces(far=lambda c: c >= 0, slope=0.0):
     """The near surface fills every column, the far one those that ``far`` names."""
     rng = np.random.default_rng(SEED)
     shared = {"periods": PERIODS, "columns": COLUMNS, "fwhm_px": 8.0}
-    near = line_events(
-        rng, lambda k, c: NEAR + slope * c, events=near_events, background=0.1, **shared
-    )
-    behind = line_events(
-        rng, lambda k, c: np.where(far(c), FAR, np.nan), events=far_events, background=0.0, **shared
-    )
+    rows = lambda k, c: NEAR + slope * c, lambda k, c: np.where(far(c), FAR, np.nan)
+    near = line_events(rng, rows[0], events=100.0, background=0.1, **shared)
+    behind = line_events(rng, rows[1], events=115.0, background=0.0, **shared)
     return encoded(sort_readout(*(np.concatenate(v) for v in zip(near, behind, strict=True))))
 
 
@@ -81,10 +78,10 @@ def test_smoothing_follows_each_surface_and_mixes_none():
     raw, _ = run(data, returns="all", smoothing_half_width=0)
     smooth, _ = run(data, returns="all", smoothing_half_width=3, smoothing_gate_px=100.0)
     np.testing.assert_array_equal(raw.column, smooth.column)
-    near_raw = np.abs(raw.row - NEAR - 0.3 * raw.column) < 8.0
-    error_raw = np.where(near_raw, raw.row - NEAR - 0.3 * raw.column, raw.row - FAR)
-    truth = raw.row - error_raw
-    error = smooth.row - truth
+    off_near = raw.row - NEAR - 0.3 * raw.column
+    near_raw = np.abs(off_near) < 8.0
+    error_raw = np.where(near_raw, off_near, raw.row - FAR)
+    error = smooth.row - raw.row + error_raw
     real = np.abs(error_raw) < 8.0
     assert real.mean() > 0.99
     assert np.abs(error[real]).max() < 8.0
@@ -108,9 +105,8 @@ def test_one_broad_line_is_not_two_surfaces(apart):
     """Nearer than two widths: one line with a shoulder."""
     rng = np.random.default_rng(SEED)
     rows = np.hstack([rng.normal(300.0, 4.2, (500, 30)), rng.normal(300.0 + apart, 4.2, (500, 25))])
-    found = estimate(
-        np.rint(rows).astype(int).ravel(), np.arange(501) * 55, returns="all", line_width_px=10.0
-    )
+    rows = np.rint(rows).astype(int).ravel()
+    found = estimate(rows, np.arange(501) * 55, returns="all", line_width_px=10.0)
     assert np.isfinite(found.row[:, 1]).mean() < 0.02, f"seed {SEED}"
 
 

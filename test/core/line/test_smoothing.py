@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 from line_events import encoded
+from reconstructing import reconstruct
 
 from eschorty_ros.core.evt3 import sort_readout
-from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.core.reconstruction import Settings
 
-CALIBRATION = load_calibration("config_3")
 COMMON_PX = 0.2
 
 
@@ -19,12 +17,9 @@ def smoothed(row, half_width=2):
     x = np.repeat(lit, 4)
     y = np.floor(row[x] + np.tile([0.0, 0.25, 0.5, 0.75], lit.size)).astype(int)
     events = sort_readout(np.full(x.size, 2000), x, y, np.ones(x.size, np.uint8))
-    reconstructor = Reconstructor(
-        CALIBRATION,
-        Modulation(70.0, on_edge_us=1000),
-        Settings(smoothing_half_width=half_width, sigma_common_px=COMMON_PX, isolation_events=0),
-    )
-    found = Profiles.concatenate([reconstructor.push(encoded(events)), reconstructor.flush()])
+    found, _ = reconstruct(encoded(events), settings=Settings(
+        smoothing_half_width=half_width, sigma_common_px=COMMON_PX, isolation_events=0,
+    ))  # fmt: skip
     out, sigma = np.full((2, row.size), np.nan)
     out[found.column], sigma[found.column] = found.row, found.sigma_row
     return out, sigma
