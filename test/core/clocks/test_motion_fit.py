@@ -11,6 +11,8 @@ from eschorty_ros.core.clocks.motion_fit import MotionFit
 
 ORDERED_NS = 1_700_000_000_000_000_000
 COUNT_MM = 1 / 20_000
+ORDER = plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0)
+LATER = plan_move(ORDERED_NS + 2_000_000, 5.0, 215.0, 300.0, 2000.0)
 
 
 @dataclass
@@ -38,12 +40,11 @@ class Line:
             self.next_ns += int(1e9 / self.rate_hz)
 
 
-def sweep(line: Line, speed: float, begins_ms: float = 2.0) -> tuple[MotionFit, MotionPlan]:
+def sweep(line: Line, true: MotionPlan = LATER) -> tuple[MotionFit, MotionPlan]:
     """A sweep over 210 mm, ordered but begun a little later."""
-    true = plan_move(ORDERED_NS + round(begins_ms * 1e6), 5.0, 215.0, speed, 2000.0)
     fit = MotionFit()
     line.read(fit, true, ORDERED_NS)
-    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, speed, 2000.0))
+    fit.expect_move(ORDER)
     line.read(fit, true, true.end_ns + 200_000_000)
     return fit, true
 
@@ -56,16 +57,14 @@ def worst_um(fit: MotionFit, true: MotionPlan) -> float:
 @pytest.mark.parametrize("rate_hz", [10.0, 20.0, 50.0])
 @pytest.mark.parametrize("request_ms", [0.0, 0.2])
 def test_sweep_at_300_mm_s_within_20_um(rate_hz: float, request_ms: float) -> None:
-    errors = [
-        worst_um(*sweep(Line(rate_hz, 3.0, seed, request_ms=request_ms), 300.0))
-        for seed in range(12)
-    ]
+    lines = [Line(rate_hz, 3.0, seed, request_ms=request_ms) for seed in range(12)]
+    errors = [worst_um(*sweep(line)) for line in lines]
     print(f"{rate_hz:g} Hz, requests late by {request_ms} ms: {max(errors):.1f} um at most")
     assert max(errors) < 20.0
 
 
 def test_receipt_alone_within_the_lower_envelope() -> None:
-    errors = [worst_um(*sweep(Line(50.0, 0.5, seed, asked=False), 300.0)) for seed in range(12)]
+    errors = [worst_um(*sweep(Line(50.0, 0.5, seed, asked=False))) for seed in range(12)]
     print(f"receipt only, 0.5 ms of jitter: {max(errors):.1f} um at most")
     assert max(errors) < 20.0
 
@@ -74,7 +73,7 @@ def test_odometry_of_the_past_is_as_good_once_the_delays_are_known() -> None:
     errors = []
     for seed in range(6):
         line = Line(50.0, 2.0, seed, request_ms=0.1)
-        fit, true = sweep(line, 300.0)
+        fit, true = sweep(line)
         begin_ns = true.end_ns + 500_000_000
         back = plan_move(begin_ns + 1_500_000, 215.0, 5.0, 300.0, 2000.0)
         line.read(fit, back, begin_ns)
@@ -89,18 +88,13 @@ def test_odometry_of_the_past_is_as_good_once_the_delays_are_known() -> None:
 
 def test_other_acceleration_and_speed_are_found() -> None:
     true = plan_move(ORDERED_NS + 1_000_000, 5.0, 215.0, 298.0, 1850.0)
-    fit = MotionFit()
-    line = Line(50.0, 1.0, 3)
-    line.read(fit, true, ORDERED_NS)
-    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
-    line.read(fit, true, true.end_ns + 200_000_000)
+    fit, _ = sweep(Line(50.0, 1.0, 3), true)
     assert worst_um(fit, true) < 100.0
     assert fit.residual_mm < 0.02
 
 
 def test_wrong_readings_are_outliers_and_leave_no_error() -> None:
-    true = plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0)
-    fit = MotionFit()
+    true, fit = ORDER, MotionFit()
     fit.expect_move(true)
     line = Line(50.0, 1.0, 4)
     for k, until_ns in enumerate(range(ORDERED_NS, true.end_ns, 100_000_000)):
@@ -114,14 +108,11 @@ def test_wrong_readings_are_outliers_and_leave_no_error() -> None:
 
 
 def test_a_motion_that_is_not_the_ordered_one_is_discarded() -> None:
-    blocked = plan_stop(
-        plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0), ORDERED_NS + 300_000_000, 20_000.0
-    )
+    blocked = plan_stop(ORDER, ORDERED_NS + 300_000_000, 20_000.0)
     fit = MotionFit()
-    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
-    moving = plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0)
+    fit.expect_move(ORDER)
     line = Line(50.0, 1.0, 5)
-    line.read(fit, moving, ORDERED_NS + 300_000_000)
+    line.read(fit, ORDER, ORDERED_NS + 300_000_000)
     line.read(fit, blocked, ORDERED_NS + 3_000_000_000)
     late_ns = ORDERED_NS + 2_500_000_000
     assert float(fit.state(late_ns)[0]) == pytest.approx(blocked.end_mm, abs=1e-3)
@@ -133,7 +124,7 @@ def test_profiled_stop_is_placed_by_where_it_ends() -> None:
     fit = MotionFit()
     line = Line(50.0, 1.0, 6)
     line.read(fit, moving, ORDERED_NS)
-    fit.expect_move(plan_move(ORDERED_NS, 5.0, 215.0, 300.0, 2000.0))
+    fit.expect_move(ORDER)
     line.read(fit, moving, ORDERED_NS + 350_000_000)
     fit.expect_stop(ORDERED_NS + 350_000_000, 2000.0)
     line.read(fit, stopped, stopped.end_ns + 200_000_000)

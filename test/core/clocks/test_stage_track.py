@@ -39,8 +39,7 @@ def test_forgetting_keeps_what_later_queries_need():
             stage.forget_before(t_us - 495)
             assert len(stage) <= 52
             assert stage.position_mm([t_us - 495])[0] == pytest.approx((t_us - 495) * 1e-3)
-    assert stage.last_us == 19_990
-    assert stage.first_us == 19_490
+    assert (stage.first_us, stage.last_us) == (19_490, 19_990)
     stage.forget_before(10**9)
     assert (len(stage), stage.first_us) == (1, 19_990)
     empty = StageTrack()
@@ -74,16 +73,12 @@ def test_positions_stay_between_their_samples():
     stage.append(t_us, position)
     query = rng.integers(t_us[0], t_us[-1] + 1, 20_000)
     found = stage.position_mm(query)
-    np.testing.assert_allclose(
-        found, np.interp(query - t_us[0], t_us - t_us[0], position), rtol=0, atol=1.1e-6
-    )
+    expected = np.interp(query - t_us[0], t_us - t_us[0], position)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1.1e-6)
     left = np.searchsorted(t_us, query, side="right") - 1
     right = np.minimum(left + 1, 299)
-    low, high = (
-        np.minimum(position[left], position[right]),
-        np.maximum(position[left], position[right]),
-    )
-    assert ((found >= low - 6e-7) & (found <= high + 6e-7)).all()
+    ends = np.sort([position[left], position[right]], axis=0)
+    assert ((found >= ends[0] - 6e-7) & (found <= ends[1] + 6e-7)).all()
 
 
 def test_a_position_for_each_time_is_needed():

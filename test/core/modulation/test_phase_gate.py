@@ -26,7 +26,8 @@ def line(frequency_hz: float, duty: float = 0.5, periods: int = 24):
     world = World(Plane(1320.0), CALIBRATION, seed=SEED, background_hz=0.0)
     world.set_laser(0, True, Modulation(frequency_hz, duty, on_edge_us=EDGE_US))
     data = world.advance(EDGE_US + round(periods * 1e6 / frequency_hz))
-    return Decoder(COLUMNS, CALIBRATION.rows).decode(data)
+    events = Decoder(COLUMNS, CALIBRATION.rows).decode(data)
+    return events.t, events.x, events.y, events.p
 
 
 def background(rate_hz: float, until_us: int, seed: int = SEED):
@@ -69,15 +70,14 @@ def phases(kind: str, frequency_hz: float, duty: float, until_us: int):
 )
 def test_signal_stays_and_background_goes(kind, frequency_hz, duty, gate_us, cut):
     signal = line(frequency_hz, duty)
-    end_us = int(signal.t[-1])
-    signal_part = (signal.t, signal.x, signal.y, signal.p)
+    end_us = int(signal[0][-1])
     noise_part = background(2.0, end_us)
     modulation, triggers = phases(kind, frequency_hz, duty, end_us)
-    _, both = run(stream([signal_part, noise_part], triggers), modulation, gate_us)
+    _, both = run(stream([signal, noise_part], triggers), modulation, gate_us)
     seen = both["events"] - both["events_outside_phase"]
     # The phase is known here, so that signal and noise can be distinguished.
     exact = replace(modulation, on_edge_us=EDGE_US)
-    _, quiet = run(stream([signal_part]), exact, gate_us)
+    _, quiet = run(stream([signal]), exact, gate_us)
     _, noise = run(stream([noise_part]), exact, gate_us)
     assert quiet["events_gated"] <= 0.05 * quiet["events"], f"seed {SEED}"
     assert (noise["events"] - noise["events_gated"]) * cut <= noise["events"], f"seed {SEED}"
@@ -89,7 +89,7 @@ def test_signal_stays_and_background_goes(kind, frequency_hz, duty, gate_us, cut
 
 def test_gate_off_or_as_long_as_the_period_removes_nothing():
     signal = line(1000.0, periods=10)
-    parts = [(signal.t, signal.x, signal.y, signal.p), background(5.0, int(signal.t[-1]))]
+    parts = [signal, background(5.0, int(signal[0][-1]))]
     modulation = Modulation(1000.0, on_edge_us=EDGE_US)
     for gate_us in (0, 1000 - LEAD_US, GATE_MAX_US):
         found, counts = run(stream(parts), modulation, gate_us)
@@ -102,21 +102,18 @@ def test_a_sine_has_no_edges_to_gate_by():
 
 
 def test_several_periods_per_profile_are_gated_each():
-    signal = line(300.0, periods=12)
-    data = stream([(signal.t, signal.x, signal.y, signal.p)])
+    data = stream([line(300.0, periods=12)])
     _, counts = run(data, Modulation(300.0, on_edge_us=EDGE_US), 600, periods_per_profile=4)
     assert counts["events_gated"] <= 0.05 * counts["events"], f"seed {SEED}"
 
 
 def test_few_gross_errors_are_left_in_strong_background():
     signal = line(70.0)
-    noise = background(40.0, int(signal.t[-1]))
-    data = stream([(signal.t, signal.x, signal.y, signal.p), noise])
+    data = stream([signal, background(40.0, int(signal[0][-1]))])
     modulation = Modulation(70.0, on_edge_us=EDGE_US)
     true_row = CALIBRATION.model().row(1320.0)
     spread = {}
     for gate_us in (0, 1000):
         found, _ = run(data, modulation, gate_us)
-        error = np.abs(found.row - true_row)
-        spread[gate_us] = float(np.quantile(error, 0.95))
+        spread[gate_us] = float(np.quantile(np.abs(found.row - true_row), 0.95))
     assert spread[1000] < 0.6 * spread[0], f"seed {SEED}: {spread}"

@@ -54,13 +54,9 @@ def test_hits_lie_on_the_near_side_of_the_sphere_or_miss() -> None:
     slope = MODEL.column_slope(COLUMNS)[None, :]
     direction = np.stack((np.ones_like(slope), np.zeros_like(slope), slope), axis=-1)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    start = np.stack((np.full(STAGE.size, -MODEL.b_mm), STAGE, np.zeros(STAGE.size)), axis=-1)[
-        :, None, :
-    ]
-    off = centre - start
-    apart = np.linalg.norm(
-        np.cross(off, np.broadcast_to(direction, off.shape[:1] + direction.shape[1:])), axis=-1
-    )
+    start = np.stack((np.full(STAGE.size, -MODEL.b_mm), STAGE, np.zeros(STAGE.size)), axis=-1)
+    off = (centre - start)[:, None, :]
+    apart = np.linalg.norm(np.cross(*np.broadcast_arrays(off, direction)), axis=-1)
     assert np.array_equal(apart < 45.0, hit)
 
 
@@ -80,8 +76,7 @@ def test_default_steps_have_the_promised_depths() -> None:
     assert {2.0, 3.0, 5.0} <= set(np.round(steps, 9))
     assert len(np.unique(x)) > 20
     row = load_calibration("config_3").model().row(x)
-    assert row.min() > 20
-    assert row.max() < 700
+    assert 20 < row.min() < row.max() < 700
 
 
 def test_steps_change_exactly_at_the_bands() -> None:

@@ -24,8 +24,7 @@ def test_all_of_the_scene_is_in_view(scene, model) -> None:
     x = scene.range_mm(STAGE, COLUMNS, model)
     albedo = scene.reflectance(STAGE, COLUMNS, model)
     row = model.row(x[np.isfinite(x)])
-    assert row.min() > 20.0
-    assert row.max() < model.rows - 20.0
+    assert 20.0 < row.min() < row.max() < model.rows - 20.0
     assert 0.35 < np.isfinite(x).mean() < 0.65
     assert np.array_equal(albedo > 0.0, np.isfinite(x))
     assert np.isfinite(albedo).all()
@@ -57,8 +56,7 @@ def test_overlapping_leaves_are_2_mm_apart_at_1320_mm() -> None:
     depth = np.array([leaf.depth_mm for leaf in leaves.leaves])
     # Blades and veins: nothing but up to 0.6 mm of veins stands out of a leaf's own level.
     height = (depth[index] - curved_away(leaves, x, CONFIG_3))[index >= 0]
-    assert height.min() > -1e-9
-    assert height.max() <= 0.6 + 1e-9
+    assert -1e-9 < height.min() < height.max() <= 0.6 + 1e-9
     assert np.median(height) < 0.05
     # Neighbouring columns on two leaves of the middle layer: their levels' distance.
     middle = np.abs(depth[index] - 1320.0) < 10.0
@@ -114,8 +112,8 @@ def test_the_face_has_nose_eyes_mouth_and_ears() -> None:
     z = CONFIG_3.column_slope(COLUMNS) * (x + CONFIG_3.b_mm)
 
     def depth(across: float, up: float) -> float:
-        line = x[np.argmin(np.abs(STAGE - 100.0 - across))]
-        return float(line[np.nanargmin(np.abs(z[np.argmin(np.abs(STAGE - 100.0 - across))] - up))])
+        line = np.argmin(np.abs(STAGE - 100.0 - across))
+        return float(x[line, np.nanargmin(np.abs(z[line] - up))])
 
     assert np.nanmin(x) == pytest.approx(depth(0.0, -11.0), abs=0.5)
     assert depth(0.0, 15.0) < depth(18.0, 22.0) - 8.0, "the bridge stands between the eyes"

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 
 from eschorty_ros.core.clocks import MotionPlan
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.optics import RangeModel, load_calibration
+from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.simulation.scenes import Plane, Sphere, named
 from eschorty_ros.simulation.world import World, footprint
 
@@ -29,26 +28,24 @@ class Edge:
     ranges_mm: tuple[float, float] = (1320.0, 1320.0)
     reflectances: tuple[float, float] = (1.0, 1.0)
 
-    def _choose(
-        self, stage_mm: ArrayLike, columns: ArrayLike, values: tuple[float, float]
-    ) -> np.ndarray:
+    def _choose(self, stage_mm, columns, values) -> np.ndarray:
         beyond = np.atleast_1d(stage_mm) >= self.at_mm
         return np.repeat(np.where(beyond, values[1], values[0])[:, np.newaxis], np.size(columns), 1)
 
-    def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> np.ndarray:
+    def range_mm(self, stage_mm, columns, model) -> np.ndarray:
         return self._choose(stage_mm, columns, self.ranges_mm)
 
-    def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> np.ndarray:
+    def reflectance(self, stage_mm, columns, model) -> np.ndarray:
         return self._choose(stage_mm, columns, self.reflectances)
 
 
-def centroid(scene, stage_mm: float) -> float:
-    """Mean row of all events of a resting line."""
+def rows_seen(scene) -> np.ndarray:
+    """Rows of all events of a line that rests at 50 mm."""
     print(f"seed {SEED}")
     world = World(scene, CALIBRATION, seed=SEED, background_hz=0.0)
     world.set_laser(0, True, Modulation(70.0, on_edge_us=0))
-    world.set_stage(MotionPlan(0, stage_mm))
-    return float(Decoder(48, 720).decode(world.advance(200_000)).y.mean())
+    world.set_stage(MotionPlan(0, 50.0))
+    return Decoder(48, 720).decode(world.advance(200_000)).y
 
 
 @pytest.mark.parametrize("ahead_mm", [-1.5, -0.3, 0.4, 2.0])
@@ -93,19 +90,15 @@ def test_the_end_of_a_scene_cuts_the_line() -> None:
 
 def test_a_step_from_dark_to_bright_shifts_the_line_and_mirrors() -> None:
     true_row = float(MODEL.row(1320.0))
-    dark_to_bright = centroid(Edge(50.0, reflectances=(0.04, 1.0)), 50.0) - true_row
-    bright_to_dark = centroid(Edge(50.0, reflectances=(1.0, 0.04)), 50.0) - true_row
+    dark_to_bright = rows_seen(Edge(50.0, reflectances=(0.04, 1.0))).mean() - true_row
+    bright_to_dark = rows_seen(Edge(50.0, reflectances=(1.0, 0.04))).mean() - true_row
     # Bright ahead, towards +y, appears at the lower rows.
     assert -4.5 <= dark_to_bright <= -3.0
     assert bright_to_dark == pytest.approx(-dark_to_bright, abs=0.4)
 
 
 def test_a_depth_step_lights_both_levels() -> None:
-    scene = Edge(50.0, ranges_mm=(1320.0, 1420.0))
-    world = World(scene, CALIBRATION, seed=SEED, background_hz=0.0)
-    world.set_laser(0, True, Modulation(70.0, on_edge_us=0))
-    world.set_stage(MotionPlan(0, 50.0))
-    y = Decoder(48, 720).decode(world.advance(200_000)).y
+    y = rows_seen(Edge(50.0, ranges_mm=(1320.0, 1420.0)))
     near, far = (float(MODEL.row(r)) for r in (1320.0, 1420.0))
     # Each shows half of its line: the near one above its centre, the far one below.
     at_near, at_far = y[np.abs(y - near) < 15], y[np.abs(y - far) < 15]

@@ -17,6 +17,7 @@ from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import SensorControl, World
 
 SEED = 12
+QUIET = PixelParameters(threshold_mismatch=0.0, noise=0.0, latency_jitter_us=0.0)
 SMALL = load_calibration("config_3").model_copy(update={"columns": 64, "principal_column": 31.5})
 
 
@@ -103,21 +104,19 @@ def test_a_changed_world_becomes_one_that_was_always_so(biases, frequency_hz):
     assert abs(counts[0] - counts[1]) > 0.03 * counts[0]
     # And back again.
     changed.set_sensor(30_000 + span_us, SensorControl())
-    back = [
-        events_between(one, 50_000 + span_us, 50_000 + 2 * span_us) for one in (before, changed)
-    ]
+    begin_us = 50_000 + span_us
+    back = [events_between(one, begin_us, begin_us + span_us) for one in (before, changed)]
     assert back[1] == pytest.approx(back[0], rel=0.01)
 
 
 def test_a_threshold_lowered_below_what_a_pixel_has_seen_fires_at_once():
-    quiet = PixelParameters(threshold_mismatch=0.0, noise=0.0, latency_jitter_us=0.0)
-    pixels = PixelArray(1, 9, quiet, SEED)
+    pixels = PixelArray(1, 9, QUIET, SEED)
     every, row = np.arange(1), np.array([4.0])
     # 20 % more light at the centre: below the threshold of 25 %.
-    pixels.relight(0, every, row, np.array([0.2 / quiet.amplitude]))
+    pixels.relight(0, every, row, np.array([0.2 / QUIET.amplitude]))
     pixels.run_until(50_000)
     assert pixels.take(50_000).size == 0
-    pixels.change(50_000, replace(quiet, threshold_on=0.15))
+    pixels.change(50_000, replace(QUIET, threshold_on=0.15))
     pixels.run_until(60_000)
     keys = pixels.take(60_000)
     assert set((keys >> 22).tolist()) == {50_100}
@@ -126,15 +125,14 @@ def test_a_threshold_lowered_below_what_a_pixel_has_seen_fires_at_once():
 
 
 def test_a_dead_time_that_has_begun_ends_when_it_was_to_end():
-    quiet = PixelParameters(threshold_mismatch=0.0, noise=0.0, latency_jitter_us=0.0)
     every, row, full = np.arange(1), np.array([0.0]), np.array([1.0])
 
     def second_event_us(changed: bool) -> int:
-        pixels = PixelArray(1, 1, quiet, SEED)
+        pixels = PixelArray(1, 1, QUIET, SEED)
         pixels.relight(0, every, row, full)
         pixels.run_until(400)
         if changed:
-            pixels.change(400, replace(quiet, refractory_us=5.0))
+            pixels.change(400, replace(QUIET, refractory_us=5.0))
         pixels.relight(600, every, row, 0.0 * full)
         pixels.run_until(20_000)
         return int(np.sort(pixels.take(30_000) >> 22)[1])
