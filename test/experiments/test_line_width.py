@@ -58,14 +58,9 @@ def test_swing_is_that_of_the_photoreceptor(frequency_hz):
 
 @pytest.mark.parametrize(
     ("counts", "width_px"),
-    [
-        ([0, 0, 0, 0], 0),
-        ([0, 9, 9, 9, 0], 3),
-        ([0, 4, 9, 9, 9, 5, 0], 4),
-        ([5, 0, 9, 9, 9, 0, 0], 5),
-        ([0, 0, 6, 0, 0], 1),
-    ],
-)
+    [([0, 0, 0, 0], 0), ([0, 9, 9, 9, 0], 3), ([0, 4, 9, 9, 9, 5, 0], 4),
+     ([5, 0, 9, 9, 9, 0, 0], 5), ([0, 0, 6, 0, 0], 1)],
+)  # fmt: skip
 def test_width_spans_the_bins_that_reach_half(counts, width_px):
     assert full_width_half_maximum(np.array(counts)) == width_px
 

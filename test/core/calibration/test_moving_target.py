@@ -10,13 +10,9 @@ from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
-COLUMNS = 48
-NOMINAL = load_calibration("config_3").model_copy(
-    update={"columns": COLUMNS, "principal_column": 23.5}
-)
-AS_BUILT = NOMINAL.model_copy(
-    update={"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": -1102.74}
-)
+NOMINAL = load_calibration("config_3").model_copy(update={"columns": 48, "principal_column": 23.5})
+CHANGED = {"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": -1102.74}
+AS_BUILT = NOMINAL.model_copy(update=CHANGED)
 SPEED_MM_S = 100.0
 
 

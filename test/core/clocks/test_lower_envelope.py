@@ -23,21 +23,20 @@ def jitter(t_s, rng):
     return rng.uniform(0.0, 3e6, t_s.size)
 
 
-def errors(envelope, stream, settled_s=0.0):
-    """Error of the line at each packet, ns, once ``settled_s`` have passed."""
-    found = []
+def errors(stream, settled_s=0.0, window_s=60):
+    """Error of the line at each packet, ns, once ``settled_s`` have passed; and the envelope."""
+    envelope, found = LowerEnvelope(window_s * 1_000_000_000), []
     for t, true, arrived in zip(*(part.tolist() for part in stream), strict=True):
         line = envelope.observe(t, arrived)
         assert line.to_ns(t) <= arrived
         if t >= settled_s * 1e6:
             found.append(line.to_ns(t) - true)
-    return np.array(found)
+    return np.array(found), envelope
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 50.0, -50.0, 150.0])
 def test_offset_and_drift_under_three_milliseconds_of_jitter(drift_ppm):
-    envelope = LowerEnvelope(60_000_000_000)
-    off = errors(envelope, packets(30.0, drift_ppm * 1e-6, jitter), settled_s=1.0)
+    off, envelope = errors(packets(30.0, drift_ppm * 1e-6, jitter), settled_s=1.0)
     print(f"seed {SEED}: {off.min():.0f} to {off.max():.0f} ns")
     assert np.abs(off).max() < 300_000
     assert np.abs(off[-2500:]).max() < 60_000
@@ -45,9 +44,8 @@ def test_offset_and_drift_under_three_milliseconds_of_jitter(drift_ppm):
 
 
 def test_without_delay_the_line_is_the_truth():
-    envelope = LowerEnvelope(60_000_000_000)
     stream = packets(20.0, 37e-6, lambda t_s, rng: np.zeros(t_s.size))
-    off = errors(envelope, stream, settled_s=5.0)
+    off, envelope = errors(stream, settled_s=5.0)
     assert np.abs(off).max() < 50
     assert abs(envelope.line.drift_ppb - 37_000) <= 1
 
@@ -61,34 +59,30 @@ def lagging(t_s, rng):
 @pytest.mark.parametrize("drift_ppm", [0.0, 50.0, -50.0])
 def test_seconds_of_lag_neither_shift_nor_tilt_the_line(drift_ppm):
     """A slow machine hands the camera's bytes on seconds late, in the middle of a sweep."""
-    envelope = LowerEnvelope(60_000_000_000)
-    off = errors(envelope, packets(25.0, drift_ppm * 1e-6, lagging), settled_s=2.0)
+    off, _ = errors(packets(25.0, drift_ppm * 1e-6, lagging), settled_s=2.0)
     print(f"seed {SEED}: {off.min():.0f} to {off.max():.0f} ns")
     # Ten seconds are extrapolated from five.
     assert np.abs(off).max() < 400_000
 
 
 def test_a_host_that_is_slow_at_first_leaves_no_error_once_it_is_prompt():
-    envelope = LowerEnvelope(60_000_000_000)
-    stream = packets(
-        12.0, 50e-6, lambda t_s, rng: jitter(t_s, rng) + 3e9 * np.exp(-((t_s / 2.0) ** 2))
-    )
-    off = errors(envelope, stream, settled_s=10.0)
+    def slow_at_first(t_s, rng):
+        return jitter(t_s, rng) + 3e9 * np.exp(-((t_s / 2.0) ** 2))
+
+    off, _ = errors(packets(12.0, 50e-6, slow_at_first), settled_s=10.0)
     assert np.abs(off).max() < 300_000
 
 
 def test_ever_growing_lag_is_not_taken_for_drift():
-    envelope = LowerEnvelope(60_000_000_000)
-    off = errors(envelope, packets(20.0, 0.0, lambda t_s, rng: 1e8 * t_s))
+    off, _ = errors(packets(20.0, 0.0, lambda t_s, rng: 1e8 * t_s))
     assert np.abs(off).max() <= 4_000_000
 
 
 def test_the_window_slides():
     """The oscillator changes its drift in the middle."""
-    envelope = LowerEnvelope(10_000_000_000)
     t, true, arrival = packets(25.0, 0.0, jitter)
     bent = np.clip(t - 8_000_000, 0, None) // 10
-    off = errors(envelope, (t, true + bent, arrival + bent))
+    off, envelope = errors((t, true + bent, arrival + bent), window_s=10)
     assert np.abs(off[-1000:]).max() < 60_000
     assert abs(envelope.line.drift_ppb - 100_000) < 8000
     assert len(envelope) <= 601

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from eschorty_experiments._line_width import full_width_half_maximum as fwhm
 from pixel_reference import stepped
 
 from eschorty_ros.core.modulation import Modulation
@@ -28,12 +29,6 @@ def bench(frequency_hz: float, seconds: float, columns: int = 32, **options) -> 
 def rate(events: LineEvents, seconds: float) -> float:
     """Events per second and column."""
     return len(events) / events.truth_row.size / seconds
-
-
-def fwhm(counts: np.ndarray) -> int:
-    """Rows between the first and last at half of the mean of the three highest."""
-    wide = np.flatnonzero(counts >= 0.5 * np.sort(counts)[-3:].mean())
-    return int(wide[-1] - wide[0] + 1)
 
 
 @pytest.mark.parametrize(

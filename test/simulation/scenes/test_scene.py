@@ -56,7 +56,7 @@ def test_hits_lie_on_the_near_side_of_the_sphere_or_miss() -> None:
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     start = np.stack((np.full(STAGE.size, -MODEL.b_mm), STAGE, np.zeros(STAGE.size)), axis=-1)
     off = (centre - start)[:, None, :]
-    apart = np.linalg.norm(np.cross(*np.broadcast_arrays(off, direction)), axis=-1)
+    apart = np.linalg.norm(np.cross(off, direction), axis=-1)
     assert np.array_equal(apart < 45.0, hit)
 
 
