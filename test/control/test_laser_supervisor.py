@@ -122,9 +122,7 @@ class Interrupted(HeldLaser):
             time.sleep(0.05)
 
 
-def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(
-    supervisor,
-):
+def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(supervisor):
     laser = Interrupted()
     supervisor.close()
     supervisor.open(laser, Modulation(70.0))
