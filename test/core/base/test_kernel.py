@@ -27,6 +27,19 @@ print(_total(1))
 """
 
 
+def output(tmp_path, *command):
+    """What Python prints, with the modules and the kernels' cache of this folder."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+    }
+    command = [sys.executable, "-B", *command]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 @pytest.mark.parametrize("signature", ["", "('int64(int64)')"])
 def test_a_change_in_another_file_reaches_the_kernels_that_use_it(tmp_path, signature):
     """Time and size of every file stay as they were, as after some installers."""
@@ -36,15 +49,7 @@ def test_a_change_in_another_file_reaches_the_kernels_that_use_it(tmp_path, sign
         callee = tmp_path / "callee.py"
         callee.write_text(CALLEE.format(factor=factor, scale=scale))
         os.utime(callee, (0, 0))
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
-            "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-            "PYTHONDONTWRITEBYTECODE": "1",
-        }
-        command = [sys.executable, str(tmp_path / "caller.py")]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        return int(done.stdout)
+        return int(output(tmp_path, str(tmp_path / "caller.py")))
 
     assert result(factor=10, scale=2) == 12
     assert result(factor=20, scale=2) == 22
@@ -66,15 +71,7 @@ class {name}(NamedTuple):
 def _sum(pair):
     return pair.first + pair.second
 """
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-    }
     for name in ("Pair", "Renamed"):
         (tmp_path / "pairs.py").write_text(code.format(name=name))
         call = f"from pairs import _sum, {name}; print(_sum({name}(1, 2)))"
-        done = subprocess.run(
-            [sys.executable, "-B", "-c", call], env=environment, capture_output=True, text=True
-        )
-        assert done.stdout == "3\n", done.stderr
+        assert output(tmp_path, "-c", call) == "3\n"

@@ -103,20 +103,18 @@ def test_a_compensated_row_becomes_a_range_in_its_own_column(bend):
     left_mm = np.abs(error_mm[moved]).max()
     assert left_mm < 5.0, f"seed {SEED}: {left_mm} mm"
     np.testing.assert_array_equal(on.range_mm, model.range_mm(on.row, on.column))
-    np.testing.assert_array_equal(
-        on.sigma_mm, model.range_sigma_mm(on.row, on.sigma_row, on.column)
-    )
+    sigma_mm = model.range_sigma_mm(on.row, on.sigma_row, on.column)
+    np.testing.assert_array_equal(on.sigma_mm, sigma_mm)
 
 
 def test_points_do_not_depend_on_how_the_bytes_are_split():
     case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=16, seed=SEED)
     whole, counts = case.reconstruct(reflectance_compensation="on")
     settings = Settings(reflectance_compensation="on", stage_speed_mm_s=SPEED_MM_S)
+    stream = case.data, case.modulation, settings
     for size in (1000, 7777):
         cuts = range(size, len(case.data), size)
-        parts, reconstructor = reconstruct(
-            case.data, case.modulation, settings, cuts, case.calibration
-        )
+        parts, reconstructor = reconstruct(*stream, cuts, case.calibration)
         assert_same(parts, whole)
         assert reconstructor.counters == counts
 
@@ -174,9 +172,7 @@ class Striped(Plane):
 
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
 @pytest.mark.parametrize(("start_mm", "stop_mm"), [(10.0, 70.0), (70.0, 10.0)])
-def test_recording_of_a_striped_plane_in_either_direction(
-    tmp_path, frequency_hz, start_mm, stop_mm
-):
+def test_recording_of_a_striped_plane_either_way(tmp_path, frequency_hz, start_mm, stop_mm):
     calibration = load_calibration("config_3").model_copy(update={"columns": 64})
     recording = simulate_recording(
         tmp_path, Striped(1320.0), calibration, Modulation(frequency_hz), start_mm, stop_mm,
