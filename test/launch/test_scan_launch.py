@@ -1,4 +1,4 @@
-"""Runs the launch tests with ``launch_test`` wherever it is installed.
+"""Runs the launch test with ``launch_test`` wherever it is installed.
 
 Not through launch_testing's pytest plugin: it coordinates no ROS domains and follows pytest's
 releases late.
@@ -18,21 +18,16 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytest.importorskip("launch_testing", reason="launch_testing is not installed")
 
 TESTS = Path(__file__).resolve().parents[1]
+SCENARIOS = str(TESTS / "launch" / "scan_scenarios_launch.py")
 
 
-@pytest.mark.parametrize("name", ["scan", "calibration"])
-def test_scenarios_under_launch(name, tmp_path):
+def test_scenarios_under_launch(tmp_path):
     search = [str(TESTS / "support"), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
     log_path = tmp_path / "launch.log"
     with (
         log_path.open("w") as log,
         subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "launch_testing.launch_test",
-                str(TESTS / "launch" / f"{name}_scenarios_launch.py"),
-            ],
+            [sys.executable, "-m", "launch_testing.launch_test", SCENARIOS],
             env={**os.environ, "PYTHONPATH": os.pathsep.join(search)},
             stdout=log,
             stderr=subprocess.STDOUT,

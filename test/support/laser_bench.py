@@ -26,12 +26,11 @@ class LaserBench:
         self,
         held: contextlib.ExitStack,
         folder: Path,
-        observer: Observer,
         module: str = "eschorty_ros.nodes.laser.node",
         **parameters: Any,
     ) -> None:
         self._held = held
-        self.observer = observer
+        self.observer = observer = held.enter_context(Observer())
         self.awg = held.enter_context(AwgProcess(folder))
         parameters = {"driver": "awg", "backend": self.awg.backend, **parameters}
         self.node = self.start(module, parameters)
@@ -40,9 +39,8 @@ class LaserBench:
 
     def start(self, module: str, parameters: dict[str, Any]) -> NodeProcess:
         """Start another process of this bench, whose output is printed at its end."""
-        process = self._held.enter_context(
-            NodeProcess(module, parameters, domain=self.observer.domain)
-        )
+        process = NodeProcess(module, parameters, domain=self.observer.domain)
+        self._held.enter_context(process)
         self._held.callback(lambda: print(f"--- {process.module}\n{process.output}"))
         return process
 

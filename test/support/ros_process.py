@@ -9,8 +9,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,15 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from spinning import spinning
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.dds import use_profile
+from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 
 NAMESPACE = "/eschorty"
@@ -50,36 +51,19 @@ def stamped_after(messages: list[Any], t_ns: int) -> bool:
 
 
 class NodeProcess:
-    """One node running as a process of its own, until ``kill`` or the end of a ``with``.
+    """A module with one node, as a process of its own until ``kill`` or the end of a ``with``.
 
     Start it in the main thread: it ends with the thread that started it.
-
-    Parameters
-    ----------
-    module : str
-        Module to run, e.g. ``eschorty_ros.nodes.laser.node``.
-    parameters : mapping
-        Parameters of the node.
-    domain : int
-        ``ROS_DOMAIN_ID``.
-    namespace : str
     """
 
-    def __init__(
-        self,
-        module: str,
-        parameters: Mapping[str, Any] | None = None,
-        *,
-        domain: int,
-        namespace: str = NAMESPACE,
-    ) -> None:
+    def __init__(self, module: str, parameters: Mapping[str, Any], *, domain: int) -> None:
         self.module = module
         self._log = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed in kill()
             prefix=f"{node_name(module)}_", suffix=".log"
         )
         command = [*_ENDING_WITH_PARENT, sys.executable, "-m", module]
-        command += ["--ros-args", "-r", f"__ns:={namespace}"]
-        for name, value in (parameters or {}).items():
+        command += ["--ros-args", "-r", f"__ns:={NAMESPACE}"]
+        for name, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ["-p", f"{name}:={text}"]
         self._process = subprocess.Popen(
@@ -98,7 +82,6 @@ class NodeProcess:
 
     @property
     def pid(self) -> int:
-        """Process id."""
         return self._process.pid
 
     @property
@@ -107,38 +90,29 @@ class NodeProcess:
         return Path(self._log.name).read_text(errors="replace")
 
     def send(self, number: int) -> None:
-        """Send a signal."""
         self._process.send_signal(number)
 
-    def wait(self, deadline_s: float = DEADLINE_S) -> int:
+    def wait(self) -> int:
         """Exit code; fails with the output when the process does not end in time."""
         try:
-            return self._process.wait(deadline_s)
+            return self._process.wait(DEADLINE_S)
         except subprocess.TimeoutExpired:
-            raise AssertionError(
-                f"{self.module} still runs after {deadline_s:g} s:\n{self.output}"
-            ) from None
+            raise AssertionError(f"{self.module} still runs:\n{self.output}") from None
 
     def running(self) -> bool:
-        """Whether the process is still there."""
         return self._process.poll() is None
 
-    def interrupt(self, deadline_s: float = DEADLINE_S) -> int:
+    def interrupt(self) -> int:
         """SIGINT, then the exit code."""
         if self.running():
             self.send(signal.SIGINT)
-        return self.wait(deadline_s)
-
-    def cpu_s(self) -> float:
-        """CPU time used so far, user and system."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return self.wait()
 
     def kill(self, timeout_s: float = 20.0) -> None:
         """End the process: SIGTERM first, as a killed process leaves its shared memory."""
         if self.running():
-            self._process.send_signal(signal.SIGCONT)
-            self._process.terminate()
+            self.send(signal.SIGCONT)
+            self.send(signal.SIGTERM)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout_s)
         if self.running():
@@ -162,21 +136,68 @@ def domain_environment(domain: int) -> dict[str, str]:
     }
 
 
-class Observer:
-    """A test's own node, spun in a thread: collects messages, calls services.
+@contextlib.contextmanager
+def spinning(executor: Executor) -> Iterator[None]:
+    """Within it a thread spins ``executor``, which is shut down at the end.
 
-    Use it as a context manager.
+    Not by ``executor.spin``: that would still use what shutting down destroys.
     """
+    ending = threading.Event()
 
-    def __init__(self, domain: int, name: str = "observer", namespace: str = NAMESPACE) -> None:
+    def spin() -> None:
+        while not ending.is_set():
+            executor.spin_once(timeout_sec=0.05)
+
+    thread = threading.Thread(target=spin, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join()
+        executor.shutdown()
+
+
+@contextlib.contextmanager
+def nodes_here(domain: int, threads: int = 1) -> Iterator[Callable[..., Any]]:
+    """Yield a function that makes nodes of this process, ``(kind, **parameters)``, and spin them."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    executor = (
+        SingleThreadedExecutor(context=context)
+        if threads == 1
+        else MultiThreadedExecutor(threads, context=context)
+    )
+    nodes = []
+
+    def start(kind: Callable[..., Any], **parameters: Any) -> Any:
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = kind(context=context, namespace=NAMESPACE, parameter_overrides=overrides)
+        nodes.append(node)
+        executor.add_node(node)
+        return node
+
+    with spinning(executor):
+        yield start
+        for node in nodes:
+            node.safe_state()
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+
+
+class Observer:
+    """A test's own node, spun in a thread until the end of a ``with``."""
+
+    def __init__(self, domain: int | None = None) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         use_profile()
-        self.domain = domain
+        self.domain = free_domain() if domain is None else domain
         context = rclpy.Context()
         with contextlib.ExitStack() as held:
-            rclpy.init(context=context, domain_id=domain)
+            rclpy.init(context=context, domain_id=self.domain)
             held.callback(context.try_shutdown)
-            self.node = Node(name, namespace=namespace, context=context)
+            self.node = Node("observer", namespace=NAMESPACE, context=context)
             held.callback(self.node.destroy_node)
             self._executor = SingleThreadedExecutor(context=context)
             self._executor.add_node(self.node)
@@ -202,15 +223,13 @@ class Observer:
         wait_until(publisher.get_subscription_count, f"a subscriber of {topic}")
         return publisher
 
-    def call(
-        self, service_type: Any, name: str, request: Any = None, deadline_s: float = DEADLINE_S
-    ) -> Any:
+    def call(self, service_type: Any, name: str, request: Any = None) -> Any:
         """The service's response; the service's name begins with that of its node."""
-        with self._client(service_type, name, deadline_s) as client:
+        with self._client(service_type, name, DEADLINE_S) as client:
             # A server that has not discovered the client yet would not answer it.
-            self.wait_for_answers(name.split("/")[0], deadline_s)
+            self.wait_for_answers(name.split("/")[0])
             future = client.call_async(request if request is not None else service_type.Request())
-            wait_until(future.done, f"answer of {name}", deadline_s)
+            wait_until(future.done, f"answer of {name}")
             return future.result()
 
     def ask(self, service_type: Any, name: str, deadline_s: float = DEADLINE_S) -> Any:
@@ -244,11 +263,8 @@ class Observer:
         """Label of the lifecycle state of ``node``."""
         return str(self.ask(GetState, f"{node}/get_state").current_state.label)
 
-    def wait_for_state(self, node: str, label: str, deadline_s: float = DEADLINE_S) -> None:
-        """Wait until ``node`` reports lifecycle state ``label``."""
-        wait_until(
-            lambda: self.lifecycle_state(node) == label, f"{node} {label}", deadline_s, poll_s=0.1
-        )
+    def wait_for_state(self, node: str, label: str) -> None:
+        wait_until(lambda: self.lifecycle_state(node) == label, f"{node} {label}", poll_s=0.1)
 
     def change_state(self, node: str, transition: str) -> bool:
         """Ask ``node`` for a transition by label, e.g. ``deactivate``; whether it succeeded."""

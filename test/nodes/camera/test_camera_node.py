@@ -83,7 +83,7 @@ def capture() -> Iterator[Capture]:
     with (
         bench_here(seed=7, background_hz=0.02, trigger="laser") as (bench, folder),
         processes({MODULE: {**CAMERA, "bench": folder}}, domain) as running,
-        Observer(domain, "camera_observer") as observer,
+        Observer(domain) as observer,
     ):
         yield Capture(observer, bench)
         assert running["camera"].interrupt() == 0

@@ -1,6 +1,5 @@
 """The camera node on the EVK4 driver and the emulated camera."""
 
-# ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
 from __future__ import annotations
 
 import time
@@ -10,17 +9,14 @@ from typing import Any
 
 import pytest
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from camera_on_bench import StillBench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
 from event_camera_msgs.msg import EventPacket
 from evk4_bench import OnDemand, plug
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
-from ros_process import Observer, wait_until
-from spinning import spinning
+from ros_process import Observer, nodes_here, wait_until
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -29,7 +25,6 @@ from eschorty_ros.hardware.camera import evk4
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
-from eschorty_ros.nodes.ros.domain import free_domain
 
 BUS = "camera_node"
 
@@ -37,8 +32,10 @@ BUS = "camera_node"
 class Run:
     """A camera node, its messages, and the emulated camera."""
 
-    def __init__(self, observer: Observer, node: CameraNode, source: OnDemand, model: Any) -> None:
-        self.observer, self.node, self.source, self.model = observer, node, source, model
+    node: CameraNode
+
+    def __init__(self, observer: Observer, source: OnDemand, model: Any) -> None:
+        self.observer, self.source, self.model = observer, source, model
         self.packets = observer.collect(EventPacket, "camera/events", qos.events())
         self.reports = observer.collect(DiagnosticArray, "/diagnostics", qos.stream())
         self.beats = observer.collect(Header, "camera/heartbeat", qos.heartbeat())
@@ -48,10 +45,7 @@ class Run:
             every = (status for array in list(self.reports) for status in array.status)
             return next((status for status in every if condition(status)), None)
 
-        wait_until(found, what)
-        status = found()
-        assert status is not None
-        return status
+        return wait_until(found, what)
 
     def active(self) -> Run:
         wait_until(lambda: self.node.active, "the node active")
@@ -76,37 +70,21 @@ Start = Callable[..., Run]
 
 
 @pytest.fixture
-def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
+def start(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[Start]:
     # Shorter waits of the initialisation; the driver's own tests check them.
     monkeypatch.setattr(evk4.Evk4, "_wait", lambda self, seconds: time.sleep(seconds / 100.0))
-    context = rclpy.Context()
-    with Observer(free_domain(), "evk4_observer") as observer:
-        rclpy.init(context=context, domain_id=observer.domain)
-        executor = SingleThreadedExecutor(context=context)
-        nodes: list[CameraNode] = []
+    with nodes_here(observer.domain) as start_node:
 
         def begin(plugged: bool = True, model: Evk4Model | None = None, **parameters: Any) -> Run:
             source = OnDemand()
             model = model or Evk4Model(source)
             plug(BUS, *([model] if plugged else []))
-            overrides = {"driver": "evk4", "backend": f"evk4_bench:backend?{BUS}", **parameters}
-            node = CameraNode(
-                context=context,
-                namespace="eschorty",
-                parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
-            )
-            nodes.append(node)
-            run = Run(observer, node, source, model)
-            executor.add_node(node)
+            run = Run(observer, source, model)
+            backend = f"evk4_bench:backend?{BUS}"
+            run.node = start_node(CameraNode, driver="evk4", backend=backend, **parameters)
             return run
 
-        with spinning(executor):
-            yield begin
-            for node in nodes:
-                node.safe_state()
-        for node in nodes:
-            node.destroy_node()
-        context.try_shutdown()
+        yield begin
 
 
 def test_events_stream_with_arrival_stamps(start: Start) -> None:
@@ -144,15 +122,14 @@ def test_an_unplugged_camera_is_reported_at_once_and_the_stream_restarts_at_zero
     wait_until(lambda: run.node.healthy, "the camera back")
 
     def restarted() -> list[int]:
-        """Return the numbers since the second start; packets of the first may arrive late."""
+        """The numbers since the second start; packets of the first may arrive late."""
         run.source.give(5)
         seqs = [packet.seq for packet in list(run.packets)]
         begins = [k for k, seq in enumerate(seqs) if seq == 0]
         return seqs[begins[1] :] if len(begins) > 1 else []
 
     wait_until(lambda: len(restarted()) > 3, "packets of the new stream")
-    seqs = restarted()
-    assert seqs == list(range(len(seqs)))
+    assert (seqs := restarted()) == list(range(len(seqs)))
 
 
 def test_a_camera_that_stays_unplugged_deactivates_the_node(start: Start) -> None:
@@ -185,11 +162,7 @@ def test_biases_are_parameters_that_the_camera_holds(start: Start, tmp_path: Pat
     assert "bias_fo is 56; choose -35 to 55" in reason
     answer = run.observer.call(Trigger, "camera/save_biases")
     assert answer.success, answer.message
-    assert path.read_text().splitlines()[:3] == [
-        "30  % bias_diff_on",
-        "0  % bias_diff_off",
-        "6  % bias_fo",
-    ]
+    assert path.read_text().startswith("30  % bias_diff_on\n0  % bias_diff_off\n6  % bias_fo\n")
     statistics = run.observer.call(Trigger, "camera/dump_statistics")
     assert "bias_refr 40" in statistics.message
 

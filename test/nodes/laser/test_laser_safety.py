@@ -20,11 +20,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
 from laser_bench import OFF_LIMIT_S, LaserBench
-from ros_process import NodeProcess, Observer, wait_until
+from ros_process import NodeProcess, wait_until
 from std_msgs.msg import Bool, String
 
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.domain import free_domain
 
 SUPPORT_FOLDER = str(Path(__file__).parents[2] / "support")
 SENDERS = ("laser", "camera", "stage")
@@ -44,16 +43,14 @@ class Bench(LaserBench):
         senders: tuple[str, ...],
         **parameters: Any,
     ) -> None:
-        observer = held.enter_context(Observer(free_domain(), "safety_observer"))
-        super().__init__(held, folder, observer, "breakable_laser", **TIMEOUTS, **parameters)
+        super().__init__(held, folder, "breakable_laser", **TIMEOUTS, **parameters)
         self._names = senders
         self._senders: dict[str, NodeProcess] = {}
         self.start_senders()
-        self.diagnostics = observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
-        self.breaking = observer.publisher(String, "test/break", qos.stream(10))
+        self.diagnostics = self.observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
+        self.breaking = self.observer.publisher(String, "test/break", qos.stream(10))
 
     def start_senders(self) -> None:
-        """Start the senders that do not run."""
         for name in self._names:
             if name not in self._senders:
                 topics = " ".join(f"{word}/heartbeat" for word in name.split())
@@ -93,7 +90,6 @@ class Bench(LaserBench):
 
 @pytest.fixture(scope="module", autouse=True)
 def importable() -> Iterator[None]:
-    """The processes import modules of the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{SUPPORT_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
         yield
@@ -182,6 +178,7 @@ def test_interlock(lit: Bench) -> None:
     lit.interlock.publish(Bool(data=True))
     lit.check_off("interlock", sent_ns)
     assert "interlock open" in lit.arm().message
+    assert not lit.enable().success
     lit.interlock.publish(Bool(data=False))
     lit.wait_for_state(LaserState.OUTPUT_OFF)
     lit.light()
@@ -202,8 +199,7 @@ def test_unplug_of_the_generator(lit: Bench) -> None:
     lit.observer.wait_for_state("laser", "unconfigured")
     plugged_ns = time.monotonic_ns()
     lit.awg.do("back")
-    took_s = lit.awg.off_after_s(plugged_ns)
-    print(f"off {took_s:.2f} s after it was plugged in")
+    print(f"off {lit.awg.off_after_s(plugged_ns):.2f} s after it was plugged in")
     lit.light()
 
 

@@ -1,24 +1,21 @@
 """A node whose device is missing at the start: reason logged once, retried, no traceback."""
 
-# ruff: noqa: E402 - without rclpy the file skips before it imports what needs it
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
-from ros_process import Observer, wait_until
-from spinning import spinning
+from ros_process import Observer, nodes_here, wait_until
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.nodes.ros import diagnostics, lifecycle, qos
-from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 
 
@@ -57,29 +54,10 @@ class Instrument(DeviceNode):
 
 
 @pytest.fixture
-def observer() -> Iterator[Observer]:
-    with Observer(free_domain(), "waiting_observer") as observer:
-        yield observer
-
-
-@pytest.fixture
 def run(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     monkeypatch.setattr(lifecycle, "RETRY_S", 0.3)
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=observer.domain)
-    executor = SingleThreadedExecutor(context=context)
-    nodes: list[Instrument] = []
-
-    def start(*answers: Exception | None) -> Instrument:
-        nodes.append(Instrument(Device(*answers), context=context))
-        executor.add_node(nodes[0])
-        return nodes[0]
-
-    with spinning(executor):
-        yield start
-    for node in nodes:
-        node.destroy_node()
-    context.try_shutdown()
+    with nodes_here(observer.domain) as start:
+        yield lambda *answers: start(functools.partial(Instrument, Device(*answers)))
 
 
 def test_an_absent_device_is_retried_and_logged_once_per_reason(run, observer, capfd) -> None:

@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_process import NodeProcess, Observer, processes, wait_until
 
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.lifecycle import RETRY_S
 
 NODES = "eschorty_ros.nodes.{}.node"
@@ -30,7 +29,7 @@ SCANNER = {NODES.format("reconstruction"): {}, NODES.format("scanner"): {"auto_s
 
 @pytest.fixture(scope="module")
 def observer() -> Iterator[Observer]:
-    with Observer(free_domain(), "absence_observer") as observer:
+    with Observer() as observer:
         yield observer
 
 

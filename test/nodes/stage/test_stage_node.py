@@ -23,7 +23,6 @@ from ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
 from eschorty_ros.emulation.bench.devices import Bench
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
-from eschorty_ros.nodes.ros.domain import free_domain
 
 # To the far end it takes longer than any wait of these tests.
 SLOW_M_S = 0.01
@@ -49,8 +48,7 @@ class Stage:
 
     def start(self, position: float, speed: float) -> Any:
         """Goal handle of a move, m and m/s."""
-        goal = MoveStage.Goal(position=position, speed=speed)
-        future = self._client.send_goal_async(goal)
+        future = self._client.send_goal_async(MoveStage.Goal(position=position, speed=speed))
         wait_until(future.done, "the goal's acceptance")
         handle = future.result()
         assert handle.accepted
@@ -71,7 +69,7 @@ class Stage:
 def stage() -> Iterator[Stage]:
     with (
         bench_here() as (emulated, folder),
-        Observer(free_domain(), "stage_observer") as observer,
+        Observer() as observer,
         contextlib.ExitStack() as held,
     ):
         yield Stage(held, observer, emulated, folder)
