@@ -13,9 +13,17 @@ from action_msgs.msg import GoalStatus
 from eschorty_ros.action import Calibrate
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
-from rclpy.action import ActionClient
 from ros_process import Observer, stamped_after, wait_until
-from scan_scenarios import EVENTS, SCAN_DEADLINE_S, SLOW, SLOW_HZ, Bench, device_parameters
+from scan_scenarios import (
+    EVENTS,
+    SCAN_DEADLINE_S,
+    SLOW,
+    SLOW_HZ,
+    Bench,
+    Goals,
+    assert_refused,
+    device_parameters,
+)
 from std_msgs.msg import Bool
 
 from eschorty_ros.core.optics import load_calibration, save_calibration
@@ -60,52 +68,22 @@ class CalibrationBench(Bench):
         self.active = observer.collect(
             ActiveCalibration, "reconstruction/calibration", qos.latched()
         )
-        self.seen: list[Any] = []
-        self._calibrate = ActionClient(observer.node, Calibrate, "calibrate")
-        self._done: Any = None
+        self.calibrations = Goals(observer, Calibrate, "calibrate", "reconstruction")
 
     def begin(self, **goal: Any) -> Any:
-        """Send a goal with the posts of the bench unless others are given; the handle."""
-        # As in ``start``.
-        self.observer.wait_for_answers("reconstruction", SCAN_DEADLINE_S)
-        wait_until(self._calibrate.server_is_ready, "the calibrate action", SCAN_DEADLINE_S)
-        # A new list, because feedback of the goal before may still come.
-        seen = self.seen = []
-        values = {
-            "targets": [
-                CalibrationTarget(range=post.range_mm * 1e-3, size=post.size_mm * 1e-3)
-                for post in POSTS
-            ],
-            "capture_time": 0.5,
-            "frequency": 70.0,
-        }
-        sent = self._calibrate.send_goal_async(
-            Calibrate.Goal(**{**values, **goal}),
-            feedback_callback=lambda message: seen.append(message.feedback),
-        )
-        wait_until(sent.done, "an answer to the goal")
-        handle = sent.result()
-        self._done = handle.get_result_async()
-        return handle
-
-    def end(self) -> tuple[int, Any]:
-        """Status and result of the last calibration."""
-        wait_until(self._done.done, "the calibration's end", SCAN_DEADLINE_S)
-        return self._done.result().status, self._done.result().result
+        """Start a calibration with the bench's posts unless others are given; the handle."""
+        posts = [CalibrationTarget(range=p.range_mm * 1e-3, size=p.size_mm * 1e-3) for p in POSTS]
+        values = {"targets": posts, "capture_time": 0.5, "frequency": 70.0}
+        return self.calibrations.start(**{**values, **goal})
 
     def calibrate(self, **goal: Any) -> tuple[int, Any]:
-        """Send a goal and wait for its end."""
+        """Calibrate to the end: status and result."""
         self.begin(**goal)
-        return self.end()
+        return self.calibrations.end()
 
     def wait_for_capture(self) -> None:
         """Wait until events have been captured."""
-
-        def capturing() -> bool:
-            assert not self._done.done(), self._done.result().result.message
-            return any(f.phase == "capturing" and f.events for f in list(self.seen))
-
-        wait_until(capturing, "a capture under way", SCAN_DEADLINE_S)
+        self.calibrations.wait_for(lambda f: f.phase == "capturing" and f.events, "a capture")
 
     @property
     def newest(self) -> Any:
@@ -115,19 +93,16 @@ class CalibrationBench(Bench):
 
     def wait_for_active(self, calibration_id: str) -> None:
         """Wait until this calibration is the active one; "" is the design."""
-        wait_until(
-            lambda: self.newest.id == calibration_id, f"calibration {calibration_id!r} on its topic"
-        )
+        wait_until(lambda: self.newest.id == calibration_id, f"calibration {calibration_id!r}")
 
     @contextlib.contextmanager
     def nothing_changes(self) -> Iterator[None]:
         """Within it the active calibration and the folder stay as they are."""
-        active, count = self.newest, len(self.active)
-        files = sorted(self.folder.iterdir()) if self.folder.exists() else []
+        active, count, files = self.newest, len(self.active), sorted(self.folder.glob("*"))
         yield
         assert len(self.active) == count
         assert self.newest is active
-        assert (sorted(self.folder.iterdir()) if self.folder.exists() else []) == files
+        assert sorted(self.folder.glob("*")) == files
 
 
 @contextlib.contextmanager
@@ -198,10 +173,9 @@ def nine_posts(bench: CalibrationBench, method: str) -> None:
     table = dict(zip(bench.newest.parameters, bench.newest.values, strict=True))
     assert table["b_prime_px"] == made.b_prime_px
     # The last feedback may come after the result.
+    seen = bench.calibrations.feedback
     wait_until(
-        lambda: any(
-            f.matched == len(POSTS) and len(f.residuals) == len(POSTS) for f in list(bench.seen)
-        ),
+        lambda: any(f.matched == len(f.residuals) == len(POSTS) for f in list(seen)),
         "feedback of every post",
     )
     bench.assert_off_and_at_rest()
@@ -231,23 +205,17 @@ def moving_target(bench: CalibrationBench) -> None:
 
 def bad_goals(bench: CalibrationBench) -> None:
     """Each bad value is refused by name, without any light."""
-    lines = len(bench.output_lines())
     one = CalibrationTarget(range=1.0)
+    cases = (
+        ({"targets": [one]}, ("targets holds 1",)),
+        ({"targets": [one, CalibrationTarget(range=-1.0)]}, ("range_mm is -1000",)),
+        ({"method": "magic"}, ("magic", "paper")),
+        ({"capture_time": 0.0}, ("capture_time", "0 s")),
+        ({"frequency": 5.0}, ("frequency", "5 Hz")),
+        ({"sweep_speed": 0.01}, ("targets holds 9", "sweep_speed")),
+    )
     with bench.nothing_changes():
-        for goal, words in (
-            ({"targets": [one]}, ("targets holds 1",)),
-            ({"targets": [one, CalibrationTarget(range=-1.0)]}, ("range_mm is -1000",)),
-            ({"method": "magic"}, ("magic", "paper")),
-            ({"capture_time": 0.0}, ("capture_time", "0 s")),
-            ({"frequency": 5.0}, ("frequency", "5 Hz")),
-            ({"sweep_speed": 0.01}, ("targets holds 9", "sweep_speed")),
-        ):
-            status, result = bench.calibrate(**goal)
-            assert status == GoalStatus.STATUS_ABORTED, goal
-            assert not result.success
-            for word in words:
-                assert word in result.message, (goal, result.message)
-    assert len(bench.output_lines()) == lines
+        assert_refused(bench, bench.calibrate, cases)
 
 
 def useless_captures(bench: CalibrationBench) -> None:
@@ -272,7 +240,7 @@ def useless_captures(bench: CalibrationBench) -> None:
         bench.wait_for_capture()
         canceled = handle.cancel_goal_async()
         wait_until(canceled.done, "an answer to the cancel request")
-        status, result = bench.end()
+        status, result = bench.calibrations.end()
         assert status == GoalStatus.STATUS_CANCELED, result.message
         bench.assert_off_and_at_rest()
         # The laser goes off.
@@ -280,7 +248,7 @@ def useless_captures(bench: CalibrationBench) -> None:
         bench.begin(**LONG)
         bench.wait_for_capture()
         interlock.publish(Bool(data=True))
-        status, result = bench.end()
+        status, result = bench.calibrations.end()
         interlock.publish(Bool(data=False))
         closed_ns = time.time_ns()
         wait_until(
@@ -309,11 +277,9 @@ def one_thing_at_a_time(bench: CalibrationBench) -> None:
         bench.wait_for_sweep(points=100)
         _, result = bench.calibrate()
         assert "is being collected" in result.message
-        answer = load(bench, CALIBRATION)
-        assert not answer.success
-        assert "is being collected" in answer.message
+        assert_not_done(load(bench, CALIBRATION), "is being collected")
         wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
-        status, result = bench.result()
+        status, result = bench.scans.end()
         assert status == GoalStatus.STATUS_CANCELED, result.message
     bench.assert_off_and_at_rest()
 
@@ -330,6 +296,12 @@ def save(bench: CalibrationBench, path: str | Path = "") -> Any:
     return bench.observer.call(SaveCalibration, "reconstruction/save_calibration", request)
 
 
+def assert_not_done(answer: Any, *words: str) -> None:
+    assert not answer.success
+    assert answer.message
+    assert [word for word in words if word not in answer.message] == [], answer.message
+
+
 def load_and_save(bench: CalibrationBench, folder: Path) -> None:
     """Only calibrations of this instrument are loaded; files are written completely or not."""
     own = load_calibration(CALIBRATION)
@@ -340,21 +312,12 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
             ({"name": "config_1"}, ("config_1", "config_3", "build")),
         ):
             save_calibration(own.model_copy(update=change), folder / "other.yaml")
-            answer = load(bench, folder / "other.yaml")
-            assert not answer.success
-            for word in words:
-                assert word in answer.message, answer.message
+            assert_not_done(load(bench, folder / "other.yaml"), *words)
         for name in (folder / "missing.yaml", "config_9", "config_1"):
-            answer = load(bench, name)
-            assert not answer.success
-            assert answer.message
+            assert_not_done(load(bench, name))
         (folder / "broken.yaml").write_text("name: config_3\n")
-        answer = load(bench, folder / "broken.yaml")
-        assert not answer.success
-        assert "broken.yaml" in answer.message
-        answer = save(bench, folder / "missing" / "c.yaml")
-        assert not answer.success
-        assert answer.message
+        assert_not_done(load(bench, folder / "broken.yaml"), "broken.yaml")
+        assert_not_done(save(bench, folder / "missing" / "c.yaml"))
     active = bench.newest.id
     answer = save(bench, folder / "kept.yaml")
     assert answer.success, answer.message
@@ -373,7 +336,7 @@ def camera_killed(bench: CalibrationBench, kill: Callable[[], Any]) -> None:
         bench.begin(**LONG)
         bench.wait_for_capture()
         kill()
-        status, result = bench.end()
+        status, result = bench.calibrations.end()
         assert status == GoalStatus.STATUS_ABORTED
         assert "camera" in result.message, result.message
         bench.assert_off_and_at_rest()

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from awg_process import AwgProcess
+from awg_process import awg_process
 from eschorty_ros.msg import LaserState
 from ros_process import NodeProcess, Observer, stamped_after, wait_until
 from std_msgs.msg import Bool
@@ -31,7 +31,7 @@ class LaserBench:
     ) -> None:
         self._held = held
         self.observer = observer = held.enter_context(Observer())
-        self.awg = held.enter_context(AwgProcess(folder))
+        self.awg = held.enter_context(awg_process(folder))
         parameters = {"driver": "awg", "backend": self.awg.backend, **parameters}
         self.node = self.start(module, parameters)
         self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))

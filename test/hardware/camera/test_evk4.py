@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from evk4_bench import SERIAL, CameraBench, OnDemand
@@ -35,13 +36,6 @@ def test_open_start_stop_close_follow_the_sensor_s_sequences_and_waits() -> None
     assert model.watch.phase is Phase.OFF
     assert model.watch.violations == []
     assert not model.claims
-
-
-def test_identity_comes_from_the_camera() -> None:
-    with CameraBench() as bench:
-        bench.camera.open()
-        identity = bench.camera.identity
-        assert (identity.serial, identity.firmware) == ("00051234", "3.9.0")
 
 
 def test_old_firmware_is_refused() -> None:
@@ -137,16 +131,14 @@ def test_default_settings_leave_the_pixels_alone() -> None:
         assert seen.packet_period_us == 1008
 
 
-def test_bias_is_set_and_read_back_while_streaming() -> None:
-    with CameraBench() as bench:
-        bench.streaming()
-        assert bench.camera.set_bias("bias_refr", 30) == 30
-        assert dict(bench.model.settings.biases)["bias_refr"] == 30
-        assert bench.camera.read_biases()["bias_refr"] == 30
-        with pytest.raises(ArgumentError, match="bias_refr is 236; choose -20 to 235"):
-            bench.camera.set_bias("bias_refr", 236)
-        bench.exchange()
-        assert bench.model.watch.violations == []
+def test_bias_is_set_and_read_back_while_streaming(bench: CameraBench) -> None:
+    assert bench.camera.set_bias("bias_refr", 30) == 30
+    assert dict(bench.model.settings.biases)["bias_refr"] == 30
+    assert bench.camera.read_biases()["bias_refr"] == 30
+    with pytest.raises(ArgumentError, match="bias_refr is 236; choose -20 to 235"):
+        bench.camera.set_bias("bias_refr", 236)
+    bench.exchange()
+    assert bench.model.watch.violations == []
 
 
 def test_temperature_is_read_while_streaming() -> None:
@@ -161,15 +153,13 @@ def test_temperature_is_read_while_streaming() -> None:
         wait_until(measured, "a temperature")
 
 
-def test_a_scene_without_events_is_no_failure() -> None:
-    with CameraBench() as bench:
-        bench.streaming()
-        bench.exchange()
-        before = bench.count("control_requests")
-        wait_until(lambda: bench.count("control_requests") > before + 3, "requests to the camera")
-        wait_until(lambda: bench.camera.healthy, "health")
-        bench.exchange()
-        assert (bench.count("losses"), bench.count("gaps")) == (0, 0)
+def test_a_scene_without_events_is_no_failure(bench: CameraBench) -> None:
+    bench.exchange()
+    before = bench.count("control_requests")
+    wait_until(lambda: bench.count("control_requests") > before + 3, "requests to the camera")
+    wait_until(lambda: bench.camera.healthy, "health")
+    bench.exchange()
+    assert (bench.count("losses"), bench.count("gaps")) == (0, 0)
 
 
 def test_bytes_dropped_by_a_full_queue_are_counted_and_marked() -> None:
@@ -193,40 +183,34 @@ def test_bytes_dropped_by_a_full_queue_are_counted_and_marked() -> None:
         assert bench.count("gaps") == 1
 
 
-def test_stop_ends_a_waiting_read() -> None:
-    with CameraBench() as bench:
-        bench.streaming()
-        got: list[object] = []
-        reader = threading.Thread(target=lambda: got.append(bench.camera.read(30.0)))
-        reader.start()
+def test_stop_ends_a_waiting_read(bench: CameraBench) -> None:
+    with ThreadPoolExecutor() as pool:
+        reading = pool.submit(bench.camera.read, 30.0)
         bench.camera.stop()
-        reader.join(DEADLINE_S)
-        assert got == [None]
+        assert reading.result() is None
 
 
-def test_a_hung_receiving_thread_is_an_error_and_no_second_one_starts() -> None:
+def test_a_hung_receiving_thread_is_an_error_and_no_second_one_starts(bench: CameraBench) -> None:
     before = set(threading.enumerate())
-    with CameraBench() as bench:
-        bench.streaming()
-        released = threading.Event()
-        session = bench.camera._connection.session
-        assert session is not None
-        reading = threading.Event()
+    released = threading.Event()
+    session = bench.camera._connection.session
+    assert session is not None
+    reading = threading.Event()
 
-        def hang(_timeout_s: float) -> tuple[bytes, int]:
-            reading.set()
-            released.wait(DEADLINE_S)
-            return b"", 0
+    def hang(_timeout_s: float) -> tuple[bytes, int]:
+        reading.set()
+        released.wait(DEADLINE_S)
+        return b"", 0
 
-        session.reader.read = hang  # type: ignore[method-assign]
-        assert reading.wait(DEADLINE_S)
-        with pytest.raises(DeviceError, match="do not end"):
-            bench.camera.stop()
-        with pytest.raises(DeviceError, match="have not ended"):
-            bench.camera.start()
-        released.set()
-        receiving = [t for t in set(threading.enumerate()) - before if t.name == "EVK4 events"]
-        assert len(receiving) <= 1
+    session.reader.read = hang  # type: ignore[method-assign]
+    assert reading.wait(DEADLINE_S)
+    with pytest.raises(DeviceError, match="do not end"):
+        bench.camera.stop()
+    with pytest.raises(DeviceError, match="have not ended"):
+        bench.camera.start()
+    released.set()
+    receiving = [t for t in set(threading.enumerate()) - before if t.name == "EVK4 events"]
+    assert len(receiving) <= 1
 
 
 def test_a_closed_camera_refuses_every_call() -> None:

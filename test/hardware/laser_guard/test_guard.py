@@ -11,11 +11,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from awg_process import AwgProcess
+from awg_process import AwgProcess, awg_process
 from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
@@ -39,13 +40,12 @@ SUPPORT_FOLDER = str(Path(__file__).parents[2] / "support")
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The guard imports drivers of the tests."""
     monkeypatch.setenv("PYTHONPATH", f"{SUPPORT_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
 
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AwgProcess]:
-    with AwgProcess(tmp_path_factory.mktemp("generator")) as made:
+    with awg_process(tmp_path_factory.mktemp("generator")) as made:
         yield made
 
 
@@ -114,17 +114,11 @@ def test_close_switches_off_and_releases(awg: AwgProcess) -> None:
         laser.close()
 
 
-def test_generator_that_is_absent_is_one_line(awg: AwgProcess) -> None:
+def test_what_cannot_be_opened_is_one_line(laser: GuardedLaser, awg: AwgProcess) -> None:
     with pytest.raises(DeviceGoneError, match="no such device with serial 1"):
         GuardedLaser(AWG, {"backend": awg.backend, "serial": "1"})
-
-
-def test_driver_that_is_absent_is_one_line() -> None:
     with pytest.raises(DeviceError, match="'nowhere:laser' cannot be loaded"):
         GuardedLaser("nowhere:laser", {})
-
-
-def test_second_client_is_refused(laser: GuardedLaser, awg: AwgProcess) -> None:
     with pytest.raises(DeviceError, match="in use; close the other program"):
         GuardedLaser(AWG, {"backend": awg.backend})
 
@@ -165,7 +159,7 @@ time.sleep(30.0)
 
 
 class Owner:
-    """A process that has enabled the output."""
+    """A process that has enabled the output, until the end of a ``with``."""
 
     def __init__(
         self, awg: AwgProcess, stderr: int = subprocess.DEVNULL, timeout_s: float = LONG_S
@@ -178,19 +172,31 @@ class Owner:
             stderr=stderr,
             text=True,
         )
+
+    def __enter__(self) -> Owner:
         try:
-            self.guard_pid = int(self._line())
-            assert awg.lit()
+            self.guard_pid = int(self.process.stdout.readline())
+            assert self.awg.lit()
         except BaseException:
             self._kill()
             raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._kill()
+        _wait_for_end(self.guard_pid)
+
+    def _kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        # A child of it may keep the other ends open.
+        self.process.stdin.close()
+        self.process.stdout.close()
 
     def die(self, way: str) -> float:
         """Seconds from the order until the output is off."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{way}\n")
-        self.process.stdin.flush()
-        return self.awg.off_after_s(int(self._line()))
+        print(way, file=self.process.stdin, flush=True)
+        return self.awg.off_after_s(int(self.process.stdout.readline()))
 
     def send(self, number: int) -> float:
         """Seconds from the signal until the output is off."""
@@ -198,53 +204,32 @@ class Owner:
         self.process.send_signal(number)
         return self.awg.off_after_s(sent_ns)
 
-    def _line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline()
-
-    def _kill(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        # A child of it may keep the other ends open.
-        for stream in (self.process.stdin, self.process.stdout):
-            assert stream is not None
-            stream.close()
-
-    def close(self) -> None:
-        self._kill()
-        _wait_for_end(self.guard_pid)
-
 
 @pytest.fixture
 def owner(awg: AwgProcess) -> Iterator[Owner]:
-    made = Owner(awg)
-    yield made
-    made.close()
+    with Owner(awg) as made:
+        yield made
+
+
+def check_off(took_s: float, limit_s: float = OFF_LIMIT_S) -> None:
+    print(f"off after {took_s * 1e3:.1f} ms")
+    assert took_s < limit_s
 
 
 @pytest.mark.parametrize("way", ["abort", "segfault", "exit", "exception", "child", "fork"])
 def test_off_when_the_owner_ends(owner: Owner, way: str) -> None:
-    took_s = owner.die(way)
-    print(f"{way}: off after {took_s * 1e3:.1f} ms")
-    assert took_s < OFF_LIMIT_S
+    check_off(owner.die(way))
     _wait_for_end(owner.guard_pid)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGSTOP])
 def test_off_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
-    took_s = owner.send(number)
-    print(f"signal {number}: off after {took_s * 1e3:.1f} ms")
-    assert took_s < OFF_LIMIT_S
+    check_off(owner.send(number))
 
 
 def test_off_when_the_owner_hangs(awg: AwgProcess) -> None:
-    owner = Owner(awg, timeout_s=TIMEOUT_S)
-    try:
-        took_s = owner.die("gil")
-    finally:
-        owner.close()
-    print(f"no heartbeat: off after {took_s * 1e3:.1f} ms")
-    assert took_s < TIMEOUT_S + OFF_LIMIT_S
+    with Owner(awg, timeout_s=TIMEOUT_S) as owner:
+        check_off(owner.die("gil"), TIMEOUT_S + OFF_LIMIT_S)
 
 
 def test_guard_ignores_the_terminals_signals(owner: Owner) -> None:
@@ -253,7 +238,7 @@ def test_guard_ignores_the_terminals_signals(owner: Owner) -> None:
     time.sleep(0.2)
     assert owner.awg.lit()
     assert os.getsid(owner.guard_pid) == owner.guard_pid
-    assert owner.send(signal.SIGKILL) < OFF_LIMIT_S
+    check_off(owner.send(signal.SIGKILL))
 
 
 def test_full_standard_error_does_not_delay_the_guard(awg: AwgProcess) -> None:
@@ -263,15 +248,14 @@ def test_full_standard_error_does_not_delay_the_guard(awg: AwgProcess) -> None:
         while True:
             os.write(writing, b"x" * 4096)
     os.set_blocking(writing, True)
-    owner = Owner(awg, stderr=writing)
     try:
-        for number in (signal.SIGSTOP, signal.SIGKILL):
-            assert owner.send(number) < OFF_LIMIT_S
-        _wait_for_end(owner.guard_pid)
+        with Owner(awg, stderr=writing) as owner:
+            for number in (signal.SIGSTOP, signal.SIGKILL):
+                check_off(owner.send(number))
+            _wait_for_end(owner.guard_pid)
     finally:
         os.close(reading)
         os.close(writing)
-        owner.close()
 
 
 def test_guard_imports_nothing_from_the_current_folder(
@@ -297,7 +281,7 @@ def test_missing_heartbeats_disarm_until_armed_again(awg: AwgProcess) -> None:
         light(laser)
         began_ns = time.monotonic_ns()
         ctypes.PyDLL(None).sleep(2)
-        assert awg.off_after_s(began_ns) < TIMEOUT_S + OFF_LIMIT_S
+        check_off(awg.off_after_s(began_ns), TIMEOUT_S + OFF_LIMIT_S)
         state = laser.readback()
         assert state.output is LaserOutput.OFF
         assert "no heartbeat for 0.5 s" in state.reason
@@ -314,9 +298,7 @@ def test_off_when_the_guard_dies(laser: GuardedLaser, awg: AwgProcess, number: i
     light(laser)
     sent_ns = time.monotonic_ns()
     os.kill(laser.guard_pid, number)
-    took_s = awg.off_after_s(sent_ns)
-    print(f"guard gets signal {number}: off after {took_s * 1e3:.1f} ms")
-    assert took_s < OFF_LIMIT_S
+    check_off(awg.off_after_s(sent_ns))
     for call in (laser.arm, laser.enable, laser.readback):
         with pytest.raises(DeviceGoneError, match="output switched off; configure"):
             call()
@@ -344,19 +326,13 @@ def test_stall_of_the_guard_is_no_missing_heartbeat(
     serving = threading.Thread(target=guard.Guard(Wire(there), os.getpid()).run)
     serving.start()
     try:
-        orders: list[dict[str, object]] = [
-            {
-                "do": "open",
-                "make": AWG,
-                "settings": {"backend": awg.backend},
-                "heartbeat_timeout_s": TIMEOUT_S,
-            },
-            {"do": "configure", "modulation": {"frequency_hz": 70.0}},
-            {"do": "arm"},
-            {"do": "enable"},
-        ]
-        for number, order in enumerate(orders):
-            wire.send({"id": number, **order})
+        settings = {"backend": awg.backend}
+        wire.send(
+            {"id": 0, "do": "open", "make": AWG, "settings": settings, "heartbeat_timeout_s": TIMEOUT_S}
+        )
+        wire.send({"id": 1, "do": "configure", "modulation": {"frequency_hz": 70.0}})
+        wire.send({"id": 2, "do": "arm"})
+        wire.send({"id": 3, "do": "enable"})
         wait_until(awg.lit, "light")
         clock.advance(60.0)
         assert awg.lit()
@@ -380,16 +356,18 @@ def test_guard_whose_driver_crashes(awg: AwgProcess) -> None:
 
 def test_disabling_interrupts_a_read_back(awg: AwgProcess, tmp_path: Path) -> None:
     waits = tmp_path / "waits"
-    with opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser:
+    with (
+        ThreadPoolExecutor() as pool,
+        opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser,
+    ):
         light(laser)
-        failures: list[Exception] = []
-        join = _thread(laser.readback, failures)
+        reading = pool.submit(laser.readback)
         wait_until(waits.exists, "the read-back in progress")
         asked_ns = time.monotonic_ns()
         laser.disable()
-        assert awg.off_after_s(asked_ns) < OFF_LIMIT_S
-        join()
-        assert "switched off meanwhile" in str(failures[0])
+        check_off(awg.off_after_s(asked_ns))
+        with pytest.raises(DeviceError, match="switched off meanwhile"):
+            reading.result()
 
 
 def test_an_answer_that_arrives_at_the_end_of_the_wait_counts(
@@ -409,22 +387,22 @@ def test_commands_requested_before_disabling_are_void(
     awg: AwgProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits = tmp_path / "waits"
-    with opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser:
+    with (
+        ThreadPoolExecutor() as pool,
+        opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser,
+    ):
         light(laser)
         sent: list[str] = []
         send = laser._wire.send
         monkeypatch.setattr(
             laser._wire, "send", lambda message: (send(message), sent.append(message["do"]))
         )
-        failures: list[Exception] = []
-        joins = [_thread(laser.readback, failures)]
+        calls = [pool.submit(laser.readback)]
         wait_until(waits.exists, "the read-back in progress")
-        joins += [_thread(step, failures) for step in (laser.arm, laser.enable)]
+        calls += [pool.submit(laser.arm), pool.submit(laser.enable)]
         wait_until(lambda: {"arm", "enable"} <= set(sent), "both requested")
         laser.disable()
-        for join in joins:
-            join()
-        assert len(failures) == 3, failures
+        assert all(isinstance(call.exception(), DeviceError) for call in calls)
         assert not awg.lit()
 
 
@@ -464,18 +442,6 @@ def test_another_generator_is_not_taken_for_the_lost_one(awg: AwgProcess) -> Non
     make = maker(AWG, {"backend": awg.backend})
     with pytest.raises(DeviceError, match="generator 41 is gone, AWG1234567890 is there"):
         open_again(make, "41")
-
-
-def _thread(step: Callable[[], object], failures: list[Exception]) -> Callable[[], None]:
-    def attempt() -> None:
-        try:
-            step()
-        except DeviceError as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=attempt)
-    thread.start()
-    return thread.join
 
 
 def _wait_for_end(pid: int) -> None:

@@ -19,17 +19,16 @@ CAMERA = "eschorty_ros.nodes.camera.node"
 class Instrument:
     """The test's view, the running nodes, and a camera that can be pointed elsewhere."""
 
-    def __init__(self, bench, running, emulated):
-        self.bench = bench
-        self.running = running
+    def __init__(self, bench, running, emulated, bench_folder):
+        self.bench, self.running = bench, running
         self._emulated = emulated
+        self._camera = scenarios.device_parameters(bench_folder)[CAMERA]
 
     def point_camera_at(self, scene):
         self.running["camera"].interrupt()
         self.running["camera"].kill()
-        self._emulated.set_scene(scene)
-        parameters = scenarios.device_parameters(self._emulated.folder)[CAMERA]
-        self.running["camera"] = NodeProcess(CAMERA, parameters, domain=self.bench.domain)
+        self._emulated.do(scene)
+        self.running["camera"] = NodeProcess(CAMERA, self._camera, domain=self.bench.domain)
         self.bench.observer.wait_for_state("camera", "active")
 
 
@@ -41,11 +40,11 @@ def instrument(tmp_path_factory):
     domain = free_domain()
     settings = scenarios.bench_settings(log, scenarios.KNOWN_SCENE)
     with (
-        remote_bench(**settings) as emulated,
-        processes(scenarios.node_parameters(emulated.folder, folder), domain) as running,
+        remote_bench(**settings) as (emulated, bench_folder),
+        processes(scenarios.node_parameters(bench_folder, folder), domain) as running,
         scenarios.bench(domain, log, folder) as bench,
     ):
-        yield Instrument(bench, running, emulated)
+        yield Instrument(bench, running, emulated, bench_folder)
         for name, process in running.items():
             print(f"--- {name}\n{process.output[-3000:]}")
 
