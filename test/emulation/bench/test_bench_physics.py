@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from awg_bench import Clock
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import MotionPlan, plan_move
@@ -23,25 +26,20 @@ CALIBRATION = load_calibration("config_3").model_copy(
 )
 
 
-class Clock:
-    """A clock that a test sets."""
-
-    def __init__(self, now_ns: int = 1_700_000_000_123_456_789) -> None:
-        self.now_ns = now_ns
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-
 def world() -> World:
     return World(Plane(1320.0, slope_stage=1.0), CALIBRATION, seed=SEED)
 
 
+def started(*imperfections: Any, make: Callable[[], World] = world) -> tuple[Clock, Physics]:
+    """A running sensor, and the clock of everything."""
+    clock = Clock()
+    physics = Physics(make, clock, *imperfections)
+    physics.start()
+    return clock, physics
+
+
 def drained(physics: Physics, max_bytes: int = 1 << 20) -> bytes:
-    out = []
-    while data := physics.read(max_bytes, 0.0):
-        out.append(data)
-    return b"".join(out)
+    return b"".join(iter(lambda: physics.read(max_bytes, 0.0), b""))
 
 
 def history(zero_ns: int, physics: Physics) -> list[tuple[int, object]]:
@@ -58,9 +56,7 @@ def history(zero_ns: int, physics: Physics) -> list[tuple[int, object]]:
 
 def run(read_every_ns: int, max_bytes: int) -> tuple[bytes, Physics]:
     """The bytes of the run, read every ``read_every_ns``."""
-    clock = Clock()
-    physics = Physics(world, clock)
-    physics.start()
+    clock, physics = started()
     zero_ns, out = clock.now_ns, []
     changes = history(zero_ns, physics)
     reads = range(read_every_ns, 400 * MS + read_every_ns, read_every_ns)
@@ -85,10 +81,8 @@ def test_bytes_do_not_depend_on_the_times_of_the_reads() -> None:
 
 
 def test_edges_lie_where_the_generator_puts_them_in_the_sensors_time() -> None:
-    clock = Clock()
     made = []
-    physics = Physics(lambda: made.append(world()) or made[-1], clock)
-    physics.start()
+    clock, physics = started(make=lambda: made.append(world()) or made[-1])
     clock.now_ns += 3 * MS + 400_900
     physics.set_laser(clock.now_ns, True, Modulation(100.0))
     clock.now_ns += 97 * MS
@@ -99,10 +93,7 @@ def test_edges_lie_where_the_generator_puts_them_in_the_sensors_time() -> None:
 
 @pytest.mark.parametrize(("sensor_ppm", "generator_ppm"), [(50.0, 0.0), (0.0, -40.0), (50.0, 50.0)])
 def test_clocks_drift_apart(sensor_ppm: float, generator_ppm: float) -> None:
-    clock = Clock()
-    flaws = Imperfections(sensor_ppm, generator_ppm)
-    physics = Physics(world, clock, flaws, "laser")
-    physics.start()
+    clock, physics = started(Imperfections(sensor_ppm, generator_ppm), "laser")
     physics.set_laser(clock.now_ns, True, Modulation(100.0))
     edges: list[int] = []
     decoder = Decoder(64, 720)
@@ -137,10 +128,7 @@ def test_stage_pulses_before_a_new_command_arrive_as_triggers() -> None:
 
 
 def test_missing_edges_are_counted() -> None:
-    print(f"seed {SEED}")
-    clock = Clock()
-    physics = Physics(world, clock, Imperfections(missing_edges=0.1, seed=SEED), "laser")
-    physics.start()
+    clock, physics = started(Imperfections(missing_edges=0.1, seed=SEED), "laser")
     physics.set_laser(clock.now_ns, True, Modulation(1000.0))
     decoder = Decoder(64, 720)
     seen = 0
@@ -154,9 +142,7 @@ def test_missing_edges_are_counted() -> None:
 
 def test_jitter_delays_bytes_and_changes_no_byte() -> None:
     def stream(jitter_ms: float) -> tuple[bytes, list[int]]:
-        clock = Clock()
-        physics = Physics(world, clock, Imperfections(usb_jitter_ms=jitter_ms, seed=SEED))
-        physics.start()
+        clock, physics = started(Imperfections(usb_jitter_ms=jitter_ms, seed=SEED))
         physics.set_laser(clock.now_ns, True, Modulation(100.0))
         out, sizes = [], []
         for _ in range(200):
@@ -175,10 +161,8 @@ def test_jitter_delays_bytes_and_changes_no_byte() -> None:
 
 
 def test_a_new_start_begins_at_zero_with_laser_and_stage_as_they_are() -> None:
-    clock = Clock()
     made: list[World] = []
-    physics = Physics(lambda: made.append(world()) or made[-1], clock)
-    physics.start()
+    clock, physics = started(make=lambda: made.append(world()) or made[-1])
     physics.set_laser(clock.now_ns, True, Modulation(100.0))
     physics.set_stage(plan_move(clock.now_ns, 0.0, 20.0, 100.0, 2000.0))
     clock.now_ns += 50 * MS
@@ -200,9 +184,7 @@ def test_a_new_start_begins_at_zero_with_laser_and_stage_as_they_are() -> None:
 
 
 def test_late_changes_are_counted() -> None:
-    clock = Clock()
-    physics = Physics(world, clock)
-    physics.start()
+    clock, physics = started()
     clock.now_ns += 50 * MS
     drained(physics)
     physics.set_laser(clock.now_ns - 10 * MS, True, Modulation(100.0))
@@ -227,9 +209,7 @@ def test_bad_values_are_refused(make, named: str) -> None:
 
 
 def test_reading_from_a_thread_while_devices_act() -> None:
-    clock = Clock()
-    physics = Physics(world, clock)
-    physics.start()
+    clock, physics = started()
     rng = random.Random(SEED)
     total = 0
     for _ in range(50):

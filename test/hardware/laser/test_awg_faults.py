@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import threading
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -89,19 +91,13 @@ def test_one_stall_is_recovered(bench: AwgBench, endpoint: int) -> None:
 def test_second_stall_is_an_error(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """driver: no third try, off, confirmed after opening again; user reads: ... the device stalled the transfer."""  # noqa: E501
     laser = bench.lit_laser()
-    stuck = [True]
-    clear_halt = bench.model.clear_halt
-
-    def clears(endpoint: int) -> None:
-        if not stuck[0]:
-            clear_halt(endpoint)
+    clear_halt, reset = bench.model.clear_halt, bench.model.reset
 
     def resets() -> None:
-        stuck[0] = False
+        monkeypatch.setattr(bench.model, "clear_halt", clear_halt)
         reset()
 
-    reset = bench.model.reset
-    monkeypatch.setattr(bench.model, "clear_halt", clears)
+    monkeypatch.setattr(bench.model, "clear_halt", lambda endpoint: None)
     monkeypatch.setattr(bench.model, "reset", resets)
     bench.model.stalled.add(ENDPOINT_IN)
     with pytest.raises(DeviceError, match="stalled the transfer"):
@@ -129,14 +125,8 @@ def test_mute_generator(bench: AwgBench, log: Path) -> None:
 def test_disabling_waits_two_seconds_at_most(fault: str) -> None:
     """driver: the sum of all waits of a disabling that fails is bounded; user reads: laser state unknown within 2 s."""  # noqa: E501
     waits: list[float] = []
-
-    def wait(_: threading.Condition, seconds: float | None) -> bool:
-        assert seconds is not None
-        waits.append(seconds)
-        return False
-
     bench = AwgBench()
-    bench.model = AwgModel(bench.clock, wait=wait)
+    bench.model = AwgModel(bench.clock, wait=lambda _, seconds: bool(waits.append(seconds)))
     bench.models[:] = [bench.model]
     laser = bench.lit_laser()
     waits.clear()
@@ -370,30 +360,26 @@ def test_no_generator_and_two(bench: AwgBench) -> None:
 
 def test_any_single_fault_on_the_way_to_light_leaves_no_unknown_light(bench: AwgBench) -> None:
     """Lit as requested, or reported as unknown."""
-    outcomes = set()
-    for at in range(60):
-        for fault in ("stall_in", "stall_out", "wrong_tags", "lost_replies", "gone"):
-            outcomes.add(_struck(fault, at))
+    faults: list[Callable[[AwgModel], object]] = [
+        lambda model: model.stalled.add(ENDPOINT_IN),
+        lambda model: model.stalled.add(ENDPOINT_OUT),
+        lambda model: setattr(model.faults, "wrong_tags", 1),
+        lambda model: setattr(model.faults, "lost_replies", 1),
+        lambda model: setattr(model, "gone", True),
+    ]
+    outcomes = {_struck(fault, at) for at in range(60) for fault in faults}
     assert outcomes == {"lit", "unknown"}
 
 
-def _struck(fault: str, at: int) -> str:
+def _struck(fault: Callable[[AwgModel], object], at: int) -> str:
     bench = AwgBench()
     laser = bench.laser()
-    left = [at]
+    messages = itertools.count(1)
     execute = bench.model.bulk_out
 
     def bulk_out(*arguments: Any) -> int:
-        left[0] -= 1
-        if left[0] == 0:
-            if fault == "stall_in":
-                bench.model.stalled.add(ENDPOINT_IN)
-            elif fault == "stall_out":
-                bench.model.stalled.add(ENDPOINT_OUT)
-            elif fault == "gone":
-                bench.model.gone = True
-            else:
-                setattr(bench.model.faults, fault, 1)
+        if next(messages) == at:
+            fault(bench.model)
         return execute(*arguments)
 
     bench.model.bulk_out = bulk_out  # type: ignore[method-assign]
@@ -412,9 +398,6 @@ def _struck(fault: str, at: int) -> str:
 
 def test_disabled_from_many_threads_it_is_off(bench: AwgBench, log: Path) -> None:
     laser = bench.lit_laser()
-    threads = [threading.Thread(target=laser.disable) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda _: laser.disable(), range(8)))
     assert states(log) == ["OFF", "ON", "OFF"]

@@ -15,9 +15,11 @@ from awg_bench import SQUARE, AwgBench
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.awg.model import ENDPOINT_OUT, read_output_log
-from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput
 from eschorty_ros.hardware.laser.awg import AwgLaser, open_laser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -45,9 +47,7 @@ def test_construction_switches_a_lit_generator_off(bench: AwgBench, tmp_path: Pa
 
 
 def test_identity_is_read_from_the_generator(bench: AwgBench) -> None:
-    identity = bench.laser().identity
-    assert (identity.model, identity.serial) == ("UNI-T UTG962E", "AWG1234567890")
-    assert identity.firmware == "V1.08"
+    assert bench.laser().identity == DeviceIdentity("UNI-T UTG962E", "AWG1234567890", "V1.08")
 
 
 def test_settings_are_made_in_the_safe_order(bench: AwgBench) -> None:
@@ -102,18 +102,6 @@ def test_enable_reads_all_back_before_and_the_output_after(bench: AwgBench) -> N
     assert sent[on + 1 :] == [":CHANnel1:OUTPut?", ":SYSTem:LOCK OFF"]
 
 
-def test_panel_is_free_after_every_call(bench: AwgBench) -> None:
-    laser = bench.laser()
-    steps: list[Any] = [
-        lambda: laser.configure(SQUARE), laser.arm, laser.enable, laser.readback, laser.disable,
-        laser.close,
-    ]  # fmt: skip
-    assert not bench.model.locked
-    for step in steps:
-        step()
-        assert not bench.model.locked
-
-
 def test_levels_can_be_set_from_any_others(bench: AwgBench) -> None:
     for low, high in ((0.0, 5.0), (2.0, 3.0), (0.0, 1.0), (1.5, 4.0)):
         laser = bench.laser(low_v=low, high_v=high)
@@ -157,9 +145,7 @@ def test_configured_while_on_it_is_off_in_between_and_on_again(
 
 
 def test_readback_has_the_time_of_the_switch_and_no_phase(bench: AwgBench) -> None:
-    laser = bench.laser()
-    laser.configure(SQUARE)
-    laser.arm()
+    laser = bench.ready_laser()
     bench.clock.now_ns += 5_000
     laser.enable()
     readback = laser.readback()
@@ -168,22 +154,9 @@ def test_readback_has_the_time_of_the_switch_and_no_phase(bench: AwgBench) -> No
     assert readback.modulation == SQUARE
 
 
-def test_change_of_light_is_reported_with_its_waveform(bench: AwgBench) -> None:
-    changes: list[tuple[bool, float]] = []
-    laser = bench.laser()
-    laser.configure(SQUARE)
-    bench.model.on_change = lambda _, lit, wave: changes.append((lit, wave.frequency_hz))
-    laser.arm()
-    laser.enable()
-    laser.disable()
-    assert changes == [(True, 70.0), (False, 70.0)]
-
-
 def test_warns_of_another_model_and_goes_on(bench: AwgBench, tmp_path: Path) -> None:
-    profile = Path(__file__).parents[3] / "config" / "awg_utg900e.yaml"
-    text = profile.read_text().replace("(?i)utg", "(?i)sdg")
-    other = tmp_path / "awg_other.yaml"
-    other.write_text(text)
+    profile, other = ROOT / "config" / "awg_utg900e.yaml", tmp_path / "awg_other.yaml"
+    other.write_text(profile.read_text().replace("(?i)utg", "(?i)sdg"))
     laser = bench.laser(profile=str(other))
     (warning,) = laser.readback().warnings
     assert "UTG962E" in warning
@@ -327,15 +300,11 @@ def test_driver_starts_without_numpy_and_ros() -> None:
         "a.load_profile('utg900e');"
         "print(sorted({'numpy', 'numba', 'rclpy', 'scipy'} & set(sys.modules)))"
     )
-    root = Path(__file__).parents[3]
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    found = subprocess.check_output([sys.executable, "-c", code], text=True, cwd=ROOT)
+    assert found.strip() == "[]"
 
 
-def test_switched_off_and_on_again_without_configuring() -> None:
-    bench = AwgBench()
+def test_switched_off_and_on_again_without_configuring(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     for _ in range(2):
         laser.disable()
@@ -344,4 +313,3 @@ def test_switched_off_and_on_again_without_configuring() -> None:
         laser.enable()
         assert bench.model.lit
         assert bench.model.channels[0].high_v == 5.0
-    laser.close()
