@@ -12,6 +12,8 @@ from eschorty_ros.emulation.apt.wire import BYTE_NS
 
 UNIT, BAY_2, RACK = 0x50, 0x22, 0x11
 SECOND = 1_000_000_000
+ENABLE_AND_HOME = (oracle.mod_set_chanenablestate(UNIT, 1, 1, 1), oracle.mot_move_home(UNIT, 1, 1))
+STATUS = oracle.mot_req_dcstatusupdate(UNIT, 1, 1)
 
 
 class Host:
@@ -37,7 +39,7 @@ def test_identity_axis_and_status() -> None:
     info, axis, status = Host().ask(
         oracle.hw_req_info(UNIT, 1),
         oracle.mot_req_stageaxisparams(UNIT, 1, 1),
-        oracle.mot_req_dcstatusupdate(UNIT, 1, 1),
+        STATUS,
     )
     assert info.model_number.startswith(b"KBD101")
     assert axis.part_no_axis.startswith(b"DDS220")
@@ -59,11 +61,7 @@ def test_rack_answers_for_its_bay_only() -> None:
 def test_homing_and_a_move_follow_the_trapezoid() -> None:
     host = Host(power_up_mm=5.0)
     assert host.ask(oracle.mot_move_home(UNIT, 1, 1), seconds=1.0) == []
-    (homed,) = host.ask(
-        oracle.mod_set_chanenablestate(UNIT, 1, 1, 1),
-        oracle.mot_move_home(UNIT, 1, 1),
-        seconds=2.0,
-    )
+    (homed,) = host.ask(*ENABLE_AND_HOME, seconds=2.0)
     assert homed.msg == "mot_move_homed"
     velocity, acceleration = round(100 * 134_217.7), round(1000 * 13.744)
     ordered_ns = host.now_ns
@@ -81,15 +79,14 @@ def test_homing_and_a_move_follow_the_trapezoid() -> None:
 
 def test_it_sends_50_statuses_without_a_keep_alive() -> None:
     host = Host()
-    request = oracle.mot_req_dcstatusupdate(UNIT, 1, 1)
-    assert len(host.ask(*[request] * 60, seconds=1.0)) == 50
-    assert host.ask(request) == []
-    assert len(host.ask(oracle.mot_ack_dcstatusupdate(UNIT, 1), request)) == 1
+    assert len(host.ask(*[STATUS] * 60, seconds=1.0)) == 50
+    assert host.ask(STATUS) == []
+    assert len(host.ask(oracle.mot_ack_dcstatusupdate(UNIT, 1), STATUS)) == 1
 
 
 def test_bytes_take_their_time_on_the_line() -> None:
     host = Host()
-    host.model.feed(oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    host.model.feed(STATUS)
     host.now_ns = 26 * BYTE_NS - 1
     assert host.model.step() == b""
     host.now_ns += 1
@@ -98,20 +95,16 @@ def test_bytes_take_their_time_on_the_line() -> None:
 
 def test_garbage_from_the_host_is_skipped() -> None:
     host = Host()
-    (status,) = host.ask(b"\xff\xfe\xfd" + oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    (status,) = host.ask(b"\xff\xfe\xfd" + STATUS)
     assert status.position == 0
 
 
 def test_a_restart_forgets_everything() -> None:
     host = Host()
-    host.ask(
-        oracle.mod_set_chanenablestate(UNIT, 1, 1, 1),
-        oracle.mot_move_home(UNIT, 1, 1),
-        seconds=2.0,
-    )
-    (status,) = host.ask(oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    host.ask(*ENABLE_AND_HOME, seconds=2.0)
+    (status,) = host.ask(STATUS)
     assert status.homed
     host.model.reboot()
-    (status,) = host.ask(oracle.mot_req_dcstatusupdate(UNIT, 1, 1))
+    (status,) = host.ask(STATUS)
     assert not status.homed
     assert not status.channel_enabled

@@ -2,6 +2,7 @@
 
 import errno
 import struct
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -76,6 +77,16 @@ class Host:
 
     def data(self):
         return self.device.read(DATA_IN, 128 << 10).tobytes()
+
+    def all_data(self):
+        """Everything there is, packet by packet."""
+        got = b""
+        while True:
+            try:
+                got += self.data()
+            except usb.core.USBTimeoutError:
+                if not self.source.pieces:
+                    return got
 
 
 def words(data):
@@ -222,26 +233,16 @@ def test_a_packet_of_whole_usb_packets_ends_with_an_empty_one():
 
 def test_nothing_is_lost_or_reordered_however_the_pieces_fall():
     rng = np.random.default_rng(5)
-    print("seed 5")
     times = np.cumsum(rng.integers(1, 40, 20_000))
     stream = []
-    high = -1
-    for t in times:
-        if t >> 12 != high:
-            high = t >> 12
-            stream.append(0x8000 | high)
+    for before, t in pairwise([-1, *times]):
+        if t >> 12 != before >> 12:
+            stream.append(0x8000 | t >> 12)
         stream += [0x6000 | t & 0xFFF, 0x0001, 0x2000 | int(rng.integers(1280))]
     cuts = np.sort(rng.integers(0, len(stream), 40))
     host = Host(Words(*np.split(np.array(stream), cuts)))
     host.run("init", "start")
-    got = b""
-    while True:
-        try:
-            got += host.data()
-        except usb.core.USBTimeoutError:
-            if not host.source.pieces:
-                break
-    assert got == np.array(stream, "<u2").tobytes()
+    assert host.all_data() == np.array(stream, "<u2").tobytes()
 
 
 def test_triggers_come_only_while_the_input_is_enabled():
@@ -274,7 +275,6 @@ def test_a_full_buffer_drops_words_and_marks_their_number():
 
 def test_masked_pixels_give_no_events_and_all_others_do():
     rng = np.random.default_rng(8)
-    print("seed 8")
     n = 30_000
     t, p = rng.integers(0, 50, n) * 1000, rng.integers(0, 2, n, dtype=np.uint8)
     x, y = rng.integers(0, 200, n, dtype=np.uint16), rng.integers(300, 340, n, dtype=np.uint16)
@@ -286,15 +286,7 @@ def test_masked_pixels_give_no_events_and_all_others_do():
     host.write(0x2000, 0x0000FF00)
     host.write(0x4000 + 4 * (310 // 32), 1 << 310 % 32)
     host.write(0x9100, 1 << 31 | 320 << 16 | 100)
-    got = b""
-    while host.source.pieces or host.model.pending(DATA_IN):
-        got += host.data()
-    while True:
-        try:
-            got += host.data()
-        except usb.core.USBTimeoutError:
-            break
-    events = evt3.Decoder().decode(got)
+    events = evt3.Decoder().decode(host.all_data())
     on = ((x < 8) | (x > 15)) & (y != 310) & ~((x == 100) & (y == 320))
     for field, expected in (("t", t), ("x", x), ("y", y), ("p", p)):
         assert np.array_equal(getattr(events, field), expected[on])

@@ -15,12 +15,23 @@ from eschorty_ros.hardware.stage.apt_setup import AptSettings
 DISCONNECT, STOP, KEEP_ALIVE = 0x0002, 0x0465, 0x0492
 
 
-def moving(speed_mm_s: float = 100.0, **model: object) -> AptBench:
-    """Return a bench half a second into a move to 200 mm."""
-    bench = AptBench(**model)
-    bench.stage.move_to(200.0, speed_mm_s)
+@pytest.fixture
+def bench() -> AptBench:
+    return AptBench()
+
+
+@pytest.fixture
+def moving(bench: AptBench) -> AptBench:
+    """A bench half a second into a move to 200 mm."""
+    bench.stage.move_to(200.0, 100.0)
     bench.advance(0.5)
     return bench
+
+
+def stall(bench: AptBench, seconds: float) -> None:
+    link, bench.link = bench.link, None
+    bench.advance(seconds)
+    bench.link = link
 
 
 def at_rest(bench: AptBench) -> bool:
@@ -29,10 +40,9 @@ def at_rest(bench: AptBench) -> bool:
 
 
 @pytest.mark.fault("garbage between frames")
-def test_garbage_in_a_move_is_skipped() -> None:
+def test_garbage_in_a_move_is_skipped(bench: AptBench) -> None:
     """driver: skips it and continues; user reads: skipped_bytes in the diagnostics."""
     chance = random.Random(1)
-    bench = AptBench()
     bench.stage.move_to(200.0, 100.0)
     while bench.stage.state().moving:
         bench.model.disturbance.garbage = chance.randbytes(chance.randrange(1, 12))
@@ -54,9 +64,8 @@ def test_a_move_arrives_in_spite_of_lost_bytes() -> None:
 
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("bit flips")
-def test_one_flipped_bit_moves_no_position(rests: bool) -> None:
+def test_one_flipped_bit_moves_no_position(bench: AptBench, rests: bool) -> None:
     """driver: uses no single implausible message, requests more; user reads: statuses_rejected."""
-    bench = AptBench()
     bench.move(100.0)
     if not rests:
         bench.stage.move_to(200.0, 10.0)
@@ -71,26 +80,24 @@ def test_one_flipped_bit_moves_no_position(rests: bool) -> None:
 
 
 @pytest.mark.fault("bit flips")
-def test_two_implausible_messages_in_a_row_stop_the_stage() -> None:
+def test_two_implausible_messages_in_a_row_stop_the_stage(moving: AptBench) -> None:
     """driver: stops; user reads: two status messages in a row are implausible; check cable."""
-    bench = moving()
-    bench.model.disturbance.flips = 2
-    bench.model.disturbance.flip_bit = 16 + 21
+    moving.model.disturbance.flips = 2
+    moving.model.disturbance.flip_bit = 16 + 21
 
     def next_bit() -> None:
-        if bench.model.disturbance.flips == 1:
-            bench.model.disturbance.flip_bit = 16 + 19
+        if moving.model.disturbance.flips == 1:
+            moving.model.disturbance.flip_bit = 16 + 19
 
-    bench.on_tick = next_bit
-    assert "in a row are implausible" in bench.failure()
-    assert at_rest(bench)
+    moving.on_tick = next_bit
+    assert "in a row are implausible" in moving.failure()
+    assert at_rest(moving)
 
 
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("encoder jumps")
-def test_an_encoder_jump_stops_the_stage(rests: bool) -> None:
+def test_an_encoder_jump_stops_the_stage(bench: AptBench, rests: bool) -> None:
     """driver: two readings stop it; user reads: the encoder jumped by ... mm; home again."""
-    bench = AptBench()
     if not rests:
         bench.stage.move_to(200.0, 100.0)
         bench.advance(0.5)
@@ -104,59 +111,51 @@ def test_an_encoder_jump_stops_the_stage(rests: bool) -> None:
 
 
 @pytest.mark.fault("carriage stalls")
-def test_a_stalled_carriage_is_stopped_and_disabled() -> None:
+def test_a_stalled_carriage_is_stopped_and_disabled(moving: AptBench) -> None:
     """driver: profiled stop, immediate stop, disable; user reads: stuck at ... on its move."""
-    bench = moving()
-    bench.model.axis.freeze(bench.clock_ns())
-    begun_ns = bench.now_ns
-    text = bench.failure()
-    assert "stuck at" in text
-    assert bench.now_ns - begun_ns < 400_000_000
-    bench.advance(0.6)
-    late = [data for at, data in bench.port.written if at > begun_ns]
-    modes = [data[3] for data in late if data[:2] == b"\x65\x04"]
-    assert modes == [2, 1]
-    assert not bench.model.enabled
+    moving.model.axis.freeze(moving.clock_ns())
+    begun_ns = moving.now_ns
+    assert "stuck at" in moving.failure()
+    assert moving.now_ns - begun_ns < 400_000_000
+    moving.advance(0.6)
+    late = [data for at, data in moving.port.written if at > begun_ns]
+    assert [data[3] for data in late if data[:2] == b"\x65\x04"] == [2, 1]
+    assert not moving.model.enabled
 
 
 @pytest.mark.fault("carriage stalls")
-def test_a_position_error_counts_as_a_stall() -> None:
+def test_a_position_error_counts_as_a_stall(moving: AptBench) -> None:
     """driver: the same as for a stall; user reads: the stage is stuck at ..."""
-    bench = moving()
-    bench.model.extra_bits = 0x4000
-    assert "stuck at" in bench.failure()
-    assert at_rest(bench)
+    moving.model.extra_bits = 0x4000
+    assert "stuck at" in moving.failure()
+    assert at_rest(moving)
 
 
 @pytest.mark.fault("serial line unplugged, no answer")
-def test_an_unplugged_port_fails_at_once() -> None:
+def test_an_unplugged_port_fails_at_once(moving: AptBench) -> None:
     """driver: fails at once, as does every later order; user reads: the stage's port failed: ..."""
-    bench = moving()
-    bench.model.gone = True
-    assert "port failed" in bench.failure()
+    moving.model.gone = True
+    assert "port failed" in moving.failure()
     with pytest.raises(DeviceGoneError):
-        bench.stage.move_to(10.0, 10.0)
-    bench.stage.stop()
-    bench.stage.close()
+        moving.stage.move_to(10.0, 10.0)
+    moving.stage.stop()
+    moving.stage.close()
 
 
 @pytest.mark.fault("serial line unplugged, no answer")
-def test_a_controller_that_sends_nothing_fails() -> None:
+def test_a_controller_that_sends_nothing_fails(bench: AptBench) -> None:
     """driver: warns after 0.5 s, fails after 1.5 s; user reads: sent no status for 1.5 s."""
-    bench = AptBench()
     bench.model.mute = True
     bench.advance(0.7)
     assert "status_late" in bench.stage.state().flags
     assert not bench.stage.healthy
-    text = bench.failure()
-    assert "sent no status for 1.5 s" in text
+    assert "sent no status for 1.5 s" in bench.failure()
     assert 1.4e9 < bench.stage._tracker.age_ns < 1.7e9
 
 
 @pytest.mark.fault("limit switch")
-def test_after_a_limit_in_a_move_only_the_way_back_is_free() -> None:
+def test_after_a_limit_in_a_move_only_the_way_back_is_free(bench: AptBench) -> None:
     """driver: stops, allows only the way back; user reads: met a limit at ... mm; move it back."""
-    bench = AptBench()
     bench.model.axis.obstacle_mm = 80.0
     bench.move(200.0, 100.0)
     state = bench.stage.state()
@@ -186,18 +185,16 @@ def test_motions_end_without_end_messages() -> None:
 
 
 @pytest.mark.fault("completion message missing")
-def test_a_motion_without_end_is_stopped() -> None:
+def test_a_motion_without_end_is_stopped(bench: AptBench) -> None:
     """driver: stops after the longest time it should take; user reads: does not end in time."""
-    bench = AptBench()
     bench.stage.move_to(30.0, 100.0)
     bench.model.extra_bits = apt_messages.MOVING
     assert "move does not end in time" in bench.failure(10.0)
 
 
 @pytest.mark.fault("keep-alive missing")
-def test_the_keep_alive_is_sent_twice_a_second() -> None:
+def test_the_keep_alive_is_sent_twice_a_second(bench: AptBench) -> None:
     """driver: sends it from the writer's thread twice a second; user reads: nothing."""
-    bench = AptBench()
     bench.advance(5.0)
     sent = bench.sent(KEEP_ALIVE)
     assert max(b - a for a, b in itertools.pairwise(sent)) < 700_000_000
@@ -205,9 +202,8 @@ def test_the_keep_alive_is_sent_twice_a_second() -> None:
 
 
 @pytest.mark.fault("keep-alive missing")
-def test_without_keep_alive_the_link_fails() -> None:
+def test_without_keep_alive_the_link_fails(bench: AptBench) -> None:
     """driver: fails as on a dead link; user reads: sent no status for 1.5 s; check its power ..."""
-    bench = AptBench()
     for timer in bench.link._timers:
         if timer.period_ns == 500_000_000:
             timer.action = lambda: None
@@ -224,17 +220,15 @@ def test_an_axis_that_is_not_enabled_is_refused() -> None:
 
 
 @pytest.mark.fault("disabled, not homed, move ignored")
-def test_an_axis_disabled_in_a_move_fails() -> None:
+def test_an_axis_disabled_in_a_move_fails(moving: AptBench) -> None:
     """driver: stops; user reads: does not have the axis enabled any more; configure and home."""
-    bench = moving()
-    bench.model.enabled = False
-    assert "axis enabled any more" in bench.failure()
+    moving.model.enabled = False
+    assert "axis enabled any more" in moving.failure()
 
 
 @pytest.mark.fault("disabled, not homed, move ignored")
-def test_an_ignored_move_fails() -> None:
+def test_an_ignored_move_fails(bench: AptBench) -> None:
     """driver: sees no motion within 0.3 s; user reads: does not begin its move within 0.3 s."""
-    bench = AptBench()
     bench.model.ignores_moves = True
     bench.stage.move_to(100.0, 100.0)
     begun_ns = bench.now_ns
@@ -244,29 +238,26 @@ def test_an_ignored_move_fails() -> None:
 
 @pytest.mark.parametrize("text", ["", "Motor over temperature"])
 @pytest.mark.fault("controller reports an error")
-def test_an_error_message_stops_the_stage(text: str) -> None:
+def test_an_error_message_stops_the_stage(moving: AptBench, text: str) -> None:
     """driver: stops; user reads: the controller's code and text, or to look at its display."""
-    bench = moving()
-    bench.model.send_error(17, text)
-    read = bench.failure()
+    moving.model.send_error(17, text)
+    read = moving.failure()
     assert (f"error 17: {text}" if text else "look at its display") in read
-    assert at_rest(bench)
+    assert at_rest(moving)
 
 
 @pytest.mark.fault("controller reports an error")
-def test_reported_faults_stop_the_stage() -> None:
+def test_reported_faults_stop_the_stage(moving: AptBench) -> None:
     """driver: stops when two messages have them; user reads: reports over_temperature."""
-    bench = moving()
-    bench.model.extra_bits = 0x20000
-    assert "reports over_temperature" in bench.failure()
-    assert at_rest(bench)
+    moving.model.extra_bits = 0x20000
+    assert "reports over_temperature" in moving.failure()
+    assert at_rest(moving)
 
 
 @pytest.mark.parametrize("rests", [True, False])
 @pytest.mark.fault("controller rebooted")
-def test_a_restarted_controller_must_be_homed(rests: bool) -> None:
+def test_a_restarted_controller_must_be_homed(bench: AptBench, rests: bool) -> None:
     """driver: stops; user reads: does not have its reference any more; configure and home."""
-    bench = AptBench()
     bench.move(60.0)
     if not rests:
         bench.stage.move_to(200.0, 100.0)
@@ -281,9 +272,8 @@ def test_a_restarted_controller_must_be_homed(rests: bool) -> None:
 
 
 @pytest.mark.fault("late or double reply")
-def test_double_replies_count_once() -> None:
+def test_double_replies_count_once(bench: AptBench) -> None:
     """driver: uses each answer once, by message and source; user reads: nothing."""
-    bench = AptBench()
     bench.model.disturbance.repeats = 10_000
     bench.move(100.0)
     bench.move(20.0)
@@ -303,33 +293,25 @@ def test_a_late_reply_is_requested_again() -> None:
 
 
 @pytest.mark.fault("host stalls")
-def test_positions_are_exact_after_a_stall_in_a_move() -> None:
+def test_positions_are_exact_after_a_stall_in_a_move(moving: AptBench) -> None:
     """driver: positions stay interpolated, the stall is filled afterwards; user reads: nothing."""
-    bench = AptBench()
-    bench.stage.move_to(200.0, 100.0)
-    bench.advance(0.5)
-    link, bench.link = bench.link, None
-    bench.advance(0.3)
-    bench.link = link
-    before = bench.stage.state()
-    assert before.t_ns <= bench.clock_ns() - 300_000_000
-    bench.until(lambda: not bench.stage.state().moving, 20.0)
+    stall(moving, 0.3)
+    before = moving.stage.state()
+    assert before.t_ns <= moving.clock_ns() - 300_000_000
+    moving.until(lambda: not moving.stage.state().moving, 20.0)
     for t_ns in range(before.t_ns, before.t_ns + 400_000_000, 10_000_000):
-        true_mm = bench.model.axis.position_mm(t_ns)
-        assert bench.stage.state(t_ns).position_mm == pytest.approx(true_mm, abs=0.02)
+        true_mm = moving.model.axis.position_mm(t_ns)
+        assert moving.stage.state(t_ns).position_mm == pytest.approx(true_mm, abs=0.02)
 
 
 @pytest.mark.fault("host stalls")
-def test_a_stall_as_a_move_begins_is_no_failure() -> None:
+def test_a_stall_as_a_move_begins_is_no_failure(bench: AptBench) -> None:
     """driver: an answer from before the order does not count for the move; user reads: nothing."""
-    bench = AptBench()
     for turn, stall_s in itertools.product(range(12), (0.35, 0.8)):
         bench.advance(0.007 * turn)
         target_mm = 20.0 + 60.0 * ((turn + (stall_s > 0.5)) % 2)
         bench.stage.move_to(target_mm, 50.0)
-        link, bench.link = bench.link, None
-        bench.advance(stall_s)
-        bench.link = link
+        stall(bench, stall_s)
         bench.until(lambda: not bench.stage.state().moving, 20.0)
         assert bench.stage.state().position_mm == pytest.approx(target_mm, abs=1e-4)
 

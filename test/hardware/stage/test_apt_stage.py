@@ -14,6 +14,11 @@ from eschorty_ros.hardware.stage.apt_setup import AptSettings
 BAY_2 = AptSettings(controller="bbd30x", bay=2, trigger_port=3)
 
 
+@pytest.fixture
+def bench() -> AptBench:
+    return AptBench()
+
+
 @pytest.mark.parametrize("settings", [AptSettings(), BAY_2], ids=["kbd101", "bbd30x"])
 def test_connect_home_and_move(settings: AptSettings) -> None:
     bench = AptBench(settings)
@@ -55,17 +60,15 @@ def test_odometry_within_20_um_at_300_mm_s(rate_hz: float) -> None:
     bench.move(5.0, 300.0)
     found: dict[int, float] = {}
     for target_mm in (215.0, 5.0):
-        stage = bench.stage
-        stage.move_to(target_mm, 300.0)
-        while stage.state().moving:
+        bench.stage.move_to(target_mm, 300.0)
+        while bench.stage.state().moving:
             bench.advance(0.01)
-            state = stage.state()
+            state = bench.stage.state()
             found[state.t_ns] = state.position_mm
-    t_ns = np.array(sorted(found))
-    places = np.array([found[int(t)] for t in t_ns])
-    true = np.array([bench.model.axis.position_mm(int(t)) for t in t_ns])
+    places = np.array(list(found.values()))
+    true = np.array([bench.model.axis.position_mm(t_ns) for t_ns in found])
     worst_um = np.abs(places - true).max() * 1e3
-    print(f"{rate_hz:g} Hz: {worst_um:.1f} um at most, {len(t_ns)} positions")
+    print(f"{rate_hz:g} Hz: {worst_um:.1f} um at most, {len(found)} positions")
     assert np.ptp(true) > 205.0
     assert worst_um < 20.0
     assert bench.stage.statistics()["fit_residual_um"] < 5.0
@@ -107,9 +110,8 @@ def test_profiled_stop_is_on_the_wire_at_once() -> None:
     bench.move(10.0)
 
 
-def test_a_stop_while_a_move_is_prepared_prevents_it() -> None:
+def test_a_stop_while_a_move_is_prepared_prevents_it(bench: AptBench) -> None:
     """The speed is written before the move is ordered; that takes its time."""
-    bench = AptBench()
     at_mm = bench.true_mm
     bench.on_tick = lambda: bench.stage.stop() if bench.sent(0x0413)[before:] else None
     before = len(bench.sent(0x0413))
@@ -121,8 +123,7 @@ def test_a_stop_while_a_move_is_prepared_prevents_it() -> None:
     bench.move(20.0)
 
 
-def test_a_move_that_a_stop_crosses_ends_too() -> None:
-    bench = AptBench()
+def test_a_move_that_a_stop_crosses_ends_too(bench: AptBench) -> None:
     before_mm = bench.true_mm
     orders = len(bench.sent(0x0453))
     send = bench.stage._send_stop
@@ -139,8 +140,7 @@ def test_a_move_that_a_stop_crosses_ends_too() -> None:
     assert abs(bench.true_mm - before_mm) < 1.0
 
 
-def test_a_stage_left_moving_is_stopped_at_connect() -> None:
-    bench = AptBench()
+def test_a_stage_left_moving_is_stopped_at_connect(bench: AptBench) -> None:
     bench.stage.move_to(200.0, 50.0)
     bench.advance(0.5)
     bench.stage = bench.open()
@@ -161,9 +161,8 @@ def test_pulses_every_2_mm_in_both_directions(settings: AptSettings) -> None:
         begun_ns = bench.clock_ns()
         bench.move(target_mm)
         edges = bench.model.trigger_pulses(begun_ns, bench.clock_ns())
-        rises = [t_ns for t_ns, rising in edges if rising]
-        assert len(edges) == 2 * len(rises)
-        passed = [bench.model.axis.position_mm(t_ns) for t_ns in rises]
+        passed = [bench.model.axis.position_mm(t_ns) for t_ns, rising in edges if rising]
+        assert len(edges) == 2 * len(passed)
         assert passed == pytest.approx(places, abs=1e-3)
 
 
@@ -185,8 +184,7 @@ def test_no_pulses_when_the_interval_is_0() -> None:
     assert bench.model.trigger_pulses(EPOCH_NS, bench.clock_ns()) == []
 
 
-def test_all_settings_are_written_at_each_connection() -> None:
-    bench = AptBench()
+def test_all_settings_are_written_at_each_connection(bench: AptBench) -> None:
     bench.model.reboot()
     bench.port.written.clear()
     bench.stage = bench.open()
@@ -222,8 +220,7 @@ def test_wrong_settings_are_refused(wrong: dict, text: str) -> None:
 
 @pytest.mark.parametrize("set_s", [-2, -3600, 3600])
 @pytest.mark.parametrize("moving", [False, True], ids=["at rest", "moving"])
-def test_the_odometry_continues_after_the_host_clock_is_set(set_s: int, moving: bool) -> None:
-    bench = AptBench()
+def test_the_odometry_continues_after_the_host_clock_is_set(bench: AptBench, set_s: int, moving: bool) -> None:
     bench.move(10.0)
     if moving:
         bench.stage.move_to(110.0, 100.0)
