@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import ctypes
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,6 +23,7 @@ from eschorty_ros.hardware.camera.bulk_reader import (
 libusb_package = pytest.importorskip("libusb_package", reason="libusb-package is not installed")
 pytest.importorskip("usb1", reason="libusb1 is not installed")
 
+import usb.core
 from usb1 import libusb1
 
 BACKEND = libusb_package.get_libusb1_backend()
@@ -84,8 +86,6 @@ class Empty:
         self.cleared.append(endpoint)
 
     def read(self, *_: Any) -> int:
-        import usb.core
-
         raise usb.core.USBTimeoutError("timed out", -7, 110)
 
 
@@ -94,7 +94,8 @@ def bus() -> Bus:
     return Bus()
 
 
-def reader_on(bus: Bus) -> AsyncReader:
+@pytest.fixture
+def reader(bus: Bus) -> AsyncReader:
     handle, context = ctypes.c_void_p(8), ctypes.c_void_p(16)
     clock = iter(range(10_000))
     synchronous = SyncReader(Empty(), 0x81, lambda: 0)
@@ -105,8 +106,9 @@ COMPLETED = libusb1.LIBUSB_TRANSFER_COMPLETED
 TIMED_OUT = libusb1.LIBUSB_TRANSFER_TIMED_OUT
 
 
-def test_transfers_are_queued_before_the_first_byte_and_again_after_each(bus: Bus) -> None:
-    reader = reader_on(bus)
+def test_transfers_are_queued_before_the_first_byte_and_again_after_each(
+    bus: Bus, reader: AsyncReader
+) -> None:
     reader.start()
     assert len(bus.queued) == TRANSFERS
     bus.events = [(COMPLETED, b"abcd"), (TIMED_OUT, b""), (TIMED_OUT, b"ef"), (COMPLETED, b"")]
@@ -129,9 +131,8 @@ def test_transfers_are_queued_before_the_first_byte_and_again_after_each(bus: Bu
     ],
 )
 def test_failed_transfer_comes_after_what_was_received(
-    bus: Bus, status: int, kind: type[DeviceError]
+    bus: Bus, reader: AsyncReader, status: int, kind: type[DeviceError]
 ) -> None:
-    reader = reader_on(bus)
     reader.start()
     # Data after the failure lies behind a gap and must not come before the error.
     bus.events = [(COMPLETED, b"abcd"), (status, b""), (COMPLETED, b"late")]
@@ -147,8 +148,7 @@ def test_failed_transfer_comes_after_what_was_received(
     assert bus.freed == 2 * TRANSFERS
 
 
-def test_transfer_that_cannot_be_queued_is_an_error(bus: Bus) -> None:
-    reader = reader_on(bus)
+def test_transfer_that_cannot_be_queued_is_an_error(bus: Bus, reader: AsyncReader) -> None:
     bus.submit_code = libusb1.LIBUSB_ERROR_NO_DEVICE
     reader.start()
     with pytest.raises(DeviceGoneError):
@@ -158,20 +158,10 @@ def test_transfer_that_cannot_be_queued_is_an_error(bus: Bus) -> None:
 
 
 def test_emulated_backend_is_read_synchronously() -> None:
-    class Backend: ...
-
-    assert isinstance(make_reader(Backend(), Empty(), 0x81, lambda: 0), SyncReader)  # type: ignore[arg-type]
+    assert isinstance(make_reader(object(), Empty(), 0x81, lambda: 0), SyncReader)
 
 
 def test_real_libusb_is_read_with_queued_transfers() -> None:
-    class Handle:
-        handle = ctypes.c_void_p(8)
-
-    class Context:
-        handle = Handle()
-
-    class Opened(Empty):
-        _ctx = Context()
-
-    reader = make_reader(BACKEND, Opened(), 0x81, lambda: 0)  # type: ignore[arg-type]
-    assert isinstance(reader, AsyncReader)
+    opened = Empty()
+    opened._ctx = SimpleNamespace(handle=SimpleNamespace(handle=ctypes.c_void_p(8)))
+    assert isinstance(make_reader(BACKEND, opened, 0x81, lambda: 0), AsyncReader)

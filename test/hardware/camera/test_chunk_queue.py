@@ -8,49 +8,40 @@ from eschorty_ros.core.base.errors import DeviceGoneError
 from eschorty_ros.hardware.camera.chunk_queue import ChunkQueue
 
 
-def opened() -> ChunkQueue:
+@pytest.fixture
+def queue() -> ChunkQueue:
     queue = ChunkQueue()
     queue.open()
     return queue
 
 
-def test_words_cut_by_a_transfer_are_joined() -> None:
-    queue = opened()
-    queue.put(b"abc", 1)
-    queue.put(b"d", 2)
-    queue.put(b"e", 3)
-    queue.put(b"f", 4)
-    got = [queue.get(0.0), queue.get(0.0), queue.get(0.0)]
-    assert [chunk.data for chunk in got if chunk] == [b"ab", b"cd", b"ef"]
+def test_words_cut_by_a_transfer_are_joined(queue: ChunkQueue) -> None:
+    for at, data in enumerate((b"abc", b"d", b"e", b"f")):
+        queue.put(data, at)
+    assert [queue.get(0.0).data for _ in range(3)] == [b"ab", b"cd", b"ef"]
 
 
-def test_a_gap_discards_half_a_word() -> None:
-    queue = opened()
+def test_a_gap_discards_half_a_word(queue: ChunkQueue) -> None:
     queue.put(b"abc", 1)
     queue.mark_gap()
     queue.put(b"xy", 2)
-    got = [queue.get(0.0), queue.get(0.0)]
-    assert [(chunk.data, chunk.gap) for chunk in got if chunk] == [(b"ab", False), (b"xy", True)]
+    got = [queue.get(0.0) for _ in range(2)]
+    assert [(chunk.data, chunk.gap) for chunk in got] == [(b"ab", False), (b"xy", True)]
 
 
-def test_a_restart_is_marked_once_and_replaces_the_gap_before_it() -> None:
-    queue = opened()
+def test_a_restart_is_marked_once_and_replaces_the_gap_before_it(queue: ChunkQueue) -> None:
     queue.put(b"ab", 1)
     queue.mark_gap()
     queue.mark_restart()
     queue.put(b"cd", 2)
     queue.put(b"ef", 3)
     got = [queue.get(0.0) for _ in range(3)]
-    assert [(c.restarted, c.gap) for c in got if c] == [
-        (True, False),
-        (True, False),
-        (False, False),
-    ]
+    assert not any(chunk.gap for chunk in got)
+    assert [chunk.restarted for chunk in got] == [True, True, False]
     assert queue.restarts == 2
 
 
-def test_failure_comes_after_the_last_chunk() -> None:
-    queue = opened()
+def test_failure_comes_after_the_last_chunk(queue: ChunkQueue) -> None:
     queue.put(b"ab", 1)
     queue.fail(DeviceGoneError("gone"))
     assert queue.get(0.0) is not None

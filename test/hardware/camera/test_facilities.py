@@ -5,24 +5,36 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from camera_register_file import RegisterFile
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, FormatError
 from eschorty_ros.hardware.camera import event_rate, event_trail, monitors
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
-from eschorty_ros.hardware.camera.biases import (
-    BIASES,
-    BiasBank,
-    load_bias_file,
-    save_bias_file,
-)
-from eschorty_ros.hardware.camera.pixel_selection import (
-    set_hot_pixels,
-    set_windows,
-    windows_of,
-)
+from eschorty_ros.hardware.camera.biases import BIASES, BiasBank, load_bias_file, save_bias_file
+from eschorty_ros.hardware.camera.pixel_selection import set_hot_pixels, set_windows, windows_of
 
 FACTORY = {0x1004: 0x11A1_0053, 0x100C: 0x11A1_0000, 0x1010: 0x11A1_0066, 0x1018: 0x11A1_0049}
+
+
+class RegisterFile:
+    """Stores written values; ``always_set`` bits read as 1, writes are recorded in order."""
+
+    def __init__(self, values: dict[int, int] | None = None) -> None:
+        self.values = dict(values or {})
+        self.always_set: dict[int, int] = {}
+        self.writes: list[tuple[int, int]] = []
+
+    def read(self, address: int) -> int:
+        return self.values.get(address, 0) | self.always_set.get(address, 0)
+
+    def write(self, address: int, value: int) -> None:
+        assert 0 <= value <= 0xFFFF_FFFF
+        self.values[address] = value
+        self.writes.append((address, value))
+
+
+@pytest.fixture
+def registers() -> RegisterFile:
+    return RegisterFile()
 
 
 def bank(wide: bool = False) -> tuple[RegisterFile, BiasBank]:
@@ -63,13 +75,10 @@ def test_bias_the_camera_does_not_keep_is_an_error() -> None:
         biases.write("bias_diff_on", 0)
 
 
-def test_bias_file_round_trip(tmp_path: Path) -> None:
+def test_bias_file_round_trip_and_of_the_makers_tools(tmp_path: Path) -> None:
     offsets = {"bias_diff_on": 12, "bias_diff_off": -3, "bias_fo": 0, "bias_hpf": 9, "bias_refr": 1}
     save_bias_file(tmp_path / "a.bias", offsets)
     assert load_bias_file(tmp_path / "a.bias") == offsets
-
-
-def test_bias_file_of_the_makers_tools(tmp_path: Path) -> None:
     path = tmp_path / "b.bias"
     path.write_text("% written by a tool\n0  % bias_diff\n20 % bias_diff_on\n\n-7 % bias_fo\n")
     assert load_bias_file(path) == {"bias_diff_on": 20, "bias_fo": -7}
@@ -99,8 +108,7 @@ def test_event_rate_tables_and_limit() -> None:
         event_rate.set_event_rate(registers, True, 3_300_000_000)
 
 
-def test_anti_flicker_band() -> None:
-    registers = RegisterFile()
+def test_anti_flicker_band(registers: RegisterFile) -> None:
     registers.always_set[0xC0C4] = 1 << 2
     set_anti_flicker(registers, AntiFlicker(50, 520, band_pass=True))
     # 50 Hz is period 156, 520 Hz is 15.
@@ -134,8 +142,7 @@ def test_anti_flicker_band_outside_the_sensor_is_refused(low: int, high: int) ->
         ("stc_keep_trail", 1 << 24 | 10_000 << 1 | 1, 0),
     ],
 )
-def test_trail_filters(kind: str, stc: int, trail: int) -> None:
-    registers = RegisterFile()
+def test_trail_filters(registers: RegisterFile, kind: str, stc: int, trail: int) -> None:
     assert event_trail.set_event_trail(registers, kind, 10_000) == 10_000
     assert registers.read(0xD004) == stc
     assert registers.read(0xD008) == trail
@@ -147,8 +154,7 @@ def test_trail_filters(kind: str, stc: int, trail: int) -> None:
     assert registers.values[0xD000] == 5
 
 
-def test_trail_thresholds_are_whole_milliseconds() -> None:
-    registers = RegisterFile()
+def test_trail_thresholds_are_whole_milliseconds(registers: RegisterFile) -> None:
     assert set(event_trail.TIMING) == set(range(1, 101))
     assert event_trail.set_event_trail(registers, "trail", 1_499) == 1_000
     assert event_trail.set_event_trail(registers, "trail", 99_500) == 100_000
@@ -184,8 +190,7 @@ def test_roi_outside_the_sensor_is_refused(flat: list[int]) -> None:
         windows_of(flat)
 
 
-def test_hot_pixels() -> None:
-    registers = RegisterFile()
+def test_hot_pixels(registers: RegisterFile) -> None:
     set_hot_pixels(registers, [(3, 700), (1279, 0)])
     assert registers.values[0x9100] == 1 << 31 | 700 << 16 | 3
     assert registers.values[0x9104] == 1 << 31 | 1279
@@ -196,8 +201,7 @@ def test_hot_pixels() -> None:
         set_hot_pixels(registers, [(0, 720)])
 
 
-def test_packet_period_is_in_steps_of_16_us() -> None:
-    registers = RegisterFile()
+def test_packet_period_is_in_steps_of_16_us(registers: RegisterFile) -> None:
     assert monitors.set_packet_period(registers, 1008) == 1008
     assert monitors.set_packet_period(registers, 1000) == 992
     with pytest.raises(ArgumentError, match="mipi_frame_period is 8"):

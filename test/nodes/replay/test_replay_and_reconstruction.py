@@ -24,7 +24,9 @@ from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.simulation.scenes import named
 from eschorty_ros.simulation.world import simulate_recording
 
+NODES = "eschorty_ros.nodes.{}.node"
 RELIABLE = "qos_overrides./eschorty/camera/events.subscription.reliability"
+RECONSTRUCTION = {"stage_gap": 0.0, RELIABLE: "reliable"}
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +43,7 @@ def live(tmp_path_factory):
     )
     domain = free_domain()
     with (
-        NodeProcess(
-            "eschorty_ros.nodes.reconstruction.node",
-            {"stage_gap": 0.0, RELIABLE: "reliable"},
-            domain=domain,
-        ) as node,
+        NodeProcess(NODES.format("reconstruction"), RECONSTRUCTION, domain=domain) as node,
         Observer(domain) as observer,
     ):
         topics = {
@@ -86,7 +84,7 @@ def live(tmp_path_factory):
 def replay(recording, rate, domain):
     """Replay a recording to its end."""
     parameters = {"recording": recording.path, "rate": rate, "timeout": DEADLINE_S}
-    with NodeProcess("eschorty_ros.nodes.replay.node", parameters, domain=domain) as process:
+    with NodeProcess(NODES.format("replay"), parameters, domain=domain) as process:
         assert process.wait() == 0, process.output
 
 
@@ -150,11 +148,8 @@ def test_state_counts_and_advances(live):
 
 
 def test_frames_form_one_chain(live):
-    static = {
-        t.child_frame_id: t.header.frame_id
-        for message in live.topics["/tf_static"]
-        for t in message.transforms
-    }
+    fixed = [t for message in live.topics["/tf_static"] for t in message.transforms]
+    static = {t.child_frame_id: t.header.frame_id for t in fixed}
     assert static == {"eschorty_link": "eschorty_stage", "eschorty_optical": "eschorty_link"}
     moving = [t for message in live.topics["/tf"] for t in message.transforms]
     assert {(t.header.frame_id, t.child_frame_id) for t in moving} == {
@@ -186,9 +181,8 @@ def test_a_second_replay_as_fast_as_possible_gives_the_same_points(live):
 
 
 def test_a_missing_recording_is_one_line(tmp_path):
-    with NodeProcess(
-        "eschorty_ros.nodes.replay.node", {"recording": tmp_path / "none"}, domain=free_domain()
-    ) as process:
+    parameters, domain = {"recording": tmp_path / "none"}, free_domain()
+    with NodeProcess(NODES.format("replay"), parameters, domain=domain) as process:
         assert process.wait() == 1
         lines = [line for line in process.output.splitlines() if line.strip()]
         assert len(lines) == 1, process.output
@@ -198,9 +192,8 @@ def test_a_missing_recording_is_one_line(tmp_path):
 def test_scan_services_refuse_with_a_reason(live):
     observer = live.observer
     # The replay, which publishes the events, has ended.
-    begin = observer.call(
-        BeginScan, "reconstruction/begin_scan", BeginScan.Request(scan_id="x", stop=1.0)
-    )
+    request = BeginScan.Request(scan_id="x", stop=1.0)
+    begin = observer.call(BeginScan, "reconstruction/begin_scan", request)
     assert not begin.success
     assert "no publisher of" in begin.message
     end = observer.call(EndScan, "reconstruction/end_scan", EndScan.Request(scan_id="x"))
