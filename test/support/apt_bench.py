@@ -19,7 +19,6 @@ TICK_NS = 200_000
 
 
 class MemoryPort:
-    """A port that is connected to the model directly."""
 
     timeout: float | None = None
     in_waiting = 0
@@ -43,15 +42,7 @@ class MemoryPort:
 
 
 class AptBench:
-    """Driver, model, and the clock of both.
-
-    Parameters
-    ----------
-    settings : AptSettings, optional
-    home : bool
-        Whether to home the stage at once.
-    model : keyword arguments of ``AptModel``
-    """
+    """Driver, ``AptModel`` with these arguments, and the clock of both."""
 
     def __init__(
         self, settings: AptSettings | None = None, *, home: bool = True, **model: Any
@@ -82,9 +73,7 @@ class AptBench:
         return AptStage(self._make_link, self.host_clock_ns, self.settings)
 
     def _make_link(
-        self,
-        on_frame: Callable[[Frame, int], None],
-        on_lost: Callable[[DeviceError], None],
+        self, on_frame: Callable[[Frame, int], None], on_lost: Callable[[DeviceError], None]
     ) -> AptLink:
         self.link = AptLink(self.port, on_frame, on_lost, lambda: self.now_ns, self._wait)
         return self.link
@@ -111,43 +100,37 @@ class AptBench:
         return min(to_due_ns, to_end_ns) if to_end_ns > 0 else to_due_ns
 
     def advance(self, seconds: float) -> None:
-        """Advance the clock."""
         end_ns = self.now_ns + round(seconds * 1e9)
         while self.now_ns < end_ns:
             self._tick(end_ns)
 
     def until(self, condition: Callable[[], bool], limit_s: float = 10.0) -> None:
-        """Advance the clock until a condition holds."""
         end_ns = self.now_ns + round(limit_s * 1e9)
         while not condition():
             assert self.now_ns < end_ns, f"not within {limit_s:g} s"
             self._tick(end_ns)
 
     def move(self, position_mm: float, speed_mm_s: float = 200.0) -> None:
-        """Move and wait for the end."""
         self.stage.move_to(position_mm, speed_mm_s)
         self.until(lambda: not self.stage.state().moving, 60.0)
 
     def failure(self, limit_s: float = 5.0) -> str:
         """Return the error that the user reads when the stage fails."""
-        text = ""
+        errors: list[str] = []
 
         def failed() -> bool:
-            nonlocal text
             try:
                 self.stage.state()
             except DeviceError as error:
-                text = str(error)
-                return True
-            return False
+                errors.append(str(error))
+            return bool(errors)
 
         self.until(failed, limit_s)
-        assert "\n" not in text
-        return text
+        assert "\n" not in errors[0]
+        return errors[0]
 
     @property
     def true_mm(self) -> float:
-        """Position of the carriage."""
         return self.model.axis.position_mm(self.clock_ns())
 
     def sent(self, name_id: int) -> list[int]:

@@ -15,8 +15,6 @@ SQUARE = Modulation(70.0, 0.5, "square")
 
 
 class Clock:
-    """Time that stands still until it is set."""
-
     def __init__(self) -> None:
         self.now_ns = 10**18
 
@@ -40,7 +38,6 @@ class AwgBench:
         return AwgLaser(self.settings(**changes), self.clock)
 
     def ready_laser(self, **changes: Any) -> AwgLaser:
-        """Return a laser that is configured and armed."""
         laser = self.laser(**changes)
         laser.configure(SQUARE)
         laser.arm()

@@ -32,7 +32,6 @@ def see(
 
 
 def range_error_mm(model: RangeModel, truth: RangeModel = TRUTH) -> np.ndarray:
-    """Error of ``model`` at `CHECK_MM`."""
     return model.range_mm(truth.row(CHECK_MM)) - CHECK_MM
 
 

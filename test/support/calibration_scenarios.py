@@ -60,7 +60,6 @@ def node_parameters(bench_folder: Path, folder: Path) -> dict[str, dict[str, Any
 
 
 class CalibrationBench(Bench):
-    """The test's view of the instrument while it is calibrated."""
 
     def __init__(self, observer: Observer, domain: int, laser_log: Path, folder: Path) -> None:
         super().__init__(observer, domain, laser_log)
@@ -77,17 +76,14 @@ class CalibrationBench(Bench):
         return self.calibrations.start(**{**values, **goal})
 
     def calibrate(self, **goal: Any) -> tuple[int, Any]:
-        """Calibrate to the end: status and result."""
         self.begin(**goal)
         return self.calibrations.end()
 
     def wait_for_capture(self) -> None:
-        """Wait until events have been captured."""
         self.calibrations.wait_for(lambda f: f.phase == "capturing" and f.events, "a capture")
 
     @property
     def newest(self) -> Any:
-        """The newest message of the active calibration."""
         wait_until(lambda: self.active, "a latched calibration", SCAN_DEADLINE_S)
         return self.active[-1]
 
@@ -107,7 +103,6 @@ class CalibrationBench(Bench):
 
 @contextlib.contextmanager
 def bench(domain: int, laser_log: Path, folder: Path) -> Iterator[CalibrationBench]:
-    """A bench over an observer of its own."""
     with Observer(domain) as observer:
         yield CalibrationBench(observer, domain, laser_log, folder)
 
@@ -285,13 +280,11 @@ def one_thing_at_a_time(bench: CalibrationBench) -> None:
 
 
 def load(bench: CalibrationBench, name: str | Path) -> Any:
-    """The answer of ``load_calibration``."""
     request = LoadCalibration.Request(calibration=str(name))
     return bench.observer.call(LoadCalibration, "reconstruction/load_calibration", request)
 
 
 def save(bench: CalibrationBench, path: str | Path = "") -> Any:
-    """The answer of ``save_calibration``."""
     request = SaveCalibration.Request(path=str(path))
     return bench.observer.call(SaveCalibration, "reconstruction/save_calibration", request)
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from waiting import DEADLINE_S
+from waiting import wait_until
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
@@ -23,19 +22,7 @@ COLUMNS = 64
 
 
 class StillBench:
-    """A camera of few columns before a white plane at rest.
-
-    Parameters
-    ----------
-    folder : path
-        Folder for the calibration.
-
-    Attributes
-    ----------
-    bench : Bench
-    backend : EmulatedBackend
-        The bus with its devices.
-    """
+    """A camera of few columns before a white plane at rest; ``folder`` gets its calibration."""
 
     def __init__(self, folder: Path) -> None:
         build = load_calibration("config_3").model_copy(
@@ -50,39 +37,27 @@ class StillBench:
         self.backend = EmulatedBackend(self.bench.usb_devices)
 
     def clock_ns(self) -> int:
-        """Return the bench's time."""
         return self._now_ns
 
     def light(self, frequency_hz: float) -> None:
-        """Switch the laser on now."""
         self.bench.physics.set_laser(self._now_ns, True, Modulation(frequency_hz))
 
     def statistic(self, name: str) -> int:
-        """Return one of the bench's counts."""
         return int(self.bench.physics.statistics()[name])
 
     def run(self, duration_ms: int, arrived: Callable[[], int]) -> None:
         """Advance the time; returns when as many events have ``arrived`` as left the sensor."""
         self._now_ns += duration_ms * MS
-        end_s = time.monotonic() + DEADLINE_S
-        while not (self._caught_up() and arrived() == self.statistic("events")):
-            assert time.monotonic() < end_s, f"{arrived()} of {self.statistic('events')} came"
-            time.sleep(1e-3)
 
-    def _caught_up(self) -> bool:
-        return self.bench.physics.statistics()["behind_s"] < 1.1e-3
+        def complete() -> bool:
+            counts = self.bench.physics.statistics()
+            return counts["behind_s"] < 1.1e-3 and arrived() == counts["events"]
+
+        wait_until(complete, "every event", poll_s=1e-3)
 
 
 class CameraOnBench(StillBench):
-    """The same with the EVK4 driver and a decoder.
-
-    Attributes
-    ----------
-    camera : Evk4
-    decoder : Decoder
-    times_us : list of int
-        Of all events so far.
-    """
+    """The same with the EVK4 driver and a decoder; ``times_us`` are of all events so far."""
 
     def __init__(self, folder: Path, settings: CameraSettings | None = None) -> None:
         super().__init__(folder)

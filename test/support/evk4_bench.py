@@ -75,7 +75,6 @@ def backend(name: str) -> EmulatedBackend:
 
 
 def plug(name: str, *models: Evk4Model) -> None:
-    """Put cameras on the bus of that name."""
     _BUSES[name] = list(models)
 
 
@@ -84,9 +83,8 @@ class CameraBench:
 
     def __init__(self, *, attempts: int | None = 5, serial: int = SERIAL, **options: Any) -> None:
         self.source = OnDemand()
-        self.model = Evk4Model(
-            self.source, board=BoardIdentity(serial=serial), wait=lambda *_: False
-        )
+        board = BoardIdentity(serial=serial)
+        self.model = Evk4Model(self.source, board=board, wait=lambda *_: False)
         self.bus = [self.model]
         self.backend = EmulatedBackend(lambda: self.bus)
         self.losses: list[str] = []
@@ -107,7 +105,6 @@ class CameraBench:
         time.sleep(min(seconds, 1e-3))
 
     def streaming(self) -> CameraBench:
-        """Open and start."""
         self.camera.open()
         self.camera.start()
         return self
@@ -130,7 +127,6 @@ class CameraBench:
         assert self.read(len(given)) == given
 
     def count(self, name: str) -> int:
-        """One of the driver's counters."""
         return int(self.camera.statistics()[name])
 
     def __enter__(self) -> CameraBench:

@@ -24,16 +24,13 @@ class SlowDecoder:
 
     @property
     def now(self) -> int:
-        """Time of an event that came now."""
         return max(self.newest, self.wrapped + (self.high or 0) * 4096 + self.low)
 
     def feed(self, words: list[int]) -> None:
-        """Decode ``words``."""
         for word in words:
             self.word(word >> 12, word & 0xFFF)
 
     def word(self, kind: int, q: int) -> None:
-        """Decode one word."""
         if self.high is None and kind != 8:
             self.counts["words_before_time"] += 1
             pixels = {2: 1, 4: bin(q).count("1"), 5: bin(q & 255).count("1")}.get(kind, 0)
@@ -77,7 +74,6 @@ class SlowDecoder:
             self.counts["unknown_words"] += 1
 
     def lose(self, why: str, count: int) -> None:
-        """Count lost events."""
         self.counts[why] += count
         self.counts["events_dropped"] += count
 

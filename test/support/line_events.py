@@ -45,14 +45,9 @@ def line_events(
             start = edge_us + (k + (0.0 if polarity else 0.5)) * period_us
             parts.append((start + delay, x, y, np.full(x.size, polarity)))
         n = rng.poisson(events * background * columns)
-        parts.append(
-            (
-                edge_us + (k + rng.random(n)) * period_us,
-                rng.integers(0, columns, n),
-                rng.uniform(-0.5, 719.5, n),
-                rng.integers(0, 2, n),
-            )
-        )
+        start = edge_us + (k + rng.random(n)) * period_us
+        x, y = rng.integers(0, columns, n), rng.uniform(-0.5, 719.5, n)
+        parts.append((start, x, y, rng.integers(0, 2, n)))
     t, x, y, p = (np.concatenate(values) for values in zip(*parts, strict=True))
     inside = (y > -0.5) & (y < 719.5)
     return sort_readout(
@@ -68,12 +63,10 @@ def encoded(
     triggers_us: NDArray[np.int64] | None = None,
 ) -> bytes:
     """Return the EVT3 bytes of the events, with rising trigger edges when given."""
-    t, x, y, p = events
     if triggers_us is None:
-        return Encoder().encode(t, x, y, p)
-    return Encoder().encode(
-        t, x, y, p, trigger_t=triggers_us, trigger_edge=np.ones(len(triggers_us), np.uint8)
-    )
+        return Encoder().encode(*events)
+    rising = np.ones(len(triggers_us), np.uint8)
+    return Encoder().encode(*events, trigger_t=triggers_us, trigger_edge=rising)
 
 
 def blank_profiles(size: int, **values: NDArray[np.generic]) -> Profiles:

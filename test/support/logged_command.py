@@ -50,7 +50,6 @@ class LoggedCommand:
         self.process.communicate()
 
     def end(self) -> tuple[int, str, str]:
-        """Exit code, stdout and stderr."""
         stdout, stderr = self.process.communicate(timeout=DEADLINE_S)
         return self.process.returncode, stdout, stderr
 
@@ -61,7 +60,6 @@ class LoggedCommand:
         return re.findall(r"\b(on|off)\b", self._log.read_text().lower())
 
     def signal_when_on(self, number: signal.Signals) -> None:
-        """Send a signal once the laser is on."""
 
         def on() -> bool:
             assert self.process.poll() is None, self.process.communicate()[1]

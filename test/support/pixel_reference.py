@@ -61,15 +61,8 @@ def stepped(
     rng = np.random.default_rng(seed)
     spread = 1.0 + p.threshold_mismatch * rng.standard_normal((2, offsets.size))
     thresholds = np.maximum(np.array([[p.threshold_on], [p.threshold_off]]) * spread, 0.03)
-    constants = np.array(
-        [
-            p.omega_per_us,
-            1e6 / (2.0 * math.pi * p.follower_hz),
-            p.refractory_us,
-            p.noise,
-            p.leak_hz * 1e-6,
-        ]
-    )
+    tau_us = 1e6 / (2.0 * math.pi * p.follower_hz)
+    constants = np.array([p.omega_per_us, tau_us, p.refractory_us, p.noise, p.leak_hz * 1e-6])
     out = np.empty((int(offsets.size * seconds * 3e3) + 1000, 3))
     n = _step(
         intensity, p.background_intensity, thresholds, 5e5 / frequency_hz, seconds * 1e6, dt_us,

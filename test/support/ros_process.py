@@ -260,7 +260,6 @@ class Observer:
         self.ask(GetParameters, f"{node}/get_parameters", deadline_s)
 
     def lifecycle_state(self, node: str) -> str:
-        """Label of the lifecycle state of ``node``."""
         return str(self.ask(GetState, f"{node}/get_state").current_state.label)
 
     def wait_for_state(self, node: str, label: str) -> None:

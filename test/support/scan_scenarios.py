@@ -124,12 +124,10 @@ class Bench:
         self.scans = Goals(observer, Scan, "scan", "scanner")
 
     def start(self, **goal: float) -> Any:
-        """Start a scan; the accepted handle."""
         values = {"start": START_M, "stop": STOP_M, "speed": SPEED_M_S, "frequency": FREQUENCY_HZ}
         return self.scans.start(**{**values, **goal})
 
     def scan(self, **goal: float) -> tuple[int, Any]:
-        """Scan to the end: status and result."""
         self.start(**goal)
         return self.scans.end()
 
@@ -181,7 +179,6 @@ class Bench:
 
 @contextlib.contextmanager
 def bench(domain: int, laser_log: Path) -> Iterator[Bench]:
-    """A bench over an observer of its own."""
     with Observer(domain) as observer:
         yield Bench(observer, domain, laser_log)
 

@@ -35,9 +35,8 @@ class StagePulses:
         rng = np.random.default_rng(seed)
         self.track = StageTrack(max_gap_us=500_000)
         self.true = ClockLine(0, EPOCH_NS, round(drift * 1e9))
-        crossings = []
+        crossings, plans = [], []
         now = EPOCH_NS + round(lead_s * 1e9)
-        plans = []
         for start, stop in pairwise(targets):
             plan = plan_move(now, start, stop, speed, acceleration)
             plans.append(plan)
