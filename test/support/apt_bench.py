@@ -19,7 +19,6 @@ TICK_NS = 200_000
 
 
 class MemoryPort:
-
     timeout: float | None = None
     in_waiting = 0
 

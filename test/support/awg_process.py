@@ -20,7 +20,6 @@ from eschorty_ros.emulation.bus import UsbServer
 
 
 class AwgProcess(ToldProcess):
-
     def __init__(self, log: Path, path: Path) -> None:
         self.log = log
         self.backend = f"eschorty_ros.emulation.bus.usb_remote:backend?{path}"

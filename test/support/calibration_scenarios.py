@@ -60,7 +60,6 @@ def node_parameters(bench_folder: Path, folder: Path) -> dict[str, dict[str, Any
 
 
 class CalibrationBench(Bench):
-
     def __init__(self, observer: Observer, domain: int, laser_log: Path, folder: Path) -> None:
         super().__init__(observer, domain, laser_log)
         self.folder = folder

@@ -16,7 +16,6 @@ from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.emulation.bus import UsbFault
-from eschorty_ros.hardware.camera import BIASES
 from eschorty_ros.emulation.evk4 import (
     CONTROL_IN,
     CONTROL_OUT,
@@ -25,6 +24,7 @@ from eschorty_ros.emulation.evk4 import (
     Evk4Model,
     Phase,
 )
+from eschorty_ros.hardware.camera import BIASES
 
 Answer = Callable[[bytes], bytes]
 
@@ -294,9 +294,7 @@ def test_host_stalls(bench: CameraBench) -> None:
     given, received_ns = b"", []
     for round_ in range(1, 6):
         given += bench.source.give(10)
-        wait_until(
-            lambda bytes_=80 * round_: bench.count("queue_bytes") == bytes_, "the receipt"
-        )
+        wait_until(lambda bytes_=80 * round_: bench.count("queue_bytes") == bytes_, "the receipt")
         received_ns.append(time.monotonic_ns())
     time.sleep(0.3)
     assert bench.count("queue_bytes") == len(given)

@@ -328,7 +328,13 @@ def test_stall_of_the_guard_is_no_missing_heartbeat(
     try:
         settings = {"backend": awg.backend}
         wire.send(
-            {"id": 0, "do": "open", "make": AWG, "settings": settings, "heartbeat_timeout_s": TIMEOUT_S}
+            {
+                "id": 0,
+                "do": "open",
+                "make": AWG,
+                "settings": settings,
+                "heartbeat_timeout_s": TIMEOUT_S,
+            }
         )
         wire.send({"id": 1, "do": "configure", "modulation": {"frequency_hz": 70.0}})
         wire.send({"id": 2, "do": "arm"})

@@ -220,7 +220,9 @@ def test_wrong_settings_are_refused(wrong: dict, text: str) -> None:
 
 @pytest.mark.parametrize("set_s", [-2, -3600, 3600])
 @pytest.mark.parametrize("moving", [False, True], ids=["at rest", "moving"])
-def test_the_odometry_continues_after_the_host_clock_is_set(bench: AptBench, set_s: int, moving: bool) -> None:
+def test_the_odometry_continues_after_the_host_clock_is_set(
+    bench: AptBench, set_s: int, moving: bool
+) -> None:
     bench.move(10.0)
     if moving:
         bench.stage.move_to(110.0, 100.0)
