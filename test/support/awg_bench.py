@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import AwgModel
+from eschorty_ros.emulation.awg.model import AwgModel, read_output_log
 from eschorty_ros.emulation.bus import EmulatedBackend
 from eschorty_ros.hardware.laser.awg import AwgLaser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
@@ -26,10 +26,15 @@ class AwgBench:
     """A bus with one generator on it, and lasers opened on that bus; the last one made counts."""
 
     def __init__(self, log_path: Path | None = None) -> None:
+        self._log_path = log_path
         self.clock = Clock()
         self.model = AwgModel(self.clock, log_path, wait=lambda *_: False)
         self.models = [self.model]
         _buses[:] = [self]
+
+    def outputs(self) -> list[str]:
+        """ON and OFF as the generator logged them."""
+        return [output for _, output in read_output_log(self._log_path)]
 
     def settings(self, **changes: Any) -> AwgSettings:
         return AwgSettings(**{"backend": f"{__name__}:on_the_bus", **changes})

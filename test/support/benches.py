@@ -13,7 +13,6 @@ from short_folder import short_folder
 from told_process import ToldProcess, obey
 
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
-from eschorty_ros.emulation.bench.process import bench_process
 from eschorty_ros.emulation.bench.server import serving
 
 
@@ -23,15 +22,6 @@ def bench_here(**settings: Any) -> Iterator[tuple[Bench, Path]]:
     bench = Bench(BenchSettings(**settings))
     with short_folder() as folder, serving(bench, folder):
         yield bench, folder
-
-
-@contextlib.contextmanager
-def bench_elsewhere(**options: Any) -> Iterator[Path]:
-    """Yield the folder of a bench with these options in another process."""
-    with short_folder() as folder:
-        names = {name.replace("_", "-"): value for name, value in options.items()}
-        with bench_process(folder, names):
-            yield folder
 
 
 @contextlib.contextmanager

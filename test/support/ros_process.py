@@ -127,9 +127,10 @@ def node_name(module: str) -> str:
 
 
 def domain_environment(domain: int) -> dict[str, str]:
-    """Environment of a process in ``domain``, discovering on this host only."""
+    """Of a process in ``domain``, discovering on this host only, with the tests' own nodes."""
     return {
         **os.environ,
+        "PYTHONPATH": f"{Path(__file__).parent}:{os.environ.get('PYTHONPATH', '')}",
         "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "PYTHONUNBUFFERED": "1",
@@ -160,7 +161,7 @@ def spinning(executor: Executor) -> Iterator[None]:
 
 @contextlib.contextmanager
 def nodes_here(domain: int, threads: int = 1) -> Iterator[Callable[..., Any]]:
-    """Yield a function that makes nodes of this process, ``(kind, **parameters)``, and spin them."""
+    """Yield a function that makes nodes in this process: ``(kind, **parameters)``; spin them."""
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     executor = (

@@ -31,50 +31,55 @@ class Echo:
         return answer
 
 
+@pytest.fixture
+def link(tmp_path: Path) -> Path:
+    return tmp_path / "port"
+
+
 def read(port: serial.Serial, size: int) -> bytes:
     port.timeout = DEADLINE_S
     return port.read(size)
 
 
-def test_every_byte_passes_both_ways(tmp_path: Path) -> None:
-    with PtyPort(Echo(), tmp_path / "port"), serial.Serial(str(tmp_path / "port")) as port:
+def test_every_byte_passes_both_ways(link: Path) -> None:
+    with PtyPort(Echo(), link), serial.Serial(str(link)) as port:
         for _ in range(3):
             port.write(EVERY_BYTE)
             assert read(port, 256) == EVERY_BYTE
-    assert not (tmp_path / "port").is_symlink()
+    assert not link.is_symlink()
 
 
-def test_it_can_be_opened_again(tmp_path: Path) -> None:
-    with PtyPort(Echo(), tmp_path / "port"):
+def test_it_can_be_opened_again(link: Path) -> None:
+    with PtyPort(Echo(), link):
         for _ in range(2):
-            with serial.Serial(str(tmp_path / "port"), exclusive=True) as port:
+            with serial.Serial(str(link), exclusive=True) as port:
                 port.write(b"\x11\x0d\x03")
                 assert read(port, 3) == b"\x11\x0d\x03"
 
 
-def test_an_unplugged_model_hangs_up_and_returns(tmp_path: Path) -> None:
+def test_an_unplugged_model_hangs_up_and_returns(link: Path) -> None:
     model = Echo()
-    with PtyPort(model, tmp_path / "port"):
-        with serial.Serial(str(tmp_path / "port"), timeout=DEADLINE_S) as port:
+    with PtyPort(model, link):
+        with serial.Serial(str(link), timeout=DEADLINE_S) as port:
             model.gone = True
             with pytest.raises((serial.SerialException, OSError)):
                 port.read(1)
-        wait_until(lambda: not (tmp_path / "port").exists(), "the port's end")
+        wait_until(lambda: not link.exists(), "the port's end")
         model.gone = False
-        wait_until((tmp_path / "port").exists, "the port again")
-        with serial.Serial(str(tmp_path / "port")) as port:
+        wait_until(link.exists, "the port again")
+        with serial.Serial(str(link)) as port:
             port.write(b"again")
             assert read(port, 5) == b"again"
 
 
-def test_a_host_that_does_not_read_blocks_nothing(tmp_path: Path) -> None:
+def test_a_host_that_does_not_read_blocks_nothing(link: Path) -> None:
     model = Echo()
-    with PtyPort(model, tmp_path / "port"), serial.Serial(str(tmp_path / "port")) as port:
+    with PtyPort(model, link), serial.Serial(str(link)) as port:
         for _ in range(100):
             port.write(bytes(1000))
         wait_until(lambda: len(model.received) == 100_000, "all bytes")
 
 
-def test_a_link_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+def test_a_link_that_cannot_be_made_is_one_line(link: Path) -> None:
     with pytest.raises(DeviceError, match="choose another folder"):
-        PtyPort(Echo(), tmp_path / "missing" / "port")
+        PtyPort(Echo(), link / "missing")

@@ -72,8 +72,3 @@ def test_any_bytes_are_an_answer_or_one_line(frame: bytes, request: int) -> None
     with pytest.raises(DeviceError) as caught:
         treuzell.answer_payload(request, frame)
     assert "\n" not in str(caught.value)
-
-
-def test_answer_payload_is_what_follows_the_header() -> None:
-    frame = treuzell.request_frame(treuzell.SERIAL, b"\x34\x12\0\0\0\0\0\0")
-    assert treuzell.answer_payload(treuzell.SERIAL, frame) == b"\x34\x12\0\0\0\0\0\0"

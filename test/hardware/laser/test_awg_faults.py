@@ -13,29 +13,20 @@ from awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel, read_output_log
+from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT, AwgModel
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser import awg
 
 
 @pytest.fixture
-def log(tmp_path: Path) -> Path:
-    return tmp_path / "laser.log"
-
-
-@pytest.fixture
-def bench(log: Path, monkeypatch: pytest.MonkeyPatch) -> AwgBench:
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AwgBench:
     # No wait takes time here: a stall of the host must not prevent a later try.
     monkeypatch.setattr(awg, "OFF_LIMIT_S", 600.0)
-    return AwgBench(log)
-
-
-def states(log: Path) -> list[str]:
-    return [state for _, state in read_output_log(log)]
+    return AwgBench(tmp_path / "laser.log")
 
 
 @pytest.mark.fault("USB unplugged")
-def test_generator_unplugged_while_lit(bench: AwgBench, log: Path) -> None:
+def test_generator_unplugged_while_lit(bench: AwgBench) -> None:
     """driver: counts as on, stays refused, off as soon as it is back; user reads: laser state unknown ... switch the generator off by hand."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.gone = True
@@ -107,7 +98,7 @@ def test_second_stall_is_an_error(bench: AwgBench, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.fault("no answer, time-out")
-def test_mute_generator(bench: AwgBench, log: Path) -> None:
+def test_mute_generator(bench: AwgBench) -> None:
     """driver: tries clear, reset, a new opening, then gives up within its bound; user reads: laser state unknown: ... no answer in time."""  # noqa: E501
     laser = bench.lit_laser()
     bench.model.mute = True
@@ -117,7 +108,7 @@ def test_mute_generator(bench: AwgBench, log: Path) -> None:
     assert laser.readback().counters["switch_off_failures"] == 1
     bench.model.mute = False
     laser.disable()
-    assert states(log) == ["OFF", "ON", "OFF"]
+    assert bench.outputs() == ["OFF", "ON", "OFF"]
 
 
 @pytest.mark.parametrize("fault", ["mute", "lost_replies"])
@@ -396,8 +387,8 @@ def _struck(fault: Callable[[AwgModel], object], at: int) -> str:
     return "lit"
 
 
-def test_disabled_from_many_threads_it_is_off(bench: AwgBench, log: Path) -> None:
+def test_disabled_from_many_threads_it_is_off(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda _: laser.disable(), range(8)))
-    assert states(log) == ["OFF", "ON", "OFF"]
+    assert bench.outputs() == ["OFF", "ON", "OFF"]

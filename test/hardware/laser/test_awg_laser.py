@@ -14,7 +14,7 @@ from awg_bench import SQUARE, AwgBench
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.emulation.awg.model import ENDPOINT_OUT, read_output_log
+from eschorty_ros.emulation.awg.model import ENDPOINT_OUT
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput
 from eschorty_ros.hardware.laser.awg import AwgLaser, open_laser
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
@@ -27,23 +27,19 @@ def bench(tmp_path: Path) -> AwgBench:
     return AwgBench(tmp_path / "laser.log")
 
 
-def states(tmp_path: Path) -> list[str]:
-    return [state for _, state in read_output_log(tmp_path / "laser.log")]
-
-
 def sets(bench: AwgBench) -> list[str]:
     """Commands that change something, without their channel prefix."""
     return [c.removeprefix(":CHANnel1:") for c in bench.model.commands if "?" not in c]
 
 
-def test_construction_switches_a_lit_generator_off(bench: AwgBench, tmp_path: Path) -> None:
+def test_construction_switches_a_lit_generator_off(bench: AwgBench) -> None:
     bench.model.touch("OUTPut", "ON")
     bench.model.touch("OUTPut", "ON", channel=2)
     laser = bench.laser()
     assert next(iter(bench.model.commands)) == ":CHANnel1:OUTPut OFF"
     assert [channel.output for channel in bench.model.channels] == [False, False]
     assert laser.readback().output is LaserOutput.OFF
-    assert states(tmp_path) == ["OFF", "ON", "OFF"]
+    assert bench.outputs() == ["OFF", "ON", "OFF"]
 
 
 def test_identity_is_read_from_the_generator(bench: AwgBench) -> None:
@@ -118,25 +114,23 @@ def test_volts_stay_volts_whatever_the_load_was(bench: AwgBench) -> None:
     assert bench.model.channels[0].load_ohm == 10000.0
 
 
-def test_off_again_and_again_is_off(bench: AwgBench, tmp_path: Path) -> None:
+def test_off_again_and_again_is_off(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     for _ in range(3):
         laser.disable()
     laser.close()
     laser.close()
     laser.disable()
-    assert states(tmp_path) == ["OFF", "ON", "OFF"]
+    assert bench.outputs() == ["OFF", "ON", "OFF"]
     assert bench.model.channels[0].high_v == 0.01
     with pytest.raises(DeviceError, match="closed; open it again"):
         laser.configure(SQUARE)
 
 
-def test_configured_while_on_it_is_off_in_between_and_on_again(
-    bench: AwgBench, tmp_path: Path
-) -> None:
+def test_configured_while_on_it_is_off_in_between_and_on_again(bench: AwgBench) -> None:
     laser = bench.lit_laser()
     laser.configure(Modulation(1000.0))
-    assert states(tmp_path) == ["OFF", "ON", "OFF", "ON"]
+    assert bench.outputs() == ["OFF", "ON", "OFF", "ON"]
     assert bench.model.channels[0].frequency_hz == 1000.0
     assert laser.readback().modulation.frequency_hz == 1000.0
     with pytest.raises(ArgumentError, match="sine has none"):

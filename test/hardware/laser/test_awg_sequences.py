@@ -72,7 +72,8 @@ def test_output_that_is_on_is_never_reported_as_off(steps: list[str]) -> None:
         call(laser, step)
     assert bench.model.lit
     laser.close()
-    assert not (bench.model.lit or bench.model.locked)
+    assert not bench.model.lit
+    assert not bench.model.locked
 
 
 @settings(max_examples=100, deadline=None)

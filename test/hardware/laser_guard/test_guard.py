@@ -326,16 +326,8 @@ def test_stall_of_the_guard_is_no_missing_heartbeat(
     serving = threading.Thread(target=guard.Guard(Wire(there), os.getpid()).run)
     serving.start()
     try:
-        settings = {"backend": awg.backend}
-        wire.send(
-            {
-                "id": 0,
-                "do": "open",
-                "make": AWG,
-                "settings": settings,
-                "heartbeat_timeout_s": TIMEOUT_S,
-            }
-        )
+        given = {"settings": {"backend": awg.backend}, "heartbeat_timeout_s": TIMEOUT_S}
+        wire.send({"id": 0, "do": "open", "make": AWG, **given})
         wire.send({"id": 1, "do": "configure", "modulation": {"frequency_hz": 70.0}})
         wire.send({"id": 2, "do": "arm"})
         wire.send({"id": 3, "do": "enable"})

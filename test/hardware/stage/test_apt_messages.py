@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import thorlabs_apt_protocol as oracle
 
-from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.stage import apt_messages as apt
 
 BAY = 0x21
@@ -129,12 +128,3 @@ def test_every_status_bit_has_one_name() -> None:
     assert sum(apt.STATUS_BITS) == 0xFFFF_FFFF
     assert len(set(apt.STATUS_BITS.values())) == 32
     assert apt.decode_bits(0x401) == ("forward_hard_limit", "homed")
-
-
-def test_wrong_use_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="bay is 11"):
-        apt.bay_address(11)
-    with pytest.raises(ArgumentError, match="no field speed"):
-        apt.pack("home", BAY, speed=3)
-    with pytest.raises(ArgumentError, match="complete known message"):
-        apt.parse(b"\x91\x04\x00\x00\x01\x21")

@@ -25,7 +25,6 @@ from std_msgs.msg import Bool, String
 
 from eschorty_ros.nodes.ros import qos
 
-SUPPORT_FOLDER = str(Path(__file__).parents[2] / "support")
 SENDERS = ("laser", "camera", "stage")
 WAYS_TO_ACTIVE = {"unconfigured": "configure", "inactive": "activate"}
 # Every fault here has to be noticed at once, without a timeout; and no timeout may end the light
@@ -88,13 +87,6 @@ class Bench(LaserBench):
         assert 0.0 < took_s < OFF_LIMIT_S
 
 
-@pytest.fixture(scope="module", autouse=True)
-def importable() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", f"{SUPPORT_FOLDER}:{os.environ.get('PYTHONPATH', '')}")
-        yield
-
-
 @contextlib.contextmanager
 def running(
     folder: Path, senders: tuple[str, ...] = (" ".join(SENDERS),), **parameters: Any
@@ -104,7 +96,7 @@ def running(
 
 
 @pytest.fixture(scope="module")
-def shared(importable: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     with running(tmp_path_factory.mktemp("laser"), SENDERS) as made:
         yield made
 

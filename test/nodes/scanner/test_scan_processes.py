@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import scan_scenarios as scenarios
-from benches import bench_elsewhere
+from benches import remote_bench
 from ros_process import NodeProcess, processes
 
 from eschorty_ros.nodes.ros.domain import free_domain
@@ -22,7 +22,7 @@ def instrument(tmp_path_factory):
     log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
     domain = free_domain()
     with (
-        bench_elsewhere(**scenarios.bench_settings(log)) as folder,
+        remote_bench(**scenarios.bench_settings(log)) as (_, folder),
         processes(scenarios.node_parameters(folder), domain) as running,
         scenarios.bench(domain, log) as bench,
     ):

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_process import NodeProcess, Observer, wait_until
 
 from eschorty_ros.emulation.apt.model import AptModel
@@ -45,9 +45,16 @@ def test_an_unplugged_stage_makes_the_node_leave_active(tmp_path: Path, observer
         wait_until(lambda: "stage lost: the stage's port failed" in process.output, "the log")
 
         def reported() -> bool:
-            return any("port failed" in s.message for m in list(reports) for s in m.status)
+            every = [status for message in list(reports) for status in message.status]
+            return any(
+                s.level == DiagnosticStatus.ERROR and "port failed" in s.message for s in every
+            )
 
         wait_until(reported, "diagnostics")
+        observer.wait_for_state("stage", "unconfigured")
+        model.gone = False
+        wait_until(lambda: observer.change_state("stage", "configure"), "the port open again")
+        assert observer.change_state("stage", "activate")
 
 
 @pytest.mark.fault("shutdown at any time")
