@@ -37,9 +37,7 @@ class Host:
 
 def test_identity_axis_and_status() -> None:
     info, axis, status = Host().ask(
-        oracle.hw_req_info(UNIT, 1),
-        oracle.mot_req_stageaxisparams(UNIT, 1, 1),
-        STATUS,
+        oracle.hw_req_info(UNIT, 1), oracle.mot_req_stageaxisparams(UNIT, 1, 1), STATUS
     )
     assert info.model_number.startswith(b"KBD101")
     assert axis.part_no_axis.startswith(b"DDS220")

@@ -45,10 +45,7 @@ def test_it_serves_all_devices_and_cleans_up(folder: Path, tmp_path: Path) -> No
         assert (folder / STAGE_PORT).resolve().is_char_device()
         assert int((folder / READY_FILE).read_text()) == process.pid
         assert log.read_text().split()[1::2] == ["OFF"]
-        with (
-            pytest.raises(DeviceError, match="another bench uses it"),
-            bench_process(folder, {}),
-        ):
+        with pytest.raises(DeviceError, match="another bench uses it"), bench_process(folder, {}):
             pass
         assert devices(folder)
     assert process.returncode == 0

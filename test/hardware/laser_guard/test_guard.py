@@ -354,10 +354,7 @@ def test_guard_whose_driver_crashes(awg: AwgProcess) -> None:
 
 def test_disabling_interrupts_a_read_back(awg: AwgProcess, tmp_path: Path) -> None:
     waits = tmp_path / "waits"
-    with (
-        ThreadPoolExecutor() as pool,
-        opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser,
-    ):
+    with ThreadPoolExecutor() as pool, opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser:
         light(laser)
         reading = pool.submit(laser.readback)
         wait_until(waits.exists, "the read-back in progress")
@@ -385,10 +382,7 @@ def test_commands_requested_before_disabling_are_void(
     awg: AwgProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits = tmp_path / "waits"
-    with (
-        ThreadPoolExecutor() as pool,
-        opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser,
-    ):
+    with ThreadPoolExecutor() as pool, opened(awg, make=INTERRUPTIBLE, waits=str(waits)) as laser:
         light(laser)
         sent: list[str] = []
         send = laser._wire.send

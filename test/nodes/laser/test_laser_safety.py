@@ -36,11 +36,7 @@ class Bench(LaserBench):
     """A laser node that can be broken, with the processes that send it heartbeats."""
 
     def __init__(
-        self,
-        held: contextlib.ExitStack,
-        folder: Path,
-        senders: tuple[str, ...],
-        **parameters: Any,
+        self, held: contextlib.ExitStack, folder: Path, senders: tuple[str, ...], **parameters: Any
     ) -> None:
         super().__init__(held, folder, "breakable_laser", **TIMEOUTS, **parameters)
         self._names = senders

@@ -67,11 +67,7 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    with (
-        bench_here() as (emulated, folder),
-        Observer() as observer,
-        contextlib.ExitStack() as held,
-    ):
+    with bench_here() as (emulated, folder), Observer() as observer, contextlib.ExitStack() as held:
         yield Stage(held, observer, emulated, folder)
 
 
