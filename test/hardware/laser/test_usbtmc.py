@@ -155,14 +155,3 @@ def test_unplugged_has_an_error_of_its_own(link: UsbTmc, model: Echo) -> None:
         ask(link)
     with pytest.raises(DeviceGoneError):
         link.clear()
-
-
-def test_close_gives_the_interface_back(model: Echo) -> None:
-    backend = EmulatedBackend(lambda: [model])
-    model.kernel_driver = "usbtmc"
-    link = UsbTmc(usb.core.find(backend=backend), name="generator", timeout_s=0.05)
-    assert model.kernel_driver is None
-    with pytest.raises(DeviceError, match="EBUSY"):
-        UsbTmc(usb.core.find(backend=backend), name="second", timeout_s=0.05)
-    link.close()
-    assert model.kernel_driver == "usbtmc"

@@ -199,17 +199,3 @@ def test_scan_services_refuse_with_a_reason(live):
     end = observer.call(EndScan, "reconstruction/end_scan", EndScan.Request(scan_id="x"))
     assert not end.success
     assert "'x' is not being collected" in end.message
-
-
-def test_bad_settings_are_refused_with_a_reason(live):
-    observer = live.observer
-    for name, value, word in (
-        ("centroid", "magic", "mode_mean"),
-        ("line_width_px", -1.0, "range"),
-        ("frequency", 3.0, "16"),
-        ("stage_gap", "soon", "type"),
-    ):
-        accepted, reason = observer.set_parameter("reconstruction", name, value)
-        assert not accepted, name
-        assert word in reason.lower(), (name, reason)
-    assert observer.set_parameter("reconstruction", "smoothing_half_width", 0) == (True, "")
