@@ -66,8 +66,8 @@ faults: $(SETUP)
 reference: $(SETUP)
 	@$(ENTER) python docs/interfaces.py
 
-# Pure parts share the cores; what starts processes and devices runs alone.
-PURE := $(addprefix test/,core live control simulation stability report experiments)
+# Pure parts share the cores, the longest first; what starts processes and devices runs alone.
+PURE := $(addprefix test/,experiments core live control simulation stability report)
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
