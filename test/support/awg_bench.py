@@ -28,7 +28,7 @@ class AwgBench:
     def __init__(self, log_path: Path | None = None) -> None:
         self._log_path = log_path
         self.clock = Clock()
-        self.model = AwgModel(self.clock, log_path, wait=lambda *_: False)
+        self.model = AwgModel(self.clock, log_path, wait=lambda *_: False, steady_ns=self.clock)
         self.models = [self.model]
         _buses[:] = [self]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from eschorty_ros.hardware.base.protocols import LaserModulator
+from eschorty_ros.hardware.base.protocols import RenewedLaser
 
 
-def open_laser(**settings: Any) -> LaserModulator:
+def open_laser(**settings: Any) -> RenewedLaser:
     from eschorty_ros.hardware.laser import awg
 
     return awg.open_laser(**settings)

@@ -5,12 +5,13 @@ Written from the command table of the instrument's family, not from the driver's
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 WAVES = ("SINe", "SQUare", "PULSe", "RAMP", "ARB", "NOISe", "DC")
-MODES = ("CONTinue", "AM", "PM", "FM", "FSK", "Line", "Log")
+MODES = ("CONTinue", "AM", "PM", "FM", "FSK", "Line", "Log", "BURSt")
 LEVEL_LIMIT_V = 10.0
 LEAST_SPAN_V = 0.001
 HIGH_Z_OHM = 10000.0
@@ -25,6 +26,10 @@ class ChannelState:
     sync: bool = False
     wave: str = "SINE"
     mode: str = "CONTINUE"
+    burst_type: str = "NCYC"
+    burst_source: str = "INTERNAL"
+    burst_cycles: float = 1.0
+    burst_phase_deg: float = 0.0
     frequency_hz: float = 1000.0
     high_v: float = 0.05
     low_v: float = -0.05
@@ -35,6 +40,16 @@ class ChannelState:
     limit: bool = False
     limit_lower_v: float = -LEVEL_LIMIT_V
     limit_upper_v: float = LEVEL_LIMIT_V
+
+    @property
+    def idle_v(self) -> float:
+        """Level between bursts: that of the phase at which a burst starts."""
+        turn = self.burst_phase_deg / 360.0 % 1.0
+        if self.wave == "SINE":
+            share = 0.5 + 0.5 * math.sin(2.0 * math.pi * turn)
+        else:
+            share = float(turn < self.duty_percent / 100.0)
+        return self.low_v + share * (self.high_v - self.low_v)
 
     def set_load(self, load_ohm: float) -> None:
         """Set the load; the same source voltage then reads back as other volts."""
@@ -162,6 +177,10 @@ CHANNEL_COMMANDS = (
     _value("BASE:DUTY", "duty_percent", 0.1, 99.9, 3),
     _value("BASE:PHASe", "phase_deg", -360.0, 360.0, 2),
     _command("LOAD", _put_load, lambda state: _plain(state.load_ohm, 0)),
+    _word("BURSt:TYPe", "burst_type", ("NCYC", "GATe", "INFinit")),
+    _value("BURSt:CYCLes", "burst_cycles", 1.0, 1e6, 0),
+    _value("BURSt:PHASe", "burst_phase_deg", 0.0, 360.0, 2),
+    _word("TRIGger:SOURce", "burst_source", ("INTernal", "EXTernal", "MANual")),
     _switch("INVersion", "inversion"),
     _switch("LIMit:ENABle", "limit"),
     _value("LIMit:LOWer", "limit_lower_v", -LEVEL_LIMIT_V, LEVEL_LIMIT_V, 3),

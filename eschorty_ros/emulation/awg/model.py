@@ -3,7 +3,9 @@
 Like the family it replies without a newline, never answers a request where no reply is due, locks
 the front panel at any command until ``:SYSTem:LOCK OFF``, silently ignores a value out of range,
 and has no error queue unless given one. Unconfirmed on hardware: everything after ``*RST`` and
-power-up, and that a load reads back as scaled volts.
+power-up, that a load reads back as scaled volts, and all of the burst. A burst of counted cycles
+begins at ``*TRG`` with a rising edge; a trigger while it runs begins the count again at the last
+cycle, without a change of the waveform (``burst_trigger``).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, Modulation
-from eschorty_ros.emulation.awg.commands import ChannelState, find_command
+from eschorty_ros.emulation.awg.commands import ChannelState, Command, find_command, match_keyword
 from eschorty_ros.emulation.awg.faults import AwgFaults
 from eschorty_ros.emulation.bus.usb_device import (
     SPEED_FULL,
@@ -53,14 +55,18 @@ class AwgModel(EmulatedUsbDevice):
     clock_ns : callable
         Clock of ``on_change``, ns.
     log_path : path, optional
-        File for a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and at each switch of output 1,
-        before the command is answered.
+        File for a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and each time the waveform
+        starts or stops at output 1, before the command is answered.
     serial : str
     wait : callable
         As for ``EmulatedUsbDevice``.
+    steady_ns : callable
+        Clock of the bursts, ns.
 
     Attributes
     ----------
+    burst_trigger : {"extends", "restarts", "ignored", ""}
+        Effect of a trigger while a burst runs; empty: a generator without bursts.
     channels : list of ChannelState
     locked : bool
         True while the front panel is locked.
@@ -81,6 +87,7 @@ class AwgModel(EmulatedUsbDevice):
         *,
         serial: str = "AWG1234567890",
         wait: Wait = threading.Condition.wait,
+        steady_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         identity = UsbIdentity(
             vendor_id=VENDOR_ID,
@@ -99,6 +106,11 @@ class AwgModel(EmulatedUsbDevice):
         )
         super().__init__(identity, wait=wait)
         self._clock_ns = clock_ns
+        self._steady_ns = steady_ns
+        self.burst_trigger = "extends"
+        # Start and end of channel 1's burst, steady; none runs after its end.
+        self._burst_ns = (0, 0)
+        self._burst_runs = self._burst_awaited = False
         self._log_path = None if log_path is None else Path(log_path)
         self.faults = AwgFaults()
         self.errors: deque[str] | None = None
@@ -116,10 +128,17 @@ class AwgModel(EmulatedUsbDevice):
         return self.channels[0].output
 
     @property
+    def running(self) -> bool:
+        """Return whether output 1 is on with its waveform, in a burst or continuous."""
+        state = self.channels[0]
+        return state.output and (state.mode != "BURST" or self._burst_runs)
+
+    @property
     def lit(self) -> bool:
         """Return whether output 1 reaches the level at which the laser is on."""
         state = self.channels[0]
-        return state.output and max(state.high_v, state.low_v) >= THRESHOLD_V
+        level_v = max(state.high_v, state.low_v) if self.running else state.idle_v
+        return state.output and level_v >= THRESHOLD_V
 
     def power_up(self) -> None:
         """Start: outputs off, factory settings, panel unlocked."""
@@ -137,9 +156,52 @@ class AwgModel(EmulatedUsbDevice):
             command = find_command(path)
             if self.locked or command is None:
                 return False
-            command.put(self.channels[channel - 1], text)
-            self._changed()
+            self._put(command, self.channels[channel - 1], text)
             return True
+
+    def end_burst(self) -> float:
+        """End a burst whose cycles are done; return the time until its end, s, 0 without one."""
+        with self.mutex:
+            if not self._burst_runs:
+                return 0.0
+            left_ns = self._burst_ns[1] - self._steady_ns()
+            if left_ns <= 0:
+                self._burst_runs = False
+                # The instrument is punctual, also where this process is not.
+                self._changed(late_ns=-left_ns)
+            return max(left_ns * 1e-9, 0.0)
+
+    def _trigger(self) -> None:
+        state, now_ns = self.channels[0], self._steady_ns()
+        counted = (state.mode, state.burst_type, state.burst_source) == ("BURST", "NCYC", "MANUAL")
+        if not counted or not state.output or not self.burst_trigger:
+            return
+        self.end_burst()
+        cycle_ns = 1e9 / state.frequency_hz
+        begin_ns = now_ns
+        if self._burst_runs and self.burst_trigger == "ignored":
+            return
+        if self._burst_runs and self.burst_trigger == "extends":
+            begin_ns = now_ns - round((now_ns - self._burst_ns[0]) % cycle_ns)
+        elif self._burst_runs:
+            self._burst_runs = False
+            self._changed()
+        self._burst_ns = (begin_ns, begin_ns + round(state.burst_cycles * cycle_ns))
+        if not self._burst_runs:
+            self._burst_runs = True
+            self._changed()
+        if not self._burst_awaited:
+            self._burst_awaited = True
+            threading.Thread(target=self._await_end, name="burst", daemon=True).start()
+
+    def _await_end(self) -> None:
+        while True:
+            with self.mutex:
+                left_s = self.end_burst()
+                self._burst_awaited = left_s > 0.0
+            if not left_s:
+                return
+            time.sleep(min(left_s, 0.1))
 
     def bulk_out(self, endpoint: int, data: bytes, timeout_ms: int) -> int:
         """Receive a message, or a request for a reply."""
@@ -182,6 +244,7 @@ class AwgModel(EmulatedUsbDevice):
 
     def _reset_settings(self) -> None:
         self.channels = [ChannelState() for _ in range(CHANNELS)]
+        self._burst_runs = False
         self.locked = False
         self._message = b""
         self._replies.clear()
@@ -216,13 +279,23 @@ class AwgModel(EmulatedUsbDevice):
         if path.upper() == "*RST":
             self._reset_settings()
             self.locked = True
+        elif path.upper() == "*TRG":
+            self._trigger()
         elif _LOCK.fullmatch(path):
             self.locked = parameter.upper() in ("ON", "1")
         found = _CHANNEL.fullmatch(path)
         command = find_command(found[2]) if found else None
         if found and command and command.path not in self.faults.ignored:
-            command.put(self._channel(found), self.faults.changed.get(command.path, parameter))
-            self._changed()
+            parameter = self.faults.changed.get(command.path, parameter)
+            if command.path == "MODe" and match_keyword(("BURSt",), parameter):
+                parameter *= bool(self.burst_trigger)
+            self._put(command, self._channel(found), parameter)
+
+    def _put(self, command: Command, state: ChannelState, text: str) -> None:
+        command.put(state, text)
+        # Switching off, and every change of the wave, ends a burst.
+        self._burst_runs &= self.output and command.path == "OUTPut"
+        self._changed()
 
     def _channel(self, found: re.Match[str]) -> ChannelState:
         return self.channels[int(found[1] or 1) - 1]
@@ -249,13 +322,15 @@ class AwgModel(EmulatedUsbDevice):
             self.reply(ENDPOINT_IN, b"")
         self.reply(ENDPOINT_IN, data[:7] if faults.take("short_headers") else data)
 
-    def _changed(self) -> None:
-        """Log a switch of output 1, and call ``on_change`` with the light."""
-        if self.output is not self._logged:
-            self._logged = self.output
+    def _changed(self, late_ns: int = 0) -> None:
+        """Log a start or stop of output 1, and call ``on_change`` with the light."""
+        if self.running is not self._logged:
+            self._logged = self.running
             if self._log_path is not None:
                 with self._log_path.open("a", encoding="ascii") as log:
-                    log.write(f"{time.monotonic_ns()} {'ON' if self.output else 'OFF'}\n")
+                    log.write(
+                        f"{time.monotonic_ns() - late_ns} {'ON' if self.running else 'OFF'}\n"
+                    )
         light = (self.lit, self.modulation())
         if self.on_change is not None and light != self._light:
             self.on_change(self._clock_ns(), *light)

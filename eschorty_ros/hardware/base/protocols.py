@@ -160,6 +160,13 @@ class LaserModulator(Protocol):
         """Switch off and release; idempotent."""
 
 
+class RenewedLaser(LaserModulator, Protocol):
+    """A generator whose light ends by itself, where it can, unless it is renewed."""
+
+    def renew(self) -> float:
+        """Extend light by one grant from now on; return the time to the next renewal, s."""
+
+
 @dataclass(frozen=True, slots=True)
 class StageState:
     """One reading of the stage."""

@@ -39,15 +39,18 @@ class StallMeter:
 
 
 def process_fault(pid: int) -> str:
-    """Return why process ``pid`` runs no code of its own, ``""`` while it does.
+    """Return why process ``pid`` runs no code of its own, ``""`` while it does or is not known.
 
     A crash that dumps core keeps its descriptors open for as long as the dump takes.
     """
     try:
         with open(f"/proc/{pid}/status", encoding="ascii", errors="replace") as stream:
             status = stream.read()
-    except OSError:
+    except (FileNotFoundError, ProcessLookupError):
         return "gone"
+    except OSError:
+        # Such as too many open files: this says nothing about that process.
+        return ""
     if "\nCoreDumping:\t1" in status:
         return "dumping core"
     return _STATES.get(status.partition("\nState:\t")[2][:1], "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,9 +15,9 @@ from eschorty_ros.core.base.errors import ArgumentError, DeviceError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import (
     DeviceIdentity,
-    LaserModulator,
     LaserOutput,
     LaserReadback,
+    RenewedLaser,
 )
 from eschorty_ros.hardware.base.usb import find_device, open_backend
 from eschorty_ros.hardware.laser.awg_channel import (
@@ -26,7 +27,7 @@ from eschorty_ros.hardware.laser.awg_channel import (
     requested_settings,
 )
 from eschorty_ros.hardware.laser.awg_profile import AwgProfile, load_profile
-from eschorty_ros.hardware.laser.awg_settings import AwgSettings
+from eschorty_ros.hardware.laser.awg_settings import GRANT_MIN_S, AwgSettings
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 from eschorty_ros.hardware.laser.usbtmc import UsbTmc, is_usbtmc
 
@@ -35,13 +36,28 @@ FREQUENCY_DEFAULT_HZ = 70.0
 OFF_LIMIT_S = 1.0
 """Time after which disabling begins no further try: the state is unknown then."""
 _WARNINGS_KEPT = 32
+_COUNTERS = (
+    "openings",
+    "faults",
+    "retries",
+    "switch_off_failures",
+    "light_grants",
+    "light_pauses",
+)
+_RENEWALS_PER_GRANT = 5
+_PAUSE_S = 1e-3
+UNBOUNDED = (
+    f"{NAME}: light does not end by itself: if guard and laser node end together it stays on "
+    "until it is switched off by hand; fit an interlock in hardware"
+)
 
 
 class AwgLaser:
     """A waveform generator as laser modulator; off at construction and after every failure.
 
     Thread-safe. ``disable`` may be called at any time from any thread: the command in progress
-    gives up before its next USB transfer.
+    gives up before its next USB transfer. Light is a burst of counted cycles where the generator
+    can: it ends after ``light_grant`` unless ``renew`` is called.
 
     Parameters
     ----------
@@ -80,7 +96,21 @@ class AwgLaser:
         self._since_ns = clock_ns()
         self._reason = ""
         self._warnings: list[str] = []
-        self._counters = dict.fromkeys(("openings", "faults", "retries", "switch_off_failures"), 0)
+        self._counters = dict.fromkeys(
+            (
+                "openings",
+                "faults",
+                "retries",
+                "switch_off_failures",
+                "light_grants",
+                "light_pauses",
+            ),
+            0,
+        )
+        # Length of one grant in s, 0 where light does not end by itself; of the last one the least
+        # and the latest time of its end, steady.
+        self._grant_s = 0.0
+        self._ends_s = (0.0, 0.0)
         self._open_channel: AwgChannel | None = None
         # The same generator is opened again after a loss, and identified once per opening.
         self._link_serial = ""
@@ -106,13 +136,23 @@ class AwgLaser:
             When the generator fails, or reads back something else; its output is off then.
         """
         with self._command():
-            requested = requested_settings(self._settings, self._profile, modulation)
+            bursts = self._settings.light_grant > 0.0
+            requested = requested_settings(
+                self._settings, self._profile, modulation, counted=bursts
+            )
             lit = self._output is LaserOutput.ON
             with self._disabled_on_failure():
                 self._ready = False
                 self._disable(keep_armed=True)
                 self._identify()
                 channel = self._channel
+                if not bursts or not channel.counts_cycles():
+                    self._warn(UNBOUNDED)
+                    requested = requested_settings(
+                        self._settings, self._profile, modulation, counted=False
+                    )
+                cycles = float(requested.get("burst_cycles", 0.0))
+                self._grant_s = cycles / modulation.frequency_hz
                 channel.apply(requested)
                 channel.unlock()
                 self._modulation, self._ready = modulation, True
@@ -138,6 +178,24 @@ class AwgLaser:
             with self._disabled_on_failure():
                 self._armed = False
                 self._enable()
+
+    def renew(self) -> float:
+        """Extend light by one grant from now on; return the time to the next renewal, s.
+
+        A renewal that came too late for the burst counts as a pause, after which the light began
+        with another phase: ``output_since_ns`` is its time. Does nothing for light that is off or
+        does not end by itself. Raises ``DeviceError`` for a failure; the output is off then.
+        """
+        with self._command():
+            if self._output is not LaserOutput.ON or not self._grant_s:
+                return GRANT_MIN_S / _RENEWALS_PER_GRANT
+            left_s = self._ends_s[1] + _PAUSE_S - time.monotonic()
+            if self._while_running == "ignored" and left_s > 0.0:
+                return left_s
+            with self._disabled_on_failure():
+                self._grant()
+                self._channel.unlock()
+        return self._grant_s / _RENEWALS_PER_GRANT
 
     def disable(self) -> None:
         """Switch the output off and disarm; idempotent; ends within about 1 s in any case.
@@ -171,7 +229,11 @@ class AwgLaser:
                 self._since_ns,
                 self._reason,
                 tuple(self._warnings),
-                {**self._counters, "write_only": float(self._is_write_only())},
+                {
+                    **self._counters,
+                    "light_grant_s": self._grant_s,
+                    "write_only": float(self._is_write_only()),
+                },
             )
 
     def close(self) -> None:
@@ -302,11 +364,31 @@ class AwgLaser:
         channel.unlock()
         self._output = LaserOutput.UNKNOWN
         channel.enable()
+        if self._grant_s:
+            self._ends_s = (math.inf, math.inf)
+            self._grant()
         self._note(LaserOutput.ON)
         self._reason = ""
         if channel.output() is False:
             raise DeviceError(f"{NAME}: output stays off; check the generator's display")
         channel.unlock()
+
+    @property
+    def _while_running(self) -> str:
+        return self._profile.burst.while_running if self._profile.burst is not None else ""
+
+    def _grant(self) -> None:
+        begun_s = time.monotonic()
+        self._channel.trigger()
+        done_s = time.monotonic()
+        self._counters["light_grants"] += 1
+        paused = done_s >= self._ends_s[0]
+        self._counters["light_pauses"] += paused
+        if paused or self._while_running == "restarts":
+            self._since_ns = self._clock_ns()
+        # An extended burst ends up to one cycle before a grant from the trigger on.
+        cycle_s = 1.0 / self._modulation.frequency_hz
+        self._ends_s = (begun_s + self._grant_s - cycle_s, done_s + self._grant_s)
 
     def _note(self, output: LaserOutput) -> None:
         if output is not self._output:
@@ -361,7 +443,7 @@ def _open_link(settings: AwgSettings, profile: AwgProfile, serial: str) -> UsbTm
     return UsbTmc(device, name=NAME, timeout_s=settings.usb_timeout)
 
 
-def open_laser(**settings: Any) -> LaserModulator:
+def open_laser(**settings: Any) -> RenewedLaser:
     """Open the generator from keywords, those of ``AwgSettings``.
 
     Raises

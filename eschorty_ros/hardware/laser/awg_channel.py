@@ -16,17 +16,19 @@ from eschorty_ros.hardware.laser.scpi import Scpi
 from eschorty_ros.hardware.laser.usbtmc import UsbTmc
 
 NAME = "laser generator"
-LIGHT_SETTINGS = ("waveform", "frequency", "high", "low", "duty")
+LIGHT_SETTINGS = ("mode", "waveform", "frequency", "high", "low", "duty")
 Result = TypeVar("Result")
 Requested = dict[str, Value]
 
 
 def requested_settings(
-    settings: AwgSettings, profile: AwgProfile, modulation: Modulation
+    settings: AwgSettings, profile: AwgProfile, modulation: Modulation, *, counted: bool
 ) -> Requested:
     """Return every setting of a lit output, in the order in which it is safe to make them.
 
     The load is first, since it changes what a volt means; then the clamp, before any level.
+    ``counted``: as a burst of counted cycles. It starts in the middle of the dark part of a period,
+    since some generators hold the level of that phase between bursts.
 
     Raises
     ------
@@ -55,6 +57,14 @@ def requested_settings(
         raise ArgumentError(
             f"duty is {modulation.duty:g}; waveform {modulation.waveform} has none but 0.5"
         )
+    if counted and profile.burst is not None:
+        requested |= {
+            "mode": profile.burst.mode,
+            "burst_type": profile.burst.type,
+            "burst_source": profile.burst.source,
+            "burst_cycles": float(max(1, int(settings.light_grant * modulation.frequency_hz))),
+            "burst_phase": 180.0 * (1.0 + modulation.duty),
+        }
     for name, value in requested.items():
         profile.settings[name].check(name, value)
     return requested
@@ -96,6 +106,7 @@ class AwgChannel:
         self._requested: Requested = {}
         self._lowered = False
         self._no_replies = False
+        self._counts: bool | None = None
         self._warn = warn
         own = settings.channel
         # This channel first.
@@ -139,6 +150,17 @@ class AwgChannel:
             elif name != "low":
                 self._set(name, value)
         self.verify()
+
+    def counts_cycles(self) -> bool:
+        """Return whether the generator takes the settings of a burst, tried once; output off."""
+        if self._counts is None:
+            self._counts = self._takes_burst()
+        return self._counts
+
+    def trigger(self) -> None:
+        """Start or extend a burst; raises ``DeviceError``."""
+        if self._profile.burst is not None:
+            self._scpi.command(self._profile.burst.trigger)
 
     def raise_levels(self) -> None:
         """Restore the levels that ``disable`` lowered; raises ``DeviceError``."""
@@ -193,6 +215,29 @@ class AwgChannel:
         """Free the front panel without a retry; raises ``DeviceError``."""
         if self._profile.unlock is not None:
             self.link.write(self._scpi.message(self._profile.unlock))
+
+    def _takes_burst(self) -> bool:
+        burst, own = self._profile.burst, self._settings.channel
+        if burst is None or not self.reads_back:
+            return False
+        tried: Requested = {
+            "mode": burst.mode,
+            "burst_type": burst.type,
+            "burst_source": burst.source,
+            "burst_cycles": 2.0,
+            "burst_phase": 270.0,
+        }
+        for name, value in tried.items():
+            try:
+                self._set(name, value)
+                # At the first difference: a query that the generator does not know has no reply.
+                if not self._profile.settings[name].agrees(value, self._scpi.get(name, own)):
+                    return False
+            except (DeviceGoneError, VoidedError):
+                raise
+            except DeviceError:
+                return False
+        return True
 
     def _set(self, name: str, value: Value) -> None:
         self._scpi.set(name, value, self._settings.channel)

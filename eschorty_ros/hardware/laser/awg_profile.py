@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,6 +30,8 @@ SETTINGS = (
     "duty",
 )
 """The settings that every profile describes."""
+BURST_SETTINGS = ("burst_type", "burst_source", "burst_cycles", "burst_phase")
+"""Those of a profile with a burst of counted cycles, besides."""
 
 Value = bool | float | str
 Texts = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
@@ -97,6 +100,20 @@ class Setting(Schema):
             raise ArgumentError(f"{name} is {value:g}; the generator takes {low:g} to {high:g}")
 
 
+class Burst(Schema):
+    """A burst of counted cycles: the value of ``mode``, ``burst_type`` and ``burst_source`` for it.
+
+    ``trigger`` starts it. What a trigger does while it runs: ``extends`` begins the count again and
+    leaves the waveform as it is, ``restarts`` begins count and waveform again, ``ignored`` nothing.
+    """
+
+    mode: Annotated[str, Field(min_length=1)]
+    type: Annotated[str, Field(min_length=1)]
+    source: Annotated[str, Field(min_length=1)]
+    trigger: Annotated[str, Field(min_length=1)]
+    while_running: Literal["extends", "restarts", "ignored"]
+
+
 class AwgProfile(Schema):
     """One family of generators; the keys are those of ``config/awg_*.yaml``."""
 
@@ -115,6 +132,7 @@ class AwgProfile(Schema):
     waveforms: dict[str, str]
     duty_waveforms: Texts
     mode_continuous: str
+    burst: Burst | None = None
     settings: dict[str, Setting]
 
     @field_validator("model")
@@ -128,10 +146,11 @@ class AwgProfile(Schema):
 
     @model_validator(mode="after")
     def _complete(self) -> AwgProfile:
-        missing = [name for name in SETTINGS if name not in self.settings]
+        needed = SETTINGS + (BURST_SETTINGS if self.burst is not None else ())
+        missing = [name for name in needed if name not in self.settings]
         if missing:
             raise ValueError(f"settings lack {', '.join(missing)}; add them")
-        unknown = sorted(set(self.settings) - set(SETTINGS))
+        unknown = sorted(set(self.settings) - set(needed))
         if unknown:
             raise ValueError(f"settings hold {', '.join(unknown)}, which nothing uses; remove them")
         if self.dark_limit_v < self.dark_high_v:
@@ -148,6 +167,16 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> AwgProfile:
         When there is none, or it does not fit the schema.
     """
     path = _find(os.fspath(file_path("profile", name_or_path)))
+    try:
+        changed_ns = path.stat().st_mtime_ns
+    except OSError:
+        changed_ns = 0
+    return _load(path, changed_ns)
+
+
+# Kept: opening the generator to switch it off in place of a dead guard must not parse it.
+@lru_cache(maxsize=4)
+def _load(path: Path, changed_ns: int) -> AwgProfile:
     return validate(AwgProfile, read_yaml(path, ArgumentError), path, ArgumentError)
 
 

@@ -11,6 +11,7 @@ from eschorty_ros.core.base.numbers import integer, number
 READBACK_POLICIES = ("required", "best_effort", "off")
 HIGH_LIMIT_V = 10.0
 """Above the level of any laser's modulation input."""
+GRANT_MIN_S, GRANT_MAX_S = 0.2, 0.5
 
 
 def _field(default: Any, description: str, unit: str = "", **more: Any) -> Any:
@@ -52,6 +53,13 @@ class AwgSettings:
         "replies; off = never",
         choices=READBACK_POLICIES,
     )
+    light_grant: float = _field(
+        0.5,
+        "light ends by itself after so long unless it is renewed, where the generator can count "
+        "cycles; 0 = never",
+        "s",
+        range=(0.0, GRANT_MAX_S),
+    )
     usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 2.0))
 
     def __post_init__(self) -> None:
@@ -61,6 +69,11 @@ class AwgSettings:
             raise ArgumentError(
                 f"high_v is {self.high_v:g} V, above high_max_v, {self.high_max_v:g} V; lower it, "
                 "or raise high_max_v if the laser's input takes that"
+            )
+        if 0.0 < self.light_grant < GRANT_MIN_S:
+            raise ArgumentError(
+                f"light_grant is {self.light_grant:g} s; give {GRANT_MIN_S:g} to "
+                f"{GRANT_MAX_S:g}, or 0 for light that does not end by itself"
             )
         if self.low_v >= self.high_v:
             raise ArgumentError(

@@ -19,17 +19,20 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.hardware.base.protocols import LaserModulator, LaserOutput
+from eschorty_ros.hardware.base.protocols import LaserOutput, RenewedLaser
 from eschorty_ros.hardware.base.stalls import StallMeter, process_fault
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 from eschorty_ros.hardware.laser_guard.messages import Message, Wire, failure_message
 from eschorty_ros.hardware.laser_guard.opening import maker, open_again
 
 _TURN_S = 0.02
+_RENEW_S = 0.05
+_WATCH_LIMIT_S = 0.2
 _RETRY_S = 0.25
 _RETRIES_END_S = 30.0
 _PRINT_TIMEOUT_S = 0.1
@@ -39,21 +42,22 @@ class Guard:
     """Serves one owner over a wire and watches it.
 
     A worker thread carries out what may take long. The watching thread disables the output at once,
-    beside the worker: the generator's driver lets ``disable`` overtake other commands.
+    beside the worker: the generator's driver lets ``disable`` overtake other commands. A third one
+    renews light that ends by itself, as long as the watching thread has taken a turn of late.
 
     Parameters
     ----------
     wire : Wire
     owner_pid : int
-        Process to watch, the parent of this one.
+        Process to watch, the parent of this one; 0 for one that cannot be seen from here.
     """
 
     def __init__(self, wire: Wire, owner_pid: int) -> None:
         self._wire = wire
         self._owner_pid = owner_pid
         self._heartbeat_timeout_s = float("inf")
-        self._make: Callable[[], LaserModulator] | None = None
-        self._laser: LaserModulator | None = None
+        self._make: Callable[[], RenewedLaser] | None = None
+        self._laser: RenewedLaser | None = None
         self._jobs: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
         self._in_flight = CommandsInFlight()
         self._lit = False
@@ -67,7 +71,8 @@ class Guard:
 
     def run(self) -> None:
         """Serve until the owner is gone or closes; the output is off then."""
-        threading.Thread(target=self._work, name="laser commands", daemon=True).start()
+        for name, target in (("laser commands", self._work), ("laser light", self._renew)):
+            threading.Thread(target=target, name=name, daemon=True).start()
         poller = select.poll()
         poller.register(self._wire.fileno(), select.POLLIN)
         owner = self._owner_descriptor()
@@ -99,6 +104,9 @@ class Guard:
         except OSError:
             return None
 
+    def _owner_fault(self) -> str:
+        return process_fault(self._owner_pid) if self._owner_pid else ""
+
     def _handle(self, message: Message) -> None:
         command = message["do"]
         if command == "heartbeat":
@@ -116,7 +124,7 @@ class Guard:
         """Trip for an owner that does not run or sends nothing; once, until armed again."""
         if self._tripped:
             return
-        fault = process_fault(self._owner_pid)
+        fault = self._owner_fault()
         if fault:
             self._trip(f"is {fault}")
         elif self._stalls.measured_s - self._received_s > self._heartbeat_timeout_s:
@@ -180,7 +188,8 @@ class Guard:
         if self._closing is not None:
             self._answer(self._closing, self._close)
         else:
-            self._trip("is gone")
+            fault = self._owner_fault()
+            self._trip(f"is {fault}" if fault else "has closed its connection")
         if self._retrying is not None:
             self._retrying.join()
         if self._laser is not None:
@@ -227,12 +236,23 @@ class Guard:
             return None
         return self._enable(laser, ticket)
 
+    def _renew(self) -> None:
+        pause, pause_s = threading.Event(), _RENEW_S
+        while not pause.wait(pause_s):
+            pause_s, laser = _RENEW_S, self._laser
+            watched = time.monotonic() - self._stalls.measured_s < _WATCH_LIMIT_S
+            if laser is None or not self._lit or self._tripped or not watched:
+                continue
+            # A failure has switched it off, which the next read-back reports.
+            with contextlib.suppress(DeviceError):
+                pause_s = laser.renew()
+
     def _open(self, message: Message) -> Message:
         self._make = maker(message["make"], message["settings"])
         self._laser = self._make()
         return asdict(self._laser.identity)
 
-    def _enable(self, laser: LaserModulator, ticket: int) -> None:
+    def _enable(self, laser: RenewedLaser, ticket: int) -> None:
         if self._tripped:
             raise DeviceError(f"laser refused: {self._tripped}; arm it again")
         self._lit = True
@@ -257,10 +277,19 @@ def _print(text: str) -> None:
         writer.join(_PRINT_TIMEOUT_S)
 
 
+def _protect() -> None:
+    """Keep this process from the kernel's out-of-memory killer and in time, where permitted."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("-1000", encoding="ascii")
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, -20)
+
+
 def main() -> None:
     """Entry point of the guard process; arguments: the wire's descriptor, the owner's pid."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(number, signal.SIG_IGN)
+    _protect()
     descriptor, owner_pid = (int(argument) for argument in sys.argv[1:])
     end = socket.socket(fileno=descriptor)
     end.set_inheritable(False)

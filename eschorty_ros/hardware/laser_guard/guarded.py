@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import itertools
 import os
 import queue
 import select
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from eschorty_ros.core.base.errors import (
@@ -34,14 +31,8 @@ from eschorty_ros.hardware.laser_guard.messages import (
     readback_from,
 )
 from eschorty_ros.hardware.laser_guard.opening import maker, open_again
+from eschorty_ros.hardware.laser_guard.starting import OwnGuard, ServedGuard
 
-# The guard runs the package that runs here, wherever it lies, and searches no current folder: with
-# -P and the package's own folder on the path no longer than it takes to find the package.
-_START_GUARD = (
-    "import sys; sys.path.insert(0, sys.argv.pop(1)); import eschorty_ros; del sys.path[0]; "
-    "from eschorty_ros.hardware.laser_guard.guard import main; main()"
-)
-_PACKAGE_FOLDER = str(Path(__file__).parents[3])
 HEARTBEATS_PER_TIMEOUT = 5
 OPEN_TIMEOUT_S = 20.0
 DISABLE_TIMEOUT_S = 2.0
@@ -67,6 +58,8 @@ class GuardedLaser:
         Without a heartbeat from this process for so long the guard disables the output.
     answer_timeout_s : float
         Longest wait for an answer.
+    guard : str
+        Socket of the guard's service (see ``service``); empty: a process that this one starts.
 
     Raises
     ------
@@ -81,6 +74,7 @@ class GuardedLaser:
         *,
         heartbeat_timeout_s: float = 1.0,
         answer_timeout_s: float = 5.0,
+        guard: str = "",
     ) -> None:
         self._heartbeat_s = heartbeat_timeout_s / HEARTBEATS_PER_TIMEOUT
         self._answer_timeout_s = answer_timeout_s
@@ -90,19 +84,12 @@ class GuardedLaser:
         self._lost = ""
         self._direct = threading.Lock()
         self._off_confirmed = False
-        # Both ends close on exec; only the guard is given its end.
-        here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with there:
-            arguments = (_PACKAGE_FOLDER, str(there.fileno()), str(os.getpid()))
-            self._guard = subprocess.Popen(
-                [sys.executable, "-P", "-c", _START_GUARD, *arguments],
-                stdin=subprocess.DEVNULL,
-                pass_fds=(there.fileno(),),
-                start_new_session=True,
-            )
-        self._wire = Wire(here)
-        self._thread = threading.Thread(target=self._serve, name="laser guard", daemon=True)
+        self._guard = ServedGuard(guard) if guard else OwnGuard()
+        self._wire = Wire(self._guard.end)
+        self._thread = threading.Thread(target=self._watch, name="laser guard", daemon=True)
         self._thread.start()
+        self._serving = threading.Thread(target=self._serve, name="laser guard wire", daemon=True)
+        self._serving.start()
         try:
             identity = self._call(
                 "open",
@@ -119,10 +106,12 @@ class GuardedLaser:
         # Loaded now: after the end of the guard there is no time for it.
         self._open_directly = maker(make, settings)
         self._opened = True
+        # Before the interpreter tears its modules down, which may take longer than light may last.
+        atexit.register(self._close_at_exit)
 
     @property
     def guard_pid(self) -> int:
-        """Process id of the guard."""
+        """Process id of the guard, 0 when its service has started it."""
         return self._guard.pid
 
     def configure(self, modulation: Modulation) -> None:
@@ -152,7 +141,7 @@ class GuardedLaser:
                     raise
             else:
                 return
-        # The serving thread does it now, or has tried.
+        # The watching thread does it now, or has tried.
         self._thread.join(EXIT_TIMEOUT_S)
         self._disable_directly()
 
@@ -169,6 +158,7 @@ class GuardedLaser:
         if self._closing:
             return
         self._closing = True
+        atexit.unregister(self._close_at_exit)
         try:
             if self._opened:
                 # Before the guard ends: until then this process replaces a guard that fails.
@@ -178,10 +168,14 @@ class GuardedLaser:
                 self._call("close", DISABLE_TIMEOUT_S)
         finally:
             self._dismissed = self._ending = True
-            self._thread.join(EXIT_TIMEOUT_S)
+            self._serving.join(EXIT_TIMEOUT_S)
             self._wire.close()
-            # It may still retry on a generator that does not answer; reaped when it ends.
-            threading.Thread(target=self._guard.wait, name="laser guard's end", daemon=True).start()
+            self._guard.release()
+
+    def _close_at_exit(self) -> None:
+        # What it could report, the guard prints.
+        with contextlib.suppress(EschortyError):
+            self.close()
 
     def _call(self, command: str, timeout_s: float, **arguments: Any) -> Any:
         number = next(self._numbers)
@@ -205,8 +199,17 @@ class GuardedLaser:
         raise_failure(answer)
         return answer["value"]
 
+    def _watch(self) -> None:
+        """Wait for the end or the stop of the guard's process, and replace it then."""
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), -20)
+        self._guard.wait_until_lost()
+        self._guard.kill()
+        if not self._dismissed:
+            self._replace_guard()
+
     def _serve(self) -> None:
-        """Hand out answers, send heartbeats to the guard, and watch the guard in turn."""
+        """Hand out answers and send heartbeats to the guard."""
         poller = select.poll()
         poller.register(self._wire.fileno(), select.POLLIN)
         heartbeat_at_s = 0.0
@@ -214,6 +217,9 @@ class GuardedLaser:
             poller.poll(_TURN_S * 1e3)
             messages = self._wire.receive()
             if messages is None:
+                if not self._dismissed:
+                    # One that serves no more, whatever its process still does.
+                    self._guard.kill()
                 break
             for message in messages:
                 answers = self._waiting.get(message["id"])
@@ -223,17 +229,14 @@ class GuardedLaser:
             if now_s >= heartbeat_at_s:
                 heartbeat_at_s = now_s + self._heartbeat_s
                 self._wire.send({"do": "heartbeat"})
-            if process_fault(self._guard.pid):
+            if self._guard.pid and process_fault(self._guard.pid):
+                # Also one that dumps core, which is not waited for.
                 self._guard.kill()
-        if not self._dismissed:
-            self._replace_guard()
 
     def _replace_guard(self) -> None:
         """Disable the output in place of the guard, then answer every call that waits for it."""
         self._lost = "laser state unknown: its guard is gone"
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._guard.wait(EXIT_TIMEOUT_S)
-        ended = f"laser guard is gone (exit code {self._guard.returncode})"
+        ended = self._guard.ending(EXIT_TIMEOUT_S)
         if self._opened:
             try:
                 self._disable_directly()

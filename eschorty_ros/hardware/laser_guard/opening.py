@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.hardware.base.protocols import LaserModulator
+from eschorty_ros.hardware.base.protocols import RenewedLaser
 
 
-def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator]:
+def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], RenewedLaser]:
     """Return the function that opens the generator: ``module:callable`` with keywords.
 
     Raises ``DeviceError`` when there is no such callable.
@@ -25,7 +25,7 @@ def maker(name: str, settings: Mapping[str, Any]) -> Callable[[], LaserModulator
     return lambda: make(**settings)
 
 
-def open_again(make: Callable[[], LaserModulator], serial: str) -> LaserModulator:
+def open_again(make: Callable[[], RenewedLaser], serial: str) -> RenewedLaser:
     """Open the generator that was lost, which disables its output.
 
     Raises ``DeviceError`` when it is not there; the output of another one proves nothing.

@@ -56,17 +56,27 @@ def test_settings_are_made_in_the_safe_order(bench: AwgBench) -> None:
         "BASE:LOW 0",
         "BASE:HIGH 0.01",
         ":SYSTem:LOCK OFF",
+        # Whether it has bursts is tried at the first configuring.
+        "MODe BURST",
+        "BURSt:TYPe NCYC",
+        "TRIGger:SOURce MANUAL",
+        "BURSt:CYCLes 2",
+        "BURSt:PHASe 270",
         "LOAD 10000",
         "LIMit:LOWer 0",
         "LIMit:UPPer 5",
         "LIMit:ENABle ON",
-        "MODe CONTINUE",
+        "MODe BURST",
         "INVersion OFF",
         "BASE:WAVe SQUARE",
         "BASE:FREQuency 1234.5",
         "BASE:HIGH 5",
         "BASE:LOW 0",
         "BASE:DUTY 25",
+        "BURSt:TYPe NCYC",
+        "TRIGger:SOURce MANUAL",
+        "BURSt:CYCLes 617",
+        "BURSt:PHASe 225",
         ":SYSTem:LOCK OFF",
     ]
     state = bench.model.channels[0]
@@ -95,7 +105,7 @@ def test_enable_reads_all_back_before_and_the_output_after(bench: AwgBench) -> N
     assert {"LOAD?", "LIMit:UPPer?", "BASE:HIGH?", "BASE:DUTY?", "INVersion?"} <= {
         text.removeprefix(":CHANnel1:") for text in sent[:on]
     }
-    assert sent[on + 1 :] == [":CHANnel1:OUTPut?", ":SYSTem:LOCK OFF"]
+    assert sent[on + 1 :] == ["*TRG", ":CHANnel1:OUTPut?", ":SYSTem:LOCK OFF"]
 
 
 def test_levels_can_be_set_from_any_others(bench: AwgBench) -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.hardware.laser.awg_profile import SETTINGS, Setting, load_profile
+from eschorty_ros.hardware.laser.awg_profile import BURST_SETTINGS, SETTINGS, Setting, load_profile
 
 PROFILE = Path(__file__).parents[3] / "config" / "awg_utg900e.yaml"
 
 
 def test_profile_is_found_by_name_and_by_path() -> None:
     assert load_profile("utg900e") == load_profile(PROFILE)
-    assert set(load_profile("utg900e").settings) == set(SETTINGS)
+    assert set(load_profile("utg900e").settings) == {*SETTINGS, *BURST_SETTINGS}
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,8 @@ def test_profile_is_found_by_name_and_by_path() -> None:
         ("channels: 2", "channels: two", "channels is 'two'"),
         ("BASE:DUTY", "BASE:{duty}", "only {channel} can be filled in"),
         ("  duty:\n", "  share:\n", "settings lack duty; add them"),
+        ("  burst_type:\n", "  burst_kind:\n", "settings lack burst_type; add them"),
+        ("burst: {mode", "# burst: {mode", "which nothing uses; remove them"),
         ("dark_limit_v: 0.1", "dark_limit_v: 0.001", "dark_limit_v lies below dark_high_v"),
         ("(?i)utg", "(?i)utg(", "it is no regular expression"),
         ("0x0834", "0x10834", "usb.product_ids.0 is 67636"),

@@ -15,7 +15,7 @@ from eschorty_ros.emulation.awg.model import ENDPOINT_IN, ENDPOINT_OUT
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser.awg import AwgLaser
 
-CALLS = ("configure 70", "configure 1000", "arm", "enable", "disable", "readback")
+CALLS = ("configure 70", "configure 1000", "arm", "enable", "renew", "disable", "readback")
 FAULTS = {
     "stall in": lambda model: model.stalled.add(ENDPOINT_IN),
     "stall out": lambda model: model.stalled.add(ENDPOINT_OUT),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 import signal
 import socket
@@ -14,6 +15,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from awg_process import AwgProcess, awg_process
@@ -22,7 +24,9 @@ from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.base import stalls
 from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.hardware.laser.awg_settings import GRANT_MAX_S
 from eschorty_ros.hardware.laser_guard import guard, guarded
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 from eschorty_ros.hardware.laser_guard.messages import Wire
@@ -33,6 +37,7 @@ TIMEOUT_S = 0.5
 # Where heartbeats are not the subject: a loaded machine may delay the owner.
 LONG_S = 30.0
 AWG = "eschorty_ros.hardware.laser.awg:open_laser"
+SERVICE = "eschorty_ros.hardware.laser_guard.service"
 INTERRUPTIBLE = "interruptible_awg:open_laser"
 SQUARE = Modulation(70.0)
 SUPPORT_FOLDER = str(Path(__file__).parents[2] / "support")
@@ -57,7 +62,7 @@ def awg(shared: AwgProcess) -> Iterator[AwgProcess]:
 
 @contextlib.contextmanager
 def opened(
-    awg: AwgProcess, timeout_s: float = LONG_S, make: str = AWG, **settings: str
+    awg: AwgProcess, timeout_s: float = LONG_S, make: str = AWG, **settings: Any
 ) -> Iterator[GuardedLaser]:
     """A configured laser that is closed whatever the result of the test."""
     made = GuardedLaser(make, {"backend": awg.backend, **settings}, heartbeat_timeout_s=timeout_s)
@@ -129,8 +134,10 @@ for number in (signal.SIGHUP, signal.SIGTERM):
     signal.signal(number, signal.SIG_DFL)  # inherited as ignored under nohup
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
-driver, backend, timeout_s = sys.argv[1:]
-laser = GuardedLaser(driver, {"backend": backend}, heartbeat_timeout_s=float(timeout_s))
+driver, backend, timeout_s, guard = sys.argv[1:]
+laser = GuardedLaser(
+    driver, {"backend": backend}, heartbeat_timeout_s=float(timeout_s), guard=guard
+)
 laser.configure(Modulation(70.0))
 laser.arm()
 laser.enable()
@@ -162,11 +169,24 @@ class Owner:
     """A process that has enabled the output, until the end of a ``with``."""
 
     def __init__(
-        self, awg: AwgProcess, stderr: int = subprocess.DEVNULL, timeout_s: float = LONG_S
+        self,
+        awg: AwgProcess,
+        stderr: int = subprocess.DEVNULL,
+        timeout_s: float = LONG_S,
+        guard: str = "",
     ) -> None:
         self.awg = awg
         self.process = subprocess.Popen(
-            [sys.executable, "-c", OWNER, "lazy_awg:open_laser", awg.backend, str(timeout_s)],
+            [
+                sys.executable,
+                "-c",
+                OWNER,
+                "lazy_awg:open_laser",
+                awg.backend,
+                str(timeout_s),
+                guard,
+            ],
+            start_new_session=True,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -199,9 +219,9 @@ class Owner:
         return self.awg.off_after_s(int(self.process.stdout.readline()))
 
     def send(self, number: int) -> float:
-        """Seconds from the signal until the output is off."""
+        """Seconds from a signal to the process and its group until the output is off."""
         sent_ns = time.monotonic_ns()
-        self.process.send_signal(number)
+        os.killpg(self.process.pid, number)
         return self.awg.off_after_s(sent_ns)
 
 
@@ -227,9 +247,98 @@ def test_off_when_the_owner_gets_a_signal(owner: Owner, number: int) -> None:
     check_off(owner.send(number))
 
 
+@pytest.mark.parametrize("stopped", ["", "guard", "both"])
+def test_light_ends_when_guard_and_owner_are_gone_together(owner: Owner, stopped: str) -> None:
+    """Killed within 1 ms, the guard stopped before, or both stopped: a frozen container."""
+    assert owner.awg.lit()
+    sent_ns = time.monotonic_ns()
+    os.kill(owner.guard_pid, signal.SIGSTOP if stopped else signal.SIGKILL)
+    os.kill(owner.process.pid, signal.SIGSTOP if stopped == "both" else signal.SIGKILL)
+    check_off(owner.awg.off_after_s(sent_ns), GRANT_MAX_S)
+    os.kill(owner.guard_pid, signal.SIGKILL)
+
+
+def test_guard_renews_the_light(owner: Owner) -> None:
+    time.sleep(4.0 * GRANT_MAX_S)
+    # On a loaded machine a renewal may be late.
+    wait_until(owner.awg.lit, "light")
+
+
 def test_off_when_the_owner_hangs(awg: AwgProcess) -> None:
     with Owner(awg, timeout_s=TIMEOUT_S) as owner:
         check_off(owner.die("gil"), TIMEOUT_S + OFF_LIMIT_S)
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The guard's service and its socket."""
+    path = str(tmp_path / "guard.sock")
+    process = subprocess.Popen(
+        [sys.executable, "-m", SERVICE, path], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert path in process.stdout.readline()
+    yield process, path
+    process.terminate()
+    assert process.wait() == 0
+    process.stdout.close()
+
+
+def test_guard_as_a_service_outlives_its_owners(
+    awg: AwgProcess, served: tuple[subprocess.Popen[str], str]
+) -> None:
+    service, path = served
+    # One owner after the other, as when the node's container is started again.
+    for number in (signal.SIGKILL, signal.SIGSTOP):
+        with Owner(awg, guard=path) as owner:
+            check_off(owner.send(number))
+    with contextlib.closing(GuardedLaser(AWG, {"backend": awg.backend}, guard=path)) as laser:
+        laser.configure(SQUARE)
+        light(laser)
+        [guard_pid] = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
+        sent_ns = time.monotonic_ns()
+        os.kill(int(guard_pid), signal.SIGKILL)
+        check_off(awg.off_after_s(sent_ns))
+        with pytest.raises(DeviceGoneError, match="service is gone; output switched off"):
+            laser.enable()
+    second = subprocess.run([sys.executable, "-m", SERVICE, path], capture_output=True, text=True)
+    assert (second.returncode, second.stderr.count("\n")) == (1, 1)
+    assert "another guard serves it" in second.stderr
+
+
+def test_guard_service_that_does_not_run_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGoneError, match="start its service"):
+        GuardedLaser(AWG, {}, guard=str(tmp_path / "guard.sock"))
+
+
+def test_guard_has_a_session_and_the_kernels_protection_of_its_own(owner: Owner) -> None:
+    pid = owner.guard_pid
+    assert os.getsid(pid) == os.getpgid(pid) == pid
+    permitted = subprocess.run(
+        ["sh", "-c", "echo -1000 > /proc/self/oom_score_adj"], capture_output=True
+    )
+    adjusted = int(Path(f"/proc/{pid}/oom_score_adj").read_text())
+    assert adjusted == (-1000 if permitted.returncode == 0 else adjusted)
+
+
+def test_a_living_owner_is_not_reported_as_gone(
+    owner: Owner, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Neither without descriptors to read its state, nor when it closes its end of the wire."""
+
+    def exhausted(*_: object, **__: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr("builtins.open", exhausted)
+    assert stalls.process_fault(owner.process.pid) == ""
+    monkeypatch.undo()
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    serving = guard.Guard(Wire(there), os.getpid())
+    serving._lit = True
+    here.close()
+    serving.run()
+    there.close()
+    assert f"process {os.getpid()} has closed its connection" in capfd.readouterr().err
 
 
 def test_guard_ignores_the_terminals_signals(owner: Owner) -> None:
@@ -403,7 +512,7 @@ def test_mute_generator_is_unknown_and_the_guard_retries(
 ) -> None:
     # A guard that is replaced for being slow does not retry.
     monkeypatch.setattr(guarded, "DISABLE_TIMEOUT_S", LONG_S)
-    with opened(awg) as laser:
+    with opened(awg, light_grant=0.0) as laser:
         light(laser)
         awg.do("mute")
         with pytest.raises(DeviceError, match="laser state unknown"):
