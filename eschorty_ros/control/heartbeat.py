@@ -7,6 +7,7 @@ for two processes of the same process id space.
 from __future__ import annotations
 
 import os
+import re
 import socket
 from dataclasses import dataclass
 from functools import cache
@@ -14,6 +15,8 @@ from functools import cache
 from eschorty_ros.hardware.base.stalls import process_fault
 
 _STOPPED = "stopped"
+# Anybody may publish a heartbeat: more than this is no text of ours, and is not read.
+_TEXT = re.compile(rf"(\S{{1,200}}) ([0-9]{{1,10}})( {_STOPPED})?", re.ASCII)
 CHECK_S = 0.02
 PERIOD_S = 0.1
 LAST_HEARTBEATS = 3
@@ -49,13 +52,10 @@ def heartbeat_text(*, stopped: bool) -> str:
 
 def read_heartbeat(text: str) -> tuple[Sender | None, bool]:
     """Return a heartbeat's sender, ``None`` for any other text, and whether it reports a stop."""
-    match text.split():
-        case [sender_place, number] if number.isdecimal():
-            return Sender(sender_place, int(number)), False
-        case [sender_place, number, state] if number.isdecimal() and state == _STOPPED:
-            return Sender(sender_place, int(number)), True
-        case _:
-            return None, False
+    found = _TEXT.fullmatch(text)
+    if found is None:
+        return None, False
+    return Sender(found[1], int(found[2])), found[3] is not None
 
 
 class HeartbeatSchedule:

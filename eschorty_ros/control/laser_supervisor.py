@@ -129,8 +129,9 @@ class LaserSupervisor:
 
     def arm(self) -> None:
         """Allow ``enable`` for a while; raises ``DeviceError`` when it must not be."""
-        if self.interlock.contact_open:
-            raise DeviceError("laser refused: interlock open; close it")
+        fault = self.interlock.contact_fault()
+        if fault:
+            raise DeviceError(f"laser refused: {fault}")
         with self._command() as (laser, ticket):
             laser.arm()
             with self._lock:

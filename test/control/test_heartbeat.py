@@ -61,5 +61,6 @@ def test_texts_are_read_back():
     assert read_heartbeat(heartbeat_text(stopped=False)) == (own, False)
     assert read_heartbeat(heartbeat_text(stopped=True)) == (own, True)
     assert own.fault() == ""
-    for text in ("", "camera", "a b c d", "host x", "host 1 started"):
+    for text in ("", "camera", "a b c d", "host x", "host 1 started", f"host {'9' * 5000}",
+                 "host \u0661", f"{'x' * 201} 1", "host 1\n"):  # fmt: skip
         assert read_heartbeat(text) == (None, False)

@@ -65,7 +65,7 @@ def test_refusals_name_what_is_missing(interlock, clock):
 
 
 def test_required_contact_is_open_unless_it_is_reported_closed_repeatedly(clock):
-    interlock = LaserInterlock(10.0, 60.0, {}, contact_timeout_s=1.0, now_s=clock)
+    interlock = LaserInterlock(10.0, 60.0, {}, contact_required=True, now_s=clock)
     interlock.arm()
     assert "interlock open" in str(interlock.refusal())
     interlock.receive_contact(False)
@@ -79,6 +79,30 @@ def test_required_contact_is_open_unless_it_is_reported_closed_repeatedly(clock)
     assert interlock.trip_reason() is None
     interlock.receive_contact(True)
     assert "interlock open" in str(interlock.trip_reason())
+
+
+def test_every_source_must_be_closed_and_fresh_and_an_opened_one_reset(clock):
+    interlock = LaserInterlock(10.0, 60.0, {}, now_s=clock)
+    assert not interlock.contact_open
+    interlock.receive_contact(True, "door")
+    interlock.receive_contact(False, "lid")
+    assert interlock.contact_fault() == "interlock open (door); close it"
+    assert interlock.reset_contact() == "interlock open (door); close it"
+    interlock.receive_contact(False, "door")
+    assert "was opened (door); call laser/reset_interlock" in interlock.contact_fault()
+    clock.now_s += 0.6
+    interlock.receive_contact(False, "door")
+    clock.now_s += 0.6
+    assert "interlock open (lid): closed was last reported" in interlock.reset_contact()
+    interlock.receive_contact(False, "lid")
+    assert interlock.contact_open
+    assert interlock.reset_contact() == ""
+    assert not interlock.contact_open
+    # More sources than are kept: closed ones do not displace the others, an open one counts.
+    for number in range(100):
+        interlock.receive_contact(False, f"crowd {number}")
+    interlock.receive_contact(True, "the last")
+    assert "was opened (the last)" in interlock.contact_fault()
 
 
 def test_each_heartbeat_is_stale_at_its_own_age(interlock, clock):
@@ -128,6 +152,23 @@ def test_reported_stop_trips_unless_it_is_of_another_sender(interlock):
     assert "reports stopped" in str(interlock.trip_reason())
     interlock.receive_heartbeat(CLIENT_HEARTBEAT, heartbeat_text(stopped=False))
     assert interlock.trip_reason() is None
+
+
+def test_only_the_sender_that_had_it_enabled_keeps_the_light(interlock, clock):
+    light(interlock, heartbeat_text(stopped=False))
+    clock.now_s += 1.1
+    interlock.receive_heartbeat(CAMERA)
+    for number in range(100):
+        interlock.receive_heartbeat(CLIENT_HEARTBEAT)
+        interlock.receive_heartbeat(CLIENT_HEARTBEAT, heartbeat_text(stopped=False), f"{number}")
+        interlock.receive_heartbeat(CAMERA, "", f"{number}")
+    assert "laser/heartbeat older than 1 s" in str(interlock.trip_reason())
+    assert interlock.strangers == 300
+    interlock.receive_heartbeat(CLIENT_HEARTBEAT, heartbeat_text(stopped=False))
+    assert interlock.trip_reason() is None
+    interlock.note_disabled()
+    interlock.arm()
+    assert "senders at once" in str(interlock.refusal())
 
 
 def test_stall_of_this_process_ages_no_heartbeat(interlock, clock):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
+from contact import Contact
 from eschorty_ros.action import Calibrate
 from eschorty_ros.msg import ActiveCalibration, CalibrationTarget
 from eschorty_ros.srv import LoadCalibration, SaveCalibration
-from ros_process import Observer, stamped_after, wait_until
+from ros_process import Observer, wait_until
 from scan_scenarios import (
     EVENTS,
     SCAN_DEADLINE_S,
@@ -24,7 +24,6 @@ from scan_scenarios import (
     assert_refused,
     device_parameters,
 )
-from std_msgs.msg import Bool
 
 from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.nodes.ros import qos
@@ -238,17 +237,12 @@ def useless_captures(bench: CalibrationBench) -> None:
         assert status == GoalStatus.STATUS_CANCELED, result.message
         bench.assert_off_and_at_rest()
         # The laser goes off.
-        interlock = bench.observer.publisher(Bool, "laser/interlock", qos.stream(10))
+        contact = Contact(bench.observer)
         bench.begin(**LONG)
         bench.wait_for_capture()
-        interlock.publish(Bool(data=True))
+        contact.open()
         status, result = bench.calibrations.end()
-        interlock.publish(Bool(data=False))
-        closed_ns = time.time_ns()
-        wait_until(
-            lambda: stamped_after(bench.laser, closed_ns) and not bench.laser[-1].interlock_open,
-            "the interlock closed",
-        )
+        contact.close()
         assert status == GoalStatus.STATUS_ABORTED
         assert "laser: went off: interlock open" in result.message, result.message
         bench.assert_off_and_at_rest()

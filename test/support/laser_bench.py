@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from awg_process import awg_process
+from contact import Contact
 from eschorty_ros.msg import LaserState
 from ros_process import NodeProcess, Observer, stamped_after, wait_until
-from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.nodes.ros import qos
@@ -32,10 +32,12 @@ class LaserBench:
         self._held = held
         self.observer = observer = held.enter_context(Observer())
         self.awg = held.enter_context(awg_process(folder))
-        parameters = {"driver": "awg", "backend": self.awg.backend, **parameters}
+        # No report of the contact that a loaded machine delays may end the light.
+        defaults = {"driver": "awg", "backend": self.awg.backend, "interlock_timeout": 60.0}
+        parameters = {**defaults, **parameters}
         self.node = self.start(module, parameters)
         self.states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
-        self.interlock = observer.publisher(Bool, "laser/interlock", qos.stream(10))
+        self.contact = Contact(observer)
 
     def start(self, module: str, parameters: dict[str, Any]) -> NodeProcess:
         """Start another process of this bench, whose output is printed at its end."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -27,6 +26,7 @@ from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param, from_settings
+from eschorty_ros.nodes.ros.publishers import Publishers
 from eschorty_ros.nodes.ros.spin import run
 
 STATE_RATE_HZ = 20.0
@@ -51,7 +51,9 @@ TABLE = (
     Param("heartbeat_timeout", 1.0, "age at which laser/heartbeat is stale", "s", 0.05, 60.0),
     Param("max_on_time", 600.0, "longest time on", "s", 0.1, 86400.0),
     Param("interlock_required", False, "interlock is open unless laser/interlock reports closed"),
-    Param("interlock_timeout", 1.0, "age at which a required 'closed' is stale", "s", 0.05, 60.0),
+    Param("interlock_timeout", 1.0, "age at which a source's 'closed' is stale", "s", 0.05, 60.0),
+    Param("allowed_peers", "", "names of the nodes whose laser/heartbeat counts; empty = any"),
+    Param("guard", "", "socket of a guard that runs as a service; empty: starts one of its own"),
     Param("watch", " ".join(WATCHED), "nodes whose heartbeats light needs: camera, stage, none"),
     Param("camera_timeout", 1.0, "age at which camera/heartbeat is stale", "s", 0.05, 60.0),
     Param("stage_timeout", 1.0, "age at which stage/heartbeat is stale", "s", 0.05, 60.0),
@@ -63,12 +65,13 @@ TABLE = (
 class LaserNode(DeviceNode):
     """``laser/arm``, ``laser/enable``, ``laser/heartbeat``, ``laser/interlock`` -> ``laser/state``.
 
-    ``laser/interlock`` (std_msgs/Bool): true means open, and open means off. With
-    ``interlock_required`` it is open unless a message within ``interlock_timeout`` reports it
-    closed, else closed until one reports it open. The output is disabled when ``laser/heartbeat``
-    (of the client), ``camera/heartbeat`` or ``stage/heartbeat`` is stale or its sender on this host
-    dies, with an open interlock, after ``max_on_time``, and when the generator does not read back
-    as requested. Watchdog threads on the steady clock check this, also when the executor is stuck.
+    ``laser/interlock`` (std_msgs/Bool): true means open, and open means off, until every node that
+    ever published it reports closed within ``interlock_timeout`` and ``laser/reset_interlock`` is
+    called. ``interlock_required``: open, too, while no node has. The output is disabled when
+    ``laser/heartbeat`` (of the client that had it enabled), ``camera/heartbeat`` or
+    ``stage/heartbeat`` is stale or its sender on this host dies, with an open interlock, after
+    ``max_on_time``, and when the generator does not read back as requested. Watchdog threads on the
+    steady clock check this, also when the executor is stuck.
     Spin it with several threads: commands take their time, heartbeats must not wait for them.
     """
 
@@ -90,7 +93,15 @@ class LaserNode(DeviceNode):
         control = ReentrantCallbackGroup()
         self.create_service(Trigger, "laser/arm", self._on_arm, callback_group=control)
         self.create_service(SetBool, "laser/enable", self._on_enable, callback_group=control)
+        self.create_service(
+            Trigger, "laser/reset_interlock", self._on_reset, callback_group=control
+        )
         reports = MutuallyExclusiveCallbackGroup()
+        self._contacts = Publishers(self, "laser/interlock")
+        self._allowed = {
+            name if name.startswith("/") else f"{self.get_namespace().rstrip('/')}/{name}"
+            for name in self.parameters["allowed_peers"].replace(",", " ").split()
+        }
         self.create_subscription(
             Bool, "laser/interlock", self._on_interlock, qos.stream(10), callback_group=reports
         )
@@ -98,7 +109,7 @@ class LaserNode(DeviceNode):
             self.create_subscription(
                 Header,
                 topic,
-                partial(self._on_heartbeat, topic),
+                partial(self._on_heartbeat, topic, Publishers(self, topic)),
                 qos.heartbeat(),
                 callback_group=reports,
             )
@@ -149,11 +160,8 @@ class LaserNode(DeviceNode):
             self.parameters["arm_timeout"],
             self.parameters["max_on_time"],
             timeouts,
-            contact_timeout_s=(
-                self.parameters["interlock_timeout"]
-                if self.parameters["interlock_required"]
-                else math.inf
-            ),
+            contact_timeout_s=self.parameters["interlock_timeout"],
+            contact_required=self.parameters["interlock_required"],
         )
 
     def _apply(self, values: dict[str, Any]) -> None:
@@ -166,6 +174,13 @@ class LaserNode(DeviceNode):
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         step = self._enable if request.data else self._disable
         response.success, response.message = self._attempted(step)
+        return response
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        refusal = self._supervisor.interlock.reset_contact()
+        response.success = not refusal
+        response.message = f"laser refused: {refusal}" if refusal else "interlock closed"
+        self._supervisor.report()
         return response
 
     def _attempted(self, step: Callable[[], str]) -> tuple[bool, str]:
@@ -198,17 +213,30 @@ class LaserNode(DeviceNode):
         if not self.active:
             raise DeviceError(f"laser refused: node is {self.state_label}; activate it first")
 
-    def _on_interlock(self, message: Bool) -> None:
+    def _on_interlock(self, message: Bool, info: Mapping[str, Any]) -> None:
         interlock = self._supervisor.interlock
-        opens = message.data and not interlock.contact_open
-        interlock.receive_contact(bool(message.data))
-        # Only at the change; the watchdog checks the contact all the time.
-        if opens:
-            self._supervisor.trip("interlock open")
+        source = self._contacts.name(info)
+        if message.data or source or not self._contacts.id(info):
+            opens = message.data and not interlock.contact_open
+            interlock.receive_contact(bool(message.data), source)
+            # Only at the change; the watchdog checks the contact all the time.
+            if opens:
+                self._supervisor.trip(interlock.contact_fault())
+        # A closed contact counts once its node is known, an open one at once.
         self._supervisor.report()
 
-    def _on_heartbeat(self, topic: str, message: Header) -> None:
-        self._supervisor.interlock.receive_heartbeat(topic, message.frame_id)
+    def _on_heartbeat(
+        self, topic: str, publishers: Publishers, message: Header, info: Mapping[str, Any]
+    ) -> None:
+        if topic == CLIENT_HEARTBEAT and self._allowed:
+            name = publishers.name(info)
+            if name not in self._allowed:
+                self.get_logger().warning(
+                    f"{topic} of {name or 'a nameless node'} ignored: not in allowed_peers",
+                    throttle_duration_sec=5.0,
+                )
+                return
+        self._supervisor.interlock.receive_heartbeat(topic, message.frame_id, publishers.id(info))
 
     def _alarm(self, text: str) -> None:
         with contextlib.suppress(Exception):
@@ -254,6 +282,8 @@ class LaserNode(DeviceNode):
             "requested": (status.requested if status else LaserOutput.OFF).name,
             "armed": interlock.armed,
             "interlock_open": interlock.contact_open,
+            "interlock": interlock.contact_fault() or "closed",
+            "heartbeats of strangers while on": interlock.strangers,
             "reason": status.reason if status else "",
             "switch_offs": supervisor.switch_offs,
         }
@@ -274,7 +304,9 @@ def _make_laser(parameters: Mapping[str, Any], _: drivers.ClockNs) -> GuardedLas
     settings = {param.name: parameters[param.name] for param in DRIVER_TABLE}
     # Refused here, before a process is started for it.
     AwgSettings(**settings)
-    return GuardedLaser("eschorty_ros.hardware.laser.awg:open_laser", settings)
+    return GuardedLaser(
+        "eschorty_ros.hardware.laser.awg:open_laser", settings, guard=parameters["guard"]
+    )
 
 
 def _modulation(values: dict[str, Any]) -> Modulation:

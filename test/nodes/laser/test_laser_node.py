@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from eschorty_ros.msg import LaserState
 from laser_bench import OFF_LIMIT_S, LaserBench
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, stamped_after, wait_until
-from std_msgs.msg import Bool, Header
+from std_msgs.msg import Header
 
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.emulation.awg.model import read_output_log
@@ -45,7 +45,6 @@ class Bench(LaserBench):
         held.callback(observer.node.destroy_timer, timer)
         observer.wait_for_state("laser", "active")
         wait_until(self._heartbeat.get_subscription_count, "the heartbeat's subscriber")
-        wait_until(self.interlock.get_subscription_count, "the interlock's subscriber")
         wait_until(lambda: self.states, "a laser state")
 
     def _send(self) -> None:
@@ -74,16 +73,6 @@ class Bench(LaserBench):
     def wait_until_off(self) -> None:
         wait_until(lambda: not self.awg.lit(), "the laser off in the log")
 
-    def close_interlock(self) -> None:
-        """Report the interlock as closed; published on return."""
-        self.interlock.publish(Bool(data=False))
-        reported_ns = time.time_ns()
-
-        def closed() -> bool:
-            return stamped_after(self.states, reported_ns) and not self.states[-1].interlock_open
-
-        wait_until(closed, "the interlock closed")
-
 
 @contextlib.contextmanager
 def running(folder: Path, **parameters: Any) -> Iterator[Bench]:
@@ -101,7 +90,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def bench(shared: Bench) -> Iterator[Bench]:
     yield shared
     shared.alive = False
-    shared.close_interlock()
+    shared.contact.close()
     shared.enable(False)
     if shared.observer.lifecycle_state("laser") == "inactive":
         assert shared.observer.change_state("laser", "activate")

@@ -5,107 +5,42 @@ Scanner, camera and stage are processes that only send heartbeats.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from eschorty_ros.msg import LaserState
-from laser_bench import OFF_LIMIT_S, LaserBench
-from ros_process import NodeProcess, wait_until
-from std_msgs.msg import Bool, String
+from rclpy.node import Node
+from ros_process import NAMESPACE, wait_until
+from safety_bench import SENDERS, SafetyBench, guard_of, running
+from std_msgs.msg import Bool, Header, String
 
+from eschorty_ros.control.heartbeat import place
 from eschorty_ros.nodes.ros import qos
-
-SENDERS = ("laser", "camera", "stage")
-WAYS_TO_ACTIVE = {"unconfigured": "configure", "inactive": "activate"}
-# Every fault here has to be noticed at once, without a timeout; and no timeout may end the light
-# when a loaded machine delays the senders.
-TIMEOUTS = {f"{name}_timeout": 60.0 for name in ("heartbeat", "camera", "stage")}
-
-
-class Bench(LaserBench):
-    """A laser node that can be broken, with the processes that send it heartbeats."""
-
-    def __init__(
-        self, held: contextlib.ExitStack, folder: Path, senders: tuple[str, ...], **parameters: Any
-    ) -> None:
-        super().__init__(held, folder, "breakable_laser", **TIMEOUTS, **parameters)
-        self._names = senders
-        self._senders: dict[str, NodeProcess] = {}
-        self.start_senders()
-        self.diagnostics = self.observer.collect(DiagnosticArray, "/diagnostics", qos.stream(100))
-        self.breaking = self.observer.publisher(String, "test/break", qos.stream(10))
-
-    def start_senders(self) -> None:
-        for name in self._names:
-            if name not in self._senders:
-                topics = " ".join(f"{word}/heartbeat" for word in name.split())
-                self._senders[name] = self.start("heartbeat_sender", {"topics": topics})
-
-    def lose(self, name: str, number: int) -> int:
-        """Send a signal to a sender, which does not count as running any more; its time."""
-        sent_ns = time.monotonic_ns()
-        self._senders.pop(name).send(number)
-        return sent_ns
-
-    def light(self) -> None:
-        """Switch on, from any state of the node and of the senders."""
-        self.start_senders()
-
-        def lit() -> bool:
-            state = self.observer.lifecycle_state("laser")
-            if state in WAYS_TO_ACTIVE:
-                # A guard that is about to end may still hold the generator.
-                self.observer.change_state("laser", WAYS_TO_ACTIVE[state])
-            if state != "active":
-                return False
-            answers = self.arm(), self.enable()
-            print("light:", *(answer.message for answer in answers))
-            return all(answer.success for answer in answers)
-
-        wait_until(lit, "light", poll_s=0.2)
-        self.wait_for_state(LaserState.OUTPUT_ON)
-        time.sleep(0.3)
-        assert self.awg.lit()
-
-    def check_off(self, cause: str, since_ns: int) -> None:
-        took_s = self.awg.off_after_s(since_ns)
-        print(f"{cause}: off after {took_s * 1e3:.1f} ms")
-        assert 0.0 < took_s < OFF_LIMIT_S
-
-
-@contextlib.contextmanager
-def running(
-    folder: Path, senders: tuple[str, ...] = (" ".join(SENDERS),), **parameters: Any
-) -> Iterator[Bench]:
-    with contextlib.ExitStack() as held:
-        yield Bench(held, folder, senders, **parameters)
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SafetyBench]:
     with running(tmp_path_factory.mktemp("laser"), SENDERS) as made:
         yield made
 
 
 @pytest.fixture
-def lit(shared: Bench) -> Bench:
+def lit(shared: SafetyBench) -> SafetyBench:
     """A bench whose laser is on, for tests that its node survives."""
     shared.light()
     return shared
 
 
 @pytest.fixture
-def doomed(tmp_path: Path) -> Iterator[Bench]:
+def doomed(tmp_path: Path) -> Iterator[SafetyBench]:
     """A bench whose laser is on, for tests that its node does not survive."""
     with running(tmp_path) as made:
         made.light()
@@ -113,7 +48,7 @@ def doomed(tmp_path: Path) -> Iterator[Bench]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_laser_node_gets_a_signal(doomed: Bench, number: int) -> None:
+def test_laser_node_gets_a_signal(doomed: SafetyBench, number: int) -> None:
     sent_ns = time.monotonic_ns()
     doomed.node.send(number)
     doomed.check_off(signal.Signals(number).name, sent_ns)
@@ -123,14 +58,14 @@ def test_laser_node_gets_a_signal(doomed: Bench, number: int) -> None:
 
 
 @pytest.mark.parametrize("way", ["exception", "abort", "segfault"])
-def test_laser_node_breaks_by_itself(doomed: Bench, way: str) -> None:
+def test_laser_node_breaks_by_itself(doomed: SafetyBench, way: str) -> None:
     sent_ns = time.monotonic_ns()
     doomed.breaking.publish(String(data=way))
     doomed.check_off(way, sent_ns)
     assert doomed.node.wait() != 0
 
 
-def test_laser_node_is_stopped(lit: Bench) -> None:
+def test_laser_node_is_stopped(lit: SafetyBench) -> None:
     sent_ns = time.monotonic_ns()
     lit.node.send(signal.SIGSTOP)
     lit.check_off("SIGSTOP", sent_ns)
@@ -141,7 +76,7 @@ def test_laser_node_is_stopped(lit: Bench) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGUSR1])
 @pytest.mark.parametrize("name", SENDERS)
-def test_sender_of_a_heartbeat_fails(lit: Bench, name: str, number: int) -> None:
+def test_sender_of_a_heartbeat_fails(lit: SafetyBench, name: str, number: int) -> None:
     """Killed, stopped, or reporting that it stopped."""
     sent_ns = lit.lose(name, number)
     lit.check_off(f"{name} {signal.Signals(number).name}", sent_ns)
@@ -152,8 +87,8 @@ def test_sender_of_a_heartbeat_fails(lit: Bench, name: str, number: int) -> None
     assert not lit.awg.lit()
 
 
-def test_guard_dies(lit: Bench) -> None:
-    guard = _child(lit.node.pid, "eschorty_ros.hardware.laser_guard.guard")
+def test_guard_dies(lit: SafetyBench) -> None:
+    guard = guard_of(lit.node.pid)
     sent_ns = time.monotonic_ns()
     os.kill(guard, signal.SIGKILL)
     lit.check_off("guard SIGKILL", sent_ns)
@@ -161,23 +96,59 @@ def test_guard_dies(lit: Bench) -> None:
     lit.light()
 
 
-def test_interlock(lit: Bench) -> None:
+def test_interlock(lit: SafetyBench) -> None:
     sent_ns = time.monotonic_ns()
-    lit.interlock.publish(Bool(data=True))
+    lit.contact.open()
     lit.check_off("interlock", sent_ns)
     assert "interlock open" in lit.arm().message
     assert not lit.enable().success
-    lit.interlock.publish(Bool(data=False))
-    lit.wait_for_state(LaserState.OUTPUT_OFF)
+    lit.contact.close()
     lit.light()
 
 
+def test_an_interlock_that_one_source_opened_stays_open_until_it_is_reset(
+    doomed: SafetyBench,
+) -> None:
+    doomed.contact.close()
+    node = Node("door", namespace=NAMESPACE, context=doomed.observer.node.context)
+    door = node.create_publisher(Bool, "laser/interlock", qos.stream(10))
+    wait_until(door.get_subscription_count, "the interlock's subscriber")
+    sent_ns = time.monotonic_ns()
+    door.publish(Bool(data=True))
+    doomed.check_off("interlock of another source", sent_ns)
+    assert not doomed.contact.reset()
+    assert "interlock open (/eschorty/door)" in doomed.arm().message
+    door.publish(Bool(data=False))
+    latched = "was opened (/eschorty/door); call laser/reset_interlock"
+    wait_until(lambda: latched in doomed.arm().message, "the latch")
+    assert doomed.contact.reset()
+    doomed.light()
+    node.destroy_node()
+
+
+def test_heartbeats_of_strangers_keep_no_light(doomed: SafetyBench) -> None:
+    """Nor does any text of them end the node."""
+    observer, texts = doomed.observer, ("", f"{place()} {os.getpid()}", f"host {'9' * 5000}")
+    for publisher in [
+        observer.publisher(Header, f"{name}/heartbeat", qos.heartbeat()) for name in SENDERS
+    ]:
+        for text in texts:
+            message = Header(frame_id=text)
+            observer.node.create_timer(0.05, lambda p=publisher, m=message: p.publish(m))
+    time.sleep(0.5)
+    assert doomed.awg.lit()
+    doomed.check_off("SIGKILL", doomed.lose(" ".join(SENDERS), signal.SIGKILL))
+    doomed.wait_for_reason("/heartbeat: process")
+    assert doomed.node.running()
+
+
 @pytest.mark.fault("USB unplugged")
-def test_unplug_of_the_generator(lit: Bench) -> None:
-    """driver: alarm, retries for 30 s, off on replug; user reads: laser state unknown"""
+def test_unplug_of_the_generator(lit: SafetyBench) -> None:
+    """driver: alarm, retries for 30 s, off after light_grant; user reads: laser state unknown"""
     lit.awg.do("gone")
     wait_until(lambda: lit.states[-1].output == LaserState.OUTPUT_UNKNOWN, "unknown")
-    assert lit.awg.lit()
+    # Without renewals.
+    wait_until(lambda: not lit.awg.lit(), "dark")
 
     def alarm() -> bool:
         status = [s for a in lit.diagnostics for s in a.status if s.name.endswith("laser")][-1:]
@@ -185,14 +156,12 @@ def test_unplug_of_the_generator(lit: Bench) -> None:
 
     wait_until(alarm, "the alarm in /diagnostics")
     lit.observer.wait_for_state("laser", "unconfigured")
-    plugged_ns = time.monotonic_ns()
     lit.awg.do("back")
-    print(f"off {lit.awg.off_after_s(plugged_ns):.2f} s after it was plugged in")
     lit.light()
 
 
 @pytest.mark.fault("setting clamped or ignored")
-def test_panel_touched_while_lit(lit: Bench) -> None:
+def test_panel_touched_while_lit(lit: SafetyBench) -> None:
     """driver: reads back five times a second, switches off; user reads: what differs"""
     lit.awg.do("touch BASE:FREQuency 90")
     wait_until(lambda: not lit.awg.lit(), "the output off")
@@ -202,7 +171,7 @@ def test_panel_touched_while_lit(lit: Bench) -> None:
 
 
 @pytest.mark.fault("generator rebooted")
-def test_generator_restarted(lit: Bench) -> None:
+def test_generator_restarted(lit: SafetyBench) -> None:
     """driver: off, refuses light until configured; user reads: output reads back OFF"""
     lit.awg.do("reboot")
     assert not lit.awg.lit()
@@ -219,22 +188,8 @@ def test_required_interlock_is_open_unless_it_is_reported_closed(tmp_path: Path)
         bench.observer.wait_for_state("laser", "active")
         wait_until(lambda: bench.states and bench.states[-1].interlock_open, "the interlock open")
         assert "interlock open" in bench.arm().message
-        closing = bench.observer.node.create_timer(
-            0.2, lambda: bench.interlock.publish(Bool(data=False))
-        )
-        wait_until(lambda: not bench.states[-1].interlock_open, "the interlock closed")
+        bench.contact.close()
         bench.light()
-        bench.observer.node.destroy_timer(closing)
+        bench.contact.end()
         bench.wait_for_reason("interlock open")
         assert bench.states[-1].output == LaserState.OUTPUT_OFF
-
-
-def _child(pid: int, module: str) -> int:
-    """Return the process started by any thread of ``pid`` that runs ``module``."""
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        # A thread or a child may end meanwhile.
-        with contextlib.suppress(OSError):
-            for number in (task / "children").read_text().split():
-                if module in Path(f"/proc/{number}/cmdline").read_text():
-                    return int(number)
-    raise AssertionError(f"no process of {module}")
