@@ -3,7 +3,7 @@
 # make report the paper's experiments again: report/index.html
 # make tradeoff speed against error again, and the README's table from it
 # make faults the fault table of docs/faults.md again, from its tests
-# make reference the tables of docs/interfaces.md again, from the nodes
+# make reference docs/interfaces.md and config/sros2 again, from the nodes
 # make test   every test
 # make quick  the tests of the pure parts: no processes, no ROS
 # make picture docs/architecture.png again
@@ -64,7 +64,7 @@ faults: $(SETUP)
 	@$(ENTER) python docs/faults.py
 
 reference: $(SETUP)
-	@$(ENTER) python docs/interfaces.py
+	@$(ENTER) python docs/interfaces.py && python docs/policies.py
 
 # Pure parts share the cores, the longest first; what starts processes and devices runs alone.
 PURE := $(addprefix test/,experiments core live control simulation stability report)

@@ -10,7 +10,10 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import interfaces as tables
+import policies
 from rclpy.node import Node
+
+from eschorty_ros.nodes.ros.instrument_client import InstrumentClient
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 
@@ -48,6 +51,37 @@ def test_the_parameter_tables_are_what_the_nodes_declare(nodes):
         described = {param.name for param in tables.PARAMETERS[node.get_name()]}
         declared = {name for name in node._parameters if not name.startswith("qos_overrides.")}
         assert declared - {"use_sim_time", "start_type_description_service"} == described
+
+
+def test_the_policies_of_sros2_allow_what_the_nodes_do_and_no_more(nodes):
+    made = policies.policies(nodes)
+    assert {path.name for path in policies.FOLDER.iterdir()} == {
+        policies.file_of(name).name for name in made
+    }
+    for name, text in made.items():
+        assert policies.file_of(name).read_text(encoding="utf-8") == text, "run: make reference"
+
+
+def test_what_the_reconstruction_makes_for_a_calibration_is_allowed(nodes):
+    calibrating = Node("calibrating", namespace=tables.NAMESPACE)
+    try:
+        InstrumentClient(calibrating, 1.0, 1.0, 1.0)
+        needed = policies.rights(calibrating)
+    finally:
+        calibrating.destroy_node()
+    [node] = [node for node in nodes if node.get_name() == "reconstruction"]
+    allowed = policies.rights(node)
+    for key, names in needed.items():
+        assert {name for name in names if "/calibrating/" not in name} <= allowed[key], key
+
+
+def test_only_scanner_and_reconstruction_may_light_the_laser_under_sros2(nodes):
+    for node in nodes:
+        rights = policies.rights(node)
+        lights = {"/eschorty/laser/heartbeat"} & rights["topics", "publish"]
+        lights |= {"/eschorty/laser/arm"} & rights["services", "request"]
+        assert bool(lights) == (node.get_name() in ("scanner", "reconstruction")), node.get_name()
+    assert "heartbeat" not in policies.file_of(policies.OPERATOR).read_text().split("subscribe")[0]
 
 
 def test_the_readme_names_every_topic_of_the_instrument(nodes):

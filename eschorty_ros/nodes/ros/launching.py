@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from launch.actions import DeclareLaunchArgument, ExecuteProcess
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, SetEnvironmentVariable
 from launch.conditions import IfCondition
 from launch.substitutions import (
+    EnvironmentVariable,
     EqualsSubstitution,
     IfElseSubstitution,
     LaunchConfiguration,
@@ -56,9 +57,14 @@ PARAMETERS: Argument = (
 )
 
 
-def declare(arguments: tuple[Argument, ...]) -> list[DeclareLaunchArgument]:
-    """Return launch arguments from a table."""
-    return [
+def declare(arguments: tuple[Argument, ...]) -> list[Any]:
+    """Return launch arguments from a table, and the discovery on this host alone by default.
+
+    ``ROS_AUTOMATIC_DISCOVERY_RANGE`` in the environment changes that.
+    """
+    discovery = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    range_ = EnvironmentVariable(discovery, default_value="LOCALHOST")
+    return [SetEnvironmentVariable(discovery, range_)] + [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
         for name, default, text, choices in arguments
     ]
@@ -130,6 +136,8 @@ def node(executable: str, parameters: dict[str, Any]) -> Any:
         executable=executable,
         name=executable,
         namespace=NAMESPACE,
+        # Without effect unless ROS_SECURITY_ENABLE is set; see docs/sros2.md.
+        ros_arguments=["--enclave", f"/{NAMESPACE}/{executable}"],
         parameters=[parameters, ParameterFile(LaunchConfiguration("parameters"))],
         output="screen",
         emulate_tty=True,
