@@ -212,8 +212,8 @@ def test_any_choice_gives_a_report_or_one_line():
         free = tuple(rng.permutation(names)[: rng.integers(1, 7)].tolist())
         options = {"free": free} if rng.random() < 0.7 else {}
         if options and rng.random() < 0.5:
-            sigma = rng.choice([math.inf, 1e-3, 1.0, 1e3], len(free))
-            options["prior_sigma"] = dict(zip(free, sigma.tolist(), strict=True))
+            sigma = [math.inf, 1e-3, 1.0, 1e3]
+            options["prior_sigma"] = {name: float(rng.choice(sigma)) for name in free}
         try:
             report = calibrate(targets, NOMINAL, **options)
         except (ArgumentError, FitError) as error:
