@@ -1,8 +1,17 @@
 """The package's errors: each message is one line that names the thing, the value and the remedy."""
 
+MESSAGE_MAX = 280
+"""Characters of a message; a longer one loses its middle, not the thing and the remedy."""
+
 
 class EschortyError(Exception):
     """A failure a user can cause or cure; command line and nodes print it without a traceback."""
+
+    def __init__(self, message: object = "") -> None:
+        text = " ".join(str(message).splitlines())
+        if len(text) > MESSAGE_MAX:
+            text = f"{text[: MESSAGE_MAX - 104]} ... {text[-99:]}"
+        super().__init__(text)
 
 
 class ArgumentError(EschortyError, ValueError):

@@ -10,7 +10,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from eschorty_ros.core.base.errors import EschortyError
-from eschorty_ros.core.base.numbers import file_path, short
+from eschorty_ros.core.base.files import read_regular_file
+from eschorty_ros.core.base.numbers import short
+
+YAML_BYTES_MAX = 65_536
 
 
 class Schema(BaseModel):
@@ -37,7 +40,9 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def read_yaml(path: str | os.PathLike[str], error: type[EschortyError]) -> Any:
+def read_yaml(
+    path: str | os.PathLike[str], error: type[EschortyError], follow_links: bool = True
+) -> Any:
     """Parse a YAML file.
 
     Raises
@@ -45,10 +50,9 @@ def read_yaml(path: str | os.PathLike[str], error: type[EschortyError]) -> Any:
     error
         When the file cannot be read or is not YAML.
     """
+    data = read_regular_file(path, YAML_BYTES_MAX, error, follow_links)
     try:
-        text = file_path("path", path).read_text(encoding="utf-8")
-    except OSError as cause:
-        raise error(f"cannot read {path}: {cause.strerror or cause}; check the path") from cause
+        text = data.decode("utf-8")
     except UnicodeDecodeError as cause:
         raise error(f"{path}: it is not text; give a YAML file") from cause
     try:

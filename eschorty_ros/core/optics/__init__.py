@@ -6,8 +6,10 @@ from eschorty_ros.core.optics.calibration_file import (
     Calibration,
     config_file,
     load_calibration,
+    load_named_calibration,
     refuse_other_instrument,
     save_calibration,
+    save_named_calibration,
 )
 from eschorty_ros.core.optics.design import Design, DesignTable, design, design_for_ranges
 from eschorty_ros.core.optics.range_model import (
@@ -33,6 +35,8 @@ __all__ = [
     "design",
     "design_for_ranges",
     "load_calibration",
+    "load_named_calibration",
     "refuse_other_instrument",
     "save_calibration",
+    "save_named_calibration",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import re
+import stat
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,9 +13,9 @@ import numpy as np
 import yaml
 from pydantic import Field, field_validator, model_validator
 
-from eschorty_ros.core.base.arrays import file_path
-from eschorty_ros.core.base.errors import CalibrationError
-from eschorty_ros.core.base.files import atomic_write, config_folders
+from eschorty_ros.core.base.arrays import file_path, short
+from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
+from eschorty_ros.core.base.files import BARE_NAME, atomic_write, config_folders, is_bare_name
 from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
@@ -63,7 +64,7 @@ class Calibration(Schema):
     that order and in their units, ``range_mm`` is the span of the targets.
     """
 
-    name: Annotated[str, Field(min_length=1)]
+    name: str
     focal_length_mm: Positive
     f_number: Positive
     pixel_um: Positive = PIXEL_UM
@@ -98,6 +99,13 @@ class Calibration(Schema):
     def _date_as_text(cls, value: Any) -> Any:
         # YAML turns an unquoted date into a date object.
         return value.isoformat() if isinstance(value, datetime.date) else value
+
+    @field_validator("name", "id")
+    @classmethod
+    def _names_a_file(cls, value: str | None) -> str | None:
+        if value is not None and not is_bare_name(value):
+            raise ValueError(f"give {BARE_NAME}")
+        return value
 
     @field_validator("theta_prime_deg")
     @classmethod
@@ -205,9 +213,78 @@ def load_calibration(name_or_path: str | os.PathLike[str]) -> Calibration:
     >>> print(build.model().range_mm([0, 719]).round(1))
     [ 784.6 2116. ]
     """
-    path = _find(name_or_path)
-    data = read_yaml(path, CalibrationError)
-    if isinstance(data, str) and _is_bare_name(data):
+    return _read(_find(name_or_path))
+
+
+def load_named_calibration(folder: str | os.PathLike[str], name: str) -> Calibration:
+    """Read a calibration of ``folder`` by its bare name, else the one of that name in ``config/``.
+
+    Bounded in size and time whatever lies in the folder: links, pipes and devices are refused.
+
+    Parameters
+    ----------
+    folder : path
+    name : str
+        As `save_named_calibration` takes it; with or without ``.yaml``.
+
+    Raises
+    ------
+    CalibrationError
+        One line naming file, key, value and remedy.
+    """
+    path = _named_path(folder, name)
+    if os.path.lexists(path):
+        return _read(path, follow_links=False)
+    if shipped := _shipped(path.stem):
+        return _read(shipped)
+    raise CalibrationError(
+        f"there is no calibration named {short(name)} in {folder}; save it there first, or "
+        f"choose one of {', '.join(BUILDS)}"
+    )
+
+
+def save_named_calibration(
+    folder: str | os.PathLike[str], calibration: Calibration, name: str = ""
+) -> Path:
+    """Write a calibration into ``folder``, made when missing, and return the file's path.
+
+    Parameters
+    ----------
+    folder : path
+    calibration : Calibration
+    name : str
+        Without path separators, not beginning with a dot; ``""``: the calibration's id, or its
+        name when it has none.
+
+    Raises
+    ------
+    CalibrationError
+        When the name is no bare name, or stands for something other than a regular file.
+    ArgumentError
+        When the file cannot be written.
+    """
+    path = _named_path(folder, name or calibration.id or calibration.name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
+            raise CalibrationError(f"cannot write {path}: it is no regular file; choose a name")
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot write {path}: {error.strerror or error}; choose a folder that is writable"
+        ) from error
+    save_calibration(calibration, path)
+    return path
+
+
+def _named_path(folder: str | os.PathLike[str], name: str) -> Path:
+    if not is_bare_name(name):
+        raise CalibrationError(f"name of the calibration is {short(name)}; give {BARE_NAME}")
+    return file_path("folder", folder) / f"{name.removesuffix('.yaml')}.yaml"
+
+
+def _read(path: Path, follow_links: bool = True) -> Calibration:
+    data = read_yaml(path, CalibrationError, follow_links)
+    if isinstance(data, str) and _may_be_shipped(data):
         path = _find(data)
         data = read_yaml(path, CalibrationError)
     return validate(Calibration, data, path, CalibrationError)
@@ -255,18 +332,24 @@ def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None
             )
 
 
-def _is_bare_name(text: str) -> bool:
-    return re.fullmatch(r"[A-Za-z0-9_-]+", text) is not None
+def _may_be_shipped(text: str) -> bool:
+    return re.fullmatch(r"[A-Za-z0-9_-]{1,100}", text) is not None
+
+
+def _shipped(name: str) -> Path | None:
+    """Return the file of a calibration in ``config/``, ``None`` when there is none."""
+    if not _may_be_shipped(name):
+        return None
+    candidates = (folder / f"{name}.yaml" for folder in config_folders())
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _find(name_or_path: str | os.PathLike[str]) -> Path:
     text = os.fspath(file_path("name_or_path", name_or_path))
-    if not _is_bare_name(text):
+    if not _may_be_shipped(text):
         return Path(text)
-    for folder in config_folders():
-        candidate = folder / f"{text}.yaml"
-        if candidate.is_file():
-            return candidate
+    if shipped := _shipped(text):
+        return shipped
     raise CalibrationError(
         f"there is no calibration named {text!r}; choose one of {', '.join(BUILDS)} "
         "or give a path ending in .yaml"
