@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 from eschorty_ros.core.clocks import plan_move
 from eschorty_ros.core.modulation import Modulation
@@ -40,8 +41,8 @@ CASES = [
 
 def run(scene: str, lit: int, frequency_hz: float, seconds: float) -> tuple[float, int, int]:
     """Return thread seconds, events and bytes; with ``lit`` 0 all columns without laser."""
-    calibration = load_calibration("config_3").model_copy(
-        update={"columns": lit or 1280, "principal_column": (lit or 1280) / 2 - 0.5}
+    calibration = replace(
+        load_calibration("config_3"), columns=lit or 1280, principal_column=(lit or 1280) / 2 - 0.5
     )
     world = World(named(scene), calibration, seed=1, background_hz=BACKGROUND_HZ)
     if lit:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,7 +102,7 @@ def crossing(
     reach = int(np.ceil(margin_rows / step)) + 1
     rng = np.random.default_rng(seed)
     full = columns + BOARD_COLUMNS
-    calibration = load_calibration("config_3").model_copy(update={"columns": full})
+    calibration = replace(load_calibration("config_3"), columns=full)
     line_row = float(calibration.model().row(RANGE_MM)) + rng.random(full)
     slant = np.arange(full) / columns * step if slanted else np.zeros(full)
     offsets = np.arange(-reach, reach + 1)[:, None] * step + slant

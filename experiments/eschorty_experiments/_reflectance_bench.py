@@ -102,7 +102,7 @@ def _points(
         background_hz=BACKGROUND_HZ,
         seed=seed,
     )
-    calibration = load_calibration("config_3").model_copy(update={"columns": columns})
+    calibration = replace(load_calibration("config_3"), columns=columns)
     data = Encoder(columns, calibration.rows).encode(*sort_readout(line.t, line.x, line.y, line.p))
     reconstructor = Reconstructor(calibration, modulation, settings)
     found = Profiles.concatenate([reconstructor.push(data), reconstructor.flush()])

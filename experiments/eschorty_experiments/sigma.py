@@ -112,8 +112,8 @@ def _ratios(
 ) -> list[Ratios]:
     scene = SCENES[scene_name]
     columns = effort.choose(640, 160)
-    calibration = load_calibration("config_3").model_copy(
-        update={"columns": columns, "principal_column": (columns - 1) / 2}
+    calibration = replace(
+        load_calibration("config_3"), columns=columns, principal_column=(columns - 1) / 2
     )
     found = []
     with TemporaryDirectory() as folder:

@@ -1,6 +1,7 @@
 """`eschorty calibrate`: from targets and recordings to a file and a page."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import html_check
@@ -16,8 +17,8 @@ from eschorty_ros.simulation.scenes import Plane, Posts, bench
 from eschorty_ros.simulation.world import simulate_recording
 
 SEED = 16
-AS_BUILT = NOMINAL.model_copy(
-    update={"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": NOMINAL.b_prime_px + 40.0}
+AS_BUILT = replace(
+    NOMINAL, k_prime_px=0.96 * NOMINAL.k_prime_px, b_prime_px=NOMINAL.b_prime_px + 40.0
 )
 CHECK_MM = np.linspace(800.0, 2100.0, 131)
 
@@ -106,7 +107,7 @@ def test_posts_of_a_recording_give_the_build_back(tmp_path):
 
 def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
     small = {"columns": 48, "principal_column": 23.5}
-    nominal, as_built = NOMINAL.model_copy(update=small), AS_BUILT.model_copy(update=small)
+    nominal, as_built = replace(NOMINAL, **small), replace(AS_BUILT, **small)
     save_calibration(nominal, tmp_path / "nominal.yaml")
     folders = []
     for start, stop in ((10.0, 310.0), (310.0, 10.0)):
@@ -126,9 +127,9 @@ def test_a_target_moved_by_the_stage_gives_the_build_back(tmp_path):
 def test_roll_and_smile_show_in_a_target_moved_by_the_stage(tmp_path):
     small = {"columns": 192, "principal_column": 95.5}
     bent = {"b_prime_1_px": -9.0, "b_prime_2_px": 5.0}
-    save_calibration(NOMINAL.model_copy(update=small), tmp_path / "nominal.yaml")
+    save_calibration(replace(NOMINAL, **small), tmp_path / "nominal.yaml")
     simulate_recording(
-        tmp_path / "rec", Plane(1500.0, slope_stage=1.0), AS_BUILT.model_copy(update=small | bent),
+        tmp_path / "rec", Plane(1500.0, slope_stage=1.0), replace(AS_BUILT, **(small | bent)),
         start_mm=10.0, stop_mm=160.0, speed_mm_s=300.0, seed=SEED,
     )  # fmt: skip
     free = [f"--free={name}" for name in ("k_prime_px", "b_prime_px", *bent)]

@@ -19,8 +19,8 @@ MODEL = load_calibration("config_3").model()
 
 
 def narrow(columns=64):
-    return load_calibration("config_3").model_copy(
-        update={"columns": columns, "principal_column": columns / 2 - 0.5}
+    return replace(
+        load_calibration("config_3"), columns=columns, principal_column=columns / 2 - 0.5
     )
 
 

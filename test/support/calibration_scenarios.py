@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -297,7 +298,7 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
             ({"roi_px": (0, 100, 1280, 400)}, ("roi_px",)),
             ({"name": "config_1"}, ("config_1", "config_3", "build")),
         ):
-            save_calibration(own.model_copy(update=change), folder / "other.yaml")
+            save_calibration(replace(own, **change), folder / "other.yaml")
             assert_not_done(load(bench, folder / "other.yaml"), *words)
         for name in (folder / "missing.yaml", "config_9", "config_1"):
             assert_not_done(load(bench, name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ class StillBench:
     """A camera of few columns before a white plane at rest; ``folder`` gets its calibration."""
 
     def __init__(self, folder: Path) -> None:
-        build = load_calibration("config_3").model_copy(
-            update={"columns": COLUMNS, "principal_column": (COLUMNS - 1) / 2}
+        build = replace(
+            load_calibration("config_3"), columns=COLUMNS, principal_column=(COLUMNS - 1) / 2
         )
         path = folder / "build.yaml"
         save_calibration(build, path)

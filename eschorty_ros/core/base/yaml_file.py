@@ -1,113 +1,179 @@
-"""YAML files with a schema: one line that names file, key, value and remedy when they are wrong."""
+"""YAML files from anywhere: bounded in size, depth and numbers; one line names every fault.
+
+The parser's events become plain values here, without the library's constructors: nothing can be
+referred to twice, carry a tag or grow beyond what the file holds.
+"""
 
 from __future__ import annotations
 
 import os
-from difflib import get_close_matches
-from typing import Any, TypeVar
+from dataclasses import dataclass, field
+from typing import Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.core.base.files import read_regular_file
 from eschorty_ros.core.base.numbers import short
 
-YAML_BYTES_MAX = 65_536
+BYTES_MAX = 65_536
+DEPTH_MAX = 20
+NUMBER_MAX = 60
+"""Characters of a number."""
+
+_ENTRY = "tag:yaml.org,2002:"
+_RESOLVER = yaml.resolver.Resolver()
+_NUMBERS = yaml.constructor.SafeConstructor()
+
+Keys = tuple[str | int, ...]
 
 
-class Schema(BaseModel):
-    """Base of file schemas: frozen, no unknown keys, no silent conversion, no NaN."""
+@dataclass(frozen=True)
+class Document:
+    """The content of a YAML file: text, numbers, truth values, ``None``, lists, dictionaries."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    path: str
+    data: Any
+    lines: dict[Keys, int]
+    """Line of each entry; keys of an entry from the outermost one."""
 
-
-Model = TypeVar("Model", bound=Schema)
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses a key given twice, of which plain YAML silently keeps the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys: set[str] = set()
-        scalars = (key for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        for key_node in scalars:
-            if key_node.value in keys:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key_node.value!r} appears twice", key_node.start_mark
-                )
-            keys.add(key_node.value)
-        return super().construct_mapping(node, deep)
+    def at(self, keys: Keys) -> str:
+        """Return file and line of an entry, or of the innermost one around it."""
+        while keys and keys not in self.lines:
+            keys = keys[:-1]
+        return f"{self.path} line {self.lines[keys]}" if keys else self.path
 
 
 def read_yaml(
     path: str | os.PathLike[str], error: type[EschortyError], follow_links: bool = True
-) -> Any:
+) -> Document:
     """Parse a YAML file.
 
     Raises
     ------
     error
-        When the file cannot be read or is not YAML.
+        When the file cannot be read, is too large or is not plain YAML.
     """
-    data = read_regular_file(path, YAML_BYTES_MAX, error, follow_links)
+    data = read_regular_file(path, BYTES_MAX, error, follow_links)
+    return parse_yaml(data, path, error)
+
+
+def parse_yaml(data: bytes, path: str | os.PathLike[str], error: type[EschortyError]) -> Document:
+    """Parse the bytes of a YAML file; ``path`` is for messages."""
     try:
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as cause:
         raise error(f"{path}: it is not text; give a YAML file") from cause
+    builder = _Builder()
+    loader = None
     try:
-        # A subclass of SafeLoader: it builds nothing but plain values.
-        return yaml.load(text, _UniqueKeyLoader)
+        loader = yaml.SafeLoader(text)
+        while loader.check_event():
+            builder.add(loader.get_event())
     except yaml.MarkedYAMLError as cause:
         mark = cause.problem_mark or cause.context_mark
-        line = f" line {mark.line + 1}" if mark else ""
-        raise error(f"{path}{line}: {cause.problem}; correct the YAML") from cause
-    except (yaml.YAMLError, ValueError) as cause:
-        raise error(f"{path}: {' '.join(str(cause).split())}; correct the YAML") from cause
+        line = mark.line if mark else 0
+        reason = cause.problem or cause.context or "it is not YAML"
+    except yaml.reader.ReaderError as cause:
+        line = text.count("\n", 0, cause.position)
+        reason = "a character that YAML does not allow"
+    except _Refused as cause:
+        line, reason = cause.line, str(cause)
+    except (ValueError, ArithmeticError, LookupError) as cause:
+        # The library converts numbers of escapes and directives without a check.
+        line, reason = getattr(loader, "line", 0), f"an escape or directive ({cause})"
+    else:
+        return Document(os.fspath(path), builder.data, builder.lines)
+    raise error(f"{path} line {line + 1}: {reason}; correct the YAML")
 
 
-def validate(
-    schema: type[Model], data: Any, where: str | os.PathLike[str], error: type[EschortyError]
-) -> Model:
-    """Check ``data`` against ``schema``.
+class _Refused(Exception):  # noqa: N818 - leaves this file as the caller's error
+    def __init__(self, event: yaml.Event, reason: str) -> None:
+        super().__init__(reason)
+        self.line = event.start_mark.line if event.start_mark else 0
 
-    Raises
-    ------
-    error
-        With one line for the first fault and the number of further ones.
-    """
-    if not isinstance(data, dict):
-        raise error(
-            f"{where}: it has {short(data)} instead of keys; write {', '.join(_required(schema))}"
-        )
+
+@dataclass
+class _Open:
+    """A list or dictionary whose end has not come."""
+
+    values: Any
+    keys: Keys
+    key: str | None = None
+
+
+@dataclass
+class _Builder:
+    """Values and lines from the parser's events."""
+
+    data: Any = None
+    lines: dict[Keys, int] = field(default_factory=dict)
+    _open: list[_Open] = field(default_factory=list)
+    _documents: int = 0
+
+    def add(self, event: yaml.Event) -> None:
+        if isinstance(event, yaml.DocumentStartEvent):
+            self._documents += 1
+            if self._documents > 1:
+                raise _Refused(event, "a second document begins")
+        elif isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
+            self._open.pop()
+        elif isinstance(event, yaml.NodeEvent):
+            self._add_node(event)
+
+    def _add_node(self, event: Any) -> None:
+        if event.anchor is not None:
+            raise _Refused(event, f"anchors and aliases such as {short(event.anchor)} are not read")
+        if event.tag is not None:
+            raise _Refused(event, f"tags such as {short(event.tag)} are not read")
+        parent = self._open[-1] if self._open else None
+        if parent is not None and isinstance(parent.values, dict) and parent.key is None:
+            self._add_key(event, parent)
+            return
+        keys: Keys = ()
+        if parent is not None:
+            dictionary = isinstance(parent.values, dict)
+            keys = (*parent.keys, parent.key if dictionary else len(parent.values))  # type: ignore[arg-type]
+            self.lines.setdefault(keys, event.start_mark.line + 1)
+        if isinstance(event, yaml.ScalarEvent):
+            value = _scalar(event)
+        else:
+            value = {} if isinstance(event, yaml.MappingStartEvent) else []
+            if len(self._open) == DEPTH_MAX:
+                raise _Refused(event, f"it is nested more than {DEPTH_MAX} deep")
+            self._open.append(_Open(value, keys))
+        if parent is None:
+            self.data = value
+        elif isinstance(parent.values, dict):
+            parent.values[parent.key], parent.key = value, None
+        else:
+            parent.values.append(value)
+
+    def _add_key(self, event: Any, parent: _Open) -> None:
+        if not isinstance(event, yaml.ScalarEvent):
+            raise _Refused(event, "a key is a list or a dictionary")
+        if event.value in parent.values:
+            raise _Refused(event, f"key {short(event.value)} appears twice")
+        parent.key = event.value
+        self.lines[(*parent.keys, event.value)] = event.start_mark.line + 1
+
+
+def _scalar(event: yaml.ScalarEvent) -> Any:
+    """Return text, a number, a truth value or ``None``; dates stay text."""
+    tag = _RESOLVER.resolve(yaml.ScalarNode, event.value, event.implicit)
+    kind = tag.removeprefix(_ENTRY)
+    if kind == "null":
+        return None
+    if kind == "bool":
+        return _NUMBERS.bool_values[event.value.lower()]
+    if kind not in ("int", "float"):
+        return event.value
+    if len(event.value) > NUMBER_MAX:
+        raise _Refused(event, f"a number of {len(event.value)} characters")
+    node = yaml.ScalarNode(tag, event.value)
     try:
-        return schema.model_validate(data)
-    except ValidationError as cause:
-        # An unknown key first: misspelt, it is also the reason why another one is missing.
-        faults = sorted(
-            cause.errors(include_url=False), key=lambda fault: fault["type"] != "extra_forbidden"
-        )
-        more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-        raise error(f"{where}: {_line(schema, faults[0])}{more}") from cause
-
-
-def _required(schema: type[Schema]) -> list[str]:
-    return [name for name, field in schema.model_fields.items() if field.is_required()]
-
-
-def _line(schema: type[Schema], fault: Any) -> str:
-    kind, value = fault["type"], short(fault["input"])
-    key = ".".join(str(part) for part in fault["loc"])
-    if kind == "missing":
-        return f"{key} is missing; add it"
-    if kind == "extra_forbidden":
-        near = get_close_matches(key, schema.model_fields, n=1)
-        remedy = f"did you mean {near[0]}?" if near else "remove it"
-        return f"{key} is {value}, and no such key exists; {remedy}"
-    if kind == "value_error":
-        reason = str(fault["ctx"]["error"])
-        return f"{key} is {value}; {reason}" if key else reason
-    remedy = str(fault["msg"]).replace("Input should", "it should")
-    if kind == "float_type" and isinstance(fault["input"], str):
-        remedy = "write a number such as 24.0 or 1.0e+3"
-    return f"{key} is {value}; {remedy}"
+        if kind == "int":
+            return _NUMBERS.construct_yaml_int(node)
+        return _NUMBERS.construct_yaml_float(node)
+    except (ValueError, ArithmeticError, LookupError):
+        raise _Refused(event, f"{short(event.value)} is no number") from None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -330,19 +330,20 @@ def _calibration(
     at = [found.free.index(name) for name in fitted]
     matrix = found.covariance[np.ix_(at, at)]
     matrix = 0.5 * (matrix + matrix.T)
-    values = {name: found.values[name] for name in fitted}
+    values: dict[str, Any] = {name: found.values[name] for name in fitted}
     digest = hashlib.sha256(
         repr((nominal.name, method, sorted(values.items()), kept.row.tolist(),
               kept.range_mm.tolist())).encode()
     )  # fmt: skip
     parts = (nominal.name, *((date,) if date else ()), digest.hexdigest()[:8])
-    data = nominal.model_dump() | values | {
-        "id": "-".join(parts),
-        "date": date,
-        "parameters_fitted": tuple(fitted),
-        "covariance": tuple(tuple(row) for row in matrix.tolist()),
-        "residual_rms_px": float(np.sqrt(np.mean(found.residual_px**2))),
-        "condition_number": found.condition_number,
-        "range_mm": (float(kept.range_mm.min()), float(kept.range_mm.max())),
-    }  # fmt: skip
-    return Calibration.model_validate(data)
+    return replace(
+        nominal,
+        id="-".join(parts),
+        date=date,
+        parameters_fitted=tuple(fitted),
+        covariance=tuple(tuple(row) for row in matrix.tolist()),
+        residual_rms_px=float(np.sqrt(np.mean(found.residual_px**2))),
+        condition_number=found.condition_number,
+        range_mm=(float(kept.range_mm.min()), float(kept.range_mm.max())),
+        **values,
+    )

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import re
 import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import yaml
-from pydantic import Field, field_validator, model_validator
 
 from eschorty_ros.core.base.arrays import file_path, short
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
 from eschorty_ros.core.base.files import BARE_NAME, atomic_write, config_folders, is_bare_name
-from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
+from eschorty_ros.core.base.schema import Schema, Within, validate
+from eschorty_ros.core.base.yaml_file import parse_yaml, read_yaml
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXEL_UM,
@@ -45,12 +46,11 @@ _OF_THE_INSTRUMENT = {
     "roi_px": "window that the camera reads out",
 }
 
-Positive = Annotated[float, Field(gt=0.0)]
-# A strict tuple refuses a YAML list; its items stay strict.
-Vector = Annotated[tuple[float, float, float], Field(strict=False)]
-Window = Annotated[tuple[int, int, int, int], Field(strict=False)]
+Positive = Annotated[float, Within(above=0.0)]
+Pixels = Annotated[int, Within(1, 2048)]
 
 
+@dataclass(frozen=True, kw_only=True)
 class Calibration(Schema):
     """The optical build that turns rows and columns into millimetres.
 
@@ -68,103 +68,65 @@ class Calibration(Schema):
     focal_length_mm: Positive
     f_number: Positive
     pixel_um: Positive = PIXEL_UM
-    theta_deg: Annotated[float, Field(gt=0.0, le=90.0)]
-    theta_prime_deg: Annotated[float, Field(gt=-90.0, lt=90.0)]
+    theta_deg: Annotated[float, Within(above=0.0, high=90.0)]
+    theta_prime_deg: Annotated[float, Within(above=-90.0, below=90.0)]
     k_mm: Positive | None = None
-    k_prime_px: Annotated[float, Field(lt=0.0)]
+    k_prime_px: Annotated[float, Within(below=0.0)]
     b_mm: float = 0.0
-    b_prime_px: Annotated[float, Field(le=-POLE_MARGIN_PX)]
+    b_prime_px: Annotated[float, Within(high=-POLE_MARGIN_PX)]
     b_prime_1_px: float = 0.0
     b_prime_2_px: float = 0.0
-    columns: Annotated[int, Field(gt=0, le=2048)] = COLUMNS
-    rows: Annotated[int, Field(gt=0, le=2048)] = ROWS
-    roi_px: Window | None = None
+    columns: Pixels = COLUMNS
+    rows: Pixels = ROWS
+    roi_px: tuple[int, int, int, int] | None = None
     principal_column: float = PRINCIPAL_COLUMN
-    stage_direction: Vector = (0.0, 1.0, 0.0)
+    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
     id: str | None = None
     date: str | None = None
-    parameters_fitted: Annotated[tuple[str, ...], Field(strict=False)] | None = None
-    covariance: (
-        Annotated[
-            tuple[Annotated[tuple[float, ...], Field(strict=False)], ...], Field(strict=False)
-        ]
-        | None
-    ) = None
-    residual_rms_px: Annotated[float, Field(ge=0.0)] | None = None
-    condition_number: Annotated[float, Field(ge=1.0)] | None = None
-    range_mm: Annotated[tuple[float, float], Field(strict=False)] | None = None
+    parameters_fitted: tuple[str, ...] | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    residual_rms_px: Annotated[float, Within(low=0.0)] | None = None
+    condition_number: Annotated[float, Within(low=1.0)] | None = None
+    range_mm: tuple[float, float] | None = None
 
-    @field_validator("date", mode="before")
-    @classmethod
-    def _date_as_text(cls, value: Any) -> Any:
-        # YAML turns an unquoted date into a date object.
-        return value.isoformat() if isinstance(value, datetime.date) else value
+    def _conflicts(self) -> Iterator[tuple[str, str]]:
+        for key, name in (("name", self.name), ("id", self.id)):
+            if name is not None and not is_bare_name(name):
+                yield key, f"give {BARE_NAME}"
+        if self.theta_prime_deg == 0.0:
+            yield "theta_prime_deg", "choose a tilted sensor, such as -7.62"
+        if self.roi_px is not None:
+            column, row, columns, rows = self.roi_px
+            fits = 0 <= column < column + columns <= self.columns
+            if not (fits and 0 <= row < row + rows <= self.rows):
+                sensor = f"{self.columns} x {self.rows}"
+                yield (
+                    "roi_px",
+                    (f"write first column, first row, columns, rows within the sensor of {sensor}"),
+                )
+        length = float(np.linalg.norm(self.stage_direction))
+        if not abs(length - 1.0) <= 1e-6:
+            yield "stage_direction", f"its length is {length:g}; divide it by its length"
+        if self.range_mm is not None and not 0.0 < self.range_mm[0] < self.range_mm[1]:
+            yield "range_mm", "write the nearest range first, both positive"
+        fitted = self.parameters_fitted
+        if fitted is not None and not (len(set(fitted)) == len(fitted) and fitted):
+            yield "parameters_fitted", "name each fitted parameter once"
+        elif not set(fitted or ()) <= set(PARAMETERS):
+            yield "parameters_fitted", f"choose of {', '.join(PARAMETERS)}"
+        elif self.covariance is not None and (words := self._misfit(self.covariance)):
+            yield "covariance", words
 
-    @field_validator("name", "id")
-    @classmethod
-    def _names_a_file(cls, value: str | None) -> str | None:
-        if value is not None and not is_bare_name(value):
-            raise ValueError(f"give {BARE_NAME}")
-        return value
-
-    @field_validator("theta_prime_deg")
-    @classmethod
-    def _tilted(cls, value: float) -> float:
-        if value == 0.0:
-            raise ValueError("choose a tilted sensor, such as -7.62")
-        return value
-
-    @model_validator(mode="after")
-    def _window_on_the_sensor(self) -> Calibration:
-        if self.roi_px is None:
-            return self
-        column, row, columns, rows = self.roi_px
-        fits = 0 <= column < column + columns <= self.columns
-        if not (fits and 0 <= row < row + rows <= self.rows):
-            raise ValueError(
-                f"roi_px {list(self.roi_px)} leaves the sensor of {self.columns} x {self.rows}; "
-                "write first column, first row, columns, rows"
-            )
-        return self
-
-    @field_validator("stage_direction")
-    @classmethod
-    def _unit_vector(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        length = float(np.linalg.norm(value))
-        if abs(length - 1.0) > 1e-6:
-            raise ValueError(f"its length is {length:g}; divide it by its length")
-        return value
-
-    @field_validator("range_mm")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None and not 0.0 < value[0] < value[1]:
-            raise ValueError("write the nearest range first, both positive")
-        return value
-
-    @field_validator("parameters_fitted")
-    @classmethod
-    def _known_parameters(cls, value: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        known = value is None or (value and set(value) <= set(PARAMETERS))
-        if not known or (value and len(set(value)) != len(value)):
-            raise ValueError(f"name each fitted parameter once, of {', '.join(PARAMETERS)}")
-        return value
-
-    @model_validator(mode="after")
-    def _covariance_fits(self) -> Calibration:
-        if self.covariance is None:
-            return self
+    def _misfit(self, covariance: tuple[tuple[float, ...], ...]) -> str:
         size = len(self.parameters_fitted or ())
-        if not size or len(self.covariance) != size or {len(r) for r in self.covariance} != {size}:
-            raise ValueError(
-                f"covariance does not belong to the {size} parameters_fitted; write one row and "
-                "one column for each"
-            )
-        matrix = np.array(self.covariance)
-        scale = np.sqrt(np.abs(np.outer(np.diag(matrix), np.diag(matrix))))
-        if np.any(np.diag(matrix) < 0.0) or np.any(np.abs(matrix - matrix.T) > 1e-9 * scale):
-            raise ValueError("covariance is not symmetric with a positive diagonal; fit again")
-        return self
+        if not size or {len(row) for row in (*covariance, covariance)} != {size}:
+            return f"write one row and one column for each of the {size} parameters_fitted"
+        matrix = np.array(covariance)
+        variance = np.diag(matrix)
+        scale = np.sqrt(np.abs(variance[:, None])) * np.sqrt(np.abs(variance))
+        if np.any(variance < 0.0) or np.any(np.abs(matrix - matrix.T) > 1e-9 * scale):
+            return "it is not symmetric with a positive diagonal; fit again"
+        return ""
 
     @property
     def object_scale_mm(self) -> float:
@@ -283,11 +245,10 @@ def _named_path(folder: str | os.PathLike[str], name: str) -> Path:
 
 
 def _read(path: Path, follow_links: bool = True) -> Calibration:
-    data = read_yaml(path, CalibrationError, follow_links)
-    if isinstance(data, str) and _may_be_shipped(data):
-        path = _find(data)
-        data = read_yaml(path, CalibrationError)
-    return validate(Calibration, data, path, CalibrationError)
+    document = read_yaml(path, CalibrationError, follow_links)
+    if isinstance(document.data, str) and _may_be_shipped(document.data):
+        document = read_yaml(_find(document.data), CalibrationError)
+    return validate(Calibration, document, CalibrationError)
 
 
 def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> None:
@@ -302,12 +263,14 @@ def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> 
     ArgumentError
         When the path cannot be written.
     """
-    data = calibration.model_dump(mode="json", exclude_none=True)
+    data = calibration.as_dict()
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True)
-    if validate(Calibration, yaml.safe_load(text), path, CalibrationError) != calibration:
+    written = text.encode()
+    again = validate(Calibration, parse_yaml(written, path, CalibrationError), CalibrationError)
+    if again != calibration:
         raise CalibrationError(f"{path}: the calibration does not survive YAML; check its texts")
     with atomic_write(path) as stream:
-        stream.write(text.encode())
+        stream.write(written)
 
 
 def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None:

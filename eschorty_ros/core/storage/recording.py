@@ -16,12 +16,12 @@ from typing import Annotated, Any
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from eschorty_ros.core.base.arrays import as_array, file_path, integer_vector
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write
-from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
+from eschorty_ros.core.base.schema import Schema, Within, validate
+from eschorty_ros.core.base.yaml_file import read_yaml
 from eschorty_ros.core.clocks import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, load_calibration
@@ -39,11 +39,12 @@ TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")]
 _LINES_AT_ONCE = 65_536
 
 
+@dataclass(frozen=True, kw_only=True)
 class _LaserFile(Schema):
     frequency_hz: float
     duty: float
     waveform: str
-    on_edge_us: Annotated[int, Field(ge=-(2**63), lt=2**63)] | None = None
+    on_edge_us: Annotated[int, Within(-(2**63), 2**63 - 1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -119,9 +120,9 @@ def read_laser_yaml(path: str | os.PathLike[str]) -> Modulation:
     FormatError
         One line naming the file, the key, the value and the remedy.
     """
-    laser = validate(_LaserFile, read_yaml(path, FormatError), path, FormatError)
+    laser = validate(_LaserFile, read_yaml(path, FormatError), FormatError)
     try:
-        return Modulation(**laser.model_dump())
+        return Modulation(**laser.as_dict())
     except ArgumentError as error:
         raise FormatError(f"{path}: {error}") from error
 

@@ -302,7 +302,8 @@ class AwgLaser:
                 self._open_channel.unlock_at_once()
         first, last = str(failures[0]), str(failures[-1])
         both = first if first == last else f"{first}; opened again: {last}"
-        self._reason = f"{both}; treat the laser as on and switch the generator off by hand"
+        # The remedy first: a long message loses its middle.
+        self._reason = f"treat the laser as on and switch the generator off by hand ({both})"
         self._counters["switch_off_failures"] += 1
         self._ready = False
         self._note(LaserOutput.UNKNOWN)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
-
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import config_folders
 from eschorty_ros.core.base.numbers import file_path
-from eschorty_ros.core.base.yaml_file import Schema, read_yaml, validate
+from eschorty_ros.core.base.schema import Schema, Within, validate
+from eschorty_ros.core.base.yaml_file import read_yaml
 
 SETTINGS = (
     "output",
@@ -34,13 +35,14 @@ BURST_SETTINGS = ("burst_type", "burst_source", "burst_cycles", "burst_phase")
 """Those of a profile with a burst of counted cycles, besides."""
 
 Value = bool | float | str
-Texts = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
-Ids = Annotated[
-    tuple[Annotated[int, Field(ge=0, le=0xFFFF)], ...], Field(strict=False, min_length=1)
-]
-NotNegative = Annotated[float, Field(ge=0.0)]
+Text = Annotated[str, Within(low=1)]
+Texts = Annotated[tuple[str, ...], Within(low=1)]
+Ids = Annotated[tuple[Annotated[int, Within(0, 0xFFFF)], ...], Within(low=1)]
+Positive = Annotated[float, Within(above=0.0)]
+NotNegative = Annotated[float, Within(low=0.0)]
 
 
+@dataclass(frozen=True, kw_only=True)
 class UsbIds(Schema):
     """Product and vendor ids under which the family appears on the bus."""
 
@@ -48,14 +50,16 @@ class UsbIds(Schema):
     vendor_ids: Ids
 
 
+@dataclass(frozen=True, kw_only=True)
 class Replies(Schema):
     """Texts of switches in replies, and the units a number may carry."""
 
     on: Texts
     off: Texts
-    units: dict[str, Annotated[float, Field(gt=0.0)]]
+    units: dict[str, Positive]
 
 
+@dataclass(frozen=True, kw_only=True)
 class Setting(Schema):
     """One setting: set by ``command value``, read by ``command?``.
 
@@ -63,21 +67,16 @@ class Setting(Schema):
     by ``tolerance`` plus ``tolerance_share`` of the value at most.
     """
 
-    command: Annotated[str, Field(min_length=1)]
+    command: Text
     kind: Literal["switch", "number", "keyword"]
     minimum: float | None = None
     maximum: float | None = None
     tolerance: NotNegative = 0.0
     tolerance_share: NotNegative = 0.0
 
-    @field_validator("command")
-    @classmethod
-    def _fits(cls, value: str) -> str:
-        try:
-            value.format(channel=1)
-        except (KeyError, IndexError, ValueError):
-            raise ValueError("only {channel} can be filled in") from None
-        return value
+    def _conflicts(self) -> Iterator[tuple[str, str]]:
+        if {"{", "}"} & set(self.command.replace("{channel}", "")):
+            yield "command", "only {channel} can be filled in"
 
     def agrees(self, requested: Value, found: Value) -> bool:
         """Return whether a read-back agrees with what was set."""
@@ -100,6 +99,7 @@ class Setting(Schema):
             raise ArgumentError(f"{name} is {value:g}; the generator takes {low:g} to {high:g}")
 
 
+@dataclass(frozen=True, kw_only=True)
 class Burst(Schema):
     """A burst of counted cycles: the value of ``mode``, ``burst_type`` and ``burst_source`` for it.
 
@@ -107,55 +107,49 @@ class Burst(Schema):
     leaves the waveform as it is, ``restarts`` begins count and waveform again, ``ignored`` nothing.
     """
 
-    mode: Annotated[str, Field(min_length=1)]
-    type: Annotated[str, Field(min_length=1)]
-    source: Annotated[str, Field(min_length=1)]
-    trigger: Annotated[str, Field(min_length=1)]
+    mode: Text
+    type: Text
+    source: Text
+    trigger: Text
     while_running: Literal["extends", "restarts", "ignored"]
 
 
+@dataclass(frozen=True, kw_only=True)
 class AwgProfile(Schema):
     """One family of generators; the keys are those of ``config/awg_*.yaml``."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Text
     maker: str
     model: str
     usb: UsbIds
     terminator: str
-    channels: Annotated[int, Field(ge=1, le=8)]
+    channels: Annotated[int, Within(1, 8)]
     identify: str
     unlock: str | None = None
     error_queue: str | None = None
     replies: Replies
-    dark_high_v: Annotated[float, Field(gt=0.0)]
-    dark_limit_v: Annotated[float, Field(gt=0.0)]
+    dark_high_v: Positive
+    dark_limit_v: Positive
     waveforms: dict[str, str]
     duty_waveforms: Texts
     mode_continuous: str
     burst: Burst | None = None
     settings: dict[str, Setting]
 
-    @field_validator("model")
-    @classmethod
-    def _compiles(cls, value: str) -> str:
+    def _conflicts(self) -> Iterator[tuple[str, str]]:
         try:
-            re.compile(value)
-        except re.error as error:
-            raise ValueError(f"it is no regular expression ({error})") from None
-        return value
-
-    @model_validator(mode="after")
-    def _complete(self) -> AwgProfile:
+            re.compile(self.model)
+        except (re.error, RecursionError, OverflowError) as error:
+            yield "model", f"it is no regular expression ({error})"
         needed = SETTINGS + (BURST_SETTINGS if self.burst is not None else ())
         missing = [name for name in needed if name not in self.settings]
         if missing:
-            raise ValueError(f"settings lack {', '.join(missing)}; add them")
+            yield "settings", f"add {', '.join(missing)}"
         unknown = sorted(set(self.settings) - set(needed))
         if unknown:
-            raise ValueError(f"settings hold {', '.join(unknown)}, which nothing uses; remove them")
+            yield "settings", f"remove {', '.join(unknown)}, which nothing uses"
         if self.dark_limit_v < self.dark_high_v:
-            raise ValueError("dark_limit_v lies below dark_high_v; raise it")
-        return self
+            yield "dark_limit_v", "raise it to dark_high_v or more"
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> AwgProfile:
@@ -177,7 +171,7 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> AwgProfile:
 # Kept: opening the generator to switch it off in place of a dead guard must not parse it.
 @lru_cache(maxsize=4)
 def _load(path: Path, changed_ns: int) -> AwgProfile:
-    return validate(AwgProfile, read_yaml(path, ArgumentError), path, ArgumentError)
+    return validate(AwgProfile, read_yaml(path, ArgumentError), ArgumentError)
 
 
 def _find(text: str) -> Path:

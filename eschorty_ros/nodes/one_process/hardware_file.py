@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.base.yaml_file import read_yaml
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.nodes.camera import node as camera
@@ -40,28 +41,31 @@ def read_hardware(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
     FormatError
         When the file cannot be read, or names a node or a parameter that does not exist.
     """
-    data = read_yaml(path, FormatError) or {}
+    document = read_yaml(path, FormatError)
+    data = document.data or {}
     if not isinstance(data, dict):
-        raise FormatError(f"{path}: it holds {data!r}; write node names with their parameters")
+        raise FormatError(f"{path}: it holds {short(data)}; write node names with their parameters")
     tables: dict[str, dict[str, Any]] = {name: {"driver": real} for name, real in REAL.items()}
     for full_name, table in data.items():
-        _known(path, "node", full_name, [f"{_NAMESPACE}{name}" for name in TABLES])
+        where = document.at((full_name,))
+        _known(where, "node", full_name, [f"{_NAMESPACE}{name}" for name in TABLES])
         name = full_name.removeprefix(_NAMESPACE)
         values = table.get(_KEY) if isinstance(table, dict) and set(table) == {_KEY} else None
         if not isinstance(values, dict):
             raise FormatError(
-                f"{path}: {full_name} is {table!r}; write parameters under {_KEY} in it"
+                f"{where}: {full_name} is {short(table)}; write parameters under {_KEY} in it"
             )
         names = [param.name for param in (*TABLES[name], lifecycle.AUTO_START)]
         for parameter in values:
-            _known(path, f"parameter of {full_name}", parameter, names)
+            where = document.at((full_name, _KEY, parameter))
+            _known(where, f"parameter of {full_name}", parameter, names)
         tables.setdefault(name, {}).update(values)
     return tables
 
 
-def _known(path: str | os.PathLike[str], what: str, name: object, names: list[str]) -> None:
+def _known(where: str, what: str, name: object, names: list[str]) -> None:
     if name in names:
         return
     near = get_close_matches(str(name), names, n=1, cutoff=0.5)
     remedy = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(names)}"
-    raise FormatError(f"{path}: {name!r} is no {what}; {remedy}")
+    raise FormatError(f"{where}: {short(name)} is no {what}; {remedy}")

@@ -79,9 +79,7 @@ def active_message(calibration: Calibration, file: str, stamp_ns: int) -> Active
         residual_rms=_or_nan(calibration.residual_rms_px),
         range_min=math.nan,
         range_max=math.nan,
-        yaml=yaml.safe_dump(
-            calibration.model_dump(mode="json", exclude_none=True), sort_keys=False
-        ),
+        yaml=yaml.safe_dump(calibration.as_dict(), sort_keys=False),
     )
     if calibration.range_mm is not None:
         message.range_min, message.range_max = (m_from_mm(mm) for mm in calibration.range_mm)

@@ -1,5 +1,7 @@
 """A target that the stage moves along the range: every profile is one more known range."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,9 +12,9 @@ from eschorty_ros.core.reconstruction import Profiles, reconstruct_recording
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
-NOMINAL = load_calibration("config_3").model_copy(update={"columns": 48, "principal_column": 23.5})
+NOMINAL = replace(load_calibration("config_3"), columns=48, principal_column=23.5)
 CHANGED = {"k_prime_px": 0.96 * NOMINAL.k_prime_px, "b_prime_px": -1102.74}
-AS_BUILT = NOMINAL.model_copy(update=CHANGED)
+AS_BUILT = replace(NOMINAL, **CHANGED)
 SPEED_MM_S = 100.0
 
 

@@ -29,8 +29,8 @@ KNOWN = [KnownTarget(post.range_mm, size_mm=post.size_mm) for post in BENCH]
 
 
 def capture(scene: Posts, seed: int, duration_us: int = 500_000) -> AggregateFrame:
-    calibration = load_calibration("config_3").model_copy(
-        update={"k_prime_px": AS_BUILT.k_prime_px, "b_prime_px": AS_BUILT.b_prime_px}
+    calibration = replace(
+        load_calibration("config_3"), k_prime_px=AS_BUILT.k_prime_px, b_prime_px=AS_BUILT.b_prime_px
     )
     world = World(scene, calibration, seed=seed)
     world.set_laser(0, True, Modulation(70.0, on_edge_us=0))

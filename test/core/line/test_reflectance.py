@@ -1,5 +1,7 @@
 """Relative reflectance from width and counts against the truth of a simulated line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reconstructing import reconstruct
@@ -34,7 +36,7 @@ def profiles_of(frequency_hz: float, truth: np.ndarray, **settings) -> Profiles:
         line_row=360.0 + rng.random(columns), reflectance=truth, seed=SEED,
     )  # fmt: skip
     data = Encoder(columns, 720).encode(*sort_readout(line.t, line.x, line.y, line.p))
-    calibration = load_calibration("config_3").model_copy(update={"columns": columns})
+    calibration = replace(load_calibration("config_3"), columns=columns)
     wanted = Settings(smoothing_half_width=0, isolation_events=0, **settings)
     found, _ = reconstruct(data, modulation, wanted, calibration=calibration)
     return found.select(found.period >= 2)

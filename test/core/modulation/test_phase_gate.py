@@ -17,7 +17,7 @@ from eschorty_ros.simulation.world import World
 
 SEED = 20261121
 COLUMNS = 128
-CALIBRATION = load_calibration("config_3").model_copy(update={"columns": COLUMNS})
+CALIBRATION = replace(load_calibration("config_3"), columns=COLUMNS)
 EDGE_US = 3_217
 
 

@@ -1,14 +1,15 @@
 """Calibration files: the four builds, round trips, and faults named in one line."""
 
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from pydantic import ValidationError
 
 from eschorty_ros.core.base import files
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError
@@ -39,7 +40,7 @@ def keys() -> dict[str, Any]:
 
 
 def fitted() -> Calibration:
-    return Calibration.model_validate({**keys(), **FIT, "k_mm": 24.1, "roi_px": (10, 9, 120, 40)})
+    return Calibration(**{**keys(), **FIT, "k_mm": 24.1, "roi_px": (10, 9, 120, 40)})
 
 
 @pytest.mark.parametrize("build", BUILDS)
@@ -71,8 +72,8 @@ def test_saving_and_loading_gives_the_same(tmp_path, make):
 
 
 def test_numbers_survive_to_the_last_bit(tmp_path):
-    odd = fitted().model_copy(
-        update={"k_prime_px": -37261.86 * (1 + 2**-52), "b_mm": 1e-7 / 3, "residual_rms_px": 1e22}
+    odd = replace(
+        fitted(), k_prime_px=-37261.86 * (1 + 2**-52), b_mm=1e-7 / 3, residual_rms_px=1e22
     )
     save_calibration(odd, tmp_path / "c.yaml")
     assert load_calibration(tmp_path / "c.yaml") == odd
@@ -100,7 +101,7 @@ def test_whole_numbers_and_dates_are_read_as_meant(tmp_path):
 
 
 def test_a_calibration_cannot_be_changed_in_place():
-    with pytest.raises(ValidationError, match="frozen"):
+    with pytest.raises(FrozenInstanceError):
         load_calibration("nominal").b_mm = 1.0
 
 
@@ -114,19 +115,19 @@ WITHOUT = object()
         ({"k_prime_px": WITHOUT, "k_prim_px": -1.0}, ["k_prim_px", "did you mean k_prime_px?"]),
         ({"focal_length": 24.0}, ["focal_length is 24.0", "did you mean focal_length_mm?"]),
         ({"comment": "hello"}, ["comment is 'hello'", "remove it"]),
-        ({"k_prime_px": 37261.86}, ["k_prime_px is 37261.86", "less than 0"]),
-        ({"b_prime_px": 0.5}, ["b_prime_px is 0.5", "less than or equal to -1"]),
+        ({"k_prime_px": 37261.86}, ["k_prime_px is 37261.86", "below 0"]),
+        ({"b_prime_px": 0.5}, ["b_prime_px is 0.5", "to -1"]),
         ({"b_mm": float("nan")}, ["b_mm is nan", "finite"]),
         ({"b_mm": "1.5 mm"}, ["b_mm is '1.5 mm'", "write a number"]),
         ({"f_number": True}, ["f_number is True"]),
         ({"f_number": [2.0]}, ["f_number is [2.0]"]),
-        ({"theta_deg": 0.0}, ["theta_deg is 0.0", "greater than 0"]),
+        ({"theta_deg": 0.0}, ["theta_deg is 0.0", "above 0"]),
         ({"theta_prime_deg": 0.0}, ["theta_prime_deg is 0.0", "-7.62"]),
-        ({"k_mm": -24.0}, ["k_mm is -24.0", "greater than 0"]),
+        ({"k_mm": -24.0}, ["k_mm is -24.0", "above 0"]),
         ({"columns": 1280.5}, ["columns is 1280.5"]),
         ({"rows": 0}, ["rows is 0"]),
         ({"stage_direction": [0.0, 2.0, 0.0]}, ["stage_direction", "length is 2", "divide"]),
-        ({"stage_direction": [0.0, 1.0]}, ["stage_direction.2"]),
+        ({"stage_direction": [0.0, 1.0]}, ["stage_direction is [0.0, 1.0]", "write 3"]),
         ({"stage_direction": ["a", 1.0, 0.0]}, ["stage_direction.0 is 'a'"]),
         ({"name": ""}, ["name is ''"]),
         ({"range_mm": [2000.0, 800.0]}, ["range_mm", "nearest range first"]),
@@ -153,7 +154,7 @@ def test_faults_name_file_key_value_and_remedy(tmp_path, change, parts):
     with pytest.raises(CalibrationError) as caught:
         load_calibration(file)
     message = str(caught.value)
-    assert message.startswith(f"{file}: ")
+    assert re.match(rf"{file}( line \d+)?: ", message)
     assert "\n" not in message
     for part in parts:
         assert part in message
@@ -166,11 +167,10 @@ def test_faults_name_file_key_value_and_remedy(tmp_path, change, parts):
         (b"- 1\n- 2\n", r"has \[1, 2\] instead of keys"),
         (b"name: [1\n", "line 2"),
         (b"name: a\nname: b\n", "line 2: key 'name' appears twice"),
-        (b"name: !!python/object:os.system {}\n", "line 1"),
+        (b"name: !!python/object:os.system {}\n", "line 1: tags"),
         (b"\xff\xfe\x00", "not text"),
         (b"name: \x00\n", "correct the YAML"),
-        (b"date: 2025-13-45\n", "correct the YAML"),
-        (b"? [a, b]\n: 1\n", "correct the YAML|no such key"),
+        (b"? [a, b]\n: 1\n", "line 1: a key is a list"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_named(tmp_path, content, part):
@@ -239,11 +239,11 @@ def test_a_calibration_of_another_instrument_is_refused_by_name(change, words):
     active = load_calibration("config_3")
     refuse_other_instrument(load_calibration("config_3_as_built"), active)
     with pytest.raises(CalibrationError, match=words):
-        refuse_other_instrument(active.model_copy(update=change), active)
+        refuse_other_instrument(replace(active, **change), active)
 
 
 @pytest.mark.parametrize("window", [(0, 0, 1281, 720), (-1, 0, 10, 10), (0, 700, 10, 30),
                                     (0, 0, 0, 10)])  # fmt: skip
 def test_a_window_off_the_sensor_is_refused(window):
     with pytest.raises(ValueError, match="roi_px"):
-        Calibration.model_validate(keys() | {"roi_px": window})
+        replace(load_calibration("config_3"), roi_px=window)

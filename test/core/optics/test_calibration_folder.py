@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ NO_FILES = [make_fifo, link_to_zero, link_out_of_the_folder, make_folder]
 def test_a_calibration_is_saved_and_loaded_by_bare_name(tmp_path: Path) -> None:
     folder = tmp_path / "made" / "here"
     assert save_named_calibration(folder, BUILD) == folder / "config_3.yaml"
-    fitted = type(BUILD).model_validate(BUILD.model_dump() | {"id": "c3 2026"})
+    fitted = replace(BUILD, id="c3 2026")
     assert save_named_calibration(folder, fitted) == folder / "c3 2026.yaml"
     assert save_named_calibration(folder, fitted, "mine.yaml") == folder / "mine.yaml"
     assert load_named_calibration(folder, "mine") == load_named_calibration(folder, "c3 2026.yaml")
@@ -66,7 +67,7 @@ def test_only_bare_names_are_taken(tmp_path: Path, name: Any) -> None:
         with pytest.raises(CalibrationError, match="without slashes"):
             save_named_calibration(folder, BUILD, name)
         with pytest.raises(ValueError, match="id"):
-            type(BUILD).model_validate(BUILD.model_dump() | {"id": name if name else 3})
+            replace(BUILD, id=name)
     assert [entry.name for entry in tmp_path.iterdir()] == ["c.yaml"]
 
 
@@ -84,12 +85,12 @@ def test_links_pipes_and_folders_are_refused_without_waiting(tmp_path: Path, put
     assert [entry.name for entry in folder.iterdir()] == ["odd.yaml"]
 
 
-@pytest.mark.parametrize("path", ["/dev/zero", "/dev/stdin", "fifo", "large.yaml", "x" * 5000])
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev/stdin", "fifo.yaml", "large.yaml", "x" * 5000])
 def test_a_path_given_at_the_start_is_read_in_bounded_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    os.mkfifo("fifo")
+    os.mkfifo("fifo.yaml")
     Path("large.yaml").write_bytes(b"#" * 65_537)
     with pytest.raises(CalibrationError, match="cannot read") as caught:
         load_calibration(Path(path))

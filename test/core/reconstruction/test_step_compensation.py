@@ -93,7 +93,7 @@ def test_a_resting_stage_has_no_steps_to_compensate():
 def test_a_compensated_row_becomes_a_range_in_its_own_column(bend):
     case = crossing(PARAMETERS, 1000.0, 0.1, 1.0, columns=40, slanted=True, seed=SEED)
     middle = (case.calibration.columns - 1) / 2
-    calibration = case.calibration.model_copy(update={"principal_column": middle, **bend})
+    calibration = replace(case.calibration, **{"principal_column": middle, **bend})
     model = calibration.model()
     off, _ = replace(case, calibration=calibration).reconstruct(reflectance_compensation="off")
     on, _ = replace(case, calibration=calibration).reconstruct(reflectance_compensation="on")
@@ -173,7 +173,7 @@ class Striped(Plane):
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
 @pytest.mark.parametrize(("start_mm", "stop_mm"), [(10.0, 70.0), (70.0, 10.0)])
 def test_recording_of_a_striped_plane_either_way(tmp_path, frequency_hz, start_mm, stop_mm):
-    calibration = load_calibration("config_3").model_copy(update={"columns": 64})
+    calibration = replace(load_calibration("config_3"), columns=64)
     recording = simulate_recording(
         tmp_path, Striped(1320.0), calibration, Modulation(frequency_hz), start_mm, stop_mm,
         200.0, SEED,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,7 @@ from eschorty_ros.simulation.world import World
 
 SEED = 20240611
 MS = 1_000_000
-CALIBRATION = load_calibration("config_3").model_copy(
-    update={"columns": 64, "principal_column": 31.5}
-)
+CALIBRATION = replace(load_calibration("config_3"), columns=64, principal_column=31.5)
 
 
 def world() -> World:

@@ -1,6 +1,7 @@
 """The row arbiter, its limits, and what the stream says of losses."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import SensorControl, World
 
 SEED = 4
-SMALL = load_calibration("config_3").model_copy(update={"columns": 96, "principal_column": 47.5})
+SMALL = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
 
 
 def keys(t, y, x, p=1) -> np.ndarray:

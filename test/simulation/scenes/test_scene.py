@@ -1,6 +1,7 @@
 """Scenes: where the rays of the laser sheet hit."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatEr
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.simulation.scenes import NAMES, Plane, Sphere, Steps, load_open3d, named
 
-MODEL = load_calibration("config_3").model_copy(update={"b_mm": 7.0}).model()
+MODEL = replace(load_calibration("config_3"), b_mm=7.0).model()
 STAGE = np.linspace(0.0, 100.0, 41)
 COLUMNS = np.arange(0, 1280, 13)
 

@@ -1,5 +1,7 @@
 """Posts: where they are seen, and that they hide what is behind them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.simulation.scenes import Post, Posts, bench, named
 
-CALIBRATION = load_calibration("config_3").model_copy(update={"b_mm": 7.0})
+CALIBRATION = replace(load_calibration("config_3"), b_mm=7.0)
 MODEL = CALIBRATION.model()
 COLUMNS = np.arange(1280)
 

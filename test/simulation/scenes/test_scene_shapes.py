@@ -1,5 +1,7 @@
 """The leaf collage and the face: depths, separations, and that every hit lies on its surface."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,7 +130,7 @@ def test_the_face_has_nose_eyes_mouth_and_ears() -> None:
 
 def test_the_face_is_the_same_object_from_another_place() -> None:
     every = np.arange(1280)
-    moved = load_calibration("config_3").model_copy(update={"b_mm": 5.0}).model()
+    moved = replace(load_calibration("config_3"), b_mm=5.0).model()
     lines = []
     for model in (CONFIG_3, moved):
         x = Face().range_mm([100.0], every, model)[0]

@@ -9,8 +9,12 @@ from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.simulation.scenes import Plane
 from eschorty_ros.simulation.world import simulate_recording
 
-BENT = load_calibration("config_3").model_copy(
-    update={"columns": 96, "principal_column": 47.5, "b_prime_1_px": -9.0, "b_prime_2_px": 5.0}
+BENT = replace(
+    load_calibration("config_3"),
+    columns=96,
+    principal_column=47.5,
+    b_prime_1_px=-9.0,
+    b_prime_2_px=5.0,
 )
 
 
@@ -23,7 +27,6 @@ def test_a_flat_scene_stays_flat_when_the_calibration_knows_the_bend(tmp_path):
     by_column = [np.median(error[result.profiles.column == c]) for c in range(96)]
     print(f"seed 7: median error of columns, largest {np.abs(by_column).max():.2f} mm")
     assert np.abs(by_column).max() < 2.0
-    straight = replace(recording, calibration=BENT.model_copy(
-        update={"b_prime_1_px": 0.0, "b_prime_2_px": 0.0}))  # fmt: skip
+    straight = replace(recording, calibration=replace(BENT, b_prime_1_px=0.0, b_prime_2_px=0.0))
     error = reconstruct_recording(straight).profiles.range_mm - 1320.0
     assert np.abs(error).max() > 20.0

@@ -1,6 +1,6 @@
 """The line's thickness on edges of a scene."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,9 +13,7 @@ from eschorty_ros.simulation.scenes import Plane, Sphere, named
 from eschorty_ros.simulation.world import World, footprint
 
 SEED = 2
-CALIBRATION = load_calibration("config_3").model_copy(
-    update={"columns": 48, "principal_column": 23.5}
-)
+CALIBRATION = replace(load_calibration("config_3"), columns=48, principal_column=23.5)
 MODEL = CALIBRATION.model()
 HALF_ROWS = 12.0
 

@@ -1,7 +1,7 @@
 """The simulated world: bytes against truth."""
 
 import random
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from fractions import Fraction
 
 import numpy as np
@@ -28,7 +28,7 @@ from eschorty_ros.simulation.world import (
 
 SEED = 11
 FULL = load_calibration("config_3")
-SMALL = FULL.model_copy(update={"columns": 96, "principal_column": 47.5})
+SMALL = replace(FULL, columns=96, principal_column=47.5)
 WAVE = Modulation(70.0, 0.5, "square", 1000)
 
 
