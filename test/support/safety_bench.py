@@ -62,12 +62,14 @@ class SafetyBench(LaserBench):
                 return False
             answers = self.arm(), self.enable()
             print("light:", *(answer.message for answer in answers))
-            return all(answer.success for answer in answers)
+            if not all(answer.success for answer in answers):
+                return False
+            self.wait_for_state(LaserState.OUTPUT_ON)
+            # The lease of a sender that was killed before may expire now.
+            time.sleep(0.3)
+            return self.awg.lit()
 
         wait_until(lit, "light", poll_s=0.2)
-        self.wait_for_state(LaserState.OUTPUT_ON)
-        time.sleep(0.3)
-        assert self.awg.lit()
 
     def check_off(self, cause: str, since_ns: int) -> None:
         took_s = self.awg.off_after_s(since_ns)

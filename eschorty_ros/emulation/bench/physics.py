@@ -29,7 +29,7 @@ Pulses = Callable[[int, int], list[tuple[int, bool]]]
 PACKET_US = 1_008
 """Period of the sensor's output in its own time."""
 
-_PACKETS_AT_ONCE = 32
+_PACKETS_AT_ONCE = 16
 _PACKET_S = PACKET_US * 1e-6
 _PULSE_MAX_NS = 1_000_000_000
 _PPB = 1_000_000_000
@@ -250,7 +250,7 @@ class Physics:
         }
 
     def _simulate(self) -> bool:
-        """Advance the world by at most 32 packets; returns whether it advanced."""
+        """Advance the world by at most 16 packets; returns whether it advanced."""
         world = self._world
         assert world is not None
         with self.lock:

@@ -15,7 +15,7 @@ from eschorty_ros.core.evt3 import words as w3
 Words = NDArray[np.uint16]
 
 _VECTOR_BITS = 12
-_WAITING_PACKETS = 8
+_WAITING_PACKETS = 4
 _JOINED_BYTES = 96 << 10
 
 

@@ -202,10 +202,11 @@ def test_k_alone_has_a_profile_and_a_width_bias_alone_is_no_calibration():
     refused(ArgumentError, targets, free=(WIDTH_BIAS,), match="width_bias_px alone")
 
 
-def test_any_choice_gives_a_report_or_one_line():
+@pytest.mark.parametrize("first", [0, 50, 100])
+def test_any_choice_gives_a_report_or_one_line(first):
     names = ("k_mm", "k_prime_px", "b_mm", "b_prime_px", "b_prime_1_px", "b_prime_2_px", WIDTH_BIAS)
     reports, lines = 0, []
-    for seed in range(150):
+    for seed in range(first, first + 50):
         rng = np.random.default_rng([SEED, seed])
         count = int(rng.integers(1, 14))
         targets = posts_at_random(rng, count)
@@ -223,8 +224,8 @@ def test_any_choice_gives_a_report_or_one_line():
         assert np.isfinite(report.fit.covariance).all()
         assert np.linalg.eigvalsh(report.fit.covariance).min() > 0.0
         assert np.isfinite(report.range_sigma_mm(300.0, 0.3))
-    print(f"seed {SEED}: {reports} reports of 150")
-    assert reports > 50
+    print(f"seed {SEED}: {reports} reports of 50")
+    assert reports > 16
     assert not any("\n" in line for line in lines)
 
 
