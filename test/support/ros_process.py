@@ -50,6 +50,10 @@ def stamped_after(messages: list[Any], t_ns: int) -> bool:
     return bool(messages) and ns_from_stamp(messages[-1].header.stamp) > t_ns
 
 
+class Remap(str):
+    """Another name, given in place of a parameter's value."""
+
+
 class NodeProcess:
     """A module with one node, as a process of its own until ``kill`` or the end of a ``with``.
 
@@ -65,7 +69,7 @@ class NodeProcess:
         command += ["--ros-args", "-r", f"__ns:={NAMESPACE}"]
         for name, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
-            command += ["-p", f"{name}:={text}"]
+            command += ["-r" if isinstance(value, Remap) else "-p", f"{name}:={text}"]
         self._process = subprocess.Popen(
             command,
             stdout=self._log,
