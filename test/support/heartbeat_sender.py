@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 
@@ -15,7 +16,8 @@ class HeartbeatSender(Node):
     """Parameter ``topics``: heartbeat topics, with blanks between."""
 
     def __init__(self) -> None:
-        super().__init__("heartbeat_sender")
+        # Several run side by side.
+        super().__init__(f"heartbeat_sender_{os.getpid()}")
         self._healthy = True
         signal.signal(signal.SIGUSR1, self._fail)
         topics = self.declare_parameter("topics", "").value.split()

@@ -32,6 +32,7 @@ from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 
 NAMESPACE = "/eschorty"
+DISCOVERY = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 # With util-linux the kernel ends the nodes however the tests end.
 _ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
 
@@ -131,12 +132,12 @@ def node_name(module: str) -> str:
 
 
 def domain_environment(domain: int) -> dict[str, str]:
-    """Of a process in ``domain``, discovering on this host only, with the tests' own nodes."""
+    """Of a process in ``domain``, on this host unless chosen otherwise."""
     return {
         **os.environ,
         "PYTHONPATH": f"{Path(__file__).parent}:{os.environ.get('PYTHONPATH', '')}",
         "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        DISCOVERY: os.environ.get(DISCOVERY, "LOCALHOST"),
         "PYTHONUNBUFFERED": "1",
     }
 
@@ -195,7 +196,7 @@ class Observer:
     """A test's own node, spun in a thread until the end of a ``with``."""
 
     def __init__(self, domain: int | None = None) -> None:
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        os.environ.setdefault(DISCOVERY, "LOCALHOST")
         use_profile()
         self.domain = free_domain() if domain is None else domain
         context = rclpy.Context()

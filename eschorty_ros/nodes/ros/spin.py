@@ -22,6 +22,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 
 _PAUSE_S = 3e-4
@@ -115,8 +116,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     Returns
     -------
     int
-        0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built or a callback failed
-        (one line for an ``EschortyError``).
+        0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built, another of its name
+        runs, or a callback failed (one line for an ``EschortyError``).
     """
     nodes: list[Node] = []
     executor: Executor | None = None
@@ -133,8 +134,11 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             node = factory()
             nodes.append(node)
             executor.add_node(node)
+        second = SecondNodes(nodes)
+        second.wait()
         while rclpy.ok():
             turn(executor)
+            second.look()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except EschortyError as error:
