@@ -46,6 +46,8 @@ _COUNTERS = (
 )
 _RENEWALS_PER_GRANT = 5
 _PAUSE_S = 1e-3
+_BUSY_S = 0.02
+_RENEWAL_WAITS_S = 0.1
 UNBOUNDED = (
     f"{NAME}: light does not end by itself: if guard and laser node end together it stays on "
     "until it is switched off by hand; fit an interlock in hardware"
@@ -111,6 +113,8 @@ class AwgLaser:
         # and the latest time of its end, steady.
         self._grant_s = 0.0
         self._ends_s = (0.0, 0.0)
+        # Until when a requested renewal waits for the command in progress.
+        self._renew_until_s = 0.0
         self._open_channel: AwgChannel | None = None
         # The same generator is opened again after a loss, and identified once per opening.
         self._link_serial = ""
@@ -182,20 +186,24 @@ class AwgLaser:
     def renew(self) -> float:
         """Extend light by one grant from now on; return the time to the next renewal, s.
 
-        A renewal that came too late for the burst counts as a pause, after which the light began
-        with another phase: ``output_since_ns`` is its time. Does nothing for light that is off or
-        does not end by itself. Raises ``DeviceError`` for a failure; the output is off then.
+        Never waits for a command in progress, which extends it before its next query. A renewal
+        that came too late for the burst counts as a pause, after which the light began with another
+        phase: ``output_since_ns`` is its time. Does nothing for light that is off or does not end
+        by itself. Raises ``DeviceError`` for a failure; the output is off then.
         """
-        with self._command():
-            if self._output is not LaserOutput.ON or not self._grant_s:
-                return GRANT_MIN_S / _RENEWALS_PER_GRANT
-            left_s = self._ends_s[1] + _PAUSE_S - time.monotonic()
-            if self._while_running == "ignored" and left_s > 0.0:
-                return left_s
-            with self._disabled_on_failure():
-                self._grant()
-                self._channel.unlock()
-        return self._grant_s / _RENEWALS_PER_GRANT
+        self._renew_until_s = time.monotonic() + _RENEWAL_WAITS_S
+        if not self._lock.acquire(blocking=False):
+            return _BUSY_S
+        try:
+            with self._turn(), self._disabled_on_failure():
+                if self._renew_if_requested():
+                    self._channel.unlock()
+        finally:
+            self._lock.release()
+        left_s = self._ends_s[1] + _PAUSE_S - time.monotonic()
+        if self._while_running == "ignored" and 0.0 < left_s <= self._grant_s:
+            return left_s
+        return (self._grant_s or GRANT_MIN_S) / _RENEWALS_PER_GRANT
 
     def disable(self) -> None:
         """Switch the output off and disarm; idempotent; ends within about 1 s in any case.
@@ -320,7 +328,13 @@ class AwgLaser:
         self._link_serial = link.serial
         self._counters["openings"] += 1
         self._open_channel = AwgChannel(
-            link, self._settings, self._profile, self._refuse_void, self._warn, self._counters
+            link,
+            self._settings,
+            self._profile,
+            self._refuse_void,
+            self._renew_if_requested,
+            self._warn,
+            self._counters,
         )
 
     def _drop(self) -> None:
@@ -378,13 +392,27 @@ class AwgLaser:
     def _while_running(self) -> str:
         return self._profile.burst.while_running if self._profile.burst is not None else ""
 
+    def _renew_if_requested(self) -> bool:
+        """Extend light for a renewal that waits; return whether it did."""
+        now_s = time.monotonic()
+        lit = self._output is LaserOutput.ON and self._grant_s > 0.0 and self._ticket is not None
+        early = self._while_running == "ignored" and now_s < self._ends_s[1]
+        if not lit or early or now_s > self._renew_until_s:
+            return False
+        self._renew_until_s = 0.0
+        self._grant()
+        return True
+
     def _grant(self) -> None:
         begun_s = time.monotonic()
         self._channel.trigger()
         done_s = time.monotonic()
         self._counters["light_grants"] += 1
         paused = done_s >= self._ends_s[0]
-        self._counters["light_pauses"] += paused
+        if paused:
+            self._counters["light_pauses"] += 1
+            if self._while_running != "ignored":
+                self._warn(f"{NAME}: light paused, a renewal was late; light_pauses counts them")
         if paused or self._while_running == "restarts":
             self._since_ns = self._clock_ns()
         # An extended burst ends up to one cycle before a grant from the trigger on.
@@ -398,14 +426,18 @@ class AwgLaser:
     @contextmanager
     def _command(self) -> Iterator[None]:
         """Wait for a turn; the block gives up before its next transfer once it is void."""
-        with self._lock:
-            if self._closed:
-                raise DeviceError(f"{NAME}: closed; open it again")
-            self._ticket = self._in_flight.ticket()
-            try:
-                yield
-            finally:
-                self._ticket = None
+        with self._lock, self._turn():
+            yield
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        if self._closed:
+            raise DeviceError(f"{NAME}: closed; open it again")
+        self._ticket = self._in_flight.ticket()
+        try:
+            yield
+        finally:
+            self._ticket = None
 
     @contextmanager
     def _disabled_on_failure(self) -> Iterator[None]:

@@ -84,6 +84,8 @@ class AwgChannel:
     profile : AwgProfile
     refuse_void : callable
         Called before every transfer but those of ``disable``; raises to give up.
+    before_query : callable
+        Called before every query of a setting.
     warn : callable
         Called with one line for an oddity that is no failure.
     counters : dict
@@ -96,6 +98,7 @@ class AwgChannel:
         settings: AwgSettings,
         profile: AwgProfile,
         refuse_void: Callable[[], None],
+        before_query: Callable[[], object],
         warn: Callable[[str], None],
         counters: dict[str, int],
     ) -> None:
@@ -103,6 +106,7 @@ class AwgChannel:
         self._scpi = Scpi(link, profile, refuse_void, counters)
         self._settings = settings
         self._profile = profile
+        self._before_query = before_query
         self._requested: Requested = {}
         self._lowered = False
         self._no_replies = False
@@ -252,6 +256,7 @@ class AwgChannel:
         self._lowered = False
 
     def _get(self, name: str, channel: int) -> Value | None:
+        self._before_query()
         return self._read_back(lambda: self._scpi.get(name, channel))
 
     def _read_back(self, query: Callable[[], Result]) -> Result | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -86,10 +87,28 @@ def test_renewed_light_goes_on_with_its_phase_and_a_late_renewal_is_a_pause(
     state = laser.readback()
     assert (state.output_since_ns, state.counters["light_pauses"]) == (bench.clock.now_ns, 1)
     assert changes[-1] == bench.clock.now_ns
+    assert any("light paused" in warning for warning in state.warnings)
     laser.disable()
     assert not bench.model.output
     laser.renew()
     assert not bench.model.output
+
+
+def test_renewal_overtakes_a_read_back(bench: AwgBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    laser = bench.lit_laser()
+    queried = bench.model._queried
+
+    def slowly(path: str) -> str | None:
+        # Longer than a grant in all; the guard's thread asks for renewals all the time.
+        passes(bench, GRANT_NS // 4)
+        assert renewing.submit(laser.renew).result() < 0.1
+        return queried(path)
+
+    monkeypatch.setattr(bench.model, "_queried", slowly)
+    with ThreadPoolExecutor(1) as renewing:
+        state = laser.readback()
+    assert bench.model.lit
+    assert (state.output, state.counters["light_pauses"]) == (LaserOutput.ON, 0)
 
 
 @pytest.mark.parametrize("what", ["restarts", "ignored"])
