@@ -17,6 +17,7 @@ from unittest import mock
 import rclpy
 from rclpy.action import get_action_server_names_and_types_by_node
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -32,8 +33,7 @@ PAGE = Path(__file__).with_suffix(".md")
 NAMESPACE = "/eschorty"
 
 PARAMETERS = {
-    **{name: (AUTO_START, *table) if name in REAL else table for name, table in TABLES.items()},
-    "replay": replay.TABLE,
+    name: (AUTO_START, *table) if name in REAL else table for name, table in TABLES.items()
 }
 TOPICS = {
     "camera/events": "raw EVT3; stamp: arrival of the first byte; `seq` without gaps",
@@ -91,18 +91,22 @@ class Topic:
 def every_node() -> Iterator[list[Node]]:
     """All nodes at rest, without devices."""
     options = ("-r", f"__ns:={NAMESPACE}", "--log-level", "error")
-    given = ("-p", "auto_start:=false", "-p", "recording:=none")
-    rclpy.init(args=["--ros-args", *options, *given], domain_id=free_domain())
+    rclpy.init(args=["--ros-args", *options], domain_id=free_domain())
+    resting = [Parameter("auto_start", value=False)]
+    playing = [Parameter("recording", value="none")]
     nodes: list[Node] = []
     try:
-        nodes += [make() for make in NODES.values()]
+        nodes += [
+            make(parameter_overrides=resting if name in REAL else [])
+            for name, make in NODES.items()
+        ]
         # The replay's ends do not depend on what it plays.
         with (
             mock.patch.object(replay, "load_recording"),
             mock.patch.object(replay, "RawReader"),
             mock.patch.object(replay.ReplayNode, "_run"),
         ):
-            nodes.append(replay.ReplayNode())
+            nodes.append(replay.ReplayNode(parameter_overrides=playing))
         yield nodes
     finally:
         for node in nodes:

@@ -1,6 +1,5 @@
 """README: its Python examples run, its tables name what exists."""
 
-import ast
 import re
 import subprocess
 import sys
@@ -31,25 +30,6 @@ def test_the_python_examples_run(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "points" in done.stdout
     assert (tmp_path / "rec" / "cloud.ply").stat().st_size > 10_000
-
-
-def test_every_launch_argument_is_in_the_table_with_its_default():
-    tree = ast.parse((ROOT / "launch" / "scan.launch.py").read_text())
-    table = next(
-        node.value
-        for node in tree.body
-        if isinstance(node, ast.Assign) and node.targets[0].id == "ARGUMENTS"
-    )
-    launching = ast.parse((ROOT / "eschorty_ros" / "nodes" / "ros" / "launching.py").read_text())
-    shared = {
-        node.target.id: node.value for node in launching.body if isinstance(node, ast.AnnAssign)
-    }
-    for entry in table.elts:
-        row = shared[entry.id] if isinstance(entry, ast.Name) else entry
-        name, default = row.elts[0].value, row.elts[1]
-        line = next(line for line in README.splitlines() if re.match(rf"\| .*`{name}`", line))
-        if isinstance(default, ast.Constant):
-            assert f"`{default.value}`" in line
 
 
 def anchors(page):

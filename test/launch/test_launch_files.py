@@ -1,20 +1,20 @@
-"""Launch files and RViz view: they parse, and name only what exists."""
+"""Launch files under launch, and the RViz view: it names only what exists."""
 
-import ast
-import importlib.util
+import os
 import re
+import signal
+import subprocess
+import sys
 import xml.etree.ElementTree
 from pathlib import Path
 
 import pytest
 import yaml
+from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = ROOT / "launch"
-SHARED = ast.parse((ROOT / "eschorty_ros" / "nodes" / "ros" / "launching.py").read_text()).body
-ROWS = {node.target.id: node.value for node in SHARED if isinstance(node, ast.AnnAssign)}
-FUNCTIONS = {node.name: node for node in SHARED if isinstance(node, ast.FunctionDef)}
-NODES = {"camera", "laser", "stage", "reconstruction", "scanner", "replay"}
+FILES = sorted(path.name for path in LAUNCH.glob("*.py"))
 FRAMES = {"eschorty_base", "eschorty_stage", "eschorty_link", "eschorty_optical"}
 # Topic -> durability its publisher offers.
 CLOUDS = {
@@ -22,86 +22,96 @@ CLOUDS = {
     "/eschorty/points": "Volatile",
     "/eschorty/profile": "Volatile",
 }
-STARTED = {
-    "scan.launch.py": NODES - {"replay"},
-    "calibrate.launch.py": NODES - {"replay", "scanner"},
-    "replay.launch.py": {"reconstruction", "replay"},
-}
-EXPECTED = {
-    "scan.launch.py": "fake parameters trigger scene pixels calibration frequency speed start stop"
-    " rviz auto_scan",
-    "calibrate.launch.py": "fake parameters trigger scene pixels calibration as_built frequency"
-    " distances method capture_time calibration_folder auto_calibrate",
-    "replay.launch.py": "recording rate parameters rviz",
-}
+# As `ros2 launch FILE ARGUMENTS` does it.
+COMMAND = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+file, *given = sys.argv[1:]
+service = LaunchService(argv=given)
+source = PythonLaunchDescriptionSource(file)
+pairs = [tuple(text.split(":=", 1)) for text in given]
+included = IncludeLaunchDescription(source, launch_arguments=pairs)
+service.include_launch_description(LaunchDescription([included]))
+sys.exit(service.run())
+"""
 
 
-def declared(tree):
-    """Names and descriptions in the file's ARGUMENTS table."""
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and node.targets[0].id == "ARGUMENTS":
-            rows = [ROWS[row.id] if isinstance(row, ast.Name) else row for row in node.value.elts]
-            return {row.elts[0].value: ast.unparse(row.elts[2]) for row in rows}
-    raise AssertionError("no ARGUMENTS table")
-
-
-def configurations(tree):
-    """Every argument name the file reads, also by what it calls in `launching`."""
-    used = set()
-    for node in ast.walk(tree):
-        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
-            continue
-        name = node.func.id
-        if name in ("LaunchConfiguration", "number", "text", "boolean"):
-            used |= {value.value for value in node.args if isinstance(value, ast.Constant)}
-        elif name in FUNCTIONS:
-            used |= configurations(FUNCTIONS[name])
-        if name == "bench":
-            used |= {keyword.value.value for keyword in node.keywords}
-    return used
-
-
-@pytest.mark.parametrize("name", EXPECTED)
-def test_every_argument_is_declared_described_and_used(name):
-    tree = ast.parse((LAUNCH / name).read_text())
-    compile(tree, name, "exec")
-    arguments = declared(tree)
-    assert set(arguments) == configurations(tree) == set(EXPECTED[name].split())
-    assert all(len(description) > 15 for description in arguments.values())
-
-
-@pytest.mark.parametrize("name", EXPECTED)
-def test_launch_files_use_only_what_launch_ros_0_28_has(name):
-    text = (LAUNCH / name).read_text()
-    assert "autostart" not in text
-    assert "LifecycleNode" not in text
-
-
-def test_every_node_a_launch_file_starts_is_a_module():
-    for name in NODES:
-        assert (ROOT / "eschorty_ros" / "nodes" / name / "node.py").is_file()
-
-
-@pytest.mark.parametrize("name", EXPECTED)
-def test_launch_loads_the_description(name):
-    pytest.importorskip("launch", reason="launch is not installed")
+@pytest.fixture
+def launched(tmp_path):
+    """Run a launch file; gives its process and a function that returns its output."""
+    pytest.importorskip("launch", reason="launch is not installed").LaunchService  # noqa: B018
     pytest.importorskip("launch_ros", reason="launch_ros is not installed")
-    from launch.actions import DeclareLaunchArgument
-    from launch_ros.actions import Node
+    from eschorty_ros.nodes.ros.domain import free_domain
 
-    from launch import LaunchContext
+    started = []
 
-    spec = importlib.util.spec_from_file_location("described", LAUNCH / name)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    entities = module.generate_launch_description().entities
-    context = LaunchContext()
-    context.launch_configurations["recording"] = "/tmp"
-    for argument in filter(lambda entity: isinstance(entity, DeclareLaunchArgument), entities):
-        argument.execute(context)
-    nodes = [entity for entity in entities if isinstance(entity, Node)]
-    started = [n for n in nodes if n.condition is None or n.condition.evaluate(context)]
-    assert {node.node_executable for node in started} == STARTED[name]
+    def start(file, *given, domain=None):
+        log = tmp_path / f"{len(started)}.log"
+        with log.open("wb") as stream:
+            process = subprocess.Popen(
+                [sys.executable, "-c", COMMAND, str(LAUNCH / file), *given],
+                stdout=stream, stderr=stream, start_new_session=True,
+                env={**os.environ, "ROS_DOMAIN_ID": domain or str(free_domain()),
+                     "ROS_LOG_DIR": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path)},
+            )  # fmt: skip
+        started.append(process)
+        return process, lambda: log.read_text(errors="replace")
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            process.wait(30.0)
+
+
+def pids(output):
+    return [int(pid) for pid in re.findall(r"process started with pid \[(\d+)\]", output)]
+
+
+def running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_bad_argument_ends_the_launch_before_any_node(launched, file):
+    for given in ("parameters:=/nope.yaml", "parametres:=a"):
+        process, output = launched(file, given, "recording:=/nope")
+        assert process.wait(60.0) == 1, output()
+        assert given.partition(":=")[0] in output().splitlines()[-1]
+        assert not pids(output())
+        assert "Traceback" not in output()
+
+
+def test_a_process_that_refuses_to_run_ends_the_launch(launched, tmp_path):
+    process, output = launched("calibrate.launch.py")
+    (folder,) = wait_until(lambda: list(tmp_path.glob("eschorty-bench-*")), "the bench")
+    other, second = launched("calibrate.launch.py", domain=folder.name.rpartition("-")[2])
+    assert other.wait(120.0) == 1, second()
+    assert "another bench uses it" in second()
+    assert "bench-1 ended with exit code 1" in second()
+    assert not any(map(running, pids(second())))
+    assert process.poll() is None, output()
+
+
+def test_nodes_end_when_their_launcher_is_killed(launched):
+    process, output = launched("scan.launch.py", "auto_scan:=false")
+    wait_until(lambda: len(pids(output())) == 6, "six processes")
+    process.kill()
+    wait_until(lambda: not any(map(running, pids(output()))), "the end of all of them")
+
+
+def test_the_launch_ends_with_an_error_after_a_node_was_killed(launched):
+    process, output = launched("scan.launch.py", "auto_scan:=false")
+    wait_until(lambda: len(pids(output())) == 6, "six processes")
+    os.kill(pids(output())[0], signal.SIGKILL)
+    wait_until(lambda: "was killed by signal 9" in output(), "its line")
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30.0) == 1, output()
 
 
 def test_rviz_shows_our_topics_with_our_quality_of_service():

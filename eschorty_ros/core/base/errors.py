@@ -38,6 +38,10 @@ class DeviceGoneError(DeviceError):
     """The device is no longer there: unplugged, switched off, its port closed."""
 
 
+class DeviceNotReadyError(DeviceError):
+    """The device is being started; wait for it."""
+
+
 class DeviceTimeoutError(DeviceError):
     """The device did not answer in time."""
 

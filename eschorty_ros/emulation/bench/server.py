@@ -25,6 +25,7 @@ from eschorty_ros.emulation.bench.folder import (
 )
 from eschorty_ros.emulation.bench.physics import TRIGGERS, Imperfections
 from eschorty_ros.emulation.bus import PtyPort, UsbServer
+from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.simulation.pixels import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
 
@@ -210,6 +211,7 @@ def command(
 
 def main() -> int:
     """Entry point; a stated failure is one line and exit code 1."""
+    end_with_launcher()
     try:
         command(prog_name="eschorty-bench", standalone_mode=True)
     except EschortyError as error:

@@ -36,7 +36,7 @@ class AutoCalibration:
     """
 
     def __init__(self, node: Node, distances: str, method: str, capture_s: float) -> None:
-        targets = [target_message(target) for target in read_distances(_find(distances))]
+        targets = [target_message(target) for target in read_distances(find_distances(distances))]
         self._goal = Calibrate.Goal(targets=targets, method=method, capture_time=capture_s)
         group = ReentrantCallbackGroup()
         self._client: ActionClient[Any, Any, Any] = ActionClient(
@@ -52,6 +52,7 @@ class AutoCalibration:
             self._client.send_goal_async(self._goal)
 
 
-def _find(name_or_path: str) -> Path:
+def find_distances(name_or_path: str) -> Path:
+    """Return the path of a file of known targets: a name in ``config/`` or a path."""
     bare = os.sep not in name_or_path and "." not in name_or_path
     return config_file(f"{name_or_path}.csv") if bare else Path(name_or_path)

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from eschorty_ros.core.base.errors import ArgumentError, DeviceGoneError
+from eschorty_ros.core.base.errors import ArgumentError, DeviceGoneError, DeviceNotReadyError
 from eschorty_ros.emulation.bench.folder import READY_FILE, bench_folder
+from eschorty_ros.hardware.base.launcher import launched
 from eschorty_ros.nodes.ros.parameters import Param
 
 ClockNs = Callable[[], int]
@@ -48,6 +49,8 @@ def make(
         For an unknown name.
     DeviceGoneError
         When no bench runs in the folder.
+    DeviceNotReadyError
+        When none runs yet: the launcher of this process starts one.
     EschortyError
         When the driver refuses its parameters.
     """
@@ -55,6 +58,8 @@ def make(
     if name == "fake":
         folder = bench_folder(parameters["bench"])
         if not (folder / READY_FILE).exists():
+            if launched():
+                raise DeviceNotReadyError(f"the emulated bench in {folder} is not ready yet")
             raise DeviceGoneError(f"no emulated bench in {folder}; start eschorty-bench")
         parameters = {**parameters, **at_bench(folder)}
     elif name != REAL[node]:

@@ -1,154 +1,125 @@
-"""The common part of the launch files. Needs the packages launch and launch_ros."""
+"""A launch description of checked nodes. Needs the packages launch and launch_ros."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, SetEnvironmentVariable
-from launch.conditions import IfCondition
-from launch.substitutions import (
-    EnvironmentVariable,
-    EqualsSubstitution,
-    IfElseSubstitution,
-    LaunchConfiguration,
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    ExecuteProcess,
+    OpaqueFunction,
+    RegisterEventHandler,
+    SetEnvironmentVariable,
 )
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.events.process import ProcessExited
+from launch.substitutions import EnvironmentVariable
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
-from eschorty_ros.core.base.files import config_folders
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.hardware.base.launcher import launched_environment
+from launch import LaunchContext, LaunchDescription
 
+PACKAGE = "eschorty_ros"
 NAMESPACE = "eschorty"
-EVENTS = f"/{NAMESPACE}/camera/events"
-
-Argument = tuple[str, str | None, str, list[str] | None]
-"""Name, default (``None``: must be given), description, choices."""
+_DISCOVERY = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 
-def _config_file(name: str) -> Path:
-    paths = [folder / name for folder in config_folders()]
-    return next((path for path in paths if path.is_file()), Path(name))
+def description(arguments: Sequence[Any], check: Callable[[Mapping[str, str]], Any]) -> Any:
+    """Return a launch description that starts nothing before ``check`` accepts its arguments.
 
+    It ends, with an exit code that is not 0, when a process of it refuses to run. After a process
+    was killed the others go on, and the exit code is not 0 in the end.
 
-FAKE: Argument = (
-    "fake",
-    "true",
-    "true: real drivers at an emulated bench; false: at real devices",
-    ["true", "false"],
-)
-TRIGGER: Argument = (
-    "trigger",
-    "stage",
-    "what is wired to the camera's trigger input: none, laser or stage",
-    ["none", "laser", "stage"],
-)
-PIXELS: Argument = (
-    "pixels",
-    "paper",
-    "event pixels of an emulated camera",
-    ["paper", "ideal", "noisy", "narrow"],
-)
-PARAMETERS: Argument = (
-    "parameters",
-    str(_config_file("parameters.yaml")),
-    "YAML file of parameters by node; what it holds overrides the other arguments",
-    None,
-)
-
-
-def declare(arguments: tuple[Argument, ...]) -> list[Any]:
-    """Return launch arguments from a table, and the discovery on this host alone by default.
-
-    ``ROS_AUTOMATIC_DISCOVERY_RANGE`` in the environment changes that.
+    Parameters
+    ----------
+    arguments : sequence of Argument
+    check : callable
+        Returns a ``Description`` for the texts of the arguments, or raises.
     """
-    discovery = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-    range_ = EnvironmentVariable(discovery, default_value="LOCALHOST")
-    return [SetEnvironmentVariable(discovery, range_)] + [
-        DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
-        for name, default, text, choices in arguments
+
+    def described(context: LaunchContext) -> list[Any]:
+        names = [argument.name for argument in arguments]
+        _check_names(context.argv, names)
+        plan = check({name: context.launch_configurations[name] for name in names})
+        return _entities(plan)
+
+    declared = [
+        DeclareLaunchArgument(
+            argument.name,
+            default_value=argument.default,
+            description=argument.description,
+            choices=list(argument.choices) or None,
+        )
+        for argument in arguments
     ]
+    # On this host alone unless the environment states another range.
+    range_ = EnvironmentVariable(_DISCOVERY, default_value="LOCALHOST")
+    discovery = SetEnvironmentVariable(_DISCOVERY, range_)
+    return LaunchDescription([discovery, *declared, OpaqueFunction(function=described)])
 
 
-def number(name: str) -> Any:
-    """Return an argument's value as a float, also without a decimal point."""
-    return ParameterValue(LaunchConfiguration(name), value_type=float)
+def _check_names(given: Sequence[str], names: list[str]) -> None:
+    """Refuse misspelt arguments, which launch ignores; others may be another launch file's."""
+    for name in (text.partition(":=")[0] for text in given if ":=" in text):
+        near = get_close_matches(name, names, n=1, cutoff=0.75)
+        if name not in names and near:
+            raise ArgumentError(f"argument {name} is unknown; did you mean {near[0]}?")
 
 
-def text(name: str) -> Any:
-    """Return an argument's value as a string, also if it could be a number."""
-    return ParameterValue(LaunchConfiguration(name), value_type=str)
+def _entities(plan: Any) -> list[Any]:
+    environment = launched_environment()
+    processes = [
+        Node(
+            package=PACKAGE,
+            executable=name,
+            name=name,
+            namespace=NAMESPACE,
+            # Without effect unless ROS_SECURITY_ENABLE is set; see docs/sros2.md.
+            ros_arguments=["--enclave", f"/{NAMESPACE}/{name}"],
+            # Texts stay texts, also where they could be numbers.
+            parameters=[
+                {
+                    key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
+                    for key, value in parameters.items()
+                },
+                plan.file,
+            ],
+            output="screen",
+            emulate_tty=True,
+            additional_env=environment,
+        )
+        for name, parameters in plan.nodes.items()
+    ]
+    if plan.bench is not None:
+        options = [word for name, value in plan.bench.items() for word in (f"--{name}", value)]
+        bench = ExecutableInPackage(package=PACKAGE, executable="bench")
+        processes.insert(
+            0,
+            ExecuteProcess(
+                cmd=[bench, *options], name="bench", output="screen", additional_env=environment
+            ),
+        )
 
+    def ended(event: ProcessExited, context: LaunchContext) -> None:
+        if event.action not in processes or event.returncode == 0 or context.is_shutdown:
+            return
+        if event.returncode > 0:
+            raise RuntimeError(f"{event.process_name} ended with exit code {event.returncode}")
+        context.asyncio_loop.call_exception_handler(
+            {"message": f"{event.process_name} was killed by signal {-event.returncode}"}
+        )
 
-def boolean(name: str) -> Any:
-    """Return the value of an argument that is true or false."""
-    return ParameterValue(LaunchConfiguration(name), value_type=bool)
-
-
-def instrument(**reconstruction: Any) -> dict[str, dict[str, Any]]:
-    """Return parameters of devices and reconstruction by node, from arguments of their names.
-
-    At an emulated bench the events are reliable at both ends, because its camera can wait.
-    """
-    fake = LaunchConfiguration("fake")
-    reliability = IfElseSubstitution(fake, "reliable", "best_effort")
-    unwired = EqualsSubstitution(LaunchConfiguration("trigger"), "none")
-    return {
-        "camera": {
-            "driver": IfElseSubstitution(fake, "fake", "evk4"),
-            "trigger_in_mode": IfElseSubstitution(unwired, "disabled", "external"),
-            f"qos_overrides.{EVENTS}.publisher.reliability": reliability,
-        },
-        "laser": {
-            "driver": IfElseSubstitution(fake, "fake", "awg"),
-            "frequency": number("frequency"),
-        },
-        "stage": {"driver": IfElseSubstitution(fake, "fake", "apt")},
-        "reconstruction": {
-            "calibration": text("calibration"),
-            "trigger_source": text("trigger"),
-            **reconstruction,
-            f"qos_overrides.{EVENTS}.subscription.reliability": reliability,
-        },
-    }
-
-
-def bench(**options: str) -> Any:
-    """Return the process of the emulated devices, started when the argument ``fake`` is true.
-
-    ``options`` maps options of ``eschorty-bench`` to the launch arguments that give them.
-    """
-    command: list[Any] = [ExecutableInPackage(package="eschorty_ros", executable="bench")]
-    for option, argument in options.items():
-        command += [f"--{option}", LaunchConfiguration(argument)]
-    return ExecuteProcess(
-        cmd=command,
-        name="bench",
-        output="screen",
-        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("fake"), "true")),
-    )
-
-
-def node(executable: str, parameters: dict[str, Any]) -> Any:
-    """Return a node named as its executable; the parameter file overrides ``parameters``."""
-    return Node(
-        package="eschorty_ros",
-        executable=executable,
-        name=executable,
-        namespace=NAMESPACE,
-        # Without effect unless ROS_SECURITY_ENABLE is set; see docs/sros2.md.
-        ros_arguments=["--enclave", f"/{NAMESPACE}/{executable}"],
-        parameters=[parameters, ParameterFile(LaunchConfiguration("parameters"))],
-        output="screen",
-        emulate_tty=True,
-    )
-
-
-def rviz() -> Any:
-    """Return RViz with the package's view, started when the argument ``rviz`` is true."""
-    return Node(
-        package="rviz2",
-        executable="rviz2",
-        arguments=["-d", str(_config_file("scan.rviz"))],
-        condition=IfCondition(EqualsSubstitution(LaunchConfiguration("rviz"), "true")),
-    )
+    entities = [RegisterEventHandler(OnProcessExit(on_exit=ended)), *processes]
+    if plan.view:
+        view = Node(package="rviz2", executable="rviz2", arguments=["-d", plan.view])
+        ending = EmitEvent(event=Shutdown(reason="RViz closed"))
+        closed = OnProcessExit(target_action=view, on_exit=[ending])
+        entities += [view, RegisterEventHandler(closed)]
+    return entities

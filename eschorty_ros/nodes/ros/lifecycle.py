@@ -11,7 +11,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.core.base.errors import DeviceError, DeviceNotReadyError, EschortyError
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 
 AUTO_START = Param("auto_start", True, "configure and activate at start")
@@ -194,7 +194,9 @@ class DeviceNode(LifecycleNode):
             self.open_device()
         except DeviceError as error:
             self.waiting = f"waiting: {error}; trying again every {RETRY_S:g} s"
-            if self.waiting != self._logged:
+            if self.waiting != self._logged and isinstance(error, DeviceNotReadyError):
+                self.get_logger().info(self.waiting)
+            elif self.waiting != self._logged:
                 self.get_logger().warning(self.waiting)
             self._logged = self.waiting
         else:

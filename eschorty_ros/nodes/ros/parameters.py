@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -21,6 +24,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.base.numbers import short
+
+_OF_ROS = ("qos_overrides", "start_type_description_service", "use_sim_time")
 
 Value = bool | int | float | str | tuple[int, ...]
 
@@ -75,12 +81,44 @@ class Param:
                 ]
         return descriptor
 
-    def check(self, value: Any) -> None:
-        """Raise ``ArgumentError`` unless ``value`` is one of the choices."""
-        if self.choices and value not in self.choices:
+    def check(self, value: Any, what: str = "parameter") -> None:
+        """Raise ``ArgumentError`` unless ``value`` has type and range, or is one of the choices."""
+        given = f"{what} {self.name} is {short(value)}"
+        if not self._has_type(value):
             raise ArgumentError(
-                f"parameter {self.name} is {value!r}; choose one of {', '.join(self.choices)}"
+                f"{given}; give a value of type {type(self.default).__name__}, "
+                f"such as {short(self.default)}"
             )
+        if self.choices and value not in self.choices:
+            raise ArgumentError(f"{given}; choose one of {', '.join(self.choices)}")
+        if (
+            self.minimum is not None
+            and self.maximum is not None
+            and not self.minimum <= value <= self.maximum
+        ):
+            raise ArgumentError(f"{given}; its range is {self.minimum:g} to {self.maximum:g}")
+
+    def _has_type(self, value: Any) -> bool:
+        if isinstance(self.default, tuple):
+            several = isinstance(value, list | tuple | array)
+            return several and all(type(each) is int for each in value)
+        if isinstance(self.default, float):
+            return type(value) in (int, float) and math.isfinite(value)
+        return type(value) is type(self.default)
+
+
+def check_name(name: object, what: str, names: Sequence[str]) -> None:
+    """Raise ``ArgumentError`` with the nearest name unless ``name`` is one of ``names``."""
+    if name in names:
+        return
+    near = get_close_matches(str(name), names, n=1, cutoff=0.5)
+    remedy = f"did you mean {near[0]}?" if near else "docs/interfaces.md has all of them"
+    raise ArgumentError(f"{short(name)} is no {what}; {remedy}")
+
+
+def of_ros(name: object) -> bool:
+    """Return whether every node of ROS has the parameter ``name``."""
+    return str(name).partition(".")[0] in _OF_ROS
 
 
 def from_settings(settings_class: type[Any], *, dynamic: bool = False) -> tuple[Param, ...]:
@@ -123,7 +161,8 @@ class Parameters(Mapping[str, Any]):
     Raises
     ------
     ArgumentError
-        When a value given at start has the wrong type, or is out of range or not a choice.
+        When a value given at start has the wrong type, is out of range or not a choice, or a name
+        is unknown.
     """
 
     def __init__(
@@ -135,6 +174,10 @@ class Parameters(Mapping[str, Any]):
         self._node = node
         self._table = {param.name: param for param in table}
         self._on_change = on_change
+        # The node's own: a name that no table has would be ignored, and with it what it protects.
+        for name in node._parameter_overrides:
+            if not of_ros(name):
+                check_name(name, f"parameter of {node.get_name()}", tuple(self._table))
         for param in self._table.values():
             _declare(node, param)
             param.check(self[param.name])

@@ -22,6 +22,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 
 from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 
@@ -123,6 +124,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     executor: Executor | None = None
     code = 0
     use_profile()
+    end_with_launcher()
     try:
         started = _interrupt_during_start()
         # rclpy's handler of SIGINT and SIGTERM ends the context and so the loop below.

@@ -6,7 +6,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -61,6 +61,17 @@ _FEEDBACK_S = 0.1
 _STARTING_S = 5.0
 
 
+def scan_limits(values: Mapping[str, Any]) -> ScanLimits:
+    """Return the limits in the node's parameters."""
+    return ScanLimits(
+        travel_mm=(mm_from_m(values["travel_min"]), mm_from_m(values["travel_max"])),
+        speed_max_mm_s=mm_from_m(values["speed_max"]),
+        acceleration_mm_s2=mm_from_m(values["acceleration"]),
+        approach_mm_s=mm_from_m(values["approach_speed"]),
+        drain_timeout_s=values["drain_timeout"],
+    )
+
+
 class ScannerNode(Node):
     """Runs one scan at a time.
 
@@ -71,16 +82,7 @@ class ScannerNode(Node):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("scanner", **kwargs)
         self.parameters = Parameters(self, TABLE)
-        self._limits = ScanLimits(
-            travel_mm=(
-                mm_from_m(self.parameters["travel_min"]),
-                mm_from_m(self.parameters["travel_max"]),
-            ),
-            speed_max_mm_s=mm_from_m(self.parameters["speed_max"]),
-            acceleration_mm_s2=mm_from_m(self.parameters["acceleration"]),
-            approach_mm_s=mm_from_m(self.parameters["approach_speed"]),
-            drain_timeout_s=self.parameters["drain_timeout"],
-        )
+        self._limits = scan_limits(self.parameters)
         self._client = ScanClient(
             self,
             self.parameters["node_timeout"],

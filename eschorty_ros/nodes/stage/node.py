@@ -54,6 +54,8 @@ class StageNode(DeviceNode):
     """
 
     def __init__(self, **kwargs: Any) -> None:
+        # First, because a node whose constructor fails is destroyed, too.
+        self._move: Any = None
         self._lock = threading.RLock()
         self._busy = threading.Lock()
         self._stage: LinearStage | None = None
@@ -125,7 +127,8 @@ class StageNode(DeviceNode):
         """Destroy the action server first, which the node does not list."""
         # rclpy 9.1 drops the future of an answered result request twice and raises.
         with contextlib.suppress(ValueError):
-            self._move.destroy()
+            if self._move is not None:
+                self._move.destroy()
         super().destroy_node()
 
     def _healthy(self) -> bool:
