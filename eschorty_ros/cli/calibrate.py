@@ -6,7 +6,6 @@ import datetime
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
@@ -332,13 +331,14 @@ def _calibrate_simulated(
     one_calibration = nodes_module("one_process.calibration", make="test")
     from matplotlib.image import imsave
 
+    from eschorty_ros.core.base.files import atomic_write, temporary_folder
     from eschorty_ros.core.calibration import calibrate
     from eschorty_ros.core.optics import load_calibration
 
     design, built = load_calibration(nominal), load_calibration(as_built)
-    with ended_by_signals(), TemporaryDirectory(prefix="eschorty_") as folder:
+    with ended_by_signals(), temporary_folder() as folder:
         job = one_calibration.CalibrationJob(
-            tuple(known), folder, calibration=nominal, as_built=as_built, method=method
+            tuple(known), str(folder), calibration=nominal, as_built=as_built, method=method
         )
         with progress_bar("calibrating") as feedback:
             outcome = one_calibration.calibrate_once(job, feedback)
@@ -351,7 +351,8 @@ def _calibrate_simulated(
         if line not in shown:
             click.echo(f"rejected: {line}")
     picture = out.with_suffix(".png")
-    imsave(picture, outcome.frame, cmap="gray", vmin=0, vmax=255)
+    with atomic_write(picture) as stream:
+        imsave(stream, outcome.frame, format="png", cmap="gray", vmin=0, vmax=255)
     _print_errors(picture, design, report.calibration, built)
 
 

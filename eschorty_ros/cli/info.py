@@ -70,9 +70,13 @@ def _cloud(path: Path) -> None:
             ("intensity", "events", 1.0),
             ("column", "px", 1.0),
         ):
-            values = points[name] * scale
-            rows[name] = f"{values.min():.3f} to {values.max():.3f} {unit}"
-        rows["median sigma"] = f"{float(np.median(points['sigma'])) * 1e3:.3f} mm"
+            values = points[name].astype(np.float64) * scale
+            known = values[np.isfinite(values)]
+            span = f"{known.min():.3f} to {known.max():.3f} {unit}" if known.size else "not finite"
+            odd = len(values) - known.size
+            rows[name] = f"{span} ({odd:,} points not finite)" if odd and known.size else span
+        sigma = points["sigma"][np.isfinite(points["sigma"])].astype(np.float64)
+        rows["median sigma"] = f"{np.median(sigma) * 1e3:.3f} mm" if sigma.size else "not finite"
     pairs(str(path), rows)
 
 

@@ -9,6 +9,7 @@ import click
 from eschorty_ros.cli.console import pairs, progress_bar
 from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.files import remove_abandoned
 
 
 @click.command("simulate")
@@ -49,6 +50,7 @@ def command(
       eschorty simulate --scene sphere --frequency 300 --speed 200 --seed 7 --out rec300
     """  # noqa: D301
     check_sweep(start, stop)
+    remove_abandoned(out)
     if out.is_dir() and any(out.iterdir()):
         raise ArgumentError(f"{out} is not empty; choose a new folder")
     from eschorty_ros.core.modulation import Modulation

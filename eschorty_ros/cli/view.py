@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+from eschorty_ros.core.base.errors import FormatError
+
+if TYPE_CHECKING:
+    from eschorty_ros.core.storage import Points
+
+_BOUNDS = {"x": 1e6, "y": 1e6, "z": 1e6, "t": 1e9}
+"""Metres and seconds that a picture can hold."""
 
 
 @click.command("view")
@@ -26,7 +35,7 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
     """  # noqa: D301
     from eschorty_ros.core.storage import read_cloud
 
-    points = read_cloud(cloud)
+    points = _drawable(read_cloud(cloud), cloud)
     if window:
         _open_window(points, cloud.name)
         return
@@ -37,12 +46,30 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
     click.echo(str(target))
 
 
-def _open_window(points: object, title: str) -> None:
+def _drawable(points: Points, cloud: Path) -> Points:
+    """Return the points that have a place and a time; the others are counted."""
+    import numpy as np
+
+    good = np.ones(len(points), bool)
+    for name, bound in _BOUNDS.items():
+        good &= np.abs(points[name]) <= bound
+    if not good.any():
+        raise FormatError(
+            f"{cloud}: none of its {len(points):,} points has a finite place and time; "
+            "give a cloud with points"
+        )
+    if not good.all():
+        left_out = f"{np.count_nonzero(~good):,} of {len(points):,} points"
+        click.echo(f"eschorty: warning: {left_out} are not finite or beyond bounds", err=True)
+    return points[good]
+
+
+def _open_window(points: Points, title: str) -> None:
     import numpy as np
 
     from eschorty_ros.simulation.scenes import load_open3d
 
     open3d = load_open3d("--window")
-    xyz = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)  # type: ignore[index]
+    xyz = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)
     shape = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(xyz))
     open3d.visualization.draw_geometries([shape], window_name=title)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.report.profiles import period_s, profile_index
 
@@ -28,6 +29,7 @@ TICKS_IN_3D = 5
 SHORT_SIDE = 0.4
 SIGMAS_SHOWN = 5.0
 DPI = 110
+PIXELS_MAX = 200_000_000
 
 
 def scan_figure(
@@ -56,7 +58,7 @@ def scan_figure(
     rows = 1 if error_mm is None else 2
     figure = new_figure(12.0, 4.9 * rows)
     if title:
-        figure.suptitle(title)
+        figure.suptitle(title, parse_math=False)
     limits = _central(range_mm)
     axes = figure.add_subplot(rows, 2, 1)
     _map(axes, grid, image_of(grid, points, range_mm), "range (mm)", "viridis", limits)
@@ -122,9 +124,13 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     ArgumentError
         When the path cannot be written or its extension is unknown.
     """
+    target = Path(path)
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(target) as stream:
+            figure.savefig(stream, format=target.suffix[1:].lower(), dpi=DPI)
+    except ArgumentError:
+        raise
     except (OSError, ValueError) as error:
         raise ArgumentError(f"cannot write the picture {path}: {error}") from error
 
@@ -163,13 +169,19 @@ def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
         profile_index(points, period) if period > 0.0 else np.zeros(len(points), dtype=np.int64)
     )
     lines = int(profile.max()) + 1
+    columns = int(points["column"].max()) + 1
+    if lines * columns > PIXELS_MAX:
+        raise ArgumentError(
+            f"the cloud spans {lines:,} periods of {columns:,} columns; give one of at most "
+            f"{PIXELS_MAX:,} pixels to draw"
+        )
     counts = np.bincount(profile, minlength=lines)
     with np.errstate(invalid="ignore", divide="ignore"):
         middle = np.bincount(profile, weights=stage_mm, minlength=lines) / counts
     index = np.arange(lines)
     known = counts > 0
     positions = np.interp(index, index[known], middle[known])
-    return Grid(int(points["column"].max()) + 1, positions, profile)
+    return Grid(columns, positions, profile)
 
 
 def image_of(

@@ -9,6 +9,8 @@ from eschorty_ros.core.base.errors import ArgumentError
 
 # Largest difference of the mean times of two returns of one period, as a share of the period.
 RETURNS_APART = 0.2
+_SHORTEST_S = 1e-7
+_PERIODS_MAX = 1e12
 
 
 def period_s(points: NDArray[np.void]) -> float:
@@ -26,7 +28,7 @@ def period_s(points: NDArray[np.void]) -> float:
     t_s = points["t"][order]
     same = np.diff(points["column"][order].astype(np.int64)) == 0
     gaps = np.diff(t_s)[same]
-    gaps = gaps[gaps > 0.0]
+    gaps = gaps[gaps > _SHORTEST_S]
     if gaps.size == 0:
         return float("nan")
     gaps = gaps[gaps > RETURNS_APART * np.quantile(gaps, 0.75)]
@@ -64,6 +66,11 @@ def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
     if len(points) == 0:
         return np.empty(0, np.int64)
     turns = (points["t"] - points["t"].min()) / period
+    if not turns.max() < _PERIODS_MAX:
+        raise ArgumentError(
+            f"the cloud spans {turns.max():.3g} periods of {period:.3g} s; give one with times "
+            f"within {_PERIODS_MAX:g} periods"
+        )
     index = np.rint(turns - _phase(turns)).astype(np.int64)
     return index - index.min()
 

@@ -179,7 +179,7 @@ def test_simulate_then_reconstruct_without_ros(recording):
 @pytest.mark.parametrize("step", ["world.World.advance", "world.recorder.write_truth_csv"])
 def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step):
     def interrupted(*_):
-        assert (tmp_path / "rec" / "events.raw").is_file()
+        assert list((tmp_path / "rec").rglob("events.raw"))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"eschorty_ros.simulation.{step}", interrupted)
@@ -223,6 +223,40 @@ def test_info_gives_the_bounds_of_a_cloud(cloud):
     output = good("info", cloud)
     assert "1320.000 to 1320.000 mm" in output
     assert "0.700 mm" in output
+
+
+ODD = [np.nan, np.inf, -np.inf, 3.4e38, 5e-324]
+
+
+@pytest.mark.parametrize("extension", [".pcd", ".ply"])
+@pytest.mark.parametrize("field", ["x", "y", "z", "t", "sigma", "intensity"])
+def test_view_and_info_take_a_cloud_of_odd_numbers(cloud, tmp_path, field, extension):
+    points = read_cloud(cloud)
+    rng = np.random.default_rng(9)
+    points[field][::2] = rng.choice(ODD, len(points[::2])).astype(points[field].dtype)
+    odd = tmp_path / f"odd$${extension}"
+    write_cloud(odd, points)
+    seen = run("view", odd)
+    assert (seen.exit_code, seen.stdout) == (0, f"{tmp_path / 'odd$$.png'}\n"), seen.output
+    assert "of 1,000 points" in seen.stderr or field in ("sigma", "intensity")
+    assert "points not finite" in good("info", odd) or field == "sigma"
+
+
+@pytest.mark.parametrize("value", ["none", *map(str, ODD), "apart"])
+def test_view_and_info_take_a_cloud_of_nothing_but_odd_numbers(tmp_path, value):
+    points = np.zeros(0 if value == "none" else 9, POINT_DTYPE)
+    if value == "apart":
+        # A picture of these times and columns has more pixels than memory holds.
+        points["t"], points["column"] = [0, 0.01, 0.02, 0.03, 1e8, 0.01, 0.02, 0.03, 0.04], 65535
+    elif value != "none":
+        for name in ("x", "y", "z", "intensity", "sigma", "t"):
+            points[name] = float(value)
+    write_cloud(tmp_path / "odd.pcd", points)
+    if value == str(ODD[-1]):
+        good("view", tmp_path / "odd.pcd")
+    else:
+        assert_fails_in_one_line(run("view", tmp_path / "odd.pcd"), "; give ")
+    good("info", tmp_path / "odd.pcd")
 
 
 def test_view_writes_a_picture(cloud, tmp_path):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import stat
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -12,6 +15,7 @@ from typing import BinaryIO
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.base.numbers import file_path
 
+_PARTIAL = ".eschorty-partial"
 NAME_MAX = 100
 BARE_NAME = f"1 to {NAME_MAX} printable characters without slashes, the first no dot"
 
@@ -22,31 +26,46 @@ def is_bare_name(value: object) -> bool:
     return text.isprintable() and not {"", "."} & {text[:1]} and not set("/\\") & set(text)
 
 
+def open_regular_file(
+    path: str | os.PathLike[str], error: type[EschortyError], follow_links: bool = True
+) -> BinaryIO:
+    """Open a regular file for reading; devices and pipes are refused without opening them.
+
+    Raises
+    ------
+    error
+        When there is no such file or it cannot be opened.
+    """
+    file = file_path("path", path)
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow_links else os.O_NOFOLLOW)
+    try:
+        _check_regular(file, os.stat(file, follow_symlinks=follow_links), error)
+        stream = open(os.open(file, flags), "rb")  # noqa: SIM115 - the caller's
+    except OSError as cause:
+        raise error(f"cannot read {file}: {cause.strerror or cause}; check the path") from cause
+    try:
+        # The name may stand for another file by now.
+        _check_regular(file, os.fstat(stream.fileno()), error)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
 def read_regular_file(
     path: str | os.PathLike[str],
     bytes_max: int,
     error: type[EschortyError],
     follow_links: bool = True,
 ) -> bytes:
-    """Return the content of a regular file; devices and pipes are refused without opening them.
-
-    Raises
-    ------
-    error
-        When there is no such file, it cannot be read or holds more than ``bytes_max``.
-    """
-    file = file_path("path", path)
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow_links else os.O_NOFOLLOW)
-    try:
-        _check_regular(file, os.stat(file, follow_symlinks=follow_links), error)
-        with open(os.open(file, flags), "rb") as stream:
-            # The name may stand for another file by now.
-            _check_regular(file, os.fstat(stream.fileno()), error)
+    """Return the content of a regular file of at most ``bytes_max``, else raise ``error``."""
+    with open_regular_file(path, error, follow_links) as stream:
+        try:
             data = stream.read(bytes_max + 1)
-    except OSError as cause:
-        raise error(f"cannot read {file}: {cause.strerror or cause}; check the path") from cause
+        except OSError as cause:
+            raise error(f"cannot read {path}: {cause.strerror or cause}; check it") from cause
     if len(data) > bytes_max:
-        raise error(f"cannot read {file}: it is larger than {bytes_max} bytes; check the path")
+        raise error(f"cannot read {path}: it is larger than {bytes_max} bytes; check the path")
     return data
 
 
@@ -66,17 +85,27 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         When the file cannot be written; names the path and the reason.
     """
     target = _target(path)
-    partial = _partial(target)
-    try:
-        with _named(target):
-            with partial.open("wb") as stream:
-                yield stream
-                stream.flush()
-                os.fsync(stream.fileno())
-            partial.replace(target)
-    finally:
-        with suppress(OSError):
-            partial.unlink()
+    with _named(target), _partial(target.parent) as folder:
+        file = folder / target.name
+        with file.open("xb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        file.replace(target)
+
+
+@contextmanager
+def atomic_files(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Make a folder whose files ``names`` move to ``folder`` when the block ends without error.
+
+    The first of ``names`` is removed there before the others come and is the last to come itself,
+    so that files of two runs never look complete together.
+    """
+    with _named(folder), _partial(folder) as made:
+        yield made
+        (folder / names[0]).unlink(missing_ok=True)
+        for name in reversed(names):
+            (made / name).replace(folder / name)
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -88,13 +117,53 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         When it cannot; names the path and the reason.
     """
     target = _target(path)
-    partial = _partial(target)
-    try:
-        with _named(target):
-            partial.touch()
-    finally:
+    with _named(target), _partial(target.parent) as folder:
+        (folder / target.name).touch()
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Make a folder for short-lived files; one of a run that was killed is removed by the next."""
+    with _partial(Path(tempfile.gettempdir()), f"eschorty_{os.getuid()}_", "") as folder:
+        yield folder
+
+
+def remove_abandoned(parent: Path, prefix: str = ".", suffix: str = _PARTIAL) -> None:
+    """Remove the temporary folders in ``parent`` whose process is gone."""
+    for other in parent.glob(f"{prefix}*{suffix}"):
         with suppress(OSError):
-            partial.unlink()
+            lock = _lock(other)
+            shutil.rmtree(other, ignore_errors=True)
+            os.close(lock)
+
+
+@contextmanager
+def _partial(parent: Path, prefix: str = ".", suffix: str = _PARTIAL) -> Iterator[Path]:
+    """Make a folder in ``parent``, locked while it is in use."""
+    remove_abandoned(parent, prefix, suffix)
+    while True:
+        folder = Path(tempfile.mkdtemp(suffix, prefix, parent))
+        # Another process may have taken it for an old one before it was locked.
+        with suppress(BlockingIOError, FileNotFoundError):
+            lock = _lock(folder)
+            break
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _lock(folder: Path) -> int:
+    """Return a handle that holds the folder's lock, at most until the process ends."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.stat(folder)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
@@ -105,10 +174,6 @@ def _target(path: str | os.PathLike[str]) -> Path:
         kind = "a folder" if target.is_dir() or not target.name else "no regular file"
         raise ArgumentError(f"cannot write {target}: it is {kind}; give the name of a file")
     return target
-
-
-def _partial(target: Path) -> Path:
-    return target.with_name(f".{target.name}.{os.getpid()}.partial")
 
 
 @contextmanager

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import FormatError
-from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.files import atomic_write, read_regular_file
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.calibration.post_matching import KnownTarget
 from eschorty_ros.core.calibration.targets import SIGMA_ROW_PX, SIGMA_WIDTH_PX, Targets
 
@@ -34,6 +35,7 @@ _COLUMNS = {
     "spacing_mm": "spacing_mm",
 }
 TARGET_COLUMNS = (*_COLUMNS, "label")
+_BYTES_MAX = 16 << 20
 DISTANCE_COLUMNS = ("range_mm", "range_sigma_mm", "size_mm", "column", "row", "label")
 
 
@@ -154,7 +156,9 @@ class _Line:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise FormatError(f"{self.path} line {self.at}: {name} is {text!r}; write a number")
+            raise FormatError(
+                f"{self.path} line {self.at}: {name} is {short(text)}; write a number"
+            )
         return value
 
 
@@ -190,9 +194,7 @@ def _read(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[_Line
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as cause:
-        raise FormatError(f"cannot read {path}: {cause.strerror}; check the path") from cause
+        return read_regular_file(path, _BYTES_MAX, FormatError).decode("utf-8-sig")
     except UnicodeDecodeError as cause:
         raise FormatError(f"{path}: it is not text; give a CSV file") from cause
 
@@ -204,9 +206,9 @@ def _check_header(
         if name not in known:
             near = get_close_matches(name, known, n=1)
             remedy = f"did you mean {near[0]}?" if near else f"choose of {', '.join(known)}"
-            raise FormatError(f"{path}: column {name!r} is not known; {remedy}")
+            raise FormatError(f"{path}: column {short(name)} is not known; {remedy}")
         if header.count(name) > 1:
-            raise FormatError(f"{path}: column {name!r} appears twice; remove one")
+            raise FormatError(f"{path}: column {short(name)} appears twice; remove one")
     missing = [name for name in needed if name not in header]
     if missing:
         raise FormatError(f"{path}: column {missing[0]!r} is missing; add it to the header")

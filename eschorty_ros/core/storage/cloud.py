@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import file_path, short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.files import atomic_write, open_regular_file
 
 POINT_DTYPE = np.dtype(
     [
@@ -93,26 +93,24 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
     """
     source = file_path("path", path)
     header = _header_writer(source)
-    try:
-        data = source.read_bytes()
-    except OSError as error:
-        raise FormatError(
-            f"cannot read {source}: {error.strerror or error}; check the path"
-        ) from error
-    count, start = _parse_header(source, data)
-    dtype = next((kind for kind in _DTYPES if header(kind, count) == data[:start]), None)
+    with open_regular_file(source, FormatError) as stream:
+        head = stream.read(_HEADER_LIMIT)
+        count, start = _parse_header(source, head)
+        dtype = next((kind for kind in _DTYPES if header(kind, count) == head[:start]), None)
+        expected = 0 if dtype is None else count * dtype.itemsize
+        found = os.fstat(stream.fileno()).st_size - start
+        if dtype is not None and found == expected:
+            stream.seek(start)
+            return np.frombuffer(bytearray(stream.read(expected)), dtype, count)
     if dtype is None:
         raise FormatError(
             f"{source}: its header is not that of an eschorty_ros cloud; expected the fields "
             f"{' '.join(POINT_DTYPE.names or ())} in binary form, convert the file first"
         )
-    expected = count * dtype.itemsize
-    if len(data) - start != expected:
-        raise FormatError(
-            f"{source}: {count} points need {expected} bytes and {len(data) - start} follow the "
-            "header; the file is damaged, write it again"
-        )
-    return np.frombuffer(data, dtype, count, start).copy()
+    raise FormatError(
+        f"{source}: {short(count)} points need {short(expected)} bytes and {found} follow the "
+        "header; the file is damaged, write it again"
+    )
 
 
 def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -7,6 +7,7 @@ header stops at the first two bytes that are not ``% ``.
 from __future__ import annotations
 
 import datetime
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import BinaryIO
 
 from eschorty_ros.core.base.arrays import byte_view, file_path, integer
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.files import open_regular_file
 from eschorty_ros.core.evt3 import words as w3
 
 CHUNK_BYTES = 128 * 1024
@@ -71,14 +73,9 @@ class RawReader:
     def __init__(self, path: str | Path) -> None:
         self.path = file_path("path", path)
         self.warnings: list[str] = []
-        try:
-            with self.path.open("rb") as file:
-                head = file.read(_HEADER_MAX_BYTES)
-            self.size_bytes = self.path.stat().st_size
-        except OSError as error:
-            raise FormatError(
-                f"{self.path}: {error.strerror or error}; name a readable RAW file"
-            ) from error
+        with open_regular_file(self.path, FormatError) as file:
+            head = file.read(_HEADER_MAX_BYTES)
+            self.size_bytes = os.fstat(file.fileno()).st_size
         if not head:
             raise FormatError(f"{self.path} is empty; record it again")
         self.header = self._parse(head)
@@ -101,7 +98,7 @@ class RawReader:
 
     def _chunks(self, size: int) -> Iterator[bytes]:
         total = 0
-        with self.path.open("rb") as file:
+        with open_regular_file(self.path, FormatError) as file:
             file.seek(self.header.size_bytes)
             while piece := file.read(size):
                 total += len(piece)
@@ -259,8 +256,11 @@ class RawWriter:
         self.bytes_written += len(view)
 
     def close(self) -> None:
-        """Finish the file; idempotent."""
-        self._file.close()
+        """Finish the file; idempotent. Raises ``FormatError`` when it cannot be written."""
+        try:
+            self._file.close()
+        except OSError as error:
+            raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
 
     def __enter__(self) -> RawWriter:
         return self

@@ -10,13 +10,15 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from eschorty_ros.core.base.errors import ArgumentError, DeviceError, FormatError
+from eschorty_ros.core.base.files import atomic_write, read_regular_file
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.hardware.camera.registers import Registers
 
 ENABLED = 0x11A1_0000
 _DAC = 0xFF
+_BYTES_MAX = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,9 +118,9 @@ def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:
         For a file that cannot be read or a line that is no bias.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read the bias file {str(path)!r} ({error}); check it") from error
+        lines = read_regular_file(path, _BYTES_MAX, FormatError).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: it is not text; give a bias file") from error
     offsets: dict[str, int] = {}
     for number, line in enumerate(lines, 1):
         value, _, name = (part.strip() for part in line.partition("%"))
@@ -128,22 +130,20 @@ def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:
             offset = int(value)
         except ValueError as error:
             raise FormatError(
-                f"{path} line {number}: {line!r} is no bias; write 'value % name'"
+                f"{path} line {number}: {short(line)} is no bias; write 'value % name'"
             ) from error
         name = name.split()[0] if name else ""
         if name in BIASES:
             offsets[name] = offset
         elif not name.startswith("bias_"):
-            raise FormatError(f"{path} line {number}: {line!r} names no bias; write 'value % name'")
+            raise FormatError(
+                f"{path} line {number}: {short(line)} names no bias; write 'value % name'"
+            )
     return offsets
 
 
 def save_bias_file(path: str | os.PathLike[str], offsets: Mapping[str, int]) -> None:
     """Write offsets as a ``.bias`` file; raises ``ArgumentError`` when it cannot be written."""
     text = "".join(f"{offset}  % {name}\n" for name, offset in offsets.items())
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ArgumentError(
-            f"cannot write the bias file {str(path)!r} ({error.strerror}); choose another path"
-        ) from error
+    with atomic_write(path) as stream:
+        stream.write(text.encode())

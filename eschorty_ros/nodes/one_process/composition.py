@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -19,6 +18,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.core.base.files import temporary_folder
 from eschorty_ros.emulation.bench.process import bench_process
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.laser.node import LaserNode
@@ -155,7 +155,7 @@ def composition(values: Tables, bench: Mapping[str, object] | None = None) -> It
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with contextlib.ExitStack() as ending:
-        folder = Path(ending.enter_context(tempfile.TemporaryDirectory(prefix="eschorty_")))
+        folder = ending.enter_context(temporary_folder())
         tables = {name: dict(table) for name, table in values.items()}
         if bench is not None:
             for name in DEVICES:

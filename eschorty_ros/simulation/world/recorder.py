@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.files import atomic_files
 from eschorty_ros.core.clocks import MotionPlan, plan_move
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, save_calibration
@@ -99,32 +100,31 @@ def simulate_recording(
     world.set_stage(MotionPlan(0, start_mm))
     world.set_stage(move, 0)
     folder = _folder(out_dir)
-    writer = RawWriter(folder / EVENTS_FILE, width=world.columns, height=world.rows)
-    with _complete_or_absent(folder):
-        with writer as raw:
+    with _complete_or_absent(folder) as made:
+        with RawWriter(made / EVENTS_FILE, width=world.columns, height=world.rows) as raw:
             while world.now_us < end_us:
                 raw.write(world.advance(min(world.now_us + _CHUNK_US, end_us)))
                 if progress is not None:
                     progress(world.now_us, end_us)
         # One sample past the end: the last events must be between two samples.
         t_us = np.arange(0, end_us + 2 * _STAGE_STEP_US, _STAGE_STEP_US, dtype=np.int64)
-        write_stage_csv(folder / STAGE_FILE, t_us, move.state(t_us * 1000)[0])
-        write_laser_yaml(folder / LASER_FILE, wave)
-        save_calibration(calibration, folder / CALIBRATION_FILE)
+        write_stage_csv(made / STAGE_FILE, t_us, move.state(t_us * 1000)[0])
+        write_laser_yaml(made / LASER_FILE, wave)
+        save_calibration(calibration, made / CALIBRATION_FILE)
         truth = world.truth
-        write_truth_csv(folder / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
+        write_truth_csv(made / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
     return load_recording(folder)
 
 
 @contextmanager
-def _complete_or_absent(folder: Path) -> Iterator[None]:
-    """Remove a recording, and its folder when nothing else is in it, if the block is left early."""
+def _complete_or_absent(folder: Path) -> Iterator[Path]:
+    """Make a folder for the files; remove ``folder`` if it stays empty."""
+    names = (CALIBRATION_FILE, EVENTS_FILE, STAGE_FILE, LASER_FILE, TRUTH_FILE)
     try:
-        yield
+        with atomic_files(folder, names) as made:
+            yield made
     except BaseException:
         with suppress(OSError):
-            for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE, TRUTH_FILE):
-                (folder / name).unlink(missing_ok=True)
             folder.rmdir()
         raise
 
