@@ -228,13 +228,12 @@ def test_info_gives_the_bounds_of_a_cloud(cloud):
 ODD = [np.nan, np.inf, -np.inf, 3.4e38, 5e-324]
 
 
-@pytest.mark.parametrize("extension", [".pcd", ".ply"])
-@pytest.mark.parametrize("field", ["x", "y", "z", "t", "sigma", "intensity"])
-def test_view_and_info_take_a_cloud_of_odd_numbers(cloud, tmp_path, field, extension):
+@pytest.mark.parametrize("field", ["x", "z", "t", "sigma", "intensity"])
+def test_view_and_info_take_a_cloud_of_odd_numbers(cloud, tmp_path, field):
     points = read_cloud(cloud)
     rng = np.random.default_rng(9)
     points[field][::2] = rng.choice(ODD, len(points[::2])).astype(points[field].dtype)
-    odd = tmp_path / f"odd$${extension}"
+    odd = tmp_path / "odd$$.ply"
     write_cloud(odd, points)
     seen = run("view", odd)
     assert (seen.exit_code, seen.stdout) == (0, f"{tmp_path / 'odd$$.png'}\n"), seen.output
