@@ -17,9 +17,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
-from ros_process import wait_until
 from safety_bench import SENDERS, SafetyBench, guard_of, running
 from std_msgs.msg import String
 
@@ -43,12 +40,13 @@ def together(number: int) -> Fault:
 
 def group(number: int) -> Fault:
     """Return a fault: a signal to every process of the instrument, as to a container's."""
-    return lambda bench: sent(
-        number,
-        *(sender.pid for sender in bench.senders.values()),
-        guard_of(bench.node.pid),
-        bench.node.pid,
-    )
+
+    def end(bench: SafetyBench) -> int:
+        pids = [sender.pid for sender in bench.senders.values()]
+        bench.senders.clear()
+        return sent(number, *pids, guard_of(bench.node.pid), bench.node.pid)
+
+    return end
 
 
 def stopped_guard_killed_node(bench: SafetyBench) -> int:
@@ -73,17 +71,7 @@ def exception(bench: SafetyBench) -> int:
 
 def transition(label: str) -> Fault:
     """Return a fault: a lifecycle transition of the lit laser node."""
-
-    def change(bench: SafetyBench) -> int:
-        client = bench.observer.node.create_client(ChangeState, "laser/change_state")
-        wait_until(client.service_is_ready, "the laser's change_state")
-        bench.observer.wait_for_answers("laser")
-        request = ChangeState.Request(transition=Transition(label=label))
-        since_ns = time.monotonic_ns()
-        client.call_async(request)
-        return since_ns
-
-    return change
+    return lambda bench: bench.change(label)
 
 
 def sent(number: int, *pids: int) -> int:
@@ -114,12 +102,6 @@ FATAL: dict[str, Fault] = {
 }
 
 
-def measured(fault: Fault, bench: SafetyBench) -> float:
-    """Return the time from a fault to the end of light, s."""
-    bench.light()
-    return bench.awg.off_after_s(fault(bench))
-
-
 @contextlib.contextmanager
 def load(busy: int):
     """Run busy processes inside the context."""
@@ -139,24 +121,38 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=20)
     parser.add_argument("--busy", type=int, default=os.cpu_count())
     options = parser.parse_args()
-    with load(options.busy), contextlib.redirect_stdout(None):
-        survived, fatal = (
-            {name: table[name] for name in table if not options.names or name in options.names}
-            for table in (SURVIVED, FATAL)
-        )
-        if survived:
-            with running(Path(tempfile.mkdtemp()), SENDERS) as bench:
-                for name, fault in survived.items():
-                    show(name, [measured(fault, bench) for _ in range(options.repetitions)])
-        for name, fault in fatal.items():
+    chosen = {
+        name: fault
+        for name, fault in (SURVIVED | FATAL).items()
+        if not options.names or name in options.names
+    }
+    with load(options.busy), contextlib.redirect_stdout(None), contextlib.ExitStack() as shared:
+        bench = None
+        for name, fault in chosen.items():
             taken_s = []
             for _ in range(options.repetitions):
-                with running(Path(tempfile.mkdtemp())) as bench:
+                if name in FATAL:
+                    with running(Path(tempfile.mkdtemp())) as doomed:
+                        taken_s.append(measured(fault, doomed))
+                else:
+                    bench = bench or shared.enter_context(
+                        running(Path(tempfile.mkdtemp()), SENDERS)
+                    )
                     taken_s.append(measured(fault, bench))
-                    with contextlib.suppress(AssertionError, OSError):
-                        os.kill(guard_of(bench.node.pid), signal.SIGKILL)
-                    bench.node.send(signal.SIGKILL)
             show(name, taken_s)
+
+
+def measured(fault: Fault, bench: SafetyBench) -> float:
+    """Return the time from a fault to the end of light, s."""
+    bench.light()
+    guard_pid = guard_of(bench.node.pid)
+    taken_s = bench.awg.off_after_s(fault(bench))
+    if fault in FATAL.values():
+        # Also one that is stopped.
+        for pid in (guard_pid, bench.node.pid):
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+    return taken_s
 
 
 def show(name: str, taken_s: list[float]) -> None:

@@ -11,6 +11,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import LaserState
 from laser_bench import OFF_LIMIT_S, LaserBench
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from ros_process import NodeProcess, wait_until
 from std_msgs.msg import String
 
@@ -70,6 +72,16 @@ class SafetyBench(LaserBench):
             return self.awg.lit()
 
         wait_until(lit, "light", poll_s=0.2)
+
+    def change(self, label: str) -> int:
+        """Request a lifecycle transition of the laser node; the time of the request."""
+        client = self.observer.node.create_client(ChangeState, "laser/change_state")
+        wait_until(client.service_is_ready, "the laser's change_state")
+        self.observer.wait_for_answers("laser")
+        request = ChangeState.Request(transition=Transition(label=label))
+        sent_ns = time.monotonic_ns()
+        client.call_async(request)
+        return sent_ns
 
     def check_off(self, cause: str, since_ns: int) -> None:
         took_s = self.awg.off_after_s(since_ns)

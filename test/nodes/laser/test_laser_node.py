@@ -121,6 +121,21 @@ def test_arming_expires(tmp_path: Path) -> None:
         assert "ON" not in bench.awg.outputs()
 
 
+@pytest.mark.parametrize(
+    ("peers", "allowed"), [("scanner observer", True), ("scanner, /other/observer", False)]
+)
+def test_only_heartbeats_of_allowed_peers_count(tmp_path: Path, peers: str, allowed: bool) -> None:
+    with running(tmp_path, allowed_peers=peers) as bench:
+        if allowed:
+            bench.switch_on()
+            return
+        bench.alive = True
+        ignored = "laser/heartbeat of /eschorty/observer ignored: not in allowed_peers"
+        wait_until(lambda: ignored in bench.node.output, "the refusal in the log")
+        assert bench.arm().success
+        assert "no laser/heartbeat" in bench.enable().message
+
+
 def test_lost_heartbeat_switches_off(bench: Bench) -> None:
     bench.switch_on()
     bench.alive = False

@@ -87,13 +87,22 @@ def test_sender_of_a_heartbeat_fails(lit: SafetyBench, name: str, number: int) -
     assert not lit.awg.lit()
 
 
-def test_guard_dies(lit: SafetyBench) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_guard_dies(lit: SafetyBench, number: int) -> None:
     guard = guard_of(lit.node.pid)
     sent_ns = time.monotonic_ns()
-    os.kill(guard, signal.SIGKILL)
-    lit.check_off("guard SIGKILL", sent_ns)
+    os.kill(guard, number)
+    lit.check_off(f"guard {signal.Signals(number).name}", sent_ns)
     lit.observer.wait_for_state("laser", "unconfigured")
-    lit.light()
+
+
+def test_deactivating_switches_off_first(lit: SafetyBench) -> None:
+    lit.check_off("deactivate", lit.change("deactivate"))
+    lit.observer.wait_for_state("laser", "inactive")
+
+
+def test_shutting_down_switches_off_first(doomed: SafetyBench) -> None:
+    doomed.check_off("shutdown", doomed.change("shutdown"))
 
 
 def test_interlock(lit: SafetyBench) -> None:
