@@ -53,8 +53,9 @@ class AwgSettings:
         "replies; off = never",
         choices=READBACK_POLICIES,
     )
+    # Less than 0.5 s by what a last renewal may take on its way.
     light_grant: float = _field(
-        0.5,
+        0.45,
         "light ends by itself after so long unless it is renewed, where the generator can count "
         "cycles; 0 = never",
         "s",

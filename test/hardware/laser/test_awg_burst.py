@@ -17,7 +17,7 @@ from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.hardware.laser import awg
 from eschorty_ros.hardware.laser.awg import UNBOUNDED, AwgLaser
 
-GRANT_NS = 500_000_000
+GRANT_NS = 450_000_000
 
 
 @pytest.fixture

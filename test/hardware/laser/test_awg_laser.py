@@ -75,7 +75,7 @@ def test_settings_are_made_in_the_safe_order(bench: AwgBench) -> None:
         "BASE:DUTY 25",
         "BURSt:TYPe NCYC",
         "TRIGger:SOURce MANUAL",
-        "BURSt:CYCLes 617",
+        "BURSt:CYCLes 555",
         "BURSt:PHASe 225",
         ":SYSTem:LOCK OFF",
     ]
