@@ -1,6 +1,6 @@
 """Time from a fault to the end of light on the emulated generator's own log, as a table.
 
-A busy process runs on each core (--busy). Every fault is repeated; worst and median are printed.
+A busy process runs on each core (--busy). Every fault is repeated; median and worst are printed.
 
 Usage: PYTHONPATH=test/support:$PYTHONPATH python benchmark/laser_off.py [FAULT...]
 """
@@ -139,7 +139,7 @@ def main() -> None:
                         running(Path(tempfile.mkdtemp()), SENDERS)
                     )
                     taken_s.append(measured(fault, bench))
-            show(name, taken_s)
+                show(name, taken_s)
 
 
 def measured(fault: Fault, bench: SafetyBench) -> float:
@@ -156,9 +156,10 @@ def measured(fault: Fault, bench: SafetyBench) -> float:
 
 
 def show(name: str, taken_s: list[float]) -> None:
-    """Print median and worst of one fault, ms."""
+    """Print median and worst of one fault so far, ms; the last line of a name counts."""
     median, worst = statistics.median(taken_s) * 1e3, max(taken_s) * 1e3
-    print(f"| {name} | {median:.0f} | {worst:.0f} |", file=sys.stderr, flush=True)
+    line = f"| {name} | {len(taken_s)} | {median:.0f} | {worst:.0f} |"
+    print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
