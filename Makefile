@@ -5,6 +5,7 @@
 # make faults the fault table of docs/faults.md again, from its tests
 # make reference docs/interfaces.md and config/sros2 again, from the nodes
 # make test   every test
+# make test-floor the pure tests with the oldest versions, those of Ubuntu 24.04, in a venv of their own
 # make quick  the tests of the pure parts: no processes, no ROS
 # make picture docs/architecture.png again
 # make check  lint, types, import contracts
@@ -43,7 +44,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report tradeoff faults reference picture test quick check lint format types contracts clean
+.PHONY: help setup scan report tradeoff faults reference picture test test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -79,6 +80,19 @@ endif
 
 quick: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) test/core test/live test/control
+
+FLOOR_PYTHON ?= $(firstword $(wildcard /usr/bin/python3.11 /usr/bin/python3.12) $(PYTHON))
+FLOOR := $(BUILD)/floor
+
+test-floor: $(FLOOR)/stamp
+	@NUMBA_CACHE_DIR=$(FLOOR)/numba PYTHONPATH="$(ROOT):$(ROOT)/experiments" \
+	  $(FLOOR)/bin/python -m pytest --numprocesses $(JOBS) $(addprefix test/,core live control simulation stability)
+
+$(FLOOR)/stamp: requirements/floor.txt
+	@echo "Installing the oldest versions into $(FLOOR)"
+	@$(FLOOR_PYTHON) -m venv --clear $(FLOOR)
+	@$(FLOOR)/bin/pip --disable-pip-version-check install --quiet -r $<
+	@touch $@
 
 picture: $(BUILD)/test.stamp
 	@$(VENV)/bin/python docs/architecture.py

@@ -10,6 +10,7 @@ import os
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,9 +18,9 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import as_array, file_path, integer_vector
+from eschorty_ros.core.base.arrays import as_array, file_path, integer_vector, short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.files import atomic_write, open_regular_file
 from eschorty_ros.core.base.schema import Schema, Within, validate
 from eschorty_ros.core.base.yaml_file import read_yaml
 from eschorty_ros.core.clocks import NM_PER_MM, POSITION_LIMIT_MM, StageTrack, quantise_nm
@@ -237,11 +238,11 @@ def _read_stage(path: Path) -> NDArray[np.void]:
 def _read_csv(path: Path, dtype: np.dtype[Any]) -> NDArray[np.void]:
     names = dtype.names or ()
     try:
-        with path.open(encoding="utf-8-sig", newline=None) as stream:
+        with TextIOWrapper(open_regular_file(path, FormatError), "utf-8-sig") as stream:
             header = stream.readline().strip()
             if header.replace(" ", "") != ",".join(names):
                 raise FormatError(
-                    f"{path} line 1: it reads {header[:60]!r}; write {','.join(names)}"
+                    f"{path} line 1: it reads {short(header)}; write {','.join(names)}"
                 )
             table = _parse_table(stream, dtype)
     except OSError as error:
@@ -292,10 +293,17 @@ def _first_fault(path: Path, dtype: np.dtype[Any]) -> str:
                 f"write {len(names)}: {','.join(names)}"
             )
         for name, cell in zip(names, cells, strict=True):
-            integer = dtype[name].kind in "iu"
-            try:
-                np.asarray(int(cell) if integer else float(cell), dtype[name])
-            except (ValueError, OverflowError):
-                kind = "a whole number in range" if integer else "a number"
-                return f"{path} line {number}: {name} is {cell.strip()!r}; write {kind}"
+            kind = "a number" if dtype[name].kind == "f" else "a whole number in range"
+            if not _fits(cell, dtype[name]):
+                return f"{path} line {number}: {name} is {short(cell.strip())}; write {kind}"
     return f"{path}: it is no table of {','.join(names)}; write it again"
+
+
+def _fits(cell: str, kind: np.dtype[Any]) -> bool:
+    try:
+        if kind.kind == "f":
+            float(cell)
+            return True
+        return bool(np.iinfo(kind).min <= int(cell) <= np.iinfo(kind).max)
+    except ValueError:
+        return False
