@@ -137,7 +137,6 @@ build-package:
 	  CMAKE_PREFIX_PATH="$(PREFIX):$(UNDERLAY)" LOG="$(BUILD)/$(NAME).log"; \
 	{ cmake -S $(SOURCE) -B $(BUILD)/$(NAME) -DCMAKE_INSTALL_PREFIX=$(PREFIX) \
 	    -DPython3_EXECUTABLE=$(VENV)/bin/python -DBUILD_TESTING=OFF \
-	    -DCMAKE_PROJECT_INCLUDE=$(ROOT)/cmake/usable_imports.cmake \
 	  && cmake --build $(BUILD)/$(NAME) --parallel $(JOBS) \
 	  && cmake --install $(BUILD)/$(NAME); } > $$LOG 2>&1 \
 	|| { tail -n 40 $$LOG; echo "Building $(NAME) failed; the whole log is in $$LOG"; exit 1; }

@@ -1,7 +1,6 @@
 # The wheels of ROS 2 export the include directories of the machine they were built on with their Python
-# targets; CMake refuses imported targets that name a directory which does not exist. The Makefile includes
-# this file into each package that it builds (CMAKE_PROJECT_INCLUDE); it changes nothing on an ordinary
-# ROS 2 installation.
+# targets; CMake refuses imported targets that name a directory which does not exist. Call this after the last
+# find_package and before rosidl_generate_interfaces. It changes nothing on an ordinary ROS 2 installation.
 function(drop_missing_include_directories)
   get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
   foreach(target IN LISTS targets)
@@ -18,5 +17,3 @@ function(drop_missing_include_directories)
     set_target_properties("${target}" PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "${present}")
   endforeach()
 endfunction()
-# After the last find_package, before CMake checks the directories.
-cmake_language(DEFER CALL drop_missing_include_directories)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -54,6 +55,30 @@ def test_both_lists_of_python_packages_are_the_same() -> None:
     needed = {element.text for element in ElementTree.parse(ROOT / "package.xml").iter()}
     assert names
     assert {f"python3-{keys.get(name, name)}" for name in names} <= needed
+
+
+def test_the_oldest_versions_are_those_that_are_tested() -> None:
+    bounds, pins = (
+        {line.replace(">=", "==") for line in (ROOT / "requirements" / name).read_text().split()}
+        for name in ("run.txt", "floor.txt")
+    )
+    wanted = {line for line in bounds if "==" in line}
+    assert wanted == {line for line in pins if "==" in line}
+
+
+@pytest.mark.parametrize("name", ["event_camera_msgs", "tf2_msgs"])
+def test_message_packages_build_in_a_workspace_of_their_own(tmp_path: Path, name: str) -> None:
+    package = tmp_path / name
+    shutil.copytree(ROOT / "external_msgs" / name, package)
+    own = (ROOT / "cmake" / "usable_imports.cmake").read_text()
+    assert (package / "cmake" / "usable_imports.cmake").read_text() == own
+    prefix = os.environ["AMENT_PREFIX_PATH"].replace(os.pathsep, ";")
+    done = subprocess.run(
+        ["cmake", "-S", package, "-B", tmp_path / "build", "-DBUILD_TESTING=OFF",
+         f"-DCMAKE_PREFIX_PATH={prefix}", f"-DPython3_EXECUTABLE={sys.executable}"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_versions_agree() -> None:
