@@ -225,7 +225,7 @@ def save_named_calibration(
     ArgumentError
         When the file cannot be written.
     """
-    path = _named_path(folder, name or calibration.id or calibration.name)
+    path = _named_path(folder, (calibration.id or calibration.name) if name == "" else name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
@@ -263,13 +263,14 @@ def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> 
     ArgumentError
         When the path cannot be written.
     """
+    file = file_path("path", path)
     data = calibration.as_dict()
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True)
     written = text.encode()
-    again = validate(Calibration, parse_yaml(written, path, CalibrationError), CalibrationError)
+    again = validate(Calibration, parse_yaml(written, file, CalibrationError), CalibrationError)
     if again != calibration:
-        raise CalibrationError(f"{path}: the calibration does not survive YAML; check its texts")
-    with atomic_write(path) as stream:
+        raise CalibrationError(f"{file}: the calibration does not survive YAML; check its texts")
+    with atomic_write(file) as stream:
         stream.write(written)
 
 
