@@ -32,12 +32,14 @@ SCENE = "steps"
 EDGE_MM = 4.0
 CALIBRATION = "config_3"
 START_M, STOP_M, SPEED_M_S, FREQUENCY_HZ = 0.020, 0.040, 0.050, 70.0
+PERIODS = round((STOP_M - START_M) / SPEED_M_S * FREQUENCY_HZ)
 SLOW_HZ, SLOW_M_S, FAR_M = 20.0, 0.010, 0.200
 """Of sweeps that are interrupted: few events, and interrupted far from their end."""
 SLOW = {"stop": FAR_M, "speed": SLOW_M_S, "frequency": SLOW_HZ}
 SWEPT_POINTS = 30_000
 CLOCK_S = 0.01
 SCAN_DEADLINE_S = 300.0
+DARK_S, CUT_OFF_S = 1.5, 5.0
 
 
 def bench_settings(laser_log: Path) -> dict[str, Any]:
@@ -209,6 +211,11 @@ def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: 
     assert p95_mm <= 2.5, found
 
 
+def _positions_mm() -> np.ndarray:
+    """Positions of a full scan's periods."""
+    return 1e3 * (START_M + (STOP_M - START_M) * (np.arange(PERIODS) + 0.5) / PERIODS)
+
+
 def full_scan(bench: Bench) -> None:
     """A scan to its end gives the expected cloud."""
     before = len(bench.clouds)
@@ -218,10 +225,8 @@ def full_scan(bench: Bench) -> None:
     points, _ = bench.lit_part(bench.cloud_after(before, result.points))
     assert len(points) >= 0.99 * result.points
     assert result.packets_lost == 0
-    periods = round((STOP_M - START_M) / SPEED_M_S * FREQUENCY_HZ)
-    positions = 1e3 * (START_M + (STOP_M - START_M) * (np.arange(periods) + 0.5) / periods)
-    assert abs(int(_profile_of(points)[-1]) + 1 - periods) <= 2
-    assert_accurate(points, positions, 0.98)
+    assert abs(int(_profile_of(points)[-1]) + 1 - PERIODS) <= 2
+    assert_accurate(points, _positions_mm(), 0.98)
     sweep_s = (
         result.sweep_stop.sec - result.sweep_start.sec
         + 1e-9 * (result.sweep_stop.nanosec - result.sweep_start.nanosec)
@@ -231,6 +236,40 @@ def full_scan(bench: Bench) -> None:
     assert "sweeping" in [f.phase for f in bench.scans.feedback]
     assert 0.0 < result.sigma_median < 2e-3
     bench.assert_off_and_at_rest()
+
+
+def lossy_scan(bench: Bench) -> None:
+    """A scan in which packets are lost: each costs at most the points of its period."""
+    before = len(bench.clouds)
+    status, result = bench.scan()
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert result.packets_lost > 0
+    points, _ = bench.lit_part(bench.cloud_after(before, result.points))
+    print(f"{result.packets_lost} packets lost")
+    assert_accurate(points, _positions_mm(), 0.98 - result.packets_lost / PERIODS)
+    bench.assert_off_and_at_rest()
+
+
+def cut_off(bench: Bench, cut: Callable[[], Any], join: Callable[[], Any]) -> None:
+    """Camera, laser and stage become unreachable: dark, the goal ends, later scans work."""
+    before = len(bench.clouds)
+    bench.start(**SLOW)
+    bench.wait_for_sweep()
+    cut()
+    begun_s = time.monotonic()
+    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")
+    dark_s = time.monotonic() - begun_s
+    status, result = bench.scans.end()
+    ended_s = time.monotonic() - begun_s
+    print(f"dark after {dark_s:.2f} s, ended after {ended_s:.2f} s: {result.message}")
+    join()
+    assert status == GoalStatus.STATUS_ABORTED, result.message
+    assert dark_s < DARK_S
+    assert ended_s < CUT_OFF_S
+    # Fewer than the feedback counted: it places them by a preliminary clock.
+    assert len(bench.cloud_after(before, result.points)) > 0.8 * SWEPT_POINTS
+    bench.assert_off_and_at_rest()
+    full_scan(bench)
 
 
 def cancel_scan(bench: Bench) -> None:

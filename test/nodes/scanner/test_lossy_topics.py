@@ -1,0 +1,64 @@
+"""Scans with another camera driver, and with losses between the nodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+import scan_scenarios as scenarios
+from benches import remote_bench
+from lossy_relay import EVENTS, lossy_relay
+from ros_process import Remap, processes
+
+from eschorty_ros.nodes.ros.domain import free_domain
+
+RELIABLE = "qos_overrides./eschorty/near/events.publisher.reliability"
+
+
+def parameters(folder):
+    """The five nodes, with the relay between them; its events are those of metavision_driver."""
+    laser, stage, camera, reconstruction, scanner = scenarios.node_parameters(folder)
+    far = {"camera/events": Remap(EVENTS)}
+    heartbeats = {name: Remap(f"far/{name}") for name in ("laser/heartbeat", "stage/heartbeat")}
+    return {
+        laser: {"bench": folder, "watch": "stage", **heartbeats},
+        stage: {"bench": folder, "stage/heartbeat": Remap("near/stage/heartbeat")},
+        camera: {
+            "bench": folder,
+            "trigger_in_mode": "external",
+            "camera/events": Remap("near/events"),
+            RELIABLE: "reliable",
+        },
+        reconstruction: {"trigger_source": "stage", **far},
+        scanner: {**far, "laser/heartbeat": Remap("near/laser/heartbeat")},
+    }
+
+
+@pytest.fixture(scope="module")
+def instrument(tmp_path_factory):
+    log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
+    domain = free_domain()
+    with (
+        remote_bench(**scenarios.bench_settings(log)) as (_, folder),
+        lossy_relay(domain, "laser/heartbeat", "stage/heartbeat") as relay,
+        processes(parameters(folder), domain) as running,
+        scenarios.bench(domain, log) as bench,
+    ):
+        yield bench, running, relay
+        for name, process in running.items():
+            print(f"--- {name}\n{process.output[-3000:]}")
+
+
+def test_a_scan_with_metavision_driver_and_five_percent_of_the_heartbeats_lost(instrument):
+    bench, _, relay = instrument
+    relay.lost["Header"] = 0.05
+    scenarios.full_scan(bench)
+
+
+def test_a_lost_packet_costs_at_most_the_points_of_its_period(instrument):
+    bench, _, relay = instrument
+    relay.lost["EventPacket"] = 0.02
+    scenarios.lossy_scan(bench)
