@@ -1,0 +1,54 @@
+"""Devices and reconstruction on two hosts: network namespaces with a link that loses frames."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+import scan_scenarios as scenarios
+from benches import remote_bench
+from lossy_link import TwoHosts, missing
+from ros_process import DISCOVERY, processes
+
+from eschorty_ros.core.base.files import config_folders
+from eschorty_ros.nodes.ros.dds import VARIABLES
+
+# In namespaces of their own.
+DOMAIN = 7
+DEVICES = 3
+
+
+@pytest.fixture(scope="module")
+def instrument(tmp_path_factory):
+    reason = missing()
+    if reason:
+        pytest.skip(reason)
+    log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
+    profile = next(path for folder in config_folders() for path in folder.glob("two_hosts.xml"))
+    chosen = {DISCOVERY: "SUBNET", VARIABLES[0]: str(profile)}
+    with contextlib.ExitStack() as ending:
+        ending.enter_context(mock.patch.dict(os.environ, chosen))
+        hosts = ending.enter_context(TwoHosts())
+        _, folder = ending.enter_context(remote_bench(**scenarios.bench_settings(log)))
+        nodes = list(scenarios.node_parameters(folder).items())
+        with hosts.on("a"):
+            devices = ending.enter_context(processes(dict(nodes[:DEVICES]), DOMAIN))
+        with hosts.on("b"):
+            others = ending.enter_context(processes(dict(nodes[DEVICES:]), DOMAIN))
+            bench = ending.enter_context(scenarios.bench(DOMAIN, log))
+        yield bench, hosts
+        for name, process in (devices | others).items():
+            print(f"--- {name}\n{process.output[-3000:]}")
+
+
+@pytest.mark.parametrize("lost", [0.01, 0.05])
+def test_lost_frames_cost_no_points(instrument, lost):
+    bench, hosts = instrument
+    hosts.lose(lost)
+    scenarios.full_scan(bench)
