@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +12,9 @@ from eschorty_ros.control.scan_sequence import ScanFailure
 from eschorty_ros.hardware.base.protocols import LaserOutput
 
 # With Fast DDS's defaults a lost message is repeated after 3 s.
-_STALE_S = 4.0
+_STALE_S = 3.5
+# A laser reports nothing during a command.
+_SILENT_S = 2.5
 _REST_MM_S = 0.1
 _SAMPLES_MAX = 500_000
 
@@ -89,6 +92,20 @@ class InstrumentMonitor:
         """Return whether odometry is fresh."""
         return _age_s(self._stage_s) < _STALE_S
 
+    @property
+    def laser_reports(self) -> bool:
+        """Return whether the laser's state is fresh."""
+        return self.laser is not None and _age_s(self._laser_s) < _STALE_S
+
+    def silent(self, component: str) -> bool:
+        """Return whether ``laser``, ``stage`` or ``reconstruction`` no longer reports."""
+        reported_s = {
+            "laser": self._laser_s,
+            "stage": self._stage_s,
+            "reconstruction": self._reconstruction_s,
+        }
+        return _age_s(reported_s.get(component, math.inf)) > _SILENT_S
+
     def restart_progress(self) -> None:
         """Count the time without progress of the reconstruction from now."""
         self._advanced_s = time.monotonic()
@@ -105,7 +122,7 @@ class InstrumentMonitor:
 
     def check_laser(self) -> None:
         """Raise ``ScanFailure`` when the laser does not report or is not on."""
-        if self.laser is None or _age_s(self._laser_s) > _STALE_S:
+        if self.laser is None or not self.laser_reports:
             raise ScanFailure(f"laser: no state for {_STALE_S:g} s")
         if self.laser.output != LaserOutput.ON:
             raise ScanFailure(f"laser: went off: {self.laser.reason}")

@@ -69,7 +69,8 @@ class PacedWaiting:
 
     def watch(self, enabled: bool) -> None:
         """See ``Instrument``."""
-        self.monitor.restart_progress()
+        if enabled:
+            self.monitor.restart_progress()
         self._watching = enabled
 
     def shield(self) -> None:
@@ -88,7 +89,6 @@ class PacedWaiting:
     def drain(self, no_progress_s: float) -> None:
         """See ``Instrument``."""
         target_ns = self._now_ns()
-        self.monitor.restart_progress()
         while self.monitor.until_ns < target_ns:
             self.tick()
             self.monitor.check_progress(no_progress_s)

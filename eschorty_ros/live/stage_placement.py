@@ -15,6 +15,8 @@ _HISTORY_US = 600_000_000
 _CLOCK_BACK_US = 100_000
 # A stage at rest gives no pulses, and a wire may be off: longest wait for an edge.
 _EDGE_WAIT_S = 0.3
+# DDS repeats what got lost within 3 s.
+_STAGE_ENDED_S = 3.5
 
 
 class StagePlacer:
@@ -49,6 +51,8 @@ class StagePlacer:
         self.waiting = 0
         self.track_restarts = 0
         self._late_before = 0
+        self._sampled: tuple[int, float] | None = None
+        self._now_s = 0.0
         self.track = StageTrack(max_gap_us=round(gap_s * 1e6) or None)
         self._waiting: deque[tuple[float, TimedProfiles]] = deque()
 
@@ -79,14 +83,21 @@ class StagePlacer:
             self.waiting += len(timed.profiles)
 
     def holds(self, until_s: float) -> bool:
-        """Return whether a profile that arrived by ``until_s`` of the steady clock waits."""
-        return bool(self._waiting) and self._waiting[0][0] <= until_s
+        """Return whether a profile that arrived by ``until_s`` of the steady clock waits.
+
+        It need not wait for a stage that has sent nothing for 3.5 s.
+        """
+        ended = self._sampled is not None and self._now_s - self._sampled[1] > _STAGE_ENDED_S
+        return not ended and bool(self._waiting) and self._waiting[0][0] <= until_s
 
     def ready(self, now_s: float) -> list[tuple[TimedProfiles, NDArray[np.float64]]]:
         """Return the profiles whose positions (mm, float64) are known, oldest first."""
         placed = []
         left: deque[tuple[float, TimedProfiles]] = deque()
         last_us = self.track.last_us
+        self._now_s = now_s
+        if last_us is not None and (self._sampled is None or self._sampled[0] != last_us):
+            self._sampled = last_us, now_s
         for arrived_s, waiting in self._waiting:
             expired = now_s - arrived_s > self.timeout_s
             if not expired and (last_us is None or waiting.earliest_ns() // NS_PER_US > last_us):

@@ -23,6 +23,7 @@ from eschorty_ros.emulation.bench.process import bench_process
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.laser.node import LaserNode
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
+from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored, turn
 from eschorty_ros.nodes.scanner.node import ScannerNode
@@ -189,6 +190,8 @@ def _running(parameter_file: Path) -> Iterator[Composition]:
         made = Composition(client, nodes)
         for node in nodes:
             executor.add_node(node)
+        if os.environ.get("ROS_DOMAIN_ID"):
+            SecondNodes(nodes).wait()
         thread.start()
         yield made
     finally:

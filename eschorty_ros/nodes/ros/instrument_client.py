@@ -39,6 +39,10 @@ _TICK_LIMIT_S = 1.0
 # Part of the laser's reason when a heartbeat is missing.
 _HEARTBEAT = "/heartbeat"
 _ASSEMBLE_S = 60.0
+# The reconstruction first works off the packets that a broken link has held back.
+_BEGIN_S = 20.0
+# For an answer of a node that no longer reports.
+_SILENT_WAIT_S = 0.3
 
 
 class InstrumentClient(PacedWaiting):
@@ -121,7 +125,7 @@ class InstrumentClient(PacedWaiting):
             *((ready, f"{name.split('/')[0]}: no {name}") for name, ready in servers),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
             (lambda: self.monitor.at_rest, "stage: another move does not end"),
-            (lambda: self.monitor.laser is not None, "laser: no state"),
+            (lambda: self.monitor.laser_reports, "laser: no state"),
             (lambda: self.monitor.until_ns > begun_ns, self.monitor.cause_of_no_progress),
         ]
 
@@ -229,12 +233,23 @@ class InstrumentClient(PacedWaiting):
         return self._heartbeat_on and self.ticked_within(_TICK_LIMIT_S)
 
     def _answer(self, future: Any, name: str) -> Any:
-        self.wait(
-            future.done, self._service_timeout_s, f"{name.split('/')[0]}: no answer of {name}"
-        )
+        self._await(future.done, name, self._service_timeout_s)
         return future.result()
 
-    def _call(self, name: str, request: Any, once_within_s: float | None = None) -> Any:
+    def _await(self, answered: Callable[[], bool], name: str, timeout_s: float) -> None:
+        """Wait for an answer; only shortly for one of a node that no longer reports."""
+        component = name.split("/")[0]
+        if self.monitor.silent(component):
+            timeout_s = _SILENT_WAIT_S
+        self.wait(answered, timeout_s, f"{component}: no answer of {name}")
+
+    def _call(
+        self,
+        name: str,
+        request: Any,
+        once_within_s: float | None = None,
+        within_s: float | None = None,
+    ) -> Any:
         """Return a service's answer; the request is repeated unless ``once_within_s`` is given."""
         call = RepeatedCall(self._clients[name], request, again=once_within_s is None)
 
@@ -242,8 +257,7 @@ class InstrumentClient(PacedWaiting):
             with self._shutdown_as_failure():
                 return call.done()
 
-        timeout_s = once_within_s or self._service_timeout_s
-        self.wait(answered, timeout_s, f"{name.split('/')[0]}: no answer of {name}")
+        self._await(answered, name, once_within_s or within_s or self._service_timeout_s)
         return call.result()
 
     @contextlib.contextmanager
@@ -286,7 +300,7 @@ class ScanClient(InstrumentClient):
         )
         # A cancel before the answer would leave a scan that is never ended.
         with self.shielded():
-            answer = self._call("reconstruction/begin_scan", begin)
+            answer = self._call("reconstruction/begin_scan", begin, within_s=_BEGIN_S)
         if not answer.success:
             raise ScanFailure(f"reconstruction: {answer.message}")
 
