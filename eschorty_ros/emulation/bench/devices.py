@@ -89,6 +89,7 @@ class Bench:
         # No command may run while the world advances to the present.
         self.laser.mutex = self.physics.lock
         self.camera = Evk4Model(self.physics)
+        self.camera.lateness_ns = lambda: self.physics.late_ns
         self.camera.configure = lambda settings: self.physics.set_sensor(sensor_control(settings))
 
     def set_scene(self, scene: str) -> None:

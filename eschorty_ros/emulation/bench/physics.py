@@ -2,7 +2,8 @@
 
 Laser and stage act in bench time, int64 nanoseconds of the bench's clock. The sensor has a clock of
 its own, which starts at 0 with every start of the stream and may run fast or slow. The world is
-simulated on demand, never beyond the bench's present: on a slow machine the same bytes come later.
+simulated on demand, never beyond the bench's present: on a slow machine the same bytes come later,
+with their lateness, so that a host can stamp them as if they had come in time.
 """
 
 from __future__ import annotations
@@ -118,6 +119,8 @@ class Physics:
     Attributes
     ----------
     lock : threading.RLock
+    late_ns : int
+        Bench time between the end of the bytes simulated last and their simulation.
     late_changes : int
         Changes set after the world had passed their time.
     edges, edges_missed : int
@@ -141,6 +144,7 @@ class Physics:
             raise ArgumentError(f"trigger is {trigger!r}; choose one of {', '.join(TRIGGERS)}")
         self.lock = threading.RLock()
         self.clock_ns = clock_ns
+        self.late_ns = 0
         self.late_changes = 0
         self.edges = 0
         self.edges_missed = 0
@@ -269,6 +273,7 @@ class Physics:
         if packets < 1:
             return False
         data = world.advance(world.now_us + min(packets, _PACKETS_AT_ONCE) * PACKET_US)
+        self.late_ns = horizon_ns - self._zero_ns - self._bench_ns(world.now_us)
         if data:
             late_ns = round(self._usb_chance.uniform(0.0, self._imperfections.usb_jitter_ms) * 1e6)
             self._in_transit.append((horizon_ns + late_ns, data))

@@ -165,6 +165,9 @@ class EmulatedUsbDevice:
         Driver that holds the interface until it is detached.
     address : int
         Address on the bus; a new one after every ``replug``.
+    late_ns : int
+        Time by which the data of the last read would have come earlier from a real device, because
+        the emulation takes longer.
     """
 
     def __init__(self, identity: UsbIdentity, *, wait: Wait = threading.Condition.wait):
@@ -174,6 +177,7 @@ class EmulatedUsbDevice:
         self.stalled: set[int] = set()
         self.mute = False
         self.denied = False
+        self.late_ns = 0
         self.kernel_driver: str | None = None
         self.detached_driver: str | None = None
         self.claims: dict[int, object] = {}

@@ -29,10 +29,14 @@ _ANSWER_TIMEOUT_S = 20.0
 """After this, a stopped or overloaded server counts as an unplugged device."""
 
 
+_CLOCK_SET_NS = 10_000_000_000
+
+
 class _Link:
     """One connection, one request at a time."""
 
     def __init__(self, path: str):
+        self.late_ns = 0
         self._lock = threading.Lock()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -58,7 +62,7 @@ class _Link:
                     timeout_ms / 1e3 + _ANSWER_TIMEOUT_S if timeout_ms else None
                 )
                 send_request(self._socket, op, numbers, data)
-                code, size = receive_answer(self._socket)
+                code, size, self.late_ns = receive_answer(self._socket)
                 view = memoryview(bytearray(size)) if into is None else into[:size]
                 receive_into(self._socket, view)
             except TimeoutError:
@@ -155,6 +159,7 @@ class RemoteBackend(DescriptorBackend):
 
     def __init__(self, path: str):
         self._path = path
+        self._late_ns = 0
 
     def enumerate_devices(self) -> list[_ListedDevice]:
         """List the devices on the server's bus."""
@@ -209,10 +214,26 @@ class RemoteBackend(DescriptorBackend):
         self, dev_handle: _RemoteHandle, ep: int, intf: int, buff: array.array[int], timeout: int
     ) -> int:
         """Receive a transfer into ``buff``; returns the bytes received."""
-        view = memoryview(buff).cast("B")
-        return dev_handle.link(ep).call(
-            Op.READ, (ep, len(view), timeout), timeout_ms=timeout, into=view
-        )
+        view, link = memoryview(buff).cast("B"), dev_handle.link(ep)
+        size = link.call(Op.READ, (ep, len(view), timeout), timeout_ms=timeout, into=view)
+        self._late_ns = link.late_ns
+        return int(size)
+
+    def transfer_clock(self, clock_ns: Callable[[], int]) -> Callable[[], int]:
+        """Return the clock by which the last transfer read would have come from a real device.
+
+        It goes back only with the host's clock.
+        """
+        newest_ns = 0
+
+        def clock() -> int:
+            nonlocal newest_ns
+            t_ns = clock_ns() - self._late_ns
+            if not 0 < newest_ns - t_ns < _CLOCK_SET_NS:
+                newest_ns = t_ns
+            return newest_ns
+
+        return clock
 
     def ctrl_transfer(
         self,

@@ -109,7 +109,7 @@ class UsbServer:
                 except usb.core.USBError as error:
                     send_answer(link, error.errno or errno.ENODEV)
                 else:
-                    send_answer(link, 0, answer)
+                    send_answer(link, 0, answer, session.late_ns)
         except (Closed, OSError):
             pass
         finally:
@@ -127,6 +127,7 @@ class _Session:
         self._tokens = tokens
         self._token = 0
         self._handle: Handle | None = None
+        self.late_ns = 0
         self._buffer = memoryview(bytearray(0))
 
     def run(self, op: Op, numbers: tuple[int, int, int, int], data: bytearray) -> Any:
@@ -178,6 +179,7 @@ class _Session:
             self._buffer = memoryview(bytearray(size))
         into = self._buffer[:size]
         count = self._backend.bulk_read(handle, endpoint, 0, into, timeout)
+        self.late_ns = handle.device.late_ns
         return into[:count]
 
     def _control(

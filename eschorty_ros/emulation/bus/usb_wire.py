@@ -1,6 +1,7 @@
 """Binary frames between the server of an emulated bus and its clients.
 
-A request is an operation, four numbers and data; an answer is an error number (0 = done) and data.
+A request is an operation, four numbers and data; an answer is an error number (0 = done),
+the lateness of a read, and data.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import struct
 from enum import IntEnum
 
 _REQUEST = struct.Struct("<BxxxIIIII")
-_ANSWER = struct.Struct("<II")
+_ANSWER = struct.Struct("<IIq")
 
 
 class Op(IntEnum):
@@ -83,14 +84,16 @@ def receive_request(link: socket.socket) -> Request:
     return Op(op), (a, b, c, d), _receive(link, size)
 
 
-def send_answer(link: socket.socket, code: int, data: bytes | memoryview = b"") -> None:
+def send_answer(
+    link: socket.socket, code: int, data: bytes | memoryview = b"", late_ns: int = 0
+) -> None:
     """Send an answer."""
-    link.sendall(_ANSWER.pack(code, len(data)))
+    link.sendall(_ANSWER.pack(code, len(data), late_ns))
     if len(data):
         link.sendall(data)
 
 
-def receive_answer(link: socket.socket) -> tuple[int, int]:
-    """Wait for the header of an answer; returns the error number and the size of the data."""
-    code, size = _ANSWER.unpack(_receive(link, _ANSWER.size))
-    return code, size
+def receive_answer(link: socket.socket) -> tuple[int, int, int]:
+    """Wait for the header of an answer; returns error number, size of the data and lateness."""
+    code, size, late_ns = _ANSWER.unpack(_receive(link, _ANSWER.size))
+    return code, size, late_ns

@@ -65,6 +65,8 @@ class Evk4Model(EmulatedUsbDevice):
         words since the last read that do not fit are dropped, with the sensor's mark.
     configure : callable or None
         Called with ``SensorSettings`` after a write that changes them.
+    lateness_ns : callable or None
+        Returns ``late_ns`` of the words that the source has returned.
     """
 
     def __init__(
@@ -100,6 +102,7 @@ class Evk4Model(EmulatedUsbDevice):
         self.watch = SequenceWatch(clock_ns)
         self.buffer_bytes: int | None = None
         self.configure: Callable[[SensorSettings], None] | None = None
+        self.lateness_ns: Callable[[], int] | None = None
         self._source = source
         self.board = TreuzellBoard(board, self)
         self._packets = Packetiser()
@@ -183,6 +186,8 @@ class Evk4Model(EmulatedUsbDevice):
             self._overflow(run)
         while not self.pending(DATA_IN):
             data = self._source.read(_PULL_BYTES, max(0.0, until_s - time.monotonic()))
+            if self.lateness_ns is not None:
+                self.late_ns = self.lateness_ns()
             if not self._packetise(data, run):
                 return
 

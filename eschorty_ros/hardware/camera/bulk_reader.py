@@ -111,7 +111,12 @@ def drain(device: usb.core.Device, endpoint: int, buffer: array.array[int]) -> N
 def make_reader(
     backend: usb.backend.IBackend, device: usb.core.Device, endpoint: int, clock_ns: ClockNs
 ) -> BulkReader:
-    """Return an ``AsyncReader`` on libusb with the package ``libusb1``, else a ``SyncReader``."""
+    """Return an ``AsyncReader`` on libusb with the package ``libusb1``, else a ``SyncReader``.
+
+    A backend of an emulated bus may give the clock of its transfers.
+    """
+    if hasattr(backend, "transfer_clock"):
+        clock_ns = backend.transfer_clock(clock_ns)
     synchronous = SyncReader(device, endpoint, clock_ns)
     library = _queueing_library(backend)
     if library is None:

@@ -27,6 +27,7 @@ from eschorty_ros.nodes.ros.spin import run
 
 READ_TIMEOUT_S = 0.02
 STOP_TIMEOUT_S = 3.0
+LATE_S = 0.1
 
 _LOSSES = ("drops", "gaps", "sensor_drop_words", "erc_events_dropped")
 
@@ -230,6 +231,7 @@ class CameraNode(DeviceNode):
             "trigger_edges": words.triggers,
             **packets.losses,
             "bytes_without_subscriber": packets.unsubscribed_bytes,
+            "late_s": packets.late_s,
         }
         if source is not None:
             values |= source.statistics()
@@ -248,6 +250,9 @@ class CameraNode(DeviceNode):
         if lost > 0:
             which = ", ".join(f"{name} {values[name]:g}" for name in _LOSSES if values.get(name))
             return diagnostics.WARN, f"events were lost in the last second; so far {which}", values
+        if self.active and packets.late_s > LATE_S:
+            line = f"events come {packets.late_s:.1f} s late: this computer does not keep up"
+            return diagnostics.WARN, line, values
         return diagnostics.OK, "streaming" if self.active else self.state_label, values
 
 

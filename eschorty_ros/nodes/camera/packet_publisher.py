@@ -32,6 +32,8 @@ class PacketPublisher:
         Number of the next packet.
     packets, published_bytes, unsubscribed_bytes : int
         Packets and bytes published, and bytes without a subscriber.
+    late_s : float
+        Time by which the newest chunk waited for publication, or an emulated camera is late.
     words : WordCounter
         Counts of the words in all of them.
     """
@@ -41,6 +43,7 @@ class PacketPublisher:
         self.packets = 0
         self.published_bytes = 0
         self.unsubscribed_bytes = 0
+        self.late_s = 0.0
         self.words = WordCounter()
         self._publisher = publisher
         self._width = width
@@ -72,6 +75,7 @@ class PacketPublisher:
             self.flush()
             self.seq = 0 if chunk.restarted else self.seq + 1
         self.words.add(chunk.data)
+        self.late_s = (now_ns - chunk.arrival_ns) * 1e-9
         self._publish(self._packetizer.push(chunk.data, chunk.arrival_ns))
 
     def flush(self) -> None:

@@ -106,7 +106,7 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
                 f"{state.phase} {state.matched} of {state.posts} posts known",
             )
 
-        ended = running.result(action, goal, on_feedback, 5.0 * job.capture_s)
+        ended = running.result(action, goal, on_feedback)
     return CalibrationResult(
         success=bool(ended.success),
         message=str(ended.message),

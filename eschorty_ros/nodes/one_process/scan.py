@@ -43,11 +43,6 @@ class ScanJob:
     pixels: str = "paper"
     hardware: Tables | None = None
 
-    @property
-    def sweep_s(self) -> float:
-        """Return the time between start and stop at the scan's speed."""
-        return abs(self.stop_mm - self.start_mm) / self.speed_mm_s
-
 
 @dataclass(frozen=True, slots=True)
 class ScanResult:
@@ -91,7 +86,7 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         clouds: list[PointCloud2] = []
         running.client.create_subscription(PointCloud2, "scan/points", clouds.append, qos.latched())
         action: ActionClient[Any, Any, Any] = ActionClient(running.client, Scan, "scan")
-        ended = running.result(action, goal, on_feedback, 5.0 * job.sweep_s)
+        ended = running.result(action, goal, on_feedback)
         if ended.points:
             wait(
                 lambda: clouds and clouds[-1].width == ended.points,

@@ -182,6 +182,17 @@ def test_a_new_start_begins_at_zero_with_laser_and_stage_as_they_are() -> None:
     assert physics.late_changes == 0
 
 
+def test_bytes_that_come_late_know_by_how_much() -> None:
+    clock, physics = started()
+    clock.now_ns += 500 * MS
+    late_ns = []
+    while physics.read(1 << 20, 0.0):
+        late_ns.append(physics.late_ns)
+    assert late_ns == sorted(late_ns, reverse=True)
+    assert late_ns[0] > 400 * MS
+    assert 0 <= late_ns[-1] < 2 * MS
+
+
 def test_late_changes_are_counted() -> None:
     clock, physics = started()
     clock.now_ns += 50 * MS
