@@ -126,12 +126,15 @@ class Guard:
             return
         fault = self._owner_fault()
         if fault:
-            self._trip(f"is {fault}")
+            self._trip(f"process {self._owner_pid} is {fault}")
         elif self._stalls.measured_s - self._received_s > self._heartbeat_timeout_s:
-            self._trip(f"has sent no heartbeat for {self._heartbeat_timeout_s:g} s")
+            self._trip(
+                f"process {self._owner_pid} has sent no heartbeat for "
+                f"{self._heartbeat_timeout_s:g} s"
+            )
 
     def _trip(self, fault: str) -> None:
-        self._tripped = f"laser guard: process {self._owner_pid} {fault}"
+        self._tripped = f"laser guard: {fault}"
         lit = self._lit
         try:
             self._disable()
@@ -189,7 +192,8 @@ class Guard:
             self._answer(self._closing, self._close)
         else:
             fault = self._owner_fault()
-            self._trip(f"is {fault}" if fault else "has closed its connection")
+            how = f"is {fault}" if fault else "has closed its connection"
+            self._trip(f"process {self._owner_pid} {how}")
         if self._retrying is not None:
             self._retrying.join()
         if self._laser is not None:
@@ -243,9 +247,12 @@ class Guard:
             watched = time.monotonic() - self._stalls.measured_s < _WATCH_LIMIT_S
             if laser is None or not self._lit or self._tripped or not watched:
                 continue
-            # A failure has switched it off, which the next read-back reports.
-            with contextlib.suppress(DeviceError):
+            try:
                 pause_s = laser.renew()
+            except VoidedError:
+                pass
+            except Exception as error:
+                self._trip(f"light not renewed: {error}")
 
     def _open(self, message: Message) -> Message:
         self._make = maker(message["make"], message["settings"])

@@ -527,6 +527,23 @@ def test_mute_generator_is_unknown_and_the_guard_retries(
         awg.off_after_s(time.monotonic_ns())
 
 
+def test_renewal_that_fails_is_reported_and_retried(awg: AwgProcess) -> None:
+    with opened(awg) as laser:
+        light(laser)
+        awg.do("mute")
+        wait_until(lambda: not awg.lit(), "dark")
+
+        def found() -> str:
+            try:
+                return laser.readback().output.name
+            except DeviceError as error:
+                return str(error)
+
+        wait_until(lambda: found().startswith("laser state unknown"), "the failure")
+        awg.do("speak")
+        wait_until(lambda: found() == "OFF", "the output read back off")
+
+
 def test_disabling_that_failed_without_light_is_retried_when_it_is_called_again(
     laser: GuardedLaser, awg: AwgProcess
 ) -> None:
