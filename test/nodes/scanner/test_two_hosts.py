@@ -51,4 +51,10 @@ def instrument(tmp_path_factory):
 def test_lost_frames_cost_no_points(instrument, lost):
     bench, hosts = instrument
     hosts.lose(lost)
-    scenarios.full_scan(bench)
+    scenarios.full_scan(bench, scenarios.BUT_ONE)
+
+
+def test_a_cut_link_ends_the_scan_and_the_next_one_works(instrument):
+    bench, hosts = instrument
+    hosts.lose(0.0)
+    scenarios.cut_off(bench, lambda: hosts.lose(1.0), lambda: hosts.lose(0.0))
