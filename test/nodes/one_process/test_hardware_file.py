@@ -1,10 +1,12 @@
 """The file of `eschorty scan --hardware`: real drivers, and no misspelt parameter."""
 
+import contextlib
 import re
 from pathlib import Path
 
 import pytest
 import yaml
+from mutation import mutations
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -75,3 +77,35 @@ def test_what_cannot_be_meant_is_one_line(tmp_path, text, words):
     assert "\n" not in str(refused.value)
     for word in (*words, "lab.yaml"):
         assert word in str(refused.value)
+
+
+def test_a_mutated_parameter_file_ends_in_a_result_or_in_one_line(tmp_path):
+    seed = 20261122
+    refused = 0
+    for number, mutant in enumerate(
+        mutations((CONFIG / "parameters.yaml").read_bytes(), 150, seed)
+    ):
+        print(f"seed {seed}, mutant {number}")
+        file = tmp_path / "mutant.yaml"
+        file.write_bytes(mutant)
+        with contextlib.suppress(FormatError):
+            read_hardware(file)
+            continue
+        refused += 1
+    print(f"{refused} of 150 refused")
+    assert refused
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["/eschorty/laser: {ros__parameters: {high_v: " + "9" * 5000 + "}}\n",
+     "/eschorty/laser: {ros__parameters: " + "[" * 3000, "a: &a [*a]\n",
+     "/eschorty/laser: {ros__parameters: {high_v: [[1], {a: 1}]}}\n",
+     "/eschorty/" + "x" * 5000 + ": 1\n", "? [1]\n: 2\n"],
+    ids=["digits", "deep", "alias", "nested", "long", "key"],
+)  # fmt: skip
+def test_what_could_hurt_names_file_and_line(tmp_path, text):
+    with pytest.raises(FormatError, match=r"\.yaml line 1") as caught:
+        read_hardware(written(tmp_path, text))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) <= 300
