@@ -1,7 +1,8 @@
-"""Scans with another camera driver, and with losses between the nodes."""
+"""Scans with another camera driver, losses between the nodes, and nodes that stop answering."""
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -55,10 +56,29 @@ def instrument(tmp_path_factory):
 def test_a_scan_with_metavision_driver_and_five_percent_of_the_heartbeats_lost(instrument):
     bench, _, relay = instrument
     relay.lost["Header"] = 0.05
-    scenarios.full_scan(bench)
+    scenarios.full_scan(bench, scenarios.BUT_ONE)
 
 
 def test_a_lost_packet_costs_at_most_the_points_of_its_period(instrument):
     bench, _, relay = instrument
     relay.lost["EventPacket"] = 0.02
     scenarios.lossy_scan(bench)
+
+
+def test_nodes_that_stop_answering_end_the_scan_and_the_next_one_works(instrument):
+    bench, running, relay = instrument
+
+    def send(number, lost):
+        relay.lost.update(EventPacket=lost, Header=lost)
+        for name in ("stage", "laser"):
+            running[name].send(number)
+
+    def cut():
+        send(signal.SIGSTOP, 1.0)
+
+    def join():
+        send(signal.SIGCONT, 0.0)
+
+    relay.lost.update(EventPacket=0.0, Header=0.0)
+
+    scenarios.cut_off(bench, cut, join)
