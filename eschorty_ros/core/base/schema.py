@@ -73,7 +73,8 @@ class Schema:
 
     def __post_init__(self) -> None:
         faults: list[Fault] = []
-        for name, hint in _hints(self.__class__).items():
+        kind: Any = type(self)
+        for name, hint in _hints(kind).items():
             object.__setattr__(self, name, _checked(hint, getattr(self, name), (name,), faults))
         if not faults:
             faults = [_wrong((key,), getattr(self, key), words) for key, words in self._conflicts()]
@@ -126,7 +127,7 @@ def _hints(schema: Any) -> dict[str, Any]:
     return get_type_hints(schema, include_extras=True)
 
 
-def _record(schema: type[Any], data: dict[str, Any], keys: Keys, faults: list[Fault]) -> Any:
+def _record(schema: Any, data: dict[str, Any], keys: Keys, faults: list[Fault]) -> Any:
     """Return the record of ``data``; what is wrong is added to ``faults``."""
     hints, found = _hints(schema), len(faults)
     # An unknown key first: misspelt, it is also the reason why another one is missing.

@@ -150,12 +150,13 @@ class _Builder:
             parent.values.append(value)
 
     def _add_key(self, event: Any, parent: _Open) -> None:
+        line = event.start_mark.line + 1
         if not isinstance(event, yaml.ScalarEvent):
             raise _Refused(event, "a key is a list or a dictionary")
         if event.value in parent.values:
             raise _Refused(event, f"key {short(event.value)} appears twice")
         parent.key = event.value
-        self.lines[(*parent.keys, event.value)] = event.start_mark.line + 1
+        self.lines[(*parent.keys, event.value)] = line
 
 
 def _scalar(event: yaml.ScalarEvent) -> Any:
