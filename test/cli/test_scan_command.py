@@ -44,14 +44,13 @@ def test_a_signal_ends_the_scan_with_the_laser_off_and_no_traceback(tmp_path, nu
         assert command.outputs()[-1] == "off"
 
 
-@pytest.mark.parametrize(("option", "value"), [("--stop", "900"), ("--speed", "5000")])
-def test_a_sweep_that_the_scanner_refuses_is_one_line_and_exit_code_1(tmp_path, option, value):
-    with LoggedCommand(tmp_path, "scan", option, value, "--out", tmp_path / "scan") as command:
+def test_a_sweep_that_the_scanner_refuses_is_one_line_and_exit_code_1(tmp_path):
+    with LoggedCommand(tmp_path, "scan", "--stop", "900", "--out", tmp_path / "scan") as command:
         code, stdout, stderr = command.end()
         assert code == 1, stderr
         assert stdout == ""
         (line,) = [line for line in stderr.splitlines() if line.startswith("eschorty: ")]
-        assert option.removeprefix("--") in line
+        assert "stop" in line
         assert "Traceback" not in stderr
         assert "on" not in command.outputs()
 
