@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import time
@@ -9,19 +10,23 @@ from collections.abc import Sequence
 
 from rclpy.node import Node
 
+from eschorty_ros.control.heartbeat import place
 from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.hardware.base.stalls import process_fault
 
 # Discovery takes some 0.2 s, and seconds on a busy host.
 _BEFORE_SPIN_S = 1.0
 _LOOK_S = 10.0
 _POLL_S = 0.1
+_HERE = hashlib.blake2b(place().encode(), digest_size=8).hexdigest()
 
 
 class SecondNodes:
     """Looks for other nodes of these names for 10 s, the first second before the nodes are spun.
 
     A hidden node marks each one, with its state and start: one that runs stays, and of two that
-    start together the first one.
+    start together the first one. A node that was killed on this host counts no more, though
+    discovery holds its name for some seconds.
     """
 
     def __init__(self, nodes: Sequence[Node]) -> None:
@@ -60,7 +65,9 @@ class _Mark:
 
     def __init__(self, node: Node) -> None:
         self.node = node
-        self._name = re.compile(rf"_{re.escape(node.get_name())}_(runs|starts)_([0-9]+)_([0-9]+)")
+        self._name = re.compile(
+            rf"_{re.escape(node.get_name())}_(runs|starts)_([0-9]+)_([0-9]+)_([0-9a-f]+)"
+        )
         self._begun = time.time_ns(), os.getpid()
         self._shown: Node | None = None
         self.set("starts")
@@ -69,7 +76,7 @@ class _Mark:
         """Show another state."""
         before, self._state = self._shown, state
         self._shown = Node(
-            f"_{self.node.get_name()}_{state}_{self._begun[0]}_{self._begun[1]}",
+            f"_{self.node.get_name()}_{state}_{self._begun[0]}_{self._begun[1]}_{_HERE}",
             namespace=self.node.get_namespace(),
             context=self.node.context,
             use_global_arguments=False,
@@ -83,7 +90,14 @@ class _Mark:
         space = self.node.get_namespace()
         names = [name for name, of in self.node.get_node_names_and_namespaces() if of == space]
         found = [mark.groups() for name in names if (mark := self._name.fullmatch(name))]
-        first = min(((state, int(ns), int(pid)) for state, ns, pid in found), default=None)
+        first = min(
+            (
+                (state, int(ns), int(pid))
+                for state, ns, pid, where in found
+                if where != _HERE or process_fault(int(pid)) not in ("gone", "dead")
+            ),
+            default=None,
+        )
         # "runs" is before "starts".
         if first is not None and first < (self._state, *self._begun):
             raise DeviceError(
