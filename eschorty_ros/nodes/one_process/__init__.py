@@ -1,1 +1,1 @@
-"""All nodes in one process, for the command line."""
+"""All nodes in one process, and the parameters of all of them."""

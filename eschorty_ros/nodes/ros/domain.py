@@ -8,17 +8,19 @@ import socket
 
 from eschorty_ros.core.base.errors import DeviceError
 
-_DOMAINS = range(1, 102)
+# First above the ports that Linux gives to any program, then below; people choose small numbers.
+_DOMAINS = (*range(215, 233), *range(60, 102))
+_HIGH = 215
 # The participant of an instrument that still runs need not be its first.
 _PARTICIPANTS = 10
 _reserved: set[int] = set()
 
 
 def free_domain() -> int:
-    """Return a ROS domain (1 to 101) without a participant on this host, and reserve it.
+    """Return a ROS domain without a participant on this host, and reserve it.
 
-    The reservation ends with this process. The next call, here or in another process, returns
-    another domain as long as there is one.
+    It is one from 215 to 232, else from 60 to 101. The reservation ends with this process. The
+    next call, here or in another process, returns another domain as long as there is one.
 
     Raises
     ------
@@ -28,11 +30,13 @@ def free_domain() -> int:
     domains = list(_DOMAINS)
     random.SystemRandom().shuffle(domains)
     # The domains that this process has reserved come last.
-    domains.sort(key=_reserved.__contains__)
+    domains.sort(key=lambda domain: (domain in _reserved, domain < _HIGH))
     for domain in domains:
         if _unused(domain) and _reserve(domain):
             return domain
-    raise DeviceError("every ROS domain from 1 to 101 is taken on this host; set ROS_DOMAIN_ID")
+    raise DeviceError(
+        "every ROS domain from 215 to 232 and 60 to 101 is taken on this host; set ROS_DOMAIN_ID"
+    )
 
 
 def _unused(domain: int) -> bool:

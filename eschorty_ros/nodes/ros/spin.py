@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
+from weakref import WeakSet
 
 import rclpy
 from rclpy.executors import (
@@ -20,6 +20,7 @@ from rclpy.executors import (
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.hardware.base.launcher import end_with_launcher
@@ -27,13 +28,17 @@ from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 
 _PAUSE_S = 3e-4
+_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ending: WeakSet[Node] = WeakSet()
 
 
 def make_safe(nodes: Sequence[Node]) -> None:
     """Call ``safe_state()`` of every node that has one, also after the failure of another.
 
-    It uses the drivers directly, because after a signal the ROS context is invalid.
+    It uses the drivers directly, because the ROS context may be invalid.
     """
+    for node in nodes:
+        _ending.add(node)
     for node in nodes:
         safe_state = getattr(node, "safe_state", None)
         if safe_state is None:
@@ -44,41 +49,44 @@ def make_safe(nodes: Sequence[Node]) -> None:
             print(f"{node.get_name()}: not safe: {error}", file=sys.stderr, flush=True)
 
 
+def ends(node: Node) -> bool:
+    """Return whether the node is on its way out."""
+    return node in _ending or not node.context.ok()
+
+
 @contextlib.contextmanager
 def unless_shut_down(node: Node) -> Iterator[None]:
     """Suppress the errors of a context that a signal has ended."""
     try:
         yield
     except (_rclpy.RCLError, _rclpy.InvalidHandle):
-        if node.context.ok():
+        if not ends(node):
             raise
 
 
-def _interrupt_during_start() -> Callable[[], None]:
-    """Let Ctrl-C raise ``KeyboardInterrupt`` until the returned function is called.
+class _Ending:
+    """The request of SIGINT, SIGTERM or SIGHUP to end.
 
-    Later it ends the context: an exception in a callback would leave half-made objects.
+    During the start it raises ``KeyboardInterrupt``, later it is only noted: an exception in a
+    callback would leave half-made objects, and an ended context would make callbacks fail.
     """
-    # An event has a lock, which the main thread may hold when the signal comes.
-    starting = True
 
-    def interrupt(*_: object) -> None:
-        if starting:
-            started()
+    def __init__(self) -> None:
+        # No event: it has a lock, which the main thread may hold when the signal comes.
+        self.requested = False
+        self.starting = True
+        for number in _ENDINGS:
+            signal.signal(number, self._request)
+
+    def _request(self, *_: object) -> None:
+        interrupts, self.starting, self.requested = self.starting, False, True
+        if interrupts:
             raise KeyboardInterrupt
-
-    def started() -> None:
-        nonlocal starting
-        starting = False
-
-    signal.signal(signal.SIGINT, interrupt)
-    return started
 
 
 def _ignore_signals() -> dict[signal.Signals, Any]:
     """Ignore the signals that end a process; return their handlers."""
-    endings = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    return {number: signal.signal(number, signal.SIG_IGN) for number in endings}
+    return {number: signal.signal(number, signal.SIG_IGN) for number in _ENDINGS}
 
 
 @contextlib.contextmanager
@@ -126,11 +134,12 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     use_profile()
     end_with_launcher()
     try:
-        started = _interrupt_during_start()
-        # rclpy's handler of SIGINT and SIGTERM ends the context and so the loop below.
-        rclpy.init(args=list(args) if args is not None else None)
-        started()
-        signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+        ending = _Ending()
+        rclpy.init(
+            args=list(args) if args is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        ending.starting = False
         executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
         for factory in factories:
             node = factory()
@@ -138,7 +147,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             executor.add_node(node)
         second = SecondNodes(nodes)
         second.wait()
-        while rclpy.ok():
+        while rclpy.ok() and not ending.requested:
             turn(executor)
             second.look()
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -147,16 +156,14 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         print(f"error: {error}", file=sys.stderr, flush=True)
         code = 1
     except Exception:
-        # A callback that publishes while a signal ends the context fails.
+        # A callback that publishes while a node ends the context fails.
         if rclpy.ok():
             traceback.print_exc()
             code = 1
     finally:
-        # Twice, because the shutdown of rclpy restores the handlers.
         _ignore_signals()
         make_safe(nodes)
         _tear_down(nodes, executor)
-        _ignore_signals()
     return code
 
 

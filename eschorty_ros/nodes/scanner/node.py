@@ -32,7 +32,7 @@ from eschorty_ros.nodes.ros import diagnostics
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
 from eschorty_ros.nodes.ros.instrument_client import ScanClient
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
-from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+from eschorty_ros.nodes.ros.spin import ends, run, unless_shut_down
 
 TABLE = (
     Param("auto_scan", False, "do one scan as soon as the other nodes are ready"),
@@ -148,7 +148,9 @@ class ScannerNode(Node):
         self._last = f"{request.scan_id}: {outcome.end.value}"
         if result.message:
             self._last += f": {result.message}"
-        if not self.context.ok():
+        if ends(self):
+            with unless_shut_down(self):
+                goal.abort()
             return result
         line = f"{self._last}; {result.points} points"
         # Two calls: rclpy's logger refuses a call site that changes its severity.

@@ -24,7 +24,7 @@ from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param
-from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+from eschorty_ros.nodes.ros.spin import ends, run, unless_shut_down
 from eschorty_ros.nodes.stage.parameters import DRIVER_TABLE, make_stage
 
 _FEEDBACK_PERIOD_S = 0.05
@@ -106,7 +106,7 @@ class StageNode(DeviceNode):
         while not stage.state().homed:
             if time.monotonic() > end_s:
                 raise DeviceError(f"the stage is not homed after {limit_s:g} s; check it")
-            if not self.context.ok():
+            if ends(self):
                 raise DeviceError("homing interrupted by shutdown")
             time.sleep(_POLL_S)
 
@@ -198,7 +198,7 @@ class StageNode(DeviceNode):
             if goal.is_cancel_requested and not stopping:
                 stage.stop()
                 stopping = True
-            if not self.context.ok():
+            if ends(self):
                 stage.stop()
                 raise DeviceError("move interrupted by shutdown")
             if time.monotonic() - feedback_s >= _FEEDBACK_PERIOD_S:
@@ -212,9 +212,8 @@ class StageNode(DeviceNode):
             time.sleep(_POLL_S)
 
     def _aborted(self, goal: Any, reason: str) -> MoveStage.Result:
-        if not self.context.ok():
-            return MoveStage.Result(success=False, message=reason)
-        self.get_logger().warning(reason)
+        if not ends(self):
+            self.get_logger().warning(reason)
         with unless_shut_down(self):
             goal.abort()
         stage, state = self._stage, None
