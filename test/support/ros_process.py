@@ -61,7 +61,9 @@ class NodeProcess:
     Start it in the main thread: it ends with the thread that started it.
     """
 
-    def __init__(self, module: str, parameters: Mapping[str, Any], *, domain: int) -> None:
+    def __init__(
+        self, module: str, parameters: Mapping[str, Any], *, domain: int, file: Path | None = None
+    ) -> None:
         self.module = module
         self._log = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed in kill()
             prefix=f"{node_name(module)}_", suffix=".log"
@@ -71,6 +73,8 @@ class NodeProcess:
         for name, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ["-r" if isinstance(value, Remap) else "-p", f"{name}:={text}"]
+        if file is not None:
+            command += ["--params-file", str(file)]
         self._process = subprocess.Popen(
             command,
             stdout=self._log,

@@ -1,27 +1,61 @@
-"""Ctrl-C with both cores busy, in the middle of a sweep: every node ends quickly and silently."""
+"""Ctrl-C with both cores busy: every node ends quickly and silently, alone or with the others."""
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import scan_scenarios as scenarios
 from benches import remote_bench
-from ros_process import processes
+from ros_process import NAMESPACE, NodeProcess, node_name, processes
 
 from eschorty_ros.nodes.ros.domain import free_domain
 
 STRAY = ("Traceback", "context is", "Destroyable", "RCLError", "Exception", "not safe", "Invalid")
 
 
-def test_ctrl_c_in_a_sweep_on_a_busy_machine(tmp_path: Path) -> None:
+@contextlib.contextmanager
+def busy() -> Iterator[None]:
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        yield
+    finally:
+        for process in loops:
+            process.kill()
+            process.wait()
+
+
+def assert_ctrl_c_ends(running: Mapping[str, NodeProcess]) -> None:
+    before = {name: len(process.output) for name, process in running.items()}
+    ended_s: dict[str, float] = {}
+    with busy():
+        begun_s = time.monotonic()
+        for process in running.values():
+            process.send(signal.SIGINT)
+        while len(ended_s) < len(running) and time.monotonic() < begun_s + 60.0:
+            for name, process in running.items():
+                if not process.running():
+                    ended_s.setdefault(name, time.monotonic() - begun_s)
+            time.sleep(0.01)
+    print({name: round(after_s, 2) for name, after_s in ended_s.items()})
+    for name, process in running.items():
+        printed = process.output[before[name] :]
+        print(f"--- {name}\n{printed}")
+        assert process.wait() == 0
+        assert not [word for word in STRAY if word in printed]
+
+
+def test_in_the_middle_of_a_sweep(tmp_path: Path) -> None:
     log, domain = tmp_path / "output.log", free_domain()
     with (
         remote_bench(**scenarios.bench_settings(log)) as (_, folder),
@@ -30,25 +64,22 @@ def test_ctrl_c_in_a_sweep_on_a_busy_machine(tmp_path: Path) -> None:
         with scenarios.bench(domain, log) as bench:
             bench.start(**scenarios.SLOW)
             bench.wait_for_sweep()
-        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
-        try:
-            before = {name: len(process.output) for name, process in running.items()}
-            begun_s, ended_s = time.monotonic(), {}
-            for process in running.values():
-                process.send(signal.SIGINT)
-            while len(ended_s) < len(running) and time.monotonic() < begun_s + 60.0:
-                for name, process in running.items():
-                    if name not in ended_s and not process.running():
-                        ended_s[name] = time.monotonic() - begun_s
-                time.sleep(0.01)
-        finally:
-            for process in busy:
-                process.kill()
-                process.wait()
-        print({name: round(after_s, 2) for name, after_s in ended_s.items()})
-        for name, process in running.items():
-            printed = process.output[before[name] :]
-            print(f"--- {name}\n{printed}")
-            assert process.wait() == 0
-            assert not [word for word in STRAY if word in printed]
+        assert_ctrl_c_ends(running)
         assert log.read_text().splitlines()[-1].endswith("OFF")
+
+
+def test_all_nodes_in_one_process_scan_and_end(tmp_path: Path) -> None:
+    log, domain, file = tmp_path / "output.log", free_domain(), tmp_path / "lab.yaml"
+    with remote_bench(**scenarios.bench_settings(log)) as (_, folder):
+        tables = {
+            f"{NAMESPACE}/{node_name(module)}": {
+                "ros__parameters": {key: str(value) for key, value in table.items()}
+            }
+            for module, table in scenarios.node_parameters(folder).items()
+        }
+        file.write_text(yaml.safe_dump(tables))
+        module = "eschorty_ros.nodes.one_process.instrument"
+        with NodeProcess(module, {}, domain=domain, file=file) as process:
+            with scenarios.bench(domain, log) as bench:
+                scenarios.full_scan(bench)
+            assert_ctrl_c_ends({"instrument": process})
