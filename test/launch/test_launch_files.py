@@ -41,7 +41,6 @@ sys.exit(service.run())
 @pytest.fixture
 def launched(tmp_path):
     """Run a launch file; gives its process and a function that returns its output."""
-    pytest.importorskip("launch", reason="launch is not installed").LaunchService  # noqa: B018
     pytest.importorskip("launch_ros", reason="launch_ros is not installed")
     from eschorty_ros.nodes.ros.domain import free_domain
 
