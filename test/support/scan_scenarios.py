@@ -40,6 +40,7 @@ SLOW_HZ, SLOW_M_S, FAR_M = 20.0, 0.010, 0.200
 SLOW = {"stop": FAR_M, "speed": SLOW_M_S, "frequency": SLOW_HZ}
 SWEPT_POINTS = 30_000
 CLOCK_S = 0.01
+PAUSE_NS = 500_000_000
 SCAN_DEADLINE_S = 300.0
 DARK_S, CUT_OFF_S = 1.5, 5.0
 
@@ -160,7 +161,12 @@ class Bench:
 
         A scan also holds points that the background makes without light, at any stage position.
         """
-        on_ns, off_ns = (t_ns for t_ns, _ in read_output_log(self._laser_log)[-2:])
+        times_ns = [t_ns for t_ns, _ in read_output_log(self._laser_log)]
+        off_ns, on = times_ns[-1], len(times_ns) - 2
+        # A renewal that comes late pauses the light.
+        while on >= 2 and times_ns[on] - times_ns[on - 1] < PAUSE_NS:
+            on -= 2
+        on_ns = times_ns[on]
         begun_ns = ns_from_stamp(self.clouds[-1].header.stamp) - ros_minus_steady_ns()
         t_s = points["t"] + 1e-9 * (begun_ns - on_ns)
         lit_s = 1e-9 * (off_ns - on_ns)
