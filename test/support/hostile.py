@@ -29,8 +29,6 @@ class Call:
     make: Callable[..., Any]
     good: dict[str, Any]
     kinds: dict[str, Kind] = field(default_factory=dict)
-    named: dict[str, str] = field(default_factory=dict)
-    """Arguments that messages call by another name."""
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, optional: bool = False) -> Kind:

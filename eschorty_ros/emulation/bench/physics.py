@@ -254,7 +254,7 @@ class Physics:
         }
 
     def _simulate(self) -> bool:
-        """Advance the world by at most 16 packets; returns whether it advanced."""
+        """Advance the world by some packets at most; returns whether it advanced."""
         world = self._world
         assert world is not None
         with self.lock:

@@ -98,17 +98,7 @@ class AwgLaser:
         self._since_ns = clock_ns()
         self._reason = ""
         self._warnings: list[str] = []
-        self._counters = dict.fromkeys(
-            (
-                "openings",
-                "faults",
-                "retries",
-                "switch_off_failures",
-                "light_grants",
-                "light_pauses",
-            ),
-            0,
-        )
+        self._counters = dict.fromkeys(_COUNTERS, 0)
         # Length of one grant in s, 0 where light does not end by itself; of the last one the least
         # and the latest time of its end, steady.
         self._grant_s = 0.0

@@ -1,4 +1,4 @@
-"""Time at which a signal that starts from rest passes a level: looked up, not summed.
+"""Time at which a signal that starts from rest passes a level, from tables.
 
 From rest photoreceptor and follower move in one direction, ``y = s1 + (s0 - s1) phi(t / tau_p)``
 with ``phi(x) = (exp(-x) - rho exp(-x / rho)) / (1 - rho)`` and ``rho = tau_f / tau_p``. A table is
