@@ -75,7 +75,7 @@ class CameraNode(DeviceNode):
         )
         self.create_service(Trigger, "~/save_biases", self._save_biases)
         self.create_service(Trigger, "~/dump_statistics", self._dump_statistics)
-        self._biases_changed = self.create_guard_condition(self._write_parameters)
+        self._biases_changed = self.on_request(self._write_parameters)
         self._diagnostics = diagnostics.Diagnostics(self, self._report)
         Heartbeat(self, "camera/heartbeat", lambda: self.healthy)
 
@@ -180,7 +180,7 @@ class CameraNode(DeviceNode):
             if offset != self._biases.get(name):
                 self._biases[name] = source.set_bias(name, offset)
                 if self._biases[name] != offset:
-                    self._biases_changed.trigger()
+                    self._biases_changed()
 
     def _write_parameters(self) -> None:
         changed = [

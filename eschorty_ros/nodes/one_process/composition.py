@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any
 import rclpy
 import yaml
 from rclpy.action import ActionClient
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -25,7 +23,8 @@ from eschorty_ros.nodes.laser.node import LaserNode
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.domain import free_domain
-from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored, turn
+from eschorty_ros.nodes.ros.executor import Spinning
+from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored
 from eschorty_ros.nodes.scanner.node import ScannerNode
 from eschorty_ros.nodes.stage.node import StageNode
 
@@ -188,29 +187,24 @@ def _running(parameter_file: Path) -> Iterator[Composition]:
         domain_id=None if os.environ.get("ROS_DOMAIN_ID") else free_domain(),
         signal_handler_options=SignalHandlerOptions.NO,
     )
-    executor = MultiThreadedExecutor(THREADS)
-    ending = threading.Event()
-    thread = threading.Thread(target=_spin, args=(executor, ending), name="nodes")
+    spinning = Spinning(THREADS)
     try:
         for factory in NODES.values():
             nodes.append(factory())
         nodes.append(client := Node("eschorty_client"))
         made = Composition(client, nodes)
         for node in nodes:
-            executor.add_node(node)
+            spinning.executor.add_node(node)
         if os.environ.get("ROS_DOMAIN_ID"):
             SecondNodes(nodes).wait()
-        thread.start()
+        spinning.start()
         yield made
     finally:
         with signals_ignored():
             make_safe(nodes)
-            ending.set()
             # An ended context also ends callbacks that wait, such as homing.
             rclpy.try_shutdown()
-            if thread.is_alive():
-                thread.join(5.0)
-            executor.shutdown(timeout_sec=2.0)
+            spinning.end(2.0)
             for node in nodes:
                 node.destroy_node()
 
@@ -219,19 +213,6 @@ def _parameter_file(values: Tables) -> str:
     return yaml.safe_dump(
         {f"{NAMESPACE}/{node}": {"ros__parameters": table} for node, table in values.items()}
     )
-
-
-def _spin(executor: MultiThreadedExecutor, ending: threading.Event) -> None:
-    # Shutting an executor down while it spins raises in this thread.
-    try:
-        while not ending.is_set():
-            turn(executor)
-    except ExternalShutdownException:
-        pass
-    except Exception:
-        # A callback that publishes while the context ends fails.
-        if not ending.is_set():
-            raise
 
 
 def wait(condition: Callable[[], Any], limit_s: float, fault: str | Callable[[], str]) -> None:

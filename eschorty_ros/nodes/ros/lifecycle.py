@@ -16,6 +16,8 @@ from eschorty_ros.nodes.ros.parameters import Param, Parameters
 
 AUTO_START = Param("auto_start", True, "configure and activate at start")
 RETRY_S = 2.0
+# A period of 0 keeps rclpy's EventsExecutor busy.
+_SOON_S = 1e-3
 
 
 class DeviceNode(LifecycleNode):
@@ -63,10 +65,10 @@ class DeviceNode(LifecycleNode):
         self._auto_starting = False
         self._logged = ""
         self._faulted = threading.Event()
-        self._fault_guard = self.create_guard_condition(self._leave_after_fault)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._fault_leaving = self.on_request(self._leave_after_fault)
         self._start_timer = (
-            self.create_timer(0.0, self._auto_start, clock=self.steady_clock)
+            self.create_timer(_SOON_S, self._auto_start, clock=self.steady_clock)
             if self.parameters["auto_start"]
             else None
         )
@@ -111,7 +113,18 @@ class DeviceNode(LifecycleNode):
             self.get_logger().error(reason)
         if not self._faulted.is_set():
             self._faulted.set()
-            self._fault_guard.trigger()
+            self._fault_leaving()
+
+    def on_request(self, callback: Callable[[], None]) -> Callable[[], None]:
+        """Return what makes the executor call ``callback`` once; from any thread."""
+
+        def once() -> None:
+            timer.cancel()
+            callback()
+
+        timer = self.create_timer(_SOON_S, once, clock=self.steady_clock, autostart=False)
+        reset: Callable[[], None] = timer.reset
+        return reset
 
     def now_ns(self) -> int:
         """Return the node's ROS time, int64 nanoseconds."""

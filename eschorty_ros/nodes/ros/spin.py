@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import select
 import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 from weakref import WeakSet
 
 import rclpy
-from rclpy.executors import (
-    Executor,
-    ExternalShutdownException,
-    MultiThreadedExecutor,
-    SingleThreadedExecutor,
-)
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -26,8 +21,9 @@ from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
+from eschorty_ros.nodes.ros.executor import Spinning
 
-_PAUSE_S = 3e-4
+_TURN_S = 0.1
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ending: WeakSet[Node] = WeakSet()
 
@@ -100,12 +96,18 @@ def signals_ignored() -> Iterator[None]:
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
-def turn(executor: Executor) -> None:
-    """Run one turn of a spin loop."""
-    executor.spin_once(timeout_sec=0.1)
-    # While a callback runs, rclpy 9 polls for the next of its group without a pause and would
-    # hold the interpreter's lock.
-    time.sleep(_PAUSE_S)
+@contextlib.contextmanager
+def _signal_pipe() -> Iterator[int]:
+    """Give a file descriptor that becomes readable when a signal comes."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    try:
+        yield reading
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(reading)
+        os.close(writing)
 
 
 def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | None = None) -> int:
@@ -129,7 +131,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         runs, or a callback failed (one line for an ``EschortyError``).
     """
     nodes: list[Node] = []
-    executor: Executor | None = None
+    spinning: Spinning | None = None
     code = 0
     use_profile()
     end_with_launcher()
@@ -140,17 +142,20 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             signal_handler_options=SignalHandlerOptions.NO,
         )
         ending.starting = False
-        executor = MultiThreadedExecutor(threads) if threads > 1 else SingleThreadedExecutor()
+        spinning = Spinning(threads)
         for factory in factories:
             node = factory()
             nodes.append(node)
-            executor.add_node(node)
+            spinning.executor.add_node(node)
         second = SecondNodes(nodes)
+        spinning.start()
         second.wait()
-        while rclpy.ok() and not ending.requested:
-            turn(executor)
-            second.look()
-    except (KeyboardInterrupt, ExternalShutdownException):
+        with _signal_pipe() as signals:
+            while rclpy.ok() and not ending.requested:
+                spinning.raise_error()
+                second.look()
+                select.select([signals], [], [], _TURN_S)
+    except KeyboardInterrupt:
         pass
     except EschortyError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
@@ -163,13 +168,13 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     finally:
         _ignore_signals()
         make_safe(nodes)
-        _tear_down(nodes, executor)
+        _tear_down(nodes, spinning)
     return code
 
 
-def _tear_down(nodes: Sequence[Node], executor: Executor | None) -> None:
-    if executor is not None:
-        executor.shutdown(timeout_sec=1.0)
+def _tear_down(nodes: Sequence[Node], spinning: Spinning | None) -> None:
+    if spinning is not None:
+        spinning.end()
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
