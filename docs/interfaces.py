@@ -50,6 +50,7 @@ TOPICS = {
     "scan/points": "the assembled scan in `eschorty_base`",
     "event_frame": "recent events, `mono8`, 10 Hz at most",
     "reconstruction/state": "progress and losses, 10 Hz",
+    "reconstruction/heartbeat": "10 Hz while it works; a scan ends without it",
     "reconstruction/calibration": "the calibration in use",
     "/diagnostics": "health of each node, 1 Hz",
     "/tf": "carriage in the base, from `stage/odom`",

@@ -28,10 +28,8 @@ _HIDDEN = "/_action/"
 
 # What a node makes when it is needed.
 _LIGHT: dict[tuple[str, str], set[str]] = {
-    ("actions", "call"): {"stage/move", "calibrate"},
-    ("services", "request"): {"laser/arm", "laser/enable", "laser/set_parameters"},
-    ("topics", "publish"): {"laser/heartbeat"},
-    ("topics", "subscribe"): {"laser/state", "reconstruction/state", "stage/odom"},
+    ("actions", "call"): {"calibrate"},
+    ("topics", "subscribe"): {"reconstruction/state", "reconstruction/heartbeat"},
 }
 ON_DEMAND = {"reconstruction": _LIGHT, "scanner": {("actions", "call"): {"scan"}}}
 

@@ -8,11 +8,13 @@ from typing import Protocol
 
 from eschorty_ros.control.scan_sequence import End, Instrument, Outcome, ScanCanceled, check_laser
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.calibration import METHODS
 from eschorty_ros.live.calibration_capture import CaptureRequest
 
 CAPTURE_MAX_S = 120.0
 _DRAIN_S = 10.0
+_DRAIN_WITHIN_S = 120.0
 _SETTLE_MM_S = 100.0
 
 
@@ -26,7 +28,9 @@ class CaptureInstrument(Instrument, Protocol):
 def check_request(request: CaptureRequest) -> None:
     """Raise ``ArgumentError`` with name, value and remedy unless the capture can be done."""
     if request.method not in METHODS:
-        raise ArgumentError(f"method is {request.method!r}; choose one of {', '.join(METHODS)}")
+        raise ArgumentError(
+            f"method is {short(request.method)}; choose one of {', '.join(METHODS)}"
+        )
     check_laser(request.frequency_hz, request.duty)
     sweep = request.sweep
     if sweep is None:
@@ -110,7 +114,7 @@ def _finish(
         steps.append(instrument.stop_stage)
     elif finish is not None:
         instrument.report("finishing")
-        steps.append(lambda: instrument.drain(_DRAIN_S))
+        steps.append(lambda: instrument.drain(_DRAIN_S, _DRAIN_WITHIN_S))
     if finish is not None:
         steps.append(finish)
     for step in steps:

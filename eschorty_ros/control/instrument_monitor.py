@@ -8,7 +8,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.scan_sequence import ScanFailure
+from eschorty_ros.control.stamp_ages import StampAges
 from eschorty_ros.hardware.base.protocols import LaserOutput
 
 # With Fast DDS's defaults a lost message is repeated after 3 s.
@@ -16,6 +18,9 @@ _STALE_S = 3.5
 # A laser reports nothing during a command.
 _SILENT_S = 2.5
 _REST_MM_S = 0.1
+# A stage needs some seconds to begin a move, and longer on a busy computer.
+_MOTION_S = 15.0
+_HEARTBEAT_S = 3.0
 _SAMPLES_MAX = 500_000
 
 
@@ -31,13 +36,17 @@ class LaserStatus:
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionStatus:
-    """Progress of the reconstruction, ROS time in ns, and its totals since its start."""
+    """Progress of the reconstruction, ROS time in ns, and its totals since its start.
+
+    ``packet_age_s`` is the least age of the last second's packets on arrival, NaN without any.
+    """
 
     processed_until_ns: int
     events_per_second: float
     profiles: int
     points: int
     scan_id: str
+    packet_age_s: float = math.nan
 
 
 class InstrumentMonitor:
@@ -63,24 +72,45 @@ class InstrumentMonitor:
         self.at_rest = False
         self.until_ns = 0
         self._laser_s = self._reconstruction_s = self._stage_s = self._advanced_s = 0.0
+        self._moved_s = 0.0
+        # Another program's reconstruction may have no heartbeat.
+        self._heartbeat_s = math.inf
+        self._sender: Sender | None = None
+        names = ("reconstruction", "camera", "laser", "stage")
+        self._ages = {name: StampAges(name) for name in names}
 
-    def update_laser(self, status: LaserStatus) -> None:
-        """Store the laser's newest status."""
+    def update_laser(self, status: LaserStatus, age_s: float) -> None:
+        """Store the laser's newest status, which arrived ``age_s`` after its stamp."""
         self.laser, self._laser_s = status, time.monotonic()
+        self._ages["laser"].add(age_s)
 
-    def update_reconstruction(self, status: ReconstructionStatus) -> None:
-        """Store the reconstruction's newest status."""
+    def update_reconstruction(self, status: ReconstructionStatus, age_s: float) -> None:
+        """Store the reconstruction's newest status, which arrived ``age_s`` after its stamp."""
         now_s = time.monotonic()
+        self._ages["reconstruction"].add(age_s)
+        if math.isfinite(status.packet_age_s):
+            self._ages["camera"].add(status.packet_age_s)
         if status.processed_until_ns != self.until_ns:
             self.until_ns, self._advanced_s = status.processed_until_ns, now_s
         self.reconstruction, self._reconstruction_s = status, now_s
 
-    def update_stage(self, t_ns: int, position_mm: float, velocity_mm_s: float) -> None:
-        """Store a sample of the stage's position."""
+    def update_stage(
+        self, t_ns: int, position_mm: float, velocity_mm_s: float, age_s: float
+    ) -> None:
+        """Store a sample of the stage's position, which arrived ``age_s`` after its stamp."""
+        now_s = time.monotonic()
+        if position_mm != self.position_mm:
+            self._moved_s = now_s
         self.position_mm = position_mm
-        self._stage_s = time.monotonic()
+        self._stage_s = now_s
+        self._ages["stage"].add(age_s)
         self.at_rest = abs(velocity_mm_s) < _REST_MM_S
         self.samples.append((t_ns, position_mm))
+
+    def update_heartbeat(self, text: str) -> None:
+        """Store a heartbeat of the reconstruction."""
+        self._sender, stopped = read_heartbeat(text)
+        self._heartbeat_s = -math.inf if stopped else time.monotonic()
 
     @property
     def output(self) -> int | None:
@@ -114,6 +144,26 @@ class InstrumentMonitor:
         """Raise ``ScanFailure`` when odometry stopped."""
         if not self.stage_reports:
             raise ScanFailure(f"stage: no odometry for {_STALE_S:g} s")
+
+    def check_motion(self, begun_s: float) -> None:
+        """Raise ``ScanFailure`` when a move that began then has ended without a result."""
+        if _age_s(max(begun_s, self._moved_s)) > _MOTION_S:
+            raise ScanFailure(
+                f"stage: it rests at {self.position_mm * 1e-3:g} m, but its move does not end"
+            )
+
+    def check_clocks(self) -> None:
+        """Raise ``ScanFailure`` when a node's stamps are not of this host's time."""
+        for ages in self._ages.values():
+            ages.check()
+
+    def check_reconstruction(self) -> None:
+        """Raise ``ScanFailure`` when the reconstruction's process or its heartbeat has ended."""
+        fault = self._sender.fault() if self._sender is not None else ""
+        if not fault and _age_s(self._heartbeat_s) > _HEARTBEAT_S:
+            fault = "its heartbeat has stopped"
+        if fault:
+            raise ScanFailure(f"reconstruction: {fault}; the scan ends")
 
     def check_progress(self, timeout_s: float) -> None:
         """Raise ``ScanFailure`` when the reconstruction made no progress for ``timeout_s``."""

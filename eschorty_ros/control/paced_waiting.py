@@ -11,6 +11,7 @@ from eschorty_ros.control.instrument_monitor import InstrumentMonitor
 from eschorty_ros.control.scan_sequence import ScanCanceled, ScanFailure
 
 _TICK_S = 0.02
+_NOTED_S = 0.5
 
 
 class PacedWaiting:
@@ -29,6 +30,11 @@ class PacedWaiting:
         Returns whether the program continues.
     events_timeout_s : float
         Longest time without progress of the reconstruction while watching.
+
+    Attributes
+    ----------
+    waits_for : str
+        What a wait of more than half a second lacks, ``""`` otherwise.
     """
 
     def __init__(
@@ -51,6 +57,7 @@ class PacedWaiting:
         self._canceled: Callable[[], bool] = lambda: False
         self._feedback: Callable[[str], None] = lambda phase: None
         self._phase = ""
+        self.waits_for = ""
 
     def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
         """Reset for a new sequence; both callables are used at every tick."""
@@ -86,12 +93,20 @@ class PacedWaiting:
         finally:
             self._shielded = before
 
-    def drain(self, no_progress_s: float) -> None:
+    def drain(self, no_progress_s: float, within_s: float) -> None:
         """See ``Instrument``."""
         target_ns = self._now_ns()
+        end_s = time.monotonic() + within_s
         while self.monitor.until_ns < target_ns:
             self.tick()
+            self.monitor.check_reconstruction()
             self.monitor.check_progress(no_progress_s)
+            if time.monotonic() > end_s:
+                behind_s = (target_ns - self.monitor.until_ns) * 1e-9
+                raise ScanFailure(
+                    f"reconstruction: {behind_s:.1f} s behind the end of the sweep after "
+                    f"{within_s:.0f} s; look at the computer's load and at the hosts' clocks"
+                )
 
     def hold(self, duration_s: float) -> None:
         """Wait until the reconstruction has passed this much sensor time from now on."""
@@ -115,6 +130,7 @@ class PacedWaiting:
         self._feedback(self._phase)
         if self._watching:
             self.monitor.check_laser()
+            self.monitor.check_reconstruction()
             self.monitor.check_progress(self._events_timeout_s)
         if not self._shielded and self._canceled():
             raise ScanCanceled
@@ -124,9 +140,14 @@ class PacedWaiting:
         self, condition: Callable[[], bool], timeout_s: float, failure: str | Callable[[], str]
     ) -> None:
         """Wait for ``condition``; raises ``ScanFailure`` with ``failure`` after ``timeout_s``."""
-        end_s = time.monotonic() + timeout_s
-        while not condition():
-            self.tick()
-            if time.monotonic() > end_s:
+        begun_s = time.monotonic()
+        try:
+            while not condition():
+                waited_s = time.monotonic() - begun_s
                 text = failure if isinstance(failure, str) else failure()
-                raise ScanFailure(f"{text} within {timeout_s:g} s; check that the node runs")
+                if waited_s > timeout_s:
+                    raise ScanFailure(f"{text} within {timeout_s:.3g} s; check that the node runs")
+                self.waits_for = text if waited_s > _NOTED_S else ""
+                self.tick()
+        finally:
+            self.waits_for = ""

@@ -12,6 +12,14 @@ from typing import Protocol
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 
+# The periods at the ends of a sweep may be cut.
+_COMPLETE = 0.98
+_FAILED_DRAIN_S = 5.0
+# Longest time for the end of a scan per second of its sweep, on a computer that falls behind.
+_DRAIN_PER_S = 20.0
+SPEED_MIN_MM_S = 1e-3
+"""Least speed of a scan or move: a slower one takes days."""
+
 
 class ScanFailure(EschortyError):  # noqa: N818 - reported like the other failures
     """A scan that cannot continue; the message begins with the component that failed."""
@@ -43,13 +51,17 @@ class ScanRequest:
 
 @dataclass(frozen=True, slots=True)
 class ScanLimits:
-    """The stage's limits, its speed to the start, and the longest wait for the last events."""
+    """The stage's limits, its speed to the start, the longest wait for the last events.
+
+    Below ``completeness_min`` a scan fails.
+    """
 
     travel_mm: tuple[float, float]
     speed_max_mm_s: float
     acceleration_mm_s2: float
     approach_mm_s: float
     drain_timeout_s: float
+    completeness_min: float = 0.9
 
 
 @dataclass(slots=True)
@@ -63,6 +75,23 @@ class ScanSummary:
     events_dropped: int = 0
     sigma_median_m: float = math.nan
     message: str = ""
+    completeness: float = 1.0
+
+    @property
+    def verdict(self) -> str:
+        """Return ``complete``, ``partial`` or ``failed``: without any point."""
+        if not self.points:
+            return "failed"
+        lossless = self.completeness >= _COMPLETE and not self.packets_lost
+        return "complete" if lossless else "partial"
+
+    @property
+    def line(self) -> str:
+        """Return the verdict, with share and reason unless it is ``complete``."""
+        if self.verdict == "complete":
+            return self.verdict
+        share = f", {self.completeness:.1%}" if self.verdict == "partial" else ""
+        return f"{self.verdict}{share}: {self.message or 'look at the log'}"
 
 
 @dataclass(slots=True)
@@ -118,8 +147,8 @@ class Instrument(Protocol):
     def shield(self) -> None:
         """From here on no tick raises ``ScanCanceled``."""
 
-    def drain(self, no_progress_s: float) -> None:
-        """Wait until the reconstruction has passed the present time."""
+    def drain(self, no_progress_s: float, within_s: float) -> None:
+        """Wait until the reconstruction has passed the present time; both limits fail the scan."""
 
     def report(self, phase: str) -> None:
         """Name the phase in the feedback."""
@@ -149,9 +178,9 @@ def check_request(request: ScanRequest, limits: ScanLimits) -> None:
         raise ArgumentError(
             f"start and stop are both {request.start_mm * 1e-3:g} m; choose different ones"
         )
-    if not 0.0 < request.speed_mm_s <= limits.speed_max_mm_s:
+    if not SPEED_MIN_MM_S <= request.speed_mm_s <= limits.speed_max_mm_s:
         raise ArgumentError(
-            f"speed is {request.speed_mm_s * 1e-3:g} m/s; choose more than 0 and at most "
+            f"speed is {request.speed_mm_s * 1e-3:g} m/s; choose {SPEED_MIN_MM_S * 1e-3:g} to "
             f"{limits.speed_max_mm_s * 1e-3:g} m/s"
         )
     check_laser(request.frequency_hz, request.duty)
@@ -249,10 +278,18 @@ def _finish(
         return
     instrument.report("finishing")
     # After a failure the last events are kept, without a long wait for a camera that may be lost.
-    timeout_s = 1.0 if outcome.end is End.ABORTED else limits.drain_timeout_s
-    outcome.attempt(lambda: instrument.drain(timeout_s))
+    failed = outcome.end is End.ABORTED
+    timeout_s = 1.0 if failed else limits.drain_timeout_s
+    sweep_s = abs(request.stop_mm - request.start_mm) / request.speed_mm_s
+    within_s = _FAILED_DRAIN_S if failed else limits.drain_timeout_s + _DRAIN_PER_S * sweep_s
+    outcome.attempt(lambda: instrument.drain(timeout_s, within_s))
 
     def end_scan() -> None:
         outcome.summary = instrument.end_scan(request.scan_id)
 
     outcome.attempt(end_scan)
+    summary = outcome.summary
+    if outcome.end is End.SUCCEEDED and not (
+        summary.points and summary.completeness >= limits.completeness_min
+    ):
+        outcome.end = End.ABORTED

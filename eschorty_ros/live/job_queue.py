@@ -10,12 +10,13 @@ from collections.abc import Callable
 from eschorty_ros.core.base.errors import EschortyError
 
 _POLL_S = 0.1
+_JOBS_MAX = 200_000
 
 Job = Callable[[], None]
 
 
 class JobQueue:
-    """Jobs in the order of their arrival; bulk jobs are bounded, small ones are not.
+    """Jobs in the order of their arrival, bounded: many small ones, fewer bulk jobs.
 
     Parameters
     ----------
@@ -25,7 +26,7 @@ class JobQueue:
     Attributes
     ----------
     overflows : int
-        Bulk jobs refused because the queue was full.
+        Jobs refused because the queue was full.
     """
 
     def __init__(self, bulk_max: int) -> None:
@@ -38,9 +39,9 @@ class JobQueue:
     def __len__(self) -> int:
         return len(self._jobs)
 
-    def post(self, job: Job) -> None:
-        """Queue a small job."""
-        self._append(job, False)
+    def post(self, job: Job) -> bool:
+        """Queue a small job; return ``False`` and count it when the queue is full."""
+        return self._append(job, False)
 
     def post_bulk(self, job: Job) -> bool:
         """Queue a bulk job; return ``False`` and count it when the queue is full."""
@@ -62,10 +63,14 @@ class JobQueue:
                 job()
             except EschortyError as error:
                 refusal.append(str(error))
+            except BaseException:
+                refusal.append("internal error; see the node's log")
+                raise
             finally:
                 answered.set()
 
-        self.post(guarded)
+        if not self.post(guarded):
+            return False, "the reconstruction has too much to do; send less"
         end_s = time.monotonic() + timeout_s
         while not answered.wait(min(_POLL_S, timeout_s)):
             if not running():
@@ -85,7 +90,7 @@ class JobQueue:
 
     def _append(self, job: Job, bulk: bool) -> bool:
         with self._arrived:
-            if bulk and self._bulk >= self._bulk_max:
+            if (bulk and self._bulk >= self._bulk_max) or len(self._jobs) >= _JOBS_MAX:
                 self.overflows += 1
                 return False
             self._jobs.append((job, bulk))

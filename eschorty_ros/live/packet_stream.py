@@ -21,6 +21,12 @@ from eschorty_ros.live.packet_times import (
 from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 
 _GAP_NS = WRAP_US * NS_PER_US // 2
+# A step of the numbers that no loss explains: another stream.
+_LOST_MAX = 1_000_000
+# An announced zero and a packet's stamp agree to this; the host may be late by some of it.
+_ANNOUNCED_NS = 2_000_000_000
+# Sensor time further ahead of a stamp than the first packets can have been late.
+_AHEAD_NS = 5_000_000_000
 
 
 class PacketStream:
@@ -57,7 +63,9 @@ class PacketStream:
         Packets left out because they came twice or after later ones; ``packets_lost`` includes
         the latter.
     clock_restarts : int
-        Restarts of the clock because stamps or sensor times went back.
+        Restarts of the clock because stamps or sensor times went back, or contradict each other.
+    announcements_refused : int
+        Announced zeros that contradict the packets' stamps, which serve instead.
     announcement_expected : bool
         True while packets wait for an announcement of the camera's zero.
     """
@@ -76,6 +84,7 @@ class PacketStream:
         self.packets_late = 0
         self.restarts = 0
         self.clock_restarts = 0
+        self.announcements_refused = 0
         self.announcement_expected = True
         self._packet_period_ns = round(packet_period_s * 1e9)
         self._settings = settings
@@ -86,11 +95,13 @@ class PacketStream:
         self._pulses: PulseTrain | None = None
         self._epoch: SensorEpoch | None = None
         self._epoch_used = False
+        self._zero_ended = False
         self._laser: tuple[Modulation, int | None] | None = None
         self._on_since_ns: int | None = None
         self._reconstructor: Reconstructor | None = None
         self._wraps = 0
         self._next_seq: int | None = None
+        self._source = b""
         self._last_stamp_ns = 0
         self._retired: Counter[str] = Counter()
         self._out: list[TimedProfiles] = []
@@ -111,6 +122,13 @@ class PacketStream:
     def epoch(self) -> SensorEpoch | None:
         """Return the stream's epoch, ``None`` while its clock is unknown."""
         return self._epoch
+
+    @property
+    def profile_rate_hz(self) -> float:
+        """Return the profiles per second of the modulation, 0 while that is unknown."""
+        if self._laser is None:
+            return 0.0
+        return self._laser[0].frequency_hz / self._settings.periods_per_profile
 
     @property
     def processed_until_ns(self) -> int | None:
@@ -138,7 +156,19 @@ class PacketStream:
             self._epoch_used = False
             return
         self._retire()
+        self._zero_ended = False
         self._begin_epoch(SensorClock(zero_ns))
+
+    def forget_zero(self) -> None:
+        """Forget an announced zero before the next scan: its sender has ended."""
+        self._zero_ended = True
+
+    def begin_scan(self) -> None:
+        """Drop the state that senders have left behind."""
+        if self._zero_ended and self._epoch is not None and self._epoch.clock.exact:
+            self._retire()
+            self._epoch = None
+        self._zero_ended = False
 
     def set_laser(
         self, modulation: Modulation, epoch_ns: int | None, on_since_ns: int | None = None
@@ -191,12 +221,15 @@ class PacketStream:
     def process(self, now_s: float) -> list[TimedProfiles]:
         """Reconstruct the packets that need not wait; return the profiles completed since."""
         while self._held:
-            if overtaken(self._held[0], self._next_seq, self._last_stamp_ns):
+            if self._held[0].source == self._source and overtaken(
+                self._held[0], self._next_seq, self._last_stamp_ns
+            ):
                 self._held.popleft()
                 self.packets_late += 1
                 continue
-            if self._next_seq is not None and self._held[0].seq < self._next_seq:
+            if self._next_seq is not None and not self._goes_on(self._held[0]):
                 self._forget_stream()
+            self._source = self._held[0].source
             if not self._ready(self._held[0], now_s):
                 break
             self._push(self._held.popleft())
@@ -210,6 +243,11 @@ class PacketStream:
         if self._reconstructor is not None:
             self._collect(self._reconstructor.flush())
         return self._completed()
+
+    def _goes_on(self, packet: Packet) -> bool:
+        assert self._next_seq is not None
+        missing = packet.seq - self._next_seq
+        return packet.source == self._source and 0 <= missing <= _LOST_MAX
 
     def _forget_stream(self) -> None:
         self._retire()
@@ -269,12 +307,23 @@ class PacketStream:
         if t_us is not None:
             arrival_ns = packet.stamp_ns - self._packet_period_ns
             clock = self._epoch.clock
-            if not clock.exact and not clock.goes_on(t_us + shift_us, arrival_ns):
-                self.clock_restarts += 1
+            if self._contradicts(clock, t_us + shift_us, arrival_ns):
                 self._begin_epoch(clock := SensorClock())
+                after.set_modulation(self._modulation())
             clock.observe(t_us + shift_us, arrival_ns)
         edges_us, kinds = after.take_stage_edges()
         self._epoch.edges.add(edges_us + shift_us, kinds)
+
+    def _contradicts(self, clock: SensorClock, t_us: int, arrival_ns: int) -> bool:
+        """Return whether an arrival cannot be by this clock; count it."""
+        ahead_ns = 0 if clock.line is None else clock.to_ns(t_us) - arrival_ns
+        if clock.exact:
+            refused = abs(ahead_ns) > _ANNOUNCED_NS
+            self.announcements_refused += refused
+            return refused
+        restarts = ahead_ns > _AHEAD_NS or not clock.goes_on(t_us, arrival_ns)
+        self.clock_restarts += restarts
+        return restarts
 
     def _missed_wraps(self, packet: Packet, high_us: int | None) -> int:
         """Return the number of wraps before this packet that a new decoder has not decoded."""
@@ -321,8 +370,12 @@ class PacketStream:
 def clock_statistics(stream: PacketStream) -> dict[str, Any]:
     """Return offset age, drift and residual of the sensor's clock, and its use of stage edges."""
     epoch = stream.epoch
+    counts = {
+        "clock_restarts": stream.clock_restarts,
+        "clock_announcements_refused": stream.announcements_refused,
+    }
     if epoch is None:
-        return {"clock": "unknown", "clock_restarts": stream.clock_restarts}
+        return {"clock": "unknown", **counts}
     clock, fit = epoch.clock, epoch.edges.fit
     source = "stage edges" if clock.from_edges else "packet stamps"
     residual_ns = clock.residual_ns
@@ -331,7 +384,7 @@ def clock_statistics(stream: PacketStream) -> dict[str, Any]:
         "clock_drift_ppm": clock.drift_ppm,
         "clock_residual_ms": residual_ns * 1e-6 if residual_ns is not None else float("nan"),
         "clock_offset_age_s": clock.offset_age_us * 1e-6,
-        "clock_restarts": stream.clock_restarts,
+        **counts,
     }
     if epoch.expects_edges:
         values |= {

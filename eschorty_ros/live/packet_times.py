@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.evt3 import words as w3
 
 WRAP_US = 1 << 24
@@ -16,15 +17,32 @@ _WORDS_SEARCHED = 8192
 _STEP_US = 100_000
 # A packet at most this many numbers back that is stamped no later was overtaken in transit.
 _OVERTAKEN = 16
+# A broken word adds one wrap; a packet holds some milliseconds.
+_SPAN_MAX_US = 4 * WRAP_US
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One ``EventPacket``: ``data`` is a buffer of EVT3 words, ``stamp_ns`` its arrival time."""
+    """One ``EventPacket``: ``data`` is a buffer of EVT3 words, ``stamp_ns`` its arrival time.
+
+    ``source`` identifies its publisher, ``b""`` where that is unknown.
+    """
 
     seq: int
     stamp_ns: int
     data: Any
+    source: bytes = b""
+
+
+def check_span(data: Any) -> None:
+    """Raise ``FormatError`` for a packet whose time runs on for longer than any packet lasts."""
+    words = _words(data)
+    high = words[words & 0xF000 == w3.TIME_HIGH << 12] & 0xFFF
+    span_us = int((np.diff(high) & 0xFFF).sum(dtype=np.int64)) << 12
+    if span_us > _SPAN_MAX_US:
+        raise FormatError(
+            f"a packet of {len(words)} words spans {span_us * 1e-6:.0f} s; send EVT3 as it comes"
+        )
 
 
 def first_time_high_us(data: Any) -> int | None:

@@ -12,10 +12,14 @@ from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Settings, add_stage, place
 from eschorty_ros.live.calibration_capture import Capture
 from eschorty_ros.live.packet_stream import PacketStream
-from eschorty_ros.live.packet_times import Packet
+from eschorty_ros.live.packet_times import Packet, check_span
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.live.stage_placement import StagePlacer
+from eschorty_ros.live.sweep_coverage import SweepCoverage
+
+# At the ends of a sweep a period may be cut.
+_FEW = 0.98
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +28,24 @@ class ScanReport:
 
     scan: AssembledScan
     events: int
+    packets: int
     packets_lost: int
     events_dropped: int
     points_without_stage: int
     points_outside: int
     points_over_limit: int
+    profiles_expected: int
+
+    @property
+    def completeness(self) -> float:
+        """Return the least share of what there should be: of profiles, packets and points."""
+        points = len(self.scan.points)
+        lost = self.points_without_stage + self.points_over_limit
+        return min(
+            _share(self.scan.profiles, self.profiles_expected),
+            _share(self.packets, self.packets + self.packets_lost),
+            _share(points, points + lost),
+        )
 
     @property
     def message(self) -> str:
@@ -40,6 +57,13 @@ class ScanReport:
             notes.append(f"{self.points_over_limit} points were over the scan's limit")
         if not notes and not len(self.scan.points):
             notes.append(self._cause_of_empty())
+        if self.packets_lost:
+            notes.append(f"{self.packets_lost} packets were lost")
+        if 0 < self.scan.profiles < _FEW * self.profiles_expected:
+            notes.append(
+                f"{self.scan.profiles} profiles of {self.profiles_expected} between start and "
+                f"stop; {self.points_outside} points are outside"
+            )
         return "; ".join(notes)
 
     def _cause_of_empty(self) -> str:
@@ -54,6 +78,11 @@ class ScanReport:
             f"no points: all {self.points_outside} are outside start to stop; check that the "
             "stamps of camera and stage are of the same clock"
         )
+
+
+def _share(part: int, whole: int) -> float:
+    """Return a share, at most 1; without a whole it is 1 of nothing expected."""
+    return min(part / whole, 1.0) if whole > 0 else float(part >= whole)
 
 
 class Pipeline:
@@ -90,7 +119,8 @@ class Pipeline:
         self.capture: Capture | None = None
         self._fresh: list[TimedProfiles] = []
         self._buffer: ScanBuffer | None = None
-        self._losses_at_begin: tuple[int, int, int, int] = (0, 0, 0, 0)
+        self._coverage = SweepCoverage(0.0, 0.0)
+        self._losses_at_begin: tuple[int, ...] = (0,) * 5
 
     @property
     def scan_id(self) -> str:
@@ -98,11 +128,24 @@ class Pipeline:
         return self._buffer.scan_id if self._buffer is not None else ""
 
     def add_packet(self, packet: Packet, now_s: float) -> None:
-        """Queue a packet and reconstruct the packets that need not wait."""
+        """Queue a packet and reconstruct the packets that need not wait.
+
+        Raises
+        ------
+        FormatError
+            For a packet without the time of a camera.
+        """
+        check_span(packet.data)
         self.stream.add(packet, now_s)
         self._receive(self.stream.process(now_s), now_s)
         if self.capture is not None:
             self.capture.packet(packet)
+
+    def add_stage(self, t_ns: int, position_mm: float) -> None:
+        """Add one stage sample at ROS time ``t_ns``."""
+        self.placer.add_stage(t_ns, position_mm)
+        if self._buffer is not None:
+            self._coverage.add(t_ns, position_mm)
 
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
         """Return the profiles completed and the points placed since the last call."""
@@ -155,6 +198,8 @@ class Pipeline:
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
+        self._coverage = SweepCoverage(start_mm, stop_mm)
+        self.stream.begin_scan()
         self._losses_at_begin = self._losses()
 
     def set_capture(self, capture: Capture | None) -> None:
@@ -196,9 +241,19 @@ class Pipeline:
         buffer, self._buffer = self._buffer, None
         self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
-        events, lost, dropped, without = np.subtract(self._losses(), self._losses_at_begin).tolist()
+        events, packets, lost, dropped, without = (
+            now - before for now, before in zip(self._losses(), self._losses_at_begin, strict=True)
+        )
         return ScanReport(
-            scan, events, lost, dropped, without, buffer.points_outside, buffer.points_over_limit
+            scan,
+            events,
+            packets,
+            lost,
+            dropped,
+            without,
+            buffer.points_outside,
+            buffer.points_over_limit,
+            self._coverage.profiles(self.stream.profile_rate_hz),
         )
 
     def _receive(self, timed: list[TimedProfiles], now_s: float) -> None:
@@ -229,10 +284,11 @@ class Pipeline:
             part.sensor,
         )
 
-    def _losses(self) -> tuple[int, int, int, int]:
+    def _losses(self) -> tuple[int, ...]:
         counters = self.stream.counters
         return (
             counters["events"],
+            self.stream.packets,
             self.stream.packets_lost,
             counters["events_dropped"],
             self.placer.points_without_stage,

@@ -11,6 +11,7 @@ from eschorty_ros.control.scan_sequence import (
     ScanFailure,
     ScanLimits,
     ScanRequest,
+    ScanSummary,
     check_request,
     crossing_ns,
     run_scan,
@@ -64,6 +65,30 @@ def test_the_first_reason_stays():
 
     instrument.end_scan = end_scan
     assert run_scan(instrument, REQUEST, LIMITS).message == "camera: gone"
+
+
+@pytest.mark.parametrize(
+    ("summary", "end", "line"),
+    [
+        (ScanSummary(points=5, completeness=1.0), End.SUCCEEDED, "complete"),
+        (
+            ScanSummary(points=5, completeness=0.95, packets_lost=2, message="2 packets lost"),
+            End.SUCCEEDED,
+            "partial, 95.0%: 2 packets lost",
+        ),
+        (
+            ScanSummary(points=5, completeness=0.12, message="17 profiles of 140"),
+            End.ABORTED,
+            "partial, 12.0%: 17 profiles of 140",
+        ),
+        (ScanSummary(completeness=1.0, message="no points"), End.ABORTED, "failed: no points"),
+    ],
+)
+def test_a_scan_without_its_points_is_no_success(summary, end, line):
+    instrument = RecordingInstrument(summary=summary)
+    outcome = run_scan(instrument, REQUEST, LIMITS)
+    assert outcome.end is end
+    assert outcome.summary.line == line
 
 
 def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():

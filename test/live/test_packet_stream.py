@@ -4,13 +4,20 @@ import numpy as np
 import pytest
 from line_events import encoded, line_events
 
+from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_stream import PacketStream
-from eschorty_ros.live.packet_times import WRAP_US, Packet, first_time_high_us, first_time_us
+from eschorty_ros.live.packet_times import (
+    WRAP_US,
+    Packet,
+    check_span,
+    first_time_high_us,
+    first_time_us,
+)
 
 ZERO_NS = 1_700_000_000_123_456_789
 EDGE_US = 1000
@@ -348,3 +355,40 @@ def test_time_of_a_packets_first_bytes(words, before_us, after_us, found):
 def test_first_time_high():
     assert first_time_high_us(np.array([0x0001, 0x8003, 0x8004], "<u2").tobytes()) == 3 << 12
     assert first_time_high_us(b"\x01") is None
+
+
+def test_an_announced_zero_that_contradicts_the_stamps_is_refused_and_counted():
+    data = line()
+    subject = stream()
+    subject.announce_zero(ZERO_NS + 3_600_000_000_000)
+    subject.set_laser(MODULATION, None)
+    parts = run(subject, packets(data))
+    assert subject.announcements_refused == 1
+    assert not subject.epoch.clock.exact
+    t_ns = np.concatenate([part.t_ns for part in parts])
+    assert np.abs(t_ns - ZERO_NS).max() < 1_000_000_000
+
+
+def test_packets_of_another_source_leave_no_trace_in_the_clock():
+    data = line()
+    subject = stream()
+    subject.announcement_expected = False
+    subject.set_laser(MODULATION, None)
+    future_ns = ZERO_NS + 86_400_000_000_000
+    items = packets(line(4, 9_000_000), seq=2**64 - 9, stamp_ns=future_ns)
+    hostile = [Packet(p.seq, p.stamp_ns, p.data, b"other") for p in items[:3]]
+    run(subject, hostile)
+    lost = subject.packets_lost
+    parts = run(subject, packets(data))
+    t_ns = np.concatenate([part.t_ns for part in parts])
+    assert np.abs(t_ns - ZERO_NS).max() < 1_000_000_000
+    assert subject.packets_lost == lost == 0
+    np.testing.assert_array_equal(np.unique(joined(parts).column), np.unique(plain(data).column))
+
+
+def test_a_packet_whose_time_runs_on_is_refused():
+    wrapping = np.tile([0x8000, 0x8000, 0x87FF, 0x87FF], 5_000).astype("<u2").tobytes()
+    for data in (wrapping, np.random.default_rng(5).bytes(100_000)):
+        with pytest.raises(FormatError, match="spans"):
+            check_span(data)
+    check_span(line())

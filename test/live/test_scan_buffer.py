@@ -81,7 +81,7 @@ def test_a_scan_without_points_has_the_reason(points, events, without, outside, 
     buffer = ScanBuffer("a", 0.0, 1.0)
     if points:
         buffer.add(placed([0.5] * points, [T0_NS] * points, range(points)))
-    report = ScanReport(buffer.assemble(), events, 0, 0, without, outside, 0)
+    report = ScanReport(buffer.assemble(), events, 1, 0, 0, without, outside, 0, 0)
     assert report.message.startswith(begins)
     assert bool(report.message) == bool(begins)
 

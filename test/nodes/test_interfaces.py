@@ -65,7 +65,7 @@ def test_the_policies_of_sros2_allow_what_the_nodes_do_and_no_more(nodes):
 def test_what_the_reconstruction_makes_for_a_calibration_is_allowed(nodes):
     calibrating = Node("calibrating", namespace=tables.NAMESPACE)
     try:
-        InstrumentClient(calibrating, 1.0, 1.0, 1.0)
+        InstrumentClient(calibrating, 1.0, 1.0, 1.0).subscribe()
         needed = policies.rights(calibrating)
     finally:
         calibrating.destroy_node()

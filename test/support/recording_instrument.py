@@ -7,7 +7,8 @@ from eschorty_ros.control.scan_sequence import ScanSummary
 class RecordingInstrument:
     """Records every call; the ``failing`` one, (name, number), raises ``error``."""
 
-    def __init__(self, failing=None, error=None):
+    def __init__(self, failing=None, error=None, summary=None):
+        self._summary = summary or ScanSummary(points=5, completeness=1.0)
         self.calls = []
         self._failing = failing
         self._error = error
@@ -17,7 +18,7 @@ class RecordingInstrument:
             self.calls.append(name)
             if self._failing == (name, self.calls.count(name)):
                 raise self._error
-            return ScanSummary(points=5) if name == "end_scan" else None
+            return self._summary if name == "end_scan" else None
 
         return call
 

@@ -12,6 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.action import ActionClient
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -147,21 +149,33 @@ def domain_environment(domain: int) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def spinning(executor: Executor) -> Iterator[None]:
+def spinning(executor: Executor) -> Iterator[Callable[[], AbstractContextManager[None]]]:
     """Within it a thread spins ``executor``, which is shut down at the end.
 
-    Not by ``executor.spin``: that would still use what shutting down destroys.
+    Not by ``executor.spin``: that would still use what shutting down destroys. What it yields
+    pauses the thread, to make an action client, which rclpy uses before it is complete.
     """
-    ending = threading.Event()
+    ending, pausing, turning = threading.Event(), threading.Event(), threading.Lock()
 
     def spin() -> None:
         while not ending.is_set():
-            executor.spin_once(timeout_sec=0.05)
+            if pausing.is_set():
+                ending.wait(1e-3)
+                continue
+            with turning:
+                executor.spin_once(timeout_sec=0.05)
+
+    @contextlib.contextmanager
+    def pause() -> Iterator[None]:
+        pausing.set()
+        with turning:
+            yield
+        pausing.clear()
 
     thread = threading.Thread(target=spin, daemon=True)
     thread.start()
     try:
-        yield
+        yield pause
     finally:
         ending.set()
         thread.join()
@@ -211,7 +225,7 @@ class Observer:
             held.callback(self.node.destroy_node)
             self._executor = SingleThreadedExecutor(context=context)
             self._executor.add_node(self.node)
-            held.enter_context(spinning(self._executor))
+            self._paused = held.enter_context(spinning(self._executor))
             self._held = held.pop_all()
 
     def __enter__(self) -> Observer:
@@ -219,6 +233,11 @@ class Observer:
 
     def __exit__(self, *_: object) -> None:
         self._held.close()
+
+    def action_client(self, kind: Any, name: str) -> ActionClient:
+        """An action's client."""
+        with self._paused():
+            return ActionClient(self.node, kind, name)
 
     def collect(self, message_type: Any, topic: str, profile: QoSProfile) -> list[Any]:
         """A list that grows by every message of ``topic`` from now on."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -14,7 +15,6 @@ from action_msgs.msg import GoalStatus
 from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from nav_msgs.msg import Odometry
-from rclpy.action import ActionClient
 from ros_process import Observer, ros_minus_steady_ns, stamped_after, wait_until
 from sensor_msgs.msg import PointCloud2
 
@@ -81,7 +81,7 @@ class Goals:
 
     def __init__(self, observer: Observer, action: Any, name: str, node: str) -> None:
         self._observer, self._action, self._node = observer, action, node
-        self._client = ActionClient(observer.node, action, name)
+        self.client = observer.action_client(action, name)
         self.feedback: list[Any] = []
         self._ended: Any = None
 
@@ -89,10 +89,10 @@ class Goals:
         """Send a goal; the accepted handle."""
         # First, because the action of a node that has just ended may still be discovered.
         self._observer.wait_for_answers(self._node, SCAN_DEADLINE_S)
-        wait_until(self._client.server_is_ready, "the action", SCAN_DEADLINE_S)
+        wait_until(self.client.server_is_ready, "the action", SCAN_DEADLINE_S)
         # A new list, because feedback of the goal before may still come.
         feedback = self.feedback = []
-        sent = self._client.send_goal_async(
+        sent = self.client.send_goal_async(
             self._action.Goal(**goal),
             feedback_callback=lambda message: feedback.append(message.feedback),
         )
@@ -122,7 +122,7 @@ class Bench:
     def __init__(self, observer: Observer, domain: int, laser_log: Path) -> None:
         self.observer = observer
         self.domain = domain
-        self._laser_log = laser_log
+        self.laser_log = laser_log
         self.clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
         self.laser = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
         self.odometry = observer.collect(Odometry, "stage/odom", qos.stream())
@@ -161,7 +161,7 @@ class Bench:
 
         A scan also holds points that the background makes without light, at any stage position.
         """
-        times_ns = [t_ns for t_ns, _ in read_output_log(self._laser_log)]
+        times_ns = [t_ns for t_ns, _ in read_output_log(self.laser_log)]
         off_ns, on = times_ns[-1], len(times_ns) - 2
         # A renewal that comes late pauses the light.
         while on >= 2 and times_ns[on] - times_ns[on - 1] < PAUSE_NS:
@@ -175,7 +175,7 @@ class Bench:
 
     def output_lines(self) -> list[str]:
         """ON and OFF in the order of the emulator's own log."""
-        return [output for _, output in read_output_log(self._laser_log)]
+        return [output for _, output in read_output_log(self.laser_log)]
 
     def assert_off_and_at_rest(self) -> None:
         """Laser off by the emulator's own log and by the node; stage not moving."""
@@ -350,6 +350,46 @@ def bad_parameters(bench: Bench) -> None:
     for value in (5, 4):
         accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", value)
         assert accepted, reason
+
+
+def burst_of_goals(bench: Bench, count: int) -> None:
+    """So many bad goals at once, around a good one: none is left behind."""
+    bad = Scan.Goal(start=START_M, stop=math.nan, speed=SPEED_M_S)
+    sent = [bench.scans.client.send_goal_async(bad) for _ in range(count)]
+    handle = bench.start(**SLOW)
+    sent += [bench.scans.client.send_goal_async(bad) for _ in range(count)]
+    bench.wait_for_sweep()
+    wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
+    status, result = bench.scans.end()
+    assert status == GoalStatus.STATUS_CANCELED, result.message
+    bench.assert_off_and_at_rest()
+
+
+def reconstruction_killed(bench: Bench, kill: Callable[[], Any]) -> None:
+    """The reconstruction dies mid-scan: light off at once, the goal ends with the reason."""
+    bench.start(**SLOW)
+    bench.wait_for_sweep()
+    kill()
+    killed_ns = time.monotonic_ns()
+    status, result = bench.scans.end()
+    ended_s = (time.monotonic_ns() - killed_ns) * 1e-9
+    bench.assert_off_and_at_rest()
+    dark_s = (read_output_log(bench.laser_log)[-1][0] - killed_ns) * 1e-9
+    print(f"dark {dark_s:.3f} s, goal ended {ended_s:.1f} s after the reconstruction")
+    assert status == GoalStatus.STATUS_ABORTED
+    assert re.search(r"reconstruction: process \d+ is (gone|dead)", result.message), result.message
+    assert dark_s <= 0.25
+
+
+def scanner_killed(bench: Bench, kill: Callable[[], Any]) -> None:
+    """The scanner dies mid-scan: the reconstruction publishes the points so far."""
+    before = len(bench.clouds)
+    bench.start(**SLOW)
+    bench.wait_for_sweep()
+    kill()
+    wait_until(lambda: len(bench.clouds) > before, "the cloud so far")
+    assert bench.clouds[-1].width > SWEPT_POINTS
+    bench.assert_off_and_at_rest()
 
 
 def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:

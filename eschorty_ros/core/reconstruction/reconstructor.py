@@ -259,6 +259,8 @@ class Reconstructor:
         ``events`` (decoded) = ``events_filtered`` + ``events_gated`` + ``events_binned`` +
         ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_phase`` +
         ``events_held`` (not assigned yet).
+        Of those only ``events_over_column_limit`` and ``events_outside_sensor`` are
+        ``events_dropped``: without light there is no phase, and nothing to lose.
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
         ``decoder_*`` come from the decoder.
         """
@@ -269,8 +271,7 @@ class Reconstructor:
         if self._compensator is not None:
             counts["columns_compensated"] += self._compensator.columns_compensated
         counts["events_dropped"] = sum(
-            counts[f"events_{reason}"]
-            for reason in ("over_column_limit", "outside_sensor", "outside_phase")
+            counts[f"events_{reason}"] for reason in ("over_column_limit", "outside_sensor")
         )
         decoder = self._decoder.counters
         counts["sensor_drop_words"] = decoder.sensor_drop_words

@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
+from eschorty_ros.core.base.numbers import number
 from eschorty_ros.core.evt3 import WordCounter
 from eschorty_ros.emulation.bench.folder import usb_spec
 from eschorty_ros.hardware.base.protocols import EventSource
@@ -214,7 +215,7 @@ class CameraNode(DeviceNode):
         return response
 
     def _on_laser(self, message: LaserState) -> None:
-        self._laser_hz = message.frequency
+        self._laser_hz = number("frequency", message.frequency)
 
     def _report(self) -> diagnostics.Report:
         source, packets, words = self._source, self._packets, self.words

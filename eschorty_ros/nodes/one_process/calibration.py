@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.action import ActionClient
 
 from eschorty_ros.action import Calibrate
 from eschorty_ros.core.calibration import KnownTarget, Targets, read_targets
@@ -89,9 +88,8 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
     tables = bench_parameters()
     tables["reconstruction"] |= {"calibration": job.calibration, "calibration_folder": job.folder}
     bench = bench_options(job.scene, job.as_built, job.seed, job.pixels)
-    with composition(tables, bench) as running:
+    with composition(tables, (Calibrate, "calibrate"), bench) as running:
         feedback(0.0, "starting")
-        action: ActionClient[Any, Any, Any] = ActionClient(running.client, Calibrate, "calibrate")
         goal = Calibrate.Goal(
             targets=[target_message(target) for target in job.targets],
             method=job.method,
@@ -106,7 +104,7 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
                 f"{state.phase} {state.matched} of {state.posts} posts known",
             )
 
-        ended = running.result(action, goal, on_feedback)
+        ended = running.result(goal, on_feedback)
     return CalibrationResult(
         success=bool(ended.success),
         message=str(ended.message),

@@ -78,14 +78,16 @@ def bench_options(scene: str, calibration: str, seed: int, pixels: str) -> dict[
 
 
 class Composition:
-    """The running nodes and a client's node among them."""
+    """The running nodes and a client's node among them, with the client of one action."""
 
-    def __init__(self, client: Node, nodes: list[Node]) -> None:
+    def __init__(self, client: Node, nodes: list[Node], action: Any, spinning: Spinning) -> None:
         self.client = client
         self._nodes = nodes
+        self._spinning = spinning
+        self._action = action
 
-    def wait_until_active(self, action: Any) -> None:
-        """Wait until every node is active and the server of ``action`` has been discovered.
+    def wait_until_active(self) -> None:
+        """Wait until every node is active and the action's server has been discovered.
 
         Raises
         ------
@@ -93,17 +95,12 @@ class Composition:
             When a node failed or takes far too long.
         """
         wait(
-            lambda: self._active() and action.server_is_ready(),
+            lambda: self._active() and self._action.server_is_ready(),
             START_S,
             lambda: "; ".join(("the nodes are not active", *self._waiting())),
         )
 
-    def result(
-        self,
-        action: ActionClient[Any, Any, Any],
-        goal: Any,
-        on_feedback: Callable[[Any], None],
-    ) -> Any:
+    def result(self, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
         """Send a goal once all nodes are active; return its result. An interruption cancels it.
 
         Raises
@@ -111,7 +108,7 @@ class Composition:
         DeviceError
             When a node fails, or the server refuses the goal or sends no feedback any more.
         """
-        self.wait_until_active(action)
+        self.wait_until_active()
         newest_s = time.monotonic()
 
         def receive(message: Any) -> None:
@@ -119,7 +116,7 @@ class Composition:
             newest_s = time.monotonic()
             on_feedback(message)
 
-        sent = action.send_goal_async(goal, feedback_callback=receive)
+        sent = self._action.send_goal_async(goal, feedback_callback=receive)
         wait(sent.done, START_S, "the action does not answer")
         handle = sent.result()
         if handle is None or not handle.accepted:
@@ -128,6 +125,7 @@ class Composition:
         try:
             # A slow machine may take any time: only silence ends the wait.
             while not finished.done():
+                self._spinning.raise_error()
                 if time.monotonic() - newest_s > SILENCE_S:
                     raise DeviceError(f"no feedback of the action for {SILENCE_S:.0f} s")
                 time.sleep(_POLL_S)
@@ -144,6 +142,7 @@ class Composition:
         ]
 
     def _active(self) -> bool:
+        self._spinning.raise_error()
         failed = [
             f"{node.get_name()}: {reason.splitlines()[-1]}"
             for node in self._nodes
@@ -155,9 +154,12 @@ class Composition:
 
 
 @contextlib.contextmanager
-def composition(values: Tables, bench: Mapping[str, object] | None = None) -> Iterator[Composition]:
+def composition(
+    values: Tables, action: tuple[Any, str], bench: Mapping[str, object] | None = None
+) -> Iterator[Composition]:
     """Run all nodes with these parameters inside the context; the laser is off on every exit.
 
+    ``action`` is the type and the name of the action that is to be called.
     With ``bench``, options of ``eschorty-bench``, another process emulates the devices. Unless
     ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own, apart from other instruments.
     """
@@ -171,11 +173,11 @@ def composition(values: Tables, bench: Mapping[str, object] | None = None) -> It
             ending.enter_context(bench_process(folder / "bench", bench))
         file = folder / "parameters.yaml"
         file.write_text(_parameter_file(tables))
-        yield ending.enter_context(_running(file))
+        yield ending.enter_context(_running(file, *action))
 
 
 @contextlib.contextmanager
-def _running(parameter_file: Path) -> Iterator[Composition]:
+def _running(parameter_file: Path, kind: Any, action: str) -> Iterator[Composition]:
     nodes: list[Node] = []
     rclpy.init(
         args=[
@@ -192,7 +194,8 @@ def _running(parameter_file: Path) -> Iterator[Composition]:
         for factory in NODES.values():
             nodes.append(factory())
         nodes.append(client := Node("eschorty_client"))
-        made = Composition(client, nodes)
+        # Before the nodes spin: an executor must not use a client that is being made.
+        made = Composition(client, nodes, ActionClient(client, kind, action), spinning)
         for node in nodes:
             spinning.executor.add_node(node)
         if os.environ.get("ROS_DOMAIN_ID"):

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.action import ActionClient
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.action import Scan
@@ -46,7 +45,10 @@ class ScanJob:
 
 @dataclass(frozen=True, slots=True)
 class ScanResult:
-    """The action's result and the cloud (POINT_DTYPE, REFLECTANCE_DTYPE) of `scan/points`."""
+    """The action's result and the cloud (POINT_DTYPE, REFLECTANCE_DTYPE) of `scan/points`.
+
+    ``verdict`` is ``complete``, ``partial`` or ``failed``.
+    """
 
     success: bool
     message: str
@@ -55,6 +57,8 @@ class ScanResult:
     events: int
     packets_lost: int
     events_dropped: int
+    verdict: str = "complete"
+    completeness: float = 1.0
 
 
 def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
@@ -81,12 +85,11 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         state = message.feedback
         feedback(float(state.progress), f"{state.phase} {state.points:,} points")
 
-    with composition(tables, bench) as running:
+    with composition(tables, (Scan, "scan"), bench) as running:
         feedback(0.0, "starting")
         clouds: list[PointCloud2] = []
         running.client.create_subscription(PointCloud2, "scan/points", clouds.append, qos.latched())
-        action: ActionClient[Any, Any, Any] = ActionClient(running.client, Scan, "scan")
-        ended = running.result(action, goal, on_feedback)
+        ended = running.result(goal, on_feedback)
         if ended.points:
             wait(
                 lambda: clouds and clouds[-1].width == ended.points,

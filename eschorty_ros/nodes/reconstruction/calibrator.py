@@ -78,12 +78,11 @@ class Calibrator:
         self._in_worker = in_worker
         self._set_capture = set_capture
         self._line_width_px = line_width_px
-        self._timeouts_s = timeouts_s
-        self._client: InstrumentClient | None = None
+        # Before the node spins: rclpy's action client must not be made while an executor uses it.
+        self._client = InstrumentClient(node, *timeouts_s)
         self._one = threading.Lock()
         self._idle = threading.Event()
         self._idle.set()
-        self._ending = False
         self._server = ActionServer(
             node,
             Calibrate,
@@ -95,9 +94,7 @@ class Calibrator:
 
     def safe_state(self) -> None:
         """End a capture under way: on its way out the laser goes off and its heartbeat stops."""
-        self._ending = True
-        if self._client is not None:
-            self._client.end()
+        self._client.end()
         self._idle.wait(2.0)
 
     def _execute(self, goal: Any) -> Any:
@@ -118,8 +115,8 @@ class Calibrator:
 
     def _calibrate(self, goal: Any, request: CaptureRequest) -> Any:
         capture = make_capture(request, self._nominal, self._line_width_px())
-        feedback = _Feedback(goal, request, capture, self._in_worker)
-        client = self._made_client()
+        client = self._client
+        feedback = _Feedback(goal, request, capture, self._in_worker, client)
         client.prepare(lambda: bool(goal.is_cancel_requested), feedback.send)
         outcome = run_capture(
             client, request, lambda: self._feed(capture), lambda: self._feed(None)
@@ -177,21 +174,19 @@ class Calibrator:
         if not done:
             raise DeviceError(f"reconstruction: {reason}")
 
-    def _made_client(self) -> InstrumentClient:
-        # Made for the first goal, because its subscriptions cost time.
-        if self._client is None:
-            self._client = InstrumentClient(self._node, *self._timeouts_s)
-            if self._ending:
-                self._client.end()
-        return self._client
-
 
 class _Feedback:
     """The targets found in copies of a capture's frame while the capture lasts."""
 
     def __init__(
-        self, goal: Any, request: CaptureRequest, capture: Capture, in_worker: InWorker
+        self,
+        goal: Any,
+        request: CaptureRequest,
+        capture: Capture,
+        in_worker: InWorker,
+        client: InstrumentClient,
     ) -> None:
+        self._client = client
         self._goal = goal
         self._request = request
         self._capture = capture

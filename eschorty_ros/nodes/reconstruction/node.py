@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -20,7 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import TimeReference
 from tf2_msgs.msg import TFMessage
 
-from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.live.job_queue import JobQueue
@@ -35,8 +34,17 @@ from eschorty_ros.nodes.reconstruction.parameters import TABLE, modulation_overr
 from eschorty_ros.nodes.reconstruction.reports import Reports
 from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import diagnostics, qos, transforms
-from eschorty_ros.nodes.ros.conversions import laser_settings, mm_from_m, ns_from_stamp, pulse_train
+from eschorty_ros.nodes.ros.border import refusals
+from eschorty_ros.nodes.ros.conversions import (
+    laser_settings,
+    ns_from_stamp,
+    packet_from_message,
+    pulse_train,
+    stage_position_mm,
+)
+from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
+from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
 from eschorty_ros.nodes.ros.spin import run
 
 _STAGE_DEPTH = 2000
@@ -49,6 +57,7 @@ class ReconstructionNode(Node):
     """
 
     def __init__(self, **kwargs: Any) -> None:
+        self._camera, self._laser, self._stage = OnePublisher(), OnePublisher(), OnePublisher()
         # First, because a node whose constructor fails is destroyed, too.
         self._closing = threading.Event()
         self._worker = threading.Thread(target=self._work, name="reconstruction", daemon=True)
@@ -95,24 +104,28 @@ class ReconstructionNode(Node):
     def _make_interfaces(self) -> None:
         override = {"qos_overriding_options": qos.overridable()}
         bulk = MutuallyExclusiveCallbackGroup()
-        packets = self.create_subscription(EventPacket, "camera/events", self._on_packet,
-                                           qos.events(), callback_group=bulk,
-                                           **override)  # fmt: skip
-        latched = qos.latched()
-        self._clock_source = self.create_subscription(
-            TimeReference, "camera/clock", self._on_clock, latched
-        )
-        self.create_subscription(PositionTrigger, "stage/trigger", self._on_trigger, latched)
+        self.create_subscription(EventPacket, "camera/events", self._on_packet,
+                                 qos.events(), callback_group=bulk, **override)  # fmt: skip
+        stream = self._pipeline.stream
+        self._announcement = LatchedState(
+            self, TimeReference, "camera/clock", self._on_clock,
+            lambda: self._post(stream.forget_zero),
+        )  # fmt: skip
+        LatchedState(
+            self, PositionTrigger, "stage/trigger", self._on_trigger,
+            lambda: self._post(partial(stream.set_pulses, None)),
+        )  # fmt: skip
         self.create_subscription(
             LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )
-        odometry = self.create_subscription(
+        self.create_subscription(
             Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
         )
+        Heartbeat(self, "reconstruction/heartbeat", self._running)
         self._scans = ScanServices(
             self,
             self._pipeline,
-            (packets, odometry),
+            lambda: ("camera/events", "stage/odom", *(() if self._override else ("laser/state",))),
             self._in_worker,
             self._running,
             self.parameters["stage_timeout"],
@@ -140,45 +153,34 @@ class ReconstructionNode(Node):
 
     # Callbacks: queue and return.
 
-    def _on_packet(self, message: EventPacket) -> None:
-        if message.encoding != "evt3":
-            self.get_logger().error(
-                f"camera/events has encoding {message.encoding!r}; set the camera to evt3",
-                throttle_duration_sec=5.0,
-            )
-            return
-        packet = Packet(message.seq, ns_from_stamp(message.header.stamp), message.events)
+    def _on_packet(self, message: EventPacket, info: Mapping[str, Any]) -> None:
+        packet = packet_from_message(message, self._camera.check(info))
+        self._reports.packet_ages.add(age_s(self, info, message.header.stamp))
         self._jobs.post_bulk(partial(self._add_packet, packet))
 
     def _on_clock(self, message: TimeReference) -> None:
         zero_ns = ns_from_stamp(message.header.stamp) - ns_from_stamp(message.time_ref)
-        self._jobs.post(partial(self._pipeline.stream.announce_zero, zero_ns))
+        self._post(partial(self._pipeline.stream.announce_zero, zero_ns))
 
-    def _on_laser(self, message: LaserState) -> None:
+    def _on_laser(self, message: LaserState, info: Mapping[str, Any]) -> None:
+        self._laser.check(info)
         if self._override is None:
-            with self._bad_values_logged("laser/state"):
-                settings = laser_settings(message)
-                self._jobs.post(partial(self._pipeline.stream.set_laser, *settings))
+            self._post(partial(self._pipeline.stream.set_laser, *laser_settings(message)))
 
     def _on_trigger(self, message: PositionTrigger) -> None:
-        with self._bad_values_logged("stage/trigger"):
-            self._jobs.post(partial(self._pipeline.stream.set_pulses, pulse_train(message)))
+        self._post(partial(self._pipeline.stream.set_pulses, pulse_train(message)))
 
-    @contextlib.contextmanager
-    def _bad_values_logged(self, topic: str) -> Iterator[None]:
-        try:
-            yield
-        except ArgumentError as error:
-            self.get_logger().error(f"{topic}: {error}", throttle_duration_sec=5.0)
-
-    def _on_stage(self, message: Odometry) -> None:
-        t_ns = ns_from_stamp(message.header.stamp)
-        position_mm = mm_from_m(message.pose.pose.position.y)
-        self._jobs.post(partial(self._pipeline.placer.add_stage, t_ns, position_mm))
+    def _on_stage(self, message: Odometry, info: Mapping[str, Any]) -> None:
+        self._stage.check(info)
+        t_ns, position_mm = ns_from_stamp(message.header.stamp), stage_position_mm(message)
+        self._post(partial(self._pipeline.add_stage, t_ns, position_mm))
         if self.parameters["publish_tf"]:
             x, y, z = self.calibration.stage_direction
             carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
             self._tf.publish(TFMessage(transforms=[carriage]))
+
+    def _post(self, job: Callable[[], None]) -> None:
+        self._jobs.post(job)
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
         """Run ``job`` after the queued ones; return whether it succeeded, and the reason if not."""
@@ -215,11 +217,16 @@ class ReconstructionNode(Node):
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
 
     def _add_packet(self, packet: Packet) -> None:
-        self._outputs.packet(packet.data)
         stream = self._pipeline.stream
         if stream.epoch is None:
-            stream.announcement_expected = self._clock_source.get_publisher_count() > 0
-        self._pipeline.add_packet(packet, time.monotonic())
+            clock = self._announcement.subscription
+            stream.announcement_expected = clock.get_publisher_count() > 0
+        try:
+            self._pipeline.add_packet(packet, time.monotonic())
+        except FormatError as error:
+            refusals(self).add("camera/events", str(error))
+            return
+        self._outputs.packet(packet.data)
 
     def _step(self) -> None:
         fresh, placed = self._pipeline.step(time.monotonic())

@@ -6,11 +6,13 @@ from typing import Any
 
 from rclpy.node import Node
 
+from eschorty_ros.control.stamp_ages import StampAges
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_stream import clock_statistics
 from eschorty_ros.live.pipeline import Pipeline
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.nodes.ros import diagnostics
+from eschorty_ros.nodes.ros.border import saturated
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 
@@ -21,10 +23,13 @@ class Reports:
     ----------
     faults : int
         Unexpected exceptions of the worker, counted by the worker.
+    packet_ages : StampAges
+        Ages of the packets on arrival.
     """
 
     def __init__(self, node: Node, pipeline: Pipeline, jobs: JobQueue) -> None:
         self.faults = 0
+        self.packet_ages = StampAges("camera")
         self._node = node
         self._pipeline = pipeline
         self._jobs = jobs
@@ -41,14 +46,14 @@ class Reports:
         state.header.stamp = self._node.get_clock().now().to_msg()
         if until_ns is not None:
             state.processed_until = stamp_from_ns(until_ns)
-        state.events = counters["events"]
+        state.events = saturated(counters["events"])
         state.events_per_second = self._rate.read(counters["events"])
-        state.profiles = pipeline.profiles
-        state.points = pipeline.points
-        state.packets_lost = pipeline.stream.packets_lost
-        state.events_dropped = counters["events_dropped"]
-        state.sensor_drop_words = counters["sensor_drop_words"]
-        state.points_without_stage = pipeline.placer.points_without_stage
+        state.profiles = saturated(pipeline.profiles)
+        state.points = saturated(pipeline.points)
+        state.packets_lost = saturated(pipeline.stream.packets_lost)
+        state.events_dropped = saturated(counters["events_dropped"])
+        state.sensor_drop_words = saturated(counters["sensor_drop_words"])
+        state.points_without_stage = saturated(pipeline.placer.points_without_stage)
         state.scan_id = pipeline.scan_id
         state.calibration = pipeline.calibration.name
         self._state.publish(state)

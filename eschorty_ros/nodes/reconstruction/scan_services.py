@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
-from rclpy.subscription import Subscription
+from std_msgs.msg import Header
 
+from eschorty_ros.control.heartbeat import Sender, read_heartbeat
+from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.border import UINT32_MAX, check_text, saturated
 from eschorty_ros.nodes.ros.conversions import mm_from_m
+from eschorty_ros.nodes.ros.peers import OnePublisher, publishers_fault
 from eschorty_ros.srv import BeginScan, EndScan
 
+_END = "reconstruction/end_scan"
+_CHECK_S = 0.2
+_FOLLOWED_S = 5.0
 _CONNECT_S = 3.0
+_WORKER_S = 10.0
 _ASSEMBLE_S = 30.0
 
 
@@ -29,8 +40,8 @@ class ScanServices:
     node : rclpy.node.Node
     pipeline : Pipeline
         Used by the worker alone.
-    sources : sequence of Subscription
-        Subscriptions that a scan needs publishers of.
+    topics : callable
+        Returns the topics that a scan needs one publisher of.
     in_worker : callable
         Runs a job in the worker; returns whether it succeeded, and the reason of a failure.
     running : callable
@@ -45,13 +56,13 @@ class ScanServices:
         self,
         node: Node,
         pipeline: Pipeline,
-        sources: Sequence[Subscription],
-        in_worker: Callable[[Callable[[], None]], tuple[bool, str]],
+        topics: Callable[[], Sequence[str]],
+        in_worker: Callable[[Callable[[], None], float], tuple[bool, str]],
         running: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
     ) -> None:
-        self._node, self._pipeline, self._sources = node, pipeline, sources
+        self._node, self._pipeline, self._topics = node, pipeline, topics
         self._in_worker, self._running = in_worker, running
         self._timeout_s = stage_timeout_s + _ASSEMBLE_S
         self._publish = publish
@@ -60,9 +71,16 @@ class ScanServices:
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
             (BeginScan, "reconstruction/begin_scan", self._on_begin),
-            (EndScan, "reconstruction/end_scan", self._on_end),
+            (EndScan, _END, self._on_end),
         ):
             node.create_service(kind, name, callback, callback_group=group)
+        self._client = OnePublisher()
+        self._sender: Sender | None = None
+        self._begun_s, self._followed = 0.0, False
+        node.create_subscription(Header, CLIENT_HEARTBEAT, self._on_heartbeat, qos.heartbeat())
+        node.create_timer(
+            _CHECK_S, self._check_client, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def finish(self) -> None:
         """Publish an ended scan once all its points are placed; called in the worker."""
@@ -76,14 +94,13 @@ class ScanServices:
     def _on_begin(self, request: Any, response: Any) -> Any:
         # A publisher may discover this node's subscriptions before they discover the publisher.
         # After the answer every message sent must arrive.
-        missing = self._unconnected()
+        fault = self._fault()
         deadline_s = time.monotonic() + _CONNECT_S
-        while missing and time.monotonic() < deadline_s and self._running():
+        while fault and time.monotonic() < deadline_s and self._running():
             time.sleep(0.02)
-            missing = self._unconnected()
-        if missing:
-            response.success = False
-            response.message = f"no publisher of {' and '.join(missing)}; start camera and stage"
+            fault = self._fault()
+        if fault:
+            response.success, response.message = False, fault
             return response
         begin = partial(
             self._pipeline.begin_scan,
@@ -91,11 +108,40 @@ class ScanServices:
             mm_from_m(request.start),
             mm_from_m(request.stop),
         )
-        response.success, response.message = self._in_worker(begin)
+        response.success, response.message = self._in_worker(begin, _WORKER_S)
         return response
 
-    def _unconnected(self) -> list[str]:
-        return [source.topic_name for source in self._sources if not source.get_publisher_count()]
+    def _fault(self) -> str:
+        faults = (publishers_fault(self._node, topic) for topic in self._topics())
+        return "; ".join(fault for fault in faults if fault)
+
+    def _on_heartbeat(self, message: Header, info: Mapping[str, Any]) -> None:
+        self._client.check(info)
+        if self._pipeline.scan_id:
+            self._sender, _ = read_heartbeat(check_text("frame_id", message.frame_id))
+
+    def _check_client(self) -> None:
+        """Publish the points so far of a scan whose client has ended."""
+        now_s, scan_id = time.monotonic(), self._pipeline.scan_id
+        if not scan_id or self._ended is not None:
+            self._sender, self._begun_s, self._followed = None, now_s, False
+            return
+        fault = self._sender.fault() if self._sender is not None else ""
+        if now_s - self._begun_s > _FOLLOWED_S:
+            # A command line's client is there for its one call only.
+            clients = self._node.count_clients(self._node.resolve_service_name(_END))
+            if self._followed and not clients:
+                fault = "no client is left"
+            self._followed = clients > 0
+        if fault:
+            self._sender, self._followed = None, False
+            self._node.get_logger().warning(f"{scan_id} was left open ({fault}); ending it")
+            self._in_worker(partial(self._begin_end, scan_id, lambda _: None), 0.0)
+
+    def _begin_end(self, scan_id: str, done: Callable[[ScanReport], None]) -> None:
+        self._ended_s = time.monotonic()
+        self._pipeline.close_period(scan_id, self._ended_s)
+        self._ended = done
 
     def _on_end(self, request: Any, response: Any) -> Any:
         finished = threading.Event()
@@ -105,12 +151,9 @@ class ScanServices:
             reports.append(report)
             finished.set()
 
-        def begin_end() -> None:
-            self._ended_s = time.monotonic()
-            self._pipeline.close_period(request.scan_id, self._ended_s)
-            self._ended = done
-
-        response.success, response.message = self._in_worker(begin_end)
+        response.success, response.message = self._in_worker(
+            partial(self._begin_end, request.scan_id, done), _ASSEMBLE_S
+        )
         if not response.success:
             return response
         if not self._awaited(finished):
@@ -118,11 +161,11 @@ class ScanServices:
             response.message = "the scan was not assembled in time; see the node's log"
             return response
         report = reports[0]
-        response.profiles = report.scan.profiles
-        response.points = len(report.scan.points)
-        response.events = report.events
-        response.packets_lost = report.packets_lost
-        response.events_dropped = report.events_dropped
+        response.profiles = saturated(report.scan.profiles, UINT32_MAX)
+        response.points = saturated(len(report.scan.points), UINT32_MAX)
+        response.events = saturated(report.events)
+        response.packets_lost = saturated(report.packets_lost)
+        response.events_dropped = saturated(report.events_dropped)
         response.sigma_median = report.scan.sigma_median_m
         response.message = report.message
         return response

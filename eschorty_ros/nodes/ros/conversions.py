@@ -6,15 +6,25 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import number, short
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.live.packet_times import Packet
+from eschorty_ros.nodes.ros.border import check_text
 
 _NS_PER_S = 1_000_000_000
+_PACKET_MAX_BYTES = 16_000_000
+_INTERVAL_M = 1e-6, 1.0
+_STAMP_MIN_NS, _STAMP_MAX_NS = -(_NS_PER_S << 31), (_NS_PER_S << 31) - 1
 
 
 def stamp_from_ns(t_ns: int) -> Time:
-    """Return the message stamp of an int64 time in nanoseconds; exact."""
-    seconds, nanoseconds = divmod(int(t_ns), _NS_PER_S)
+    """Return the message stamp of a time in nanoseconds; exact from 1901 to 2038.
+
+    A time outside, which no clock shows, becomes the nearest end.
+    """
+    seconds, nanoseconds = divmod(min(max(int(t_ns), _STAMP_MIN_NS), _STAMP_MAX_NS), _NS_PER_S)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
@@ -50,6 +60,7 @@ def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
     ArgumentError
         When frequency, duty or waveform is out of range.
     """
+    check_text("waveform", state.waveform)
     modulation = Modulation(
         frequency_hz=float(state.frequency),
         duty=float(state.duty),
@@ -66,10 +77,40 @@ def pulse_train(trigger: Any) -> PulseTrain | None:
     Raises
     ------
     ArgumentError
-        When a position is not finite or the interval is negative.
+        When a position is not finite or the interval is not one of a stage.
     """
     interval_mm = mm_from_m(float(trigger.interval))
     count = int(trigger.count)
     if interval_mm == 0.0 or count == 0:
         return None
+    number("interval", trigger.interval, *_INTERVAL_M)
     return PulseTrain(mm_from_m(float(trigger.first)), interval_mm, count)
+
+
+def packet_from_message(message: Any, source: bytes) -> Packet:
+    """Return the packet of an ``EventPacket``.
+
+    Raises
+    ------
+    ArgumentError
+        When it has another encoding or more bytes than a packet may have.
+    """
+    size = len(message.events)
+    if size > _PACKET_MAX_BYTES:
+        raise ArgumentError(
+            f"a packet has {size} bytes; send {_PACKET_MAX_BYTES} at most, at a lower threshold"
+        )
+    if message.encoding != "evt3":
+        raise ArgumentError(f"encoding is {short(message.encoding)}; set the camera to evt3")
+    return Packet(message.seq, ns_from_stamp(message.header.stamp), message.events, source)
+
+
+def stage_position_mm(message: Any) -> float:
+    """Return the stage's position in an ``Odometry``.
+
+    Raises
+    ------
+    ArgumentError
+        When the position is not within 1 km.
+    """
+    return mm_from_m(number("pose.pose.position.y", message.pose.pose.position.y, -1e3, 1e3))

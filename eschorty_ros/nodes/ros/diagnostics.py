@@ -12,6 +12,8 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
+from eschorty_ros.nodes.ros.border import refusals
+
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
@@ -56,6 +58,7 @@ class Diagnostics:
     ) -> None:
         self._node = node
         self._report = report
+        self._refused = 0
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(
             1.0,
@@ -67,6 +70,12 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish now; also called every second."""
         level, message, values = self._report()
+        refused = refusals(self._node)
+        total = refused.counts.total()
+        if total != self._refused and level == OK:
+            level, message = WARN, f"{message}; messages were refused in the last second"
+        self._refused = total
+        values = {**values, **refused.values()}
         waiting = getattr(self._node, "waiting", "")
         if waiting:
             level, message = WARN, waiting

@@ -1,4 +1,4 @@
-"""Executors: callbacks in threads, one at a time in a mutually exclusive group."""
+"""Executors that outlast errors, with callbacks in threads by callback group."""
 
 from __future__ import annotations
 
@@ -9,25 +9,31 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import rclpy.task
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.context import Context
-from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.utilities import get_default_context
+
+from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.nodes.ros.border import note_error
 
 Work = Callable[[], None]
 
 _TURN_S = 0.1
 _PAUSE_S = 3e-4
+_LINE_MAX = 300
+_LOG_S = 5.0
 _TAKEN_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -58,48 +64,28 @@ class _InTurn:
             work()
 
 
-class EventExecutor(getattr(_rclpy, "EventsExecutor", object)):  # type: ignore[misc]
-    """rclpy's ``EventsExecutor`` with the callback groups of ``MultiThreadedExecutor``.
+class _Redirecting:
+    """Redirects the callbacks of an executor's nodes, also of what they create later.
 
-    It waits for events instead of building a wait set at every turn, which costs a tenth. Its one
-    thread takes messages, requests and timers; the callbacks run in ``threads`` threads.
+    An exception of a callback is counted and logged, and the node goes on. An ``EschortyError`` of
+    a timer ends it: that is a node's way to end.
     """
 
-    def __init__(self, threads: int, context: Context) -> None:
-        super().__init__(context)
-        self._pool = ThreadPoolExecutor(threads, "callback")
-        self._groups: dict[CallbackGroup, _InTurn] = {}
+    def __init__(self) -> None:
         self._members: list[Node] = []
-        self._known: set[int] = set()
-        self._error: Exception | None = None
+        self.error: Exception | None = None
 
     def add_node(self, node: Node) -> bool:
-        """Add a node and redirect its callbacks to the threads."""
+        """Add a node."""
         if node not in self._members:
             self._members.append(node)
         self._redirect()
-        return bool(super().add_node(node))
+        return bool(super().add_node(node))  # type: ignore[misc]
 
     def wake(self) -> None:
         """Take note of what a node has created."""
         self._redirect()
-        super().wake()
-
-    def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Run a coroutine, which may wait, in a thread; anything else in the executor's."""
-        if inspect.iscoroutinefunction(callback):
-            return self._pool.submit(self._guarded, lambda: asyncio.run(callback(*args, **kwargs)))
-        return super().create_task(callback, *args, **kwargs)
-
-    def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop spinning; callbacks that still wait do not run."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        return bool(super().shutdown(timeout_sec))
-
-    def raise_error(self) -> None:
-        """Raise the first exception of a callback."""
-        if self._error is not None:
-            raise self._error
+        super().wake()  # type: ignore[misc]
 
     def _redirect(self) -> None:
         for node in tuple(self._members):
@@ -109,67 +95,80 @@ class EventExecutor(getattr(_rclpy, "EventsExecutor", object)):  # type: ignore[
                 (node.services, self._redirect_service),
             ):
                 for entity in entities:
-                    if not getattr(entity, "in_threads", False):
-                        entity.in_threads = True
-                        redirect(entity)
+                    if not hasattr(entity, "redirected"):
+                        entity.redirected = True
+                        redirect(node, entity)
+
+    def _guarded(self, node: Node, entity: Any, work: Work) -> Work:
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:
+                if isinstance(entity, Timer) and isinstance(error, EschortyError):
+                    self.error = self.error or error
+                else:
+                    note_error(node, entity, error)
+
+        return guarded
 
     def _submit(self, group: CallbackGroup, work: Work) -> None:
-        guarded = partial(self._guarded, work)
-        # A pool that has ended takes no more.
-        with contextlib.suppress(RuntimeError):
-            if isinstance(group, MutuallyExclusiveCallbackGroup):
-                self._groups.setdefault(group, _InTurn(self._pool)).submit(guarded)
-            else:
-                self._pool.submit(guarded)
+        """Run work of a callback group."""
+        raise NotImplementedError
 
-    def _guarded(self, work: Work) -> None:
-        try:
-            work()
-        except Exception as error:
-            self._error = self._error or error
-
-    def _redirect_subscription(self, subscription: Subscription[Any]) -> None:
-        callback, group = subscription.callback, subscription.callback_group
-        profile = subscription.qos_profile
+    def _redirect_subscription(self, node: Node, subscription: Subscription[Any]) -> None:
+        callback, profile = subscription.callback, subscription.qos_profile
         bounded = profile.history == HistoryPolicy.KEEP_LAST and profile.depth > 0
-        waiting: deque[Any] = deque(maxlen=profile.depth if bounded else None)
+        waiting: deque[tuple[Any, ...]] = deque(maxlen=profile.depth if bounded else None)
 
-        def run() -> None:
+        def take_first() -> None:
             # A newer message may have taken its place.
             with contextlib.suppress(IndexError):
                 message = waiting.popleft()
                 callback(*message)
 
-        def take(*message: Any) -> None:
+        run = self._guarded(node, subscription, take_first)
+
+        def receive(*message: Any) -> None:
             full = len(waiting) == waiting.maxlen
-            # rclpy 9.1 gives message and information as one tuple.
+            # rclpy 9.1's EventsExecutor gives message and information as one tuple.
             waiting.append(message[0] if isinstance(message[0], tuple) else message)
             if not full:
-                self._submit(group, run)
+                self._submit(subscription.callback_group, run)
 
         # The property would look at the signature again.
-        subscription._callback = take
+        subscription._callback = receive
 
-    def _redirect_timer(self, timer: Any) -> None:
-        callback, group = timer.callback, timer.callback_group
-        waits = threading.Lock()
+    def _redirect_timer(self, node: Node, timer: Any) -> None:
+        callback, waits = timer.callback, threading.Lock()
 
-        def run() -> None:
+        def tick() -> None:
             waits.release()
             callback()
 
-        def tick() -> None:
+        run = self._guarded(node, timer, tick)
+
+        def expire() -> None:
             if waits.acquire(blocking=False):
-                self._submit(group, run)
+                self._submit(timer.callback_group, run)
 
-        timer.callback = tick
+        timer.callback = expire
 
-    def _redirect_service(self, service: Any) -> None:
-        callback, group, send = service.callback, service.callback_group, service.send_response
+    def _redirect_service(self, node: Node, service: Any) -> None:
+        callback, send = service.callback, service.send_response
 
         def request(message: Any, response: Any) -> Future[Any]:
             answered: Future[Any] = Future()
-            self._submit(group, lambda: answered.set_result(callback(message, response)))
+
+            def answer() -> None:
+                try:
+                    answered.set_result(callback(message, response))
+                except Exception as error:
+                    if hasattr(response, "message"):
+                        response.message = str(error)[:_LINE_MAX]
+                    answered.set_result(response)
+                    raise
+
+            self._submit(service.callback_group, self._guarded(node, service, answer))
             return answered
 
         def respond(answered: Future[Any], header: Any) -> None:
@@ -178,33 +177,68 @@ class EventExecutor(getattr(_rclpy, "EventsExecutor", object)):  # type: ignore[
         service.callback, service.send_response = request, respond
 
 
-class ThreadsExecutor(MultiThreadedExecutor):
+class EventExecutor(_Redirecting, getattr(_rclpy, "EventsExecutor", object)):  # type: ignore[misc]
+    """rclpy's ``EventsExecutor`` with the callback groups of ``MultiThreadedExecutor``.
+
+    It waits for events instead of building a wait set at every turn, which is what costs there.
+    Its one thread takes messages, requests and timers; callbacks run in ``threads`` threads.
+    """
+
+    def __init__(self, threads: int, context: Context) -> None:
+        _Redirecting.__init__(self)
+        getattr(_rclpy, "EventsExecutor", object).__init__(self, context)
+        self._pool = ThreadPoolExecutor(threads, "callback")
+        self._groups: dict[CallbackGroup, _InTurn] = {}
+
+    def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Run a coroutine, which may wait, in a thread; anything else in the executor's."""
+        if inspect.iscoroutinefunction(callback):
+            return self._pool.submit(lambda: asyncio.run(callback(*args, **kwargs)))
+        return super().create_task(callback, *args, **kwargs)
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Stop; callbacks that still wait do not run."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        return bool(super().shutdown(timeout_sec))
+
+    def _submit(self, group: CallbackGroup, work: Work) -> None:
+        # A pool that has ended takes no more.
+        with contextlib.suppress(RuntimeError):
+            if isinstance(group, MutuallyExclusiveCallbackGroup):
+                self._groups.setdefault(group, _InTurn(self._pool)).submit(work)
+            else:
+                self._pool.submit(work)
+
+
+class ThreadsExecutor(_Redirecting, MultiThreadedExecutor):
     """rclpy's executor with threads, for distributions without ``EventsExecutor``."""
 
+    def __init__(self, threads: int, context: Context) -> None:
+        _Redirecting.__init__(self)
+        MultiThreadedExecutor.__init__(self, threads, context=context)
+
     def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
-        """Run callbacks; ``future`` wakes it only at the next of them."""
+        """Run callbacks; ``future`` is not looked at."""
         with contextlib.suppress(ExternalShutdownException):
             self.spin_once(timeout_sec=timeout_sec)
             # While a callback runs, rclpy 9 polls for the next of its group without a pause and
             # would hold the interpreter's lock.
             time.sleep(_PAUSE_S)
 
-    def raise_error(self) -> None:
-        """Raise nothing: ``spin`` raises what a callback raises."""
+    def _submit(self, group: CallbackGroup, work: Work) -> None:
+        work()
 
 
 class Spinning:
     """An executor that a thread spins, from ``start`` to ``end``."""
 
     def __init__(self, threads: int) -> None:
-        available = hasattr(_rclpy, "EventsExecutor")
-        make = EventExecutor if available else ThreadsExecutor
+        make = EventExecutor if hasattr(_rclpy, "EventsExecutor") else ThreadsExecutor
         # rclpy's executor takes these signals for itself.
         handlers = {number: signal.getsignal(number) for number in _TAKEN_SIGNALS}
         self.executor: Any = make(threads, context=get_default_context())
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        self._error: Exception | None = None
         self._ending = False
         self._thread = threading.Thread(target=self._spin, name="executor", daemon=True)
 
@@ -213,10 +247,9 @@ class Spinning:
         self._thread.start()
 
     def raise_error(self) -> None:
-        """Raise the first exception of a callback."""
-        if self._error is not None:
-            raise self._error
-        self.executor.raise_error()
+        """Raise the error by which a node ends."""
+        if self.executor.error is not None:
+            raise self.executor.error
 
     def end(self, timeout_s: float = 1.0) -> None:
         """Run no more callbacks; wait for the thread as long as that."""
@@ -228,10 +261,12 @@ class Spinning:
             self.executor.shutdown(timeout_sec=timeout_s)
 
     def _spin(self) -> None:
-        try:
-            # Without a limit rclpy 9.1 spins its processor.
-            while self.executor.context.ok() and not self._ending:
+        # Without a limit rclpy 9.1's EventsExecutor never waits.
+        while self.executor.context.ok() and not self._ending:
+            try:
                 self.executor.spin_until_future_complete(rclpy.task.Future(), _TURN_S)
-        except Exception as error:
-            if not self._ending:
-                self._error = error
+            except Exception as error:
+                # Such as a message that cannot be read.
+                text = f"{error!r}"[:_LINE_MAX]
+                if not self._ending:
+                    get_logger("executor").error(text, throttle_duration_sec=_LOG_S)

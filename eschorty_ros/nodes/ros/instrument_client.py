@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from action_msgs.msg import GoalStatus
+from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
@@ -15,6 +16,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from eschorty_ros.action import MoveStage
@@ -26,11 +28,19 @@ from eschorty_ros.control.instrument_monitor import (
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanFailure, ScanRequest, ScanSummary
+from eschorty_ros.core.base.numbers import number
 from eschorty_ros.hardware.base.protocols import LaserOutput
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, ns_from_stamp
+from eschorty_ros.nodes.ros.border import check_text
+from eschorty_ros.nodes.ros.conversions import (
+    m_from_mm,
+    mm_from_m,
+    ns_from_stamp,
+    stage_position_mm,
+)
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
+from eschorty_ros.nodes.ros.peers import OnePublisher, age_s
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.srv import BeginScan, EndScan
 
@@ -43,6 +53,8 @@ _ASSEMBLE_S = 60.0
 _BEGIN_S = 20.0
 # For an answer of a node that no longer reports.
 _SILENT_WAIT_S = 0.3
+_LEAST_WAIT_S = 0.1
+_CLOCKS_S = 5.0
 
 
 class InstrumentClient(PacedWaiting):
@@ -66,13 +78,15 @@ class InstrumentClient(PacedWaiting):
         services: Mapping[str, Any] | None = None,
     ) -> None:
         self._node = node
+        topic = node.resolve_topic_name("camera/events")
         super().__init__(
             node.get_name(),
-            _subscribed_monitor(node),
+            InstrumentMonitor(lambda: node.count_publishers(topic) > 0),
             lambda: int(node.get_clock().now().nanoseconds),
             node.context.ok,
             events_timeout_s,
         )
+        self._subscribed = False
         needed = {
             "laser/set_parameters": SetParameters,
             "laser/arm": Trigger,
@@ -84,6 +98,12 @@ class InstrumentClient(PacedWaiting):
             name: node.create_client(kind, name, callback_group=group)
             for name, kind in needed.items()
         }
+        self._states = {
+            name: _LifecycleState(
+                node.create_client(GetState, f"{name}/get_state", callback_group=group)
+            )
+            for name in ("laser", "stage")
+        }
         self._stage = ActionClient(node, MoveStage, "stage/move", callback_group=group)
         self._node_timeout_s = node_timeout_s
         self._service_timeout_s = service_timeout_s
@@ -91,8 +111,15 @@ class InstrumentClient(PacedWaiting):
         self._heartbeat = Heartbeat(node, CLIENT_HEARTBEAT, self._light_requested)
         self._sent: Any = None
 
+    def subscribe(self) -> None:
+        """Receive the other nodes' state from now on; the first sequence does it, too."""
+        if not self._subscribed:
+            self._subscribed = True
+            _subscribe(self._node, self.monitor)
+
     def prepare(self, canceled: Callable[[], bool], feedback: Callable[[str], None]) -> None:
         """Reset for a new sequence; both callables are used at every tick."""
+        self.subscribe()
 
         def guarded(phase: str) -> None:
             with self._shutdown_as_failure():
@@ -103,16 +130,27 @@ class InstrumentClient(PacedWaiting):
     def check_nodes(self) -> None:
         """See ``Instrument``."""
         begun_ns = self.monitor.until_ns
+        end_s = time.monotonic() + self._node_timeout_s
         for holds, failure in self._needed(begun_ns):
-            self.wait(holds, self._node_timeout_s, failure)
+            self.wait(holds, max(end_s - time.monotonic(), _LEAST_WAIT_S), failure)
+        self._check_clocks()
+
+    def _check_clocks(self) -> None:
+        """Compare the nodes' clocks; a busy computer gets some seconds for prompt messages."""
+        end_s = time.monotonic() + _CLOCKS_S
+        while True:
+            try:
+                return self.monitor.check_clocks()
+            except ScanFailure:
+                if time.monotonic() > end_s:
+                    raise
+            self.tick()
 
     def missing(self) -> str:
         """Return the missing conditions, one of each node; ``""`` when a sequence can begin."""
         absent = [failure for holds, failure in self._needed(0) if not holds()]
-        named = {text.split(":")[0]: text for text in reversed(absent) if isinstance(text, str)}
-        if absent and not named:
-            # Only the events are missing, for a reason that the monitor finds.
-            return self.monitor.cause_of_no_progress()
+        texts = [text if isinstance(text, str) else text() for text in absent]
+        named = {text.split(":")[0]: text for text in reversed(texts)}
         return "; ".join(reversed(named.values()))
 
     def _needed(self, begun_ns: int) -> list[tuple[Callable[[], bool], str | Callable[[], str]]]:
@@ -121,8 +159,10 @@ class InstrumentClient(PacedWaiting):
             *((name, client.service_is_ready) for name, client in self._clients.items()),
             ("stage/move", self._stage.server_is_ready),
         )
+        states = self._states.items()
         return [
             *((ready, f"{name.split('/')[0]}: no {name}") for name, ready in servers),
+            *((state.active, f"{name}: its node is not active") for name, state in states),
             (lambda: self.monitor.stage_reports, "stage: no odometry"),
             (lambda: self.monitor.at_rest, "stage: another move does not end"),
             (lambda: self.monitor.laser_reports, "laser: no state"),
@@ -168,9 +208,11 @@ class InstrumentClient(PacedWaiting):
                 f"stage: refused to move to {position_mm * 1e-3:g} m at {speed_mm_s * 1e-3:g} m/s"
             )
         future = handle.get_result_async()
+        begun_s = time.monotonic()
         while not future.done():
             self.tick()
             self.monitor.check_stage()
+            self.monitor.check_motion(begun_s)
         self._sent = None
         answer = future.result()
         if answer.status != GoalStatus.STATUS_SUCCEEDED or not answer.result.success:
@@ -254,6 +296,8 @@ class InstrumentClient(PacedWaiting):
         call = RepeatedCall(self._clients[name], request, again=once_within_s is None)
 
         def answered() -> bool:
+            if name.startswith("reconstruction/"):
+                self.monitor.check_reconstruction()
             with self._shutdown_as_failure():
                 return call.done()
 
@@ -314,33 +358,63 @@ class ScanClient(InstrumentClient):
                            answer.events_dropped, answer.sigma_median, answer.message)  # fmt: skip
 
 
-def _subscribed_monitor(node: Node) -> InstrumentMonitor:
-    """Make a monitor that the other nodes' topics update."""
-    topic = node.resolve_topic_name("camera/events")
-    monitor = InstrumentMonitor(lambda: node.count_publishers(topic) > 0)
+class _LifecycleState:
+    """The state of a lifecycle node, asked for again and again; one without it counts as active."""
 
-    def on_laser(message: LaserState) -> None:
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._call: RepeatedCall | None = None
+        self._active = False
+
+    def active(self) -> bool:
+        """Return whether the last answer was ``active``; ask again."""
+        if not self._client.service_is_ready():
+            return True
+        if self._call is None:
+            self._call = RepeatedCall(self._client, GetState.Request(), again=True)
+        if self._call.done():
+            self._active, self._call = self._call.result().current_state.label == "active", None
+        return self._active
+
+
+def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
+    """Let the other nodes' topics update the monitor."""
+    laser, reconstruction, stage, worker = (OnePublisher() for _ in range(4))
+
+    def on_laser(message: LaserState, info: Mapping[str, Any]) -> None:
+        laser.check(info)
+        reason = check_text("reason", message.reason)
         monitor.update_laser(
-            LaserStatus(message.output, message.frequency, message.duty, message.reason)
+            LaserStatus(message.output, message.frequency, message.duty, reason),
+            age_s(node, info, message.header.stamp),
         )
 
-    def on_reconstruction(message: ReconstructionState) -> None:
+    def on_reconstruction(message: ReconstructionState, info: Mapping[str, Any]) -> None:
+        reconstruction.check(info)
         monitor.update_reconstruction(
             ReconstructionStatus(
                 ns_from_stamp(message.processed_until),
                 message.events_per_second,
                 message.profiles,
                 message.points,
-                message.scan_id,
-            )
+                check_text("scan_id", message.scan_id),
+            ),
+            age_s(node, info, message.header.stamp),
         )
 
-    def on_stage(message: Odometry) -> None:
+    def on_stage(message: Odometry, info: Mapping[str, Any]) -> None:
+        stage.check(info)
+        speed_m_s = number("twist.twist.linear.y", message.twist.twist.linear.y)
         monitor.update_stage(
             ns_from_stamp(message.header.stamp),
-            mm_from_m(message.pose.pose.position.y),
-            mm_from_m(message.twist.twist.linear.y),
+            stage_position_mm(message),
+            mm_from_m(speed_m_s),
+            age_s(node, info, message.header.stamp),
         )
+
+    def on_heartbeat(message: Header, info: Mapping[str, Any]) -> None:
+        worker.check(info)
+        monitor.update_heartbeat(check_text("frame_id", message.frame_id))
 
     # One message at a time, so that samples stay in order.
     group = MutuallyExclusiveCallbackGroup()
@@ -348,6 +422,6 @@ def _subscribed_monitor(node: Node) -> InstrumentMonitor:
         (LaserState, "laser/state", on_laser, qos.latched(qos.STATE_HISTORY)),
         (ReconstructionState, "reconstruction/state", on_reconstruction, 10),
         (Odometry, "stage/odom", on_stage, qos.stream()),
+        (Header, "reconstruction/heartbeat", on_heartbeat, qos.heartbeat()),
     ):
         node.create_subscription(kind, topic_name, callback, profile, callback_group=group)
-    return monitor

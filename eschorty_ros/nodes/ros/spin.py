@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import signal
 import sys
@@ -13,11 +14,12 @@ from typing import Any
 from weakref import WeakSet
 
 import rclpy
+import rclpy.logging
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
@@ -26,6 +28,7 @@ from eschorty_ros.nodes.ros.executor import Spinning
 _TURN_S = 0.1
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ending: WeakSet[Node] = WeakSet()
+_REASON_MAX = 240
 
 
 def make_safe(nodes: Sequence[Node]) -> None:
@@ -137,10 +140,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     end_with_launcher()
     try:
         ending = _Ending()
-        rclpy.init(
-            args=list(args) if args is not None else None,
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
+        _initialise(args)
         ending.starting = False
         spinning = Spinning(threads)
         for factory in factories:
@@ -170,6 +170,23 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         make_safe(nodes)
         _tear_down(nodes, spinning)
     return code
+
+
+def _initialise(args: Sequence[str] | None) -> None:
+    """Start rclpy; raise ``ArgumentError`` with its reason on one line."""
+    # Its log would give the same reason on lines of its own.
+    rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.FATAL)
+    try:
+        rclpy.init(
+            args=list(args) if args is not None else None,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+    except Exception as error:
+        reason = re.sub(r",? at /[^ ,;]+:\d+", "", " ".join(str(error).split()))[:_REASON_MAX]
+        secured = os.environ.get("ROS_SECURITY_ENABLE") == "true"
+        remedy = "ROS_SECURITY_KEYSTORE" if secured else "--ros-args"
+        raise ArgumentError(f"ROS does not start: {reason}; look at {remedy}") from error
+    rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.UNSET)
 
 
 def _tear_down(nodes: Sequence[Node], spinning: Spinning | None) -> None:

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -18,6 +19,7 @@ from rclpy.node import Node
 from eschorty_ros.action import Scan
 from eschorty_ros.control.scan_sequence import (
     End,
+    ScanFailure,
     ScanLimits,
     ScanOutcome,
     ScanRequest,
@@ -52,11 +54,16 @@ TABLE = (
     Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
     Param("events_timeout", 3.0, "longest pause of the events while the laser is on", "s",
           0.1, 60.0),
+    Param("completeness_min", 0.9, "share of profiles, packets and points below which a scan fails",
+          "", 0.0, 1.0),
     Param("drain_timeout", 10.0, "longest pause of the reconstruction after the sweep", "s",
           0.1, 600.0),
 )  # fmt: skip
 
 _FEEDBACK_S = 0.1
+_COUNT_S = 0.5
+# A client that has just been discovered may not be counted yet.
+_FOLLOWED_S = 5.0
 # Time for the other nodes to start before a missing one is logged.
 _STARTING_S = 5.0
 
@@ -69,6 +76,7 @@ def scan_limits(values: Mapping[str, Any]) -> ScanLimits:
         acceleration_mm_s2=mm_from_m(values["acceleration"]),
         approach_mm_s=mm_from_m(values["approach_speed"]),
         drain_timeout_s=values["drain_timeout"],
+        completeness_min=values["completeness_min"],
     )
 
 
@@ -89,10 +97,12 @@ class ScannerNode(Node):
             self.parameters["service_timeout"],
             self.parameters["events_timeout"],
         )
+        self._client.subscribe()
         self._one_scan = threading.Lock()
         self._idle = threading.Event()
         self._idle.set()
         self._scans = 0
+        self._followed_s = self._counted_s = 0.0
         self._last = "no scan yet"
         self.waiting = ""
         self._begun_s = time.monotonic()
@@ -142,12 +152,12 @@ class ScannerNode(Node):
         except EschortyError as error:
             return self._refuse(goal, str(error))
         self._scans += 1
-        self._client.prepare(lambda: bool(goal.is_cancel_requested), self._feedback(goal, request))
+        self._followed_s = time.monotonic()
+        self._client.prepare(partial(self._canceled, goal), self._feedback(goal, request))
         outcome = run_scan(self._client, request, self._limits)
         result = self._result(request, outcome)
-        self._last = f"{request.scan_id}: {outcome.end.value}"
-        if result.message:
-            self._last += f": {result.message}"
+        details = result.message.removeprefix(End.CANCELED.value).removeprefix("; ")
+        self._last = f"{request.scan_id}: {outcome.end.value}" + (details and f": {details}")
         if ends(self):
             with unless_shut_down(self):
                 goal.abort()
@@ -162,6 +172,17 @@ class ScannerNode(Node):
             _close(goal, outcome.end)
         return result
 
+    def _canceled(self, goal: Any) -> bool:
+        """Return whether the goal is canceled; ``ScanFailure`` when no client is left."""
+        now_s = time.monotonic()
+        if now_s - self._followed_s > _FOLLOWED_S:
+            raise ScanFailure("scanner: no client of the scan is left; the scan ends")
+        if now_s - self._counted_s > _COUNT_S:
+            self._counted_s = now_s
+            if self.count_clients(f"{self.resolve_service_name('scan')}/_action/get_result"):
+                self._followed_s = now_s
+        return bool(goal.is_cancel_requested)
+
     def _refuse(self, goal: Any, reason: str) -> Any:
         self.get_logger().error(f"scan refused: {reason}")
         with unless_shut_down(self):
@@ -171,12 +192,10 @@ class ScannerNode(Node):
     def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:
         sent_s = -math.inf
         sent_phase = ""
-        before = self._client.monitor.reconstruction
-        points_before = before.points if before is not None else 0
-        profiles_before = before.profiles if before is not None else 0
+        points_before = profiles_before = 0
 
         def send(phase: str) -> None:
-            nonlocal sent_s, sent_phase
+            nonlocal sent_s, sent_phase, points_before, profiles_before
             now_s = time.monotonic()
             if phase == sent_phase and now_s - sent_s < _FEEDBACK_S:
                 return
@@ -187,6 +206,9 @@ class ScannerNode(Node):
             )
             feedback.position = m_from_mm(position_mm)
             state = self._client.monitor.reconstruction
+            if state is not None and phase in ("preparing", "to_start"):
+                # Of the reconstruction that is there now: another one counts from 0.
+                points_before, profiles_before = state.points, state.profiles
             if state is not None:
                 feedback.points = max(state.points - points_before, 0)
                 feedback.profiles = max(state.profiles - profiles_before, 0)
@@ -198,9 +220,13 @@ class ScannerNode(Node):
 
     def _result(self, request: ScanRequest, outcome: ScanOutcome) -> Any:
         summary = outcome.summary
+        note = summary.message if summary.verdict == "complete" else summary.line
+        if outcome.message and not summary.points:
+            # The other reason is that of the missing points, too.
+            note = ""
         result = Scan.Result(
             success=outcome.end is End.SUCCEEDED,
-            message="; ".join(text for text in (outcome.message, summary.message) if text),
+            message="; ".join(text for text in (outcome.message, note) if text),
             scan_id=request.scan_id,
             profiles=summary.profiles,
             points=summary.points,

@@ -13,6 +13,7 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
 from eschorty_ros.action import MoveStage
+from eschorty_ros.control.scan_sequence import SPEED_MIN_MM_S
 from eschorty_ros.control.stage_states import states_since
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.clocks import PulseTrain
@@ -178,10 +179,10 @@ class StageNode(DeviceNode):
                 f"stage refused: position {m_from_mm(target_mm):g} m is outside the travel; "
                 f"choose {m_from_mm(low_mm):g} to {m_from_mm(high_mm):g} m"
             )
-        if not 0.0 < speed_mm_s <= stage.speed_max_mm_s:
+        if not SPEED_MIN_MM_S <= speed_mm_s <= stage.speed_max_mm_s:
             raise DeviceError(
-                f"stage refused: speed {m_from_mm(speed_mm_s):g} m/s; "
-                f"choose above 0 to {m_from_mm(stage.speed_max_mm_s):g} m/s"
+                f"stage refused: speed {m_from_mm(speed_mm_s):g} m/s; choose "
+                f"{m_from_mm(SPEED_MIN_MM_S):g} to {m_from_mm(stage.speed_max_mm_s):g} m/s"
             )
         stage.move_to(target_mm, speed_mm_s)
         self.moves += 1

@@ -17,7 +17,6 @@ from benches import bench_here
 from eschorty_ros.action import MoveStage
 from eschorty_ros.msg import PositionTrigger
 from nav_msgs.msg import Odometry
-from rclpy.action import ActionClient
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
 
 from eschorty_ros.emulation.bench.devices import Bench
@@ -40,7 +39,7 @@ class Stage:
         )
         self.odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
         self.observer = observer
-        self._client = ActionClient(observer.node, MoveStage, "stage/move")
+        self._client = observer.action_client(MoveStage, "stage/move")
         held.callback(self._client.destroy)
         observer.wait_for_state("stage", "active")
         wait_until(self._client.server_is_ready, "stage/move")

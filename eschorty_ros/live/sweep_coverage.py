@@ -1,0 +1,44 @@
+"""The profiles that a sweep should give, from the stage's motion between two positions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class SweepCoverage:
+    """Adds up the stage's motion between two positions.
+
+    Parameters
+    ----------
+    start_mm, stop_mm : float
+    """
+
+    def __init__(self, start_mm: float, stop_mm: float) -> None:
+        self._low_mm, self._high_mm = min(start_mm, stop_mm), max(start_mm, stop_mm)
+        self._last: tuple[int, float] | None = None
+        self._steps: list[tuple[float, float]] = []
+
+    def add(self, t_ns: int, position_mm: float) -> None:
+        """Add a stage sample at ROS time ``t_ns``."""
+        before, self._last = self._last, (t_ns, position_mm)
+        if before is None or t_ns <= before[0] or position_mm == before[1]:
+            return
+        ends_mm = np.clip((before[1], position_mm), self._low_mm, self._high_mm)
+        inside_mm = abs(float(ends_mm[1] - ends_mm[0]))
+        if inside_mm > 0.0:
+            share = inside_mm / abs(position_mm - before[1])
+            self._steps.append(((t_ns - before[0]) * 1e-9 * share, inside_mm))
+
+    def profiles(self, profile_rate_hz: float) -> int:
+        """Return the number of profiles of one pass over the whole distance, 0 without motion.
+
+        The speed is the median over the distance: neither rests nor late samples shift it.
+        """
+        if not self._steps:
+            return 0
+        time_s, distance_mm = np.array(self._steps).T
+        speed_mm_s = distance_mm / time_s
+        order = np.argsort(speed_mm_s)
+        covered_mm = np.cumsum(distance_mm[order])
+        median_mm_s = speed_mm_s[order[np.searchsorted(covered_mm, 0.5 * covered_mm[-1])]]
+        return round((self._high_mm - self._low_mm) / median_mm_s * profile_rate_hz)

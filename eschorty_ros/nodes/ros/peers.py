@@ -1,0 +1,122 @@
+"""Topics with one publisher: while it goes on, messages of another are refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock, ROSClock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+
+_SILENCE_NS = 250_000_000
+_CHECK_S = 1.0
+
+
+class OnePublisher:
+    """Checks that a stream's messages come from one publisher until that pauses for 0.25 s."""
+
+    def __init__(self) -> None:
+        self._publisher = b""
+        self._received_ns: float = -math.inf
+
+    def check(self, info: Mapping[str, Any]) -> bytes:
+        """Return the publisher of the message with this information, ``b""`` where unknown.
+
+        Raises
+        ------
+        ArgumentError
+            When another publisher's stream goes on.
+        """
+        publisher, received_ns = _publisher(info), int(info["received_timestamp"])
+        if publisher != self._publisher and abs(received_ns - self._received_ns) < _SILENCE_NS:
+            raise ArgumentError("another node publishes it, too; stop all but one")
+        self._publisher, self._received_ns = publisher, received_ns
+        return publisher
+
+
+class LatchedState:
+    """A latched topic whose state ends with its publisher.
+
+    Then those that are left give theirs again.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    kind : message type
+    topic : str
+    take : callable
+        Receives each message.
+    forget : callable
+        Called when the publisher of the newest message has ended.
+    group : rclpy.callback_groups.CallbackGroup, optional
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: Any,
+        topic: str,
+        take: Callable[[Any], None],
+        forget: Callable[[], None],
+        group: CallbackGroup | None = None,
+    ) -> None:
+        self._node, self._kind, self._topic, self._group = node, kind, topic, group
+        self._take, self._forget = take, forget
+        self._publisher: bytes = b""
+        self.subscription = self._subscribed()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_CHECK_S, self.check, callback_group=group, clock=steady)
+
+    def check(self) -> None:
+        """Forget the state if its publisher has ended."""
+        name = self.subscription.topic_name
+        living = {bytes(end.endpoint_gid) for end in self._node.get_publishers_info_by_topic(name)}
+        if not self._publisher or self._publisher in living:
+            return
+        self._publisher = b""
+        self._forget()
+        ended, self.subscription = self.subscription, self._subscribed()
+        self._node.destroy_subscription(ended)
+
+    def _subscribed(self) -> Subscription[Any]:
+        return self._node.create_subscription(
+            self._kind, self._topic, self._on_message, qos.latched(), callback_group=self._group
+        )
+
+    def _on_message(self, message: Any, info: Mapping[str, Any]) -> None:
+        self._take(message)
+        self._publisher = _publisher(info)
+
+
+def age_s(node: Node, info: Mapping[str, Any], stamp: Time) -> float:
+    """Return the age of a message on arrival by this node's clock, however late it is taken."""
+    clock = node.get_clock()
+    simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
+    received_ns = clock.now().nanoseconds if simulated else int(info["received_timestamp"])
+    return (received_ns - ns_from_stamp(stamp)) * 1e-9
+
+
+def publishers_fault(node: Node, topic: str) -> str:
+    """Return why a topic does not have exactly one publisher, ``""`` when it does."""
+    full = node.resolve_topic_name(topic)
+    names = sorted(end.node_name for end in node.get_publishers_info_by_topic(full))
+    if len(names) == 1:
+        return ""
+    if not names:
+        return f"no publisher of {full}"
+    return f"{full} has {len(names)} publishers ({', '.join(names)[:100]}); stop all but one"
+
+
+def _publisher(info: Mapping[str, Any]) -> bytes:
+    """Return the identity of a message's publisher, ``b""`` where rclpy does not give it."""
+    gid = info.get("publisher_gid")
+    return bytes(gid["data"]) if gid else b""

@@ -1,0 +1,63 @@
+"""What the monitor finds out about the other nodes: their clocks, processes and progress."""
+
+import subprocess
+import time
+
+import pytest
+
+from eschorty_ros.control.heartbeat import place
+from eschorty_ros.control.instrument_monitor import (
+    InstrumentMonitor,
+    LaserStatus,
+    ReconstructionStatus,
+)
+from eschorty_ros.control.paced_waiting import PacedWaiting
+from eschorty_ros.control.scan_sequence import ScanFailure
+
+
+def monitor(**ages_s):
+    made = InstrumentMonitor(lambda: True)
+    made.update_laser(LaserStatus(0, 70.0, 0.5, ""), ages_s.get("laser", 0.01))
+    made.update_stage(1, 10.0, 0.0, ages_s.get("stage", 0.01))
+    status = ReconstructionStatus(1, 0.0, 0, 0, "", ages_s.get("camera", 0.01))
+    made.update_reconstruction(status, ages_s.get("reconstruction", 0.01))
+    return made
+
+
+@pytest.mark.parametrize("name", ["laser", "stage", "camera", "reconstruction"])
+@pytest.mark.parametrize(("age_s", "words"), [(-1.0, "1.000 s ahead"), (3600.0, "s behind")])
+def test_a_clock_of_another_time_is_named_with_the_difference(name, age_s, words):
+    with pytest.raises(ScanFailure, match=f"{name}: its stamps are .*{words}"):
+        monitor(**{name: age_s}).check_clocks()
+
+
+def test_late_messages_beside_a_prompt_one_are_no_clock_of_another_time():
+    late = monitor(stage=0.9)
+    late.update_stage(2, 10.0, 0.0, 0.4)
+    late.check_clocks()
+
+
+def test_the_end_of_the_reconstruction_is_found_by_its_process():
+    subject = monitor()
+    subject.check_reconstruction()
+    with subprocess.Popen(["sleep", "60"]) as process:
+        subject.update_heartbeat(f"{place()} {process.pid}")
+        subject.check_reconstruction()
+        process.kill()
+    with pytest.raises(ScanFailure, match=f"reconstruction: process {process.pid} is gone"):
+        subject.check_reconstruction()
+
+
+def test_a_drain_ends_although_there_is_progress():
+    subject = monitor()
+    waiting = PacedWaiting("scanner", subject, lambda: 10**18, lambda: True, 3.0)
+
+    def advance(phase):
+        status = ReconstructionStatus(subject.until_ns + 1, 0.0, 0, 0, "")
+        subject.update_reconstruction(status, 0.0)
+
+    waiting.prepare(lambda: False, advance)
+    begun_s = time.monotonic()
+    with pytest.raises(ScanFailure, match="behind the end of the sweep"):
+        waiting.drain(10.0, 0.1)
+    assert time.monotonic() - begun_s < 5.0

@@ -1,0 +1,38 @@
+"""The profiles that a sweep should give."""
+
+import numpy as np
+import pytest
+
+from eschorty_ros.live.sweep_coverage import SweepCoverage
+
+
+def swept(positions_mm, start_mm=20.0, stop_mm=40.0):
+    coverage = SweepCoverage(start_mm, stop_mm)
+    for k, position_mm in enumerate(positions_mm):
+        coverage.add(k * 10_000_000, float(position_mm))
+    return coverage.profiles(70.0)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_profiles_of_a_sweep_with_run_up_and_rest_inside(back):
+    rng = np.random.default_rng(1)
+    rest = 20.5 + 1e-4 * rng.standard_normal(300)
+    ramp = 20.5 + 0.5 * np.arange(30) ** 2 / 60
+    sweep = np.arange(ramp[-1], 45.0, 0.5)
+    positions = np.concatenate([rest, ramp, sweep])
+    assert swept(60.0 - positions if back else positions) == 28
+
+
+def test_a_part_of_a_sweep_counts_for_the_whole():
+    assert swept(np.arange(10.0, 25.0, 0.5)) == 28
+
+
+def test_a_late_sample_does_not_count():
+    coverage = SweepCoverage(20.0, 40.0)
+    for k, position_mm in enumerate(np.arange(10.0, 45.0, 0.5)):
+        coverage.add(k * 10_000_000 + (k > 40) * 5_000_000_000, float(position_mm))
+    assert coverage.profiles(70.0) == 28
+
+
+def test_no_motion_gives_no_profiles():
+    assert swept([30.0] * 50) == swept([]) == 0
