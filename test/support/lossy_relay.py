@@ -10,12 +10,12 @@ from typing import Any
 
 import rclpy
 from event_camera_msgs.msg import EventPacket
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from ros_process import NAMESPACE, spinning
+from ros_process import NAMESPACE
 from std_msgs.msg import Header
 
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.executor import Spinning
 
 SEED = 20261122
 DRIVER, EVENTS = "event_camera", "/event_camera/events"
@@ -54,10 +54,13 @@ def lossy_relay(domain: int, *heartbeats: str) -> Iterator[LossyRelay]:
     print(f"lossy relay: seed {SEED}")
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
-    executor = SingleThreadedExecutor(context=context)
+    spinning = Spinning(1, context)
     relay = LossyRelay(context, heartbeats)
-    executor.add_node(relay)
-    with spinning(executor):
+    spinning.executor.add_node(relay)
+    spinning.start()
+    try:
         yield relay
+    finally:
+        spinning.end()
     relay.destroy_node()
     context.try_shutdown()

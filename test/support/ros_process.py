@@ -12,7 +12,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
-from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -31,6 +29,7 @@ from waiting import DEADLINE_S, wait_until
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.domain import free_domain
+from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 
 NAMESPACE = "/eschorty"
@@ -148,38 +147,10 @@ def domain_environment(domain: int) -> dict[str, str]:
     }
 
 
-@contextlib.contextmanager
-def spinning(executor: Executor) -> Iterator[Callable[[], AbstractContextManager[None]]]:
-    """Within it a thread spins ``executor``, which is shut down at the end.
+class EarlyLocked(ActionClient):
+    """An action client that may be made while its node spins: rclpy adds it before its lock."""
 
-    Not by ``executor.spin``: that would still use what shutting down destroys. What it yields
-    pauses the thread, to make an action client, which rclpy uses before it is complete.
-    """
-    ending, pausing, turning = threading.Event(), threading.Event(), threading.Lock()
-
-    def spin() -> None:
-        while not ending.is_set():
-            if pausing.is_set():
-                ending.wait(1e-3)
-                continue
-            with turning:
-                executor.spin_once(timeout_sec=0.05)
-
-    @contextlib.contextmanager
-    def pause() -> Iterator[None]:
-        pausing.set()
-        with turning:
-            yield
-        pausing.clear()
-
-    thread = threading.Thread(target=spin, daemon=True)
-    thread.start()
-    try:
-        yield pause
-    finally:
-        ending.set()
-        thread.join()
-        executor.shutdown()
+    _lock = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -187,24 +158,23 @@ def nodes_here(domain: int, threads: int = 1) -> Iterator[Callable[..., Any]]:
     """Yield a function that makes nodes in this process: ``(kind, **parameters)``; spin them."""
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
-    executor = (
-        SingleThreadedExecutor(context=context)
-        if threads == 1
-        else MultiThreadedExecutor(threads, context=context)
-    )
+    spinning = Spinning(threads, context)
     nodes = []
 
     def start(kind: Callable[..., Any], **parameters: Any) -> Any:
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
         node = kind(context=context, namespace=NAMESPACE, parameter_overrides=overrides)
         nodes.append(node)
-        executor.add_node(node)
+        spinning.executor.add_node(node)
         return node
 
-    with spinning(executor):
+    spinning.start()
+    try:
         yield start
         for node in nodes:
             node.safe_state()
+    finally:
+        spinning.end()
     for node in nodes:
         node.destroy_node()
     context.try_shutdown()
@@ -223,9 +193,10 @@ class Observer:
             held.callback(context.try_shutdown)
             self.node = Node("observer", namespace=NAMESPACE, context=context)
             held.callback(self.node.destroy_node)
-            self._executor = SingleThreadedExecutor(context=context)
-            self._executor.add_node(self.node)
-            self._paused = held.enter_context(spinning(self._executor))
+            spinning = Spinning(1, context)
+            spinning.executor.add_node(self.node)
+            held.callback(spinning.end)
+            spinning.start()
             self._held = held.pop_all()
 
     def __enter__(self) -> Observer:
@@ -236,14 +207,12 @@ class Observer:
 
     def action_client(self, kind: Any, name: str) -> ActionClient:
         """An action's client."""
-        with self._paused():
-            return ActionClient(self.node, kind, name)
+        return EarlyLocked(self.node, kind, name)
 
     def collect(self, message_type: Any, topic: str, profile: QoSProfile) -> list[Any]:
         """A list that grows by every message of ``topic`` from now on."""
         messages: list[Any] = []
         self.node.create_subscription(message_type, topic, messages.append, profile)
-        self._executor.wake()
         return messages
 
     def publisher(self, message_type: Any, topic: str, profile: QoSProfile) -> Any:

@@ -230,13 +230,21 @@ class ThreadsExecutor(_Redirecting, MultiThreadedExecutor):
 
 
 class Spinning:
-    """An executor that a thread spins, from ``start`` to ``end``."""
+    """An executor that a thread spins, from ``start`` to ``end``.
 
-    def __init__(self, threads: int) -> None:
+    Parameters
+    ----------
+    threads : int
+        Threads that run callbacks.
+    context : rclpy.context.Context, optional
+        The default one when omitted.
+    """
+
+    def __init__(self, threads: int, context: Context | None = None) -> None:
         make = EventExecutor if hasattr(_rclpy, "EventsExecutor") else ThreadsExecutor
         # rclpy's executor takes these signals for itself.
         handlers = {number: signal.getsignal(number) for number in _TAKEN_SIGNALS}
-        self.executor: Any = make(threads, context=get_default_context())
+        self.executor: Any = make(threads, context=context or get_default_context())
         for number, handler in handlers.items():
             signal.signal(number, handler)
         self._ending = False
