@@ -104,7 +104,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         direction = calibration.stage_direction
         figure = figures.scan_figure(result.points, None, title, direction)
         figures.save(figure, out / "scan.png")
-        pairs(f"{out / 'scan.pcd'}, {out / 'scan.png'}", _counted(result))
+        pairs(_headline(result, out), _counted(result))
         return
     truth = scenes.named(job.scene)
     model, direction = calibration.model(), calibration.stage_direction
@@ -117,6 +117,11 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     )
     figures.save(figures.scan_figure(result.points, error_mm, title, direction), out / "scan.png")
     _print(result, measured, sweep.seconds, out)
+
+
+def _headline(result: ScanResult, out: Path) -> str:
+    """Return the verdict and the files written."""
+    return f"{result.verdict}, {result.completeness:.1%}: {out / 'scan.pcd'}, {out / 'scan.png'}"
 
 
 def _counted(result: ScanResult) -> dict[str, str]:
@@ -132,7 +137,7 @@ def _counted(result: ScanResult) -> dict[str, str]:
 
 def _print(result: ScanResult, measured: Accuracy, seconds: float, out: Path) -> None:
     pairs(
-        f"{out / 'scan.pcd'}, {out / 'scan.png'}",
+        _headline(result, out),
         {
             **_counted(result),
             "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",

@@ -75,7 +75,7 @@ class ScanSummary:
     events_dropped: int = 0
     sigma_median_m: float = math.nan
     message: str = ""
-    completeness: float = 1.0
+    completeness: float = 0.0
 
     @property
     def verdict(self) -> str:

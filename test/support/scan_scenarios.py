@@ -161,17 +161,31 @@ class Bench:
 
         A scan also holds points that the background makes without light, at any stage position.
         """
-        times_ns = [t_ns for t_ns, _ in read_output_log(self.laser_log)]
-        off_ns, on = times_ns[-1], len(times_ns) - 2
-        # A renewal that comes late pauses the light.
-        while on >= 2 and times_ns[on] - times_ns[on - 1] < PAUSE_NS:
-            on -= 2
-        on_ns = times_ns[on]
+        times_ns = self._last_light_ns()
+        on_ns, off_ns = times_ns[0], times_ns[-1]
         begun_ns = ns_from_stamp(self.clouds[-1].header.stamp) - ros_minus_steady_ns()
         t_s = points["t"] + 1e-9 * (begun_ns - on_ns)
         lit_s = 1e-9 * (off_ns - on_ns)
         lit = (t_s > -CLOCK_S) & (t_s < lit_s + CLOCK_S)
         return points[lit], lit_s - float(t_s[lit].max())
+
+    def dark_periods(self) -> int:
+        """Periods that pauses of the last light can have cost: a renewal that comes late pauses it.
+
+        A pause may cut the periods before and after it.
+        """
+        times_ns = self._last_light_ns()
+        pauses_s = [1e-9 * (on - off) for off, on in zip(times_ns[1::2], times_ns[2::2])]
+        print(f"pauses of the light: {[round(pause_s, 3) for pause_s in pauses_s]} s")
+        return sum(math.ceil(pause_s * FREQUENCY_HZ) + 1 for pause_s in pauses_s)
+
+    def _last_light_ns(self) -> list[int]:
+        """When the output went on, off, on, ..., off in the last light."""
+        times_ns = [t_ns for t_ns, _ in read_output_log(self.laser_log)]
+        on = len(times_ns) - 2
+        while on >= 2 and times_ns[on] - times_ns[on - 1] < PAUSE_NS:
+            on -= 2
+        return times_ns[on:]
 
     def output_lines(self) -> list[str]:
         """ON and OFF in the order of the emulator's own log."""
@@ -230,6 +244,8 @@ def full_scan(bench: Bench, completeness: float = 0.98) -> None:
     status, result = bench.scan()
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     assert result.success, result.message
+    completeness -= bench.dark_periods() / PERIODS
+    assert result.verdict == "complete" or result.completeness > completeness, result.message
     points, _ = bench.lit_part(bench.cloud_after(before, result.points))
     assert len(points) >= 0.99 * result.points
     assert result.packets_lost == 0

@@ -101,7 +101,7 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
             state = message.feedback
             feedback(
                 float(state.progress),
-                f"{state.phase} {state.matched} of {state.posts} posts known",
+                state.waits_for or f"{state.phase} {state.matched} of {state.posts} posts known",
             )
 
         ended = running.result(goal, on_feedback)

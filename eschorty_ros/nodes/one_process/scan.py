@@ -83,7 +83,7 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
 
     def on_feedback(message: Any) -> None:
         state = message.feedback
-        feedback(float(state.progress), f"{state.phase} {state.points:,} points")
+        feedback(float(state.progress), state.waits_for or f"{state.phase} {state.points:,} points")
 
     with composition(tables, (Scan, "scan"), bench) as running:
         feedback(0.0, "starting")
@@ -104,6 +104,8 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         int(ended.events),
         int(ended.packets_lost),
         int(ended.events_dropped),
+        str(ended.verdict),
+        float(ended.completeness),
     )
 
 

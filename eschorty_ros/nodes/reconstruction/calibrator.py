@@ -206,6 +206,7 @@ class _Feedback:
             self._begun_s = self._searched_s = now_s
         self._sent_s = now_s
         message.phase = phase
+        message.waits_for = self._client.waits_for
         if phase == "capturing":
             share = (now_s - self._begun_s) / self._expected_s()
             message.progress = min(max(share, 0.0), 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from rclpy.node import Node
@@ -55,6 +56,8 @@ class Reports:
         state.sensor_drop_words = saturated(counters["sensor_drop_words"])
         state.points_without_stage = saturated(pipeline.placer.points_without_stage)
         state.scan_id = pipeline.scan_id
+        age_s = self.packet_ages.least_s()
+        state.packet_age = math.nan if age_s is None else age_s
         state.calibration = pipeline.calibration.name
         self._state.publish(state)
 

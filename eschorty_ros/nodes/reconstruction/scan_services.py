@@ -167,6 +167,7 @@ class ScanServices:
         response.packets_lost = saturated(report.packets_lost)
         response.events_dropped = saturated(report.events_dropped)
         response.sigma_median = report.scan.sigma_median_m
+        response.completeness = report.completeness
         response.message = report.message
         return response
 

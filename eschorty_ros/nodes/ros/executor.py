@@ -74,6 +74,7 @@ class _Redirecting:
     def __init__(self) -> None:
         self._members: list[Node] = []
         self.error: Exception | None = None
+        self.ending = False
 
     def add_node(self, node: Node) -> bool:
         """Add a node."""
@@ -106,7 +107,7 @@ class _Redirecting:
             except Exception as error:
                 if isinstance(entity, Timer) and isinstance(error, EschortyError):
                     self.error = self.error or error
-                else:
+                elif not self.ending:
                     note_error(node, entity, error)
 
         return guarded
@@ -172,7 +173,8 @@ class _Redirecting:
             return answered
 
         def respond(answered: Future[Any], header: Any) -> None:
-            answered.add_done_callback(lambda done: send(done.result(), header))
+            response = self._guarded(node, service, lambda: send(answered.result(), header))
+            answered.add_done_callback(lambda _: response())
 
         service.callback, service.send_response = request, respond
 
@@ -247,7 +249,6 @@ class Spinning:
         self.executor: Any = make(threads, context=context or get_default_context())
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        self._ending = False
         self._thread = threading.Thread(target=self._spin, name="executor", daemon=True)
 
     def start(self) -> None:
@@ -261,7 +262,7 @@ class Spinning:
 
     def end(self, timeout_s: float = 1.0) -> None:
         """Run no more callbacks; wait for the thread as long as that."""
-        self._ending = True
+        self.executor.ending = True
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.
@@ -270,11 +271,11 @@ class Spinning:
 
     def _spin(self) -> None:
         # Without a limit rclpy 9.1's EventsExecutor never waits.
-        while self.executor.context.ok() and not self._ending:
+        while self.executor.context.ok() and not self.executor.ending:
             try:
                 self.executor.spin_until_future_complete(rclpy.task.Future(), _TURN_S)
             except Exception as error:
                 # Such as a message that cannot be read.
                 text = f"{error!r}"[:_LINE_MAX]
-                if not self._ending:
+                if not self.executor.ending:
                     get_logger("executor").error(text, throttle_duration_sec=_LOG_S)

@@ -355,7 +355,8 @@ class ScanClient(InstrumentClient):
         if not answer.success:
             raise ScanFailure(f"reconstruction: {answer.message}")
         return ScanSummary(answer.profiles, answer.points, answer.events, answer.packets_lost,
-                           answer.events_dropped, answer.sigma_median, answer.message)  # fmt: skip
+                           answer.events_dropped, answer.sigma_median, answer.message,
+                           answer.completeness)  # fmt: skip
 
 
 class _LifecycleState:
@@ -398,6 +399,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
                 message.profiles,
                 message.points,
                 check_text("scan_id", message.scan_id),
+                message.packet_age,
             ),
             age_s(node, info, message.header.stamp),
         )

@@ -148,8 +148,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             nodes.append(node)
             spinning.executor.add_node(node)
         second = SecondNodes(nodes)
-        spinning.start()
         second.wait()
+        spinning.start()
         with _signal_pipe() as signals:
             while rclpy.ok() and not ending.requested:
                 spinning.raise_error()

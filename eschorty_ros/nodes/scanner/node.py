@@ -187,7 +187,7 @@ class ScannerNode(Node):
         self.get_logger().error(f"scan refused: {reason}")
         with unless_shut_down(self):
             goal.abort()
-        return Scan.Result(success=False, message=reason)
+        return Scan.Result(success=False, message=reason, verdict="failed")
 
     def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:
         sent_s = -math.inf
@@ -205,6 +205,7 @@ class ScannerNode(Node):
                 phase=phase, progress=sweep_progress(phase, position_mm, request)
             )
             feedback.position = m_from_mm(position_mm)
+            feedback.waits_for = self._client.waits_for
             state = self._client.monitor.reconstruction
             if state is not None and phase in ("preparing", "to_start"):
                 # Of the reconstruction that is there now: another one counts from 0.
@@ -234,6 +235,8 @@ class ScannerNode(Node):
             packets_lost=summary.packets_lost,
             events_dropped=summary.events_dropped,
             sigma_median=summary.sigma_median_m,
+            verdict=summary.verdict,
+            completeness=summary.completeness,
         )
         samples = list(self._client.monitor.samples)
         if samples:
