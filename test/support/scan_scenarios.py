@@ -175,7 +175,9 @@ class Bench:
         A pause may cut the periods before and after it.
         """
         times_ns = self._last_light_ns()
-        pauses_s = [1e-9 * (on - off) for off, on in zip(times_ns[1::2], times_ns[2::2])]
+        pauses_s = [
+            1e-9 * (on - off) for off, on in zip(times_ns[1::2], times_ns[2::2], strict=False)
+        ]
         print(f"pauses of the light: {[round(pause_s, 3) for pause_s in pauses_s]} s")
         return sum(math.ceil(pause_s * FREQUENCY_HZ) + 1 for pause_s in pauses_s)
 
