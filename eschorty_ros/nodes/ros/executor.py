@@ -140,16 +140,18 @@ class _Redirecting:
         subscription._callback = receive
 
     def _redirect_timer(self, node: Node, timer: Any) -> None:
-        callback, waits = timer.callback, threading.Lock()
+        callback, running = timer.callback, threading.Lock()
 
         def tick() -> None:
-            waits.release()
-            callback()
+            try:
+                callback()
+            finally:
+                running.release()
 
         run = self._guarded(node, timer, tick)
 
         def expire() -> None:
-            if waits.acquire(blocking=False):
+            if running.acquire(blocking=False):
                 self._submit(timer.callback_group, run)
 
         timer.callback = expire
