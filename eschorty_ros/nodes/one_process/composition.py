@@ -204,6 +204,7 @@ def _running(parameter_file: Path, kind: Any, action: str) -> Iterator[Compositi
         yield made
     finally:
         with signals_ignored():
+            spinning.hold()
             make_safe(nodes)
             # An ended context also ends callbacks that wait, such as homing.
             rclpy.try_shutdown()

@@ -102,6 +102,8 @@ class _Redirecting:
 
     def _guarded(self, node: Node, entity: Any, work: Work) -> Work:
         def guarded() -> None:
+            if self.ending:
+                return
             try:
                 work()
             except Exception as error:
@@ -262,9 +264,13 @@ class Spinning:
         if self.executor.error is not None:
             raise self.executor.error
 
-    def end(self, timeout_s: float = 1.0) -> None:
-        """Run no more callbacks; wait for the thread as long as that."""
+    def hold(self) -> None:
+        """Begin no more callbacks."""
         self.executor.ending = True
+
+    def end(self, timeout_s: float = 1.0) -> None:
+        """Begin no more callbacks, and wait for the thread as long as that."""
+        self.hold()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.

@@ -196,6 +196,7 @@ class DeviceNode(LifecycleNode):
             self.waiting = ""
         if self.waiting:
             self._start_timer.timer_period_ns = round(RETRY_S * 1e9)
+            self._start_timer.reset()
             return
         self._start_timer.cancel()
         if configured == TransitionCallbackReturn.SUCCESS:

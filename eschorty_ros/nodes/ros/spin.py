@@ -167,6 +167,9 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             code = 1
     finally:
         _ignore_signals()
+        # A callback must not switch on what has been made safe.
+        if spinning is not None:
+            spinning.hold()
         make_safe(nodes)
         _tear_down(nodes, spinning)
     return code
