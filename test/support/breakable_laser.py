@@ -9,6 +9,7 @@ from typing import Any
 
 from std_msgs.msg import String
 
+from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.nodes.laser.node import THREADS, LaserNode
 from eschorty_ros.nodes.ros.spin import run
 
@@ -20,11 +21,14 @@ class BreakableLaser(LaserNode):
 
     def _on_break(self, message: String) -> None:
         if message.data == "exception":
-            raise RuntimeError("a callback that fails")
+            self.create_timer(1e-3, self._fail)
         if message.data == "abort":
             os.abort()
         if message.data == "segfault":
             ctypes.string_at(0)
+
+    def _fail(self) -> None:
+        raise DeviceError("a timer that fails")
 
 
 if __name__ == "__main__":
