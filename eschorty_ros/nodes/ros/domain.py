@@ -13,14 +13,18 @@ _DOMAINS = (*range(215, 233), *range(60, 102))
 _HIGH = 215
 # The participant of an instrument that still runs need not be its first.
 _PARTICIPANTS = 10
-_reserved: set[int] = set()
+# So many at a time, the longest unused first: others on this host need some, too.
+_RESERVED_MAX = 24
+_reserved: dict[int, None] = {}
+"""By last use."""
 
 
 def free_domain() -> int:
     """Return a ROS domain without a participant on this host, and reserve it.
 
     It is one from 215 to 232, else from 60 to 101. The reservation ends with this process. The
-    next call, here or in another process, returns another domain as long as there is one.
+    next call, in another process or one of the next 23 here, returns another domain as long as
+    there is one.
 
     Raises
     ------
@@ -29,9 +33,10 @@ def free_domain() -> int:
     """
     domains = list(_DOMAINS)
     random.SystemRandom().shuffle(domains)
-    # The domains that this process has reserved come last.
-    domains.sort(key=lambda domain: (domain in _reserved, domain < _HIGH))
-    for domain in domains:
+    domains.sort(key=lambda domain: domain < _HIGH)
+    new = [domain for domain in domains if domain not in _reserved]
+    own = [domain for domain in _reserved if domain in domains]
+    for domain in (*new, *own) if len(_reserved) < _RESERVED_MAX else (*own, *new):
         if _unused(domain) and _reserve(domain):
             return domain
     raise DeviceError(
@@ -54,6 +59,7 @@ def _unused(domain: int) -> bool:
 def _reserve(domain: int) -> bool:
     """Bind a name that only one process of this host can bind, until this process ends."""
     if domain in _reserved:
+        _reserved[domain] = _reserved.pop(domain)
         return True
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
         try:
@@ -61,5 +67,5 @@ def _reserve(domain: int) -> bool:
         except OSError:
             return False
         name.detach()
-    _reserved.add(domain)
+    _reserved[domain] = None
     return True

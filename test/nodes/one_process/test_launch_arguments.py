@@ -72,7 +72,7 @@ def test_a_bad_argument_is_one_line_with_its_name(
         ("/eschorty/stage: {ros__parameters: {controller: foo}}", "controller 'foo' kbd101"),
         ("/eschorty/camera: {ros__parameters: {roi: 5}}", "roi is 5"),
         ("/eschorty/camera: {", "correct the YAML"),
-        ("/eschorty/scanner: {ros__parameters: {speed: 0.5}}", "speed 0.5 at most"),
+        ("/eschorty/scanner: {ros__parameters: {speed: 0.5}}", "speed 0.5 0.25"),
     ],
 )
 def test_a_bad_parameter_file_is_one_line(tmp_path: Path, text: str, words: str) -> None:
