@@ -407,7 +407,9 @@ def scanner_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     kill()
     wait_until(lambda: len(bench.clouds) > before, "the cloud so far")
     assert bench.clouds[-1].width > SWEPT_POINTS
-    bench.assert_off_and_at_rest()
+    # The stage goes on to its target, in the dark.
+    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")
+    wait_until(lambda: bench.laser[-1].output == LaserState.OUTPUT_OFF, "the state off")
 
 
 def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
