@@ -29,6 +29,7 @@ from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.nodes.ros.border import note_error
 
 Work = Callable[[], None]
+_Events: Any = getattr(_rclpy, "EventsExecutor", object)
 
 _TURN_S = 0.1
 _PAUSE_S = 3e-4
@@ -183,7 +184,7 @@ class _Redirecting:
         service.callback, service.send_response = request, respond
 
 
-class EventExecutor(_Redirecting, getattr(_rclpy, "EventsExecutor", object)):  # type: ignore[misc]
+class EventExecutor(_Redirecting, _Events):
     """rclpy's ``EventsExecutor`` with the callback groups of ``MultiThreadedExecutor``.
 
     It waits for events instead of building a wait set at every turn, which is what costs there.
@@ -192,7 +193,7 @@ class EventExecutor(_Redirecting, getattr(_rclpy, "EventsExecutor", object)):  #
 
     def __init__(self, threads: int, context: Context) -> None:
         _Redirecting.__init__(self)
-        getattr(_rclpy, "EventsExecutor", object).__init__(self, context)
+        _Events.__init__(self, context)
         self._pool = ThreadPoolExecutor(threads, "callback")
         self._groups: dict[CallbackGroup, _InTurn] = {}
 
@@ -247,7 +248,7 @@ class Spinning:
     """
 
     def __init__(self, threads: int, context: Context | None = None) -> None:
-        make = EventExecutor if hasattr(_rclpy, "EventsExecutor") else ThreadsExecutor
+        make = ThreadsExecutor if _Events is object else EventExecutor
         # rclpy's executor takes these signals for itself.
         handlers = {number: signal.getsignal(number) for number in _TAKEN_SIGNALS}
         self.executor: Any = make(threads, context=context or get_default_context())
