@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from eschorty_ros.control.heartbeat import place
 from eschorty_ros.core.base.errors import DeviceError
@@ -82,6 +83,8 @@ class _Mark:
             use_global_arguments=False,
             enable_rosout=False,
             start_parameter_services=False,
+            # It would not answer, because nothing spins the mark.
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
         )
         if before is not None:
             before.destroy_node()
