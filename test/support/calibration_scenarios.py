@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -273,13 +274,13 @@ def one_thing_at_a_time(bench: CalibrationBench) -> None:
     bench.assert_off_and_at_rest()
 
 
-def load(bench: CalibrationBench, name: str | Path) -> Any:
-    request = LoadCalibration.Request(calibration=str(name))
+def load(bench: CalibrationBench, name: str) -> Any:
+    request = LoadCalibration.Request(calibration=name)
     return bench.observer.call(LoadCalibration, "reconstruction/load_calibration", request)
 
 
-def save(bench: CalibrationBench, path: str | Path = "") -> Any:
-    request = SaveCalibration.Request(path=str(path))
+def save(bench: CalibrationBench, name: str = "") -> Any:
+    request = SaveCalibration.Request(path=name)
     return bench.observer.call(SaveCalibration, "reconstruction/save_calibration", request)
 
 
@@ -289,9 +290,9 @@ def assert_not_done(answer: Any, *words: str) -> None:
     assert [word for word in words if word not in answer.message] == [], answer.message
 
 
-def load_and_save(bench: CalibrationBench, folder: Path) -> None:
-    """Only calibrations of this instrument are loaded; files are written completely or not."""
-    own = load_calibration(CALIBRATION)
+def load_and_save(bench: CalibrationBench) -> None:
+    """Only calibrations of this instrument in its folder are loaded; files are whole or absent."""
+    own, folder = load_calibration(CALIBRATION), bench.folder
     with bench.nothing_changes():
         for change, words in (
             ({"columns": 640, "principal_column": 319.5}, ("columns", "640", "1280")),
@@ -299,19 +300,25 @@ def load_and_save(bench: CalibrationBench, folder: Path) -> None:
             ({"name": "config_1"}, ("config_1", "config_3", "build")),
         ):
             save_calibration(replace(own, **change), folder / "other.yaml")
-            assert_not_done(load(bench, folder / "other.yaml"), *words)
-        for name in (folder / "missing.yaml", "config_9", "config_1"):
-            assert_not_done(load(bench, name))
+            assert_not_done(load(bench, "other"), *words)
         (folder / "broken.yaml").write_text("name: config_3\n")
-        assert_not_done(load(bench, folder / "broken.yaml"), "broken.yaml")
-        assert_not_done(save(bench, folder / "missing" / "c.yaml"))
+        assert_not_done(load(bench, "broken"), "broken.yaml")
+        os.mkfifo(folder / "pipe.yaml")
+        for name in ("pipe", "../made/other", "/dev/zero", "/etc/shadow", "x" * 5000, "missing"):
+            answer = load(bench, name)
+            assert_not_done(answer)
+            assert len(answer.message) <= 300
+        for name in ("pipe", "../other", str(folder / "kept"), "."):
+            assert_not_done(save(bench, name))
+        for file in ("other", "broken", "pipe"):
+            (folder / f"{file}.yaml").unlink()
     active = bench.newest.id
-    answer = save(bench, folder / "kept.yaml")
-    assert answer.success, answer.message
+    answer = save(bench, "kept")
+    assert (answer.success, answer.file) == (True, str(folder / "kept.yaml")), answer.message
     answer = load(bench, CALIBRATION)
     assert answer.success, answer.message
     bench.wait_for_active("")
-    answer = load(bench, folder / "kept.yaml")
+    answer = load(bench, "kept")
     assert answer.success, answer.message
     assert answer.id == active
     bench.wait_for_active(active)

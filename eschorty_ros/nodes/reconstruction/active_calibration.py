@@ -10,13 +10,15 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
-from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.core.calibration import Targets, write_targets
 from eschorty_ros.core.optics import (
     Calibration,
     load_calibration,
+    load_named_calibration,
     refuse_other_instrument,
     save_calibration,
+    save_named_calibration,
 )
 from eschorty_ros.msg import ActiveCalibration as ActiveCalibrationMessage
 from eschorty_ros.nodes.reconstruction.calibration_messages import active_message
@@ -38,16 +40,25 @@ class ActiveCalibration:
         Its file.
     folder : str
         Folder for calibrations; ``""``: ``eschorty`` in ROS's home.
+    paths : bool
+        Whether the services take paths, too: any file that the process may read or write.
     use : callable
         Changes the calibration in use, or raises an ``EschortyError`` and changes nothing.
     """
 
     def __init__(
-        self, node: Node, calibration: Calibration, file: str, folder: str, use: Use
+        self,
+        node: Node,
+        calibration: Calibration,
+        file: str,
+        folder: str,
+        paths: bool,
+        use: Use,
     ) -> None:
         self.calibration = calibration
         self.folder = Path(folder).expanduser() if folder else _home()
         self._node = node
+        self._paths = paths
         self._use = use
         self._publisher = node.create_publisher(
             ActiveCalibrationMessage, "reconstruction/calibration", qos.latched()
@@ -62,7 +73,7 @@ class ActiveCalibration:
         self._publish(file)
 
     def store(self, calibration: Calibration, targets: Targets) -> str:
-        """Write the targets and ``calibration``, then use it; return the calibration's path.
+        """Write ``calibration`` and its targets, then use it; return the calibration's path.
 
         Raises
         ------
@@ -71,9 +82,8 @@ class ActiveCalibration:
             active one then stays.
         """
         refuse_other_instrument(calibration, self.calibration)
-        path = self._default_path(calibration)
+        path = save_named_calibration(self.folder, calibration)
         write_targets(targets_path(path), targets)
-        save_calibration(calibration, path)
         self._exchange(calibration, str(path))
         return str(path)
 
@@ -87,19 +97,9 @@ class ActiveCalibration:
         now_ns = self._node.get_clock().now().nanoseconds
         self._publisher.publish(active_message(self.calibration, file, now_ns))
 
-    def _default_path(self, calibration: Calibration) -> Path:
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ArgumentError(
-                f"cannot make calibration_folder {str(self.folder)!r} ({error.strerror}); choose "
-                "another"
-            ) from error
-        return self.folder / f"{calibration.id or calibration.name}.yaml"
-
     def _on_load(self, request: Any, response: Any) -> Any:
         try:
-            calibration = load_calibration(request.calibration)
+            calibration = self._load(request.calibration)
             refuse_other_instrument(calibration, self.calibration)
             self._exchange(calibration, request.calibration)
         except EschortyError as error:
@@ -111,13 +111,23 @@ class ActiveCalibration:
     def _on_save(self, request: Any, response: Any) -> Any:
         calibration = self.calibration
         try:
-            path = Path(request.path) if request.path else self._default_path(calibration)
-            save_calibration(calibration, path)
+            path = self._save(calibration, request.path)
         except EschortyError as error:
             response.message = str(error)
             return response
         response.success, response.file = True, str(path)
         return response
+
+    def _load(self, name: str) -> Calibration:
+        if self._paths and os.sep in name:
+            return load_calibration(name)
+        return load_named_calibration(self.folder, name)
+
+    def _save(self, calibration: Calibration, name: str) -> Path:
+        if self._paths and os.sep in name:
+            save_calibration(calibration, name)
+            return Path(name)
+        return save_named_calibration(self.folder, calibration, name)
 
 
 def targets_path(calibration_path: Path) -> Path:

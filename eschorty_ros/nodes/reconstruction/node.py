@@ -89,11 +89,15 @@ class ReconstructionNode(Node):
 
     def _made_calibrator(self) -> Calibrator:
         values = self.parameters
-        folder = values["calibration_folder"]
         return Calibrator(
             self,
             ActiveCalibration(
-                self, self.calibration, values["calibration"], folder, self._use_calibration
+                self,
+                self.calibration,
+                values["calibration"],
+                values["calibration_folder"],
+                values["calibration_paths"],
+                self._use_calibration,
             ),
             self._in_worker,
             self._pipeline.set_capture,

@@ -28,6 +28,8 @@ TABLE = (
     Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
     Param("calibration_folder", "", "folder for calibrations; empty: eschorty in ROS's home"),
+    Param("calibration_paths", False, "load_calibration and save_calibration take paths, too: of "
+          "any file that the node may read or write"),
     Param("auto_calibrate", False, "calibrate once as soon as the other nodes are ready"),
     Param("distances", "posts", "auto_calibrate: targets, a file's name in config/ or a path"),
     Param("method", "joint", "auto_calibrate: method of the fit", choices=METHODS),

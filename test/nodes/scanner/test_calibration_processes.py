@@ -69,8 +69,8 @@ def test_nine_posts_calibrate_the_same_scan_to_one_mm(instrument):
     scenarios.calibrated_scan_is_right(instrument.bench)
 
 
-def test_only_calibrations_of_this_instrument_are_loaded(instrument, tmp_path):
-    scenarios.load_and_save(instrument.bench, tmp_path)
+def test_only_calibrations_of_this_instrument_are_loaded(instrument):
+    scenarios.load_and_save(instrument.bench)
 
 
 def test_bad_goals_are_refused(instrument):
