@@ -49,7 +49,7 @@ def prepare(folder):
     points = read_cloud("again/cloud.pcd")
     result = SimpleNamespace(
         success=True, message="", points=points, profiles=9, events=9, events_dropped=0,
-        packets_lost=0,
+        packets_lost=0, verdict="complete", completeness=1.0,
     )  # fmt: skip
     module = SimpleNamespace(
         ScanJob=lambda *values, hardware: SimpleNamespace(

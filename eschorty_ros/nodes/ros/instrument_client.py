@@ -54,7 +54,7 @@ _BEGIN_S = 20.0
 # For an answer of a node that no longer reports.
 _SILENT_WAIT_S = 0.3
 _LEAST_WAIT_S = 0.1
-_CLOCKS_S = 5.0
+_CLOCKS_S = 20.0
 
 
 class InstrumentClient(PacedWaiting):
