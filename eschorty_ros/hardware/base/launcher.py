@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from eschorty_ros.hardware.base.stalls import process_fault
+from eschorty_ros.hardware.base.stalls import process_ended
 
 VARIABLE = "ESCHORTY_LAUNCHER"
 _POLL_S = 0.1
@@ -47,7 +47,7 @@ def _waiting(pid: int) -> Callable[[], object]:
     except OSError:
 
         def wait() -> None:
-            while process_fault(pid) not in ("gone", "dead"):
+            while not process_ended(pid):
                 time.sleep(_POLL_S)
 
         return wait

@@ -54,3 +54,8 @@ def process_fault(pid: int) -> str:
     if "\nCoreDumping:\t1" in status:
         return "dumping core"
     return _STATES.get(status.partition("\nState:\t")[2][:1], "")
+
+
+def process_ended(pid: int) -> bool:
+    """Return whether process ``pid`` has ended, and only its parent may not have noticed yet."""
+    return process_fault(pid) in ("gone", "dead")

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 
 from eschorty_ros.control.heartbeat import place
 from eschorty_ros.core.base.errors import DeviceError
-from eschorty_ros.hardware.base.stalls import process_fault
+from eschorty_ros.hardware.base.stalls import process_ended
 
 # Discovery takes some 0.2 s, and seconds on a busy host.
 _BEFORE_SPIN_S = 1.0
@@ -97,7 +97,7 @@ class _Mark:
             (
                 (state, int(ns), int(pid))
                 for state, ns, pid, where in found
-                if where != _HERE or process_fault(int(pid)) not in ("gone", "dead")
+                if where != _HERE or not process_ended(int(pid))
             ),
             default=None,
         )
