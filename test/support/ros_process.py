@@ -33,7 +33,6 @@ from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 
 NAMESPACE = "/eschorty"
-DISCOVERY = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 # With util-linux the kernel ends the nodes however the tests end.
 _ENDING_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
 
@@ -142,7 +141,6 @@ def domain_environment(domain: int) -> dict[str, str]:
         **os.environ,
         "PYTHONPATH": f"{Path(__file__).parent}:{os.environ.get('PYTHONPATH', '')}",
         "ROS_DOMAIN_ID": str(domain),
-        DISCOVERY: os.environ.get(DISCOVERY, "LOCALHOST"),
         "PYTHONUNBUFFERED": "1",
     }
 
@@ -184,7 +182,6 @@ class Observer:
     """A test's own node, spun in a thread until the end of a ``with``."""
 
     def __init__(self, domain: int | None = None) -> None:
-        os.environ.setdefault(DISCOVERY, "LOCALHOST")
         use_profile()
         self.domain = free_domain() if domain is None else domain
         context = rclpy.Context()

@@ -22,6 +22,7 @@ from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.laser.node import LaserNode
 from eschorty_ros.nodes.reconstruction.node import ReconstructionNode
 from eschorty_ros.nodes.ros.alone import SecondNodes
+from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored
@@ -163,7 +164,7 @@ def composition(
     With ``bench``, options of ``eschorty-bench``, another process emulates the devices. Unless
     ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own, apart from other instruments.
     """
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    use_profile()
     with contextlib.ExitStack() as ending:
         folder = ending.enter_context(temporary_folder())
         tables = {name: dict(table) for name, table in values.items()}

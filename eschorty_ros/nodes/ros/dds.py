@@ -6,22 +6,29 @@ import os
 
 from eschorty_ros.core.base.files import config_folders
 
-PROFILE = "fastdds.xml"
+HERE, NETWORK = "fastdds.xml", "two_hosts.xml"
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 # Fast DDS 2 of these has another format of profiles.
 _OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 
 
 def use_profile() -> None:
-    """Make Fast DDS read ``config/fastdds.xml`` unless the user has chosen a profile.
+    """Make Fast DDS read a profile of ``config/`` unless the user has chosen one.
 
-    With its defaults a message lost on a loaded host is repeated after up to 3 s, even on a
-    reliable topic. Call it before the first ``rclpy.init`` of the process.
+    ``fastdds.xml`` stays on this host; ``two_hosts.xml`` where the discovery range is set to
+    another value. With the defaults of Fast DDS a message lost on a loaded host is repeated after
+    up to 3 s, even on a reliable topic. Call it before the first ``rclpy.init`` of the process.
     """
+    here = os.environ.setdefault(RANGE, "LOCALHOST") == "LOCALHOST"
     chosen = any(name in os.environ for name in VARIABLES)
     if chosen or os.environ.get("ROS_DISTRO") in _OLD_DISTRIBUTIONS:
         return
     for folder in config_folders():
-        if (folder / PROFILE).is_file():
-            os.environ[VARIABLES[0]] = str(folder / PROFILE)
+        profile = folder / (HERE if here else NETWORK)
+        if profile.is_file():
+            os.environ[VARIABLES[0]] = str(profile)
+            if here:
+                # LOCALHOST would add shared memory to what the profile names.
+                os.environ[RANGE] = "SUBNET"
             return

@@ -17,10 +17,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 import scan_scenarios as scenarios
 from benches import remote_bench
 from lossy_link import TwoHosts, missing
-from ros_process import DISCOVERY, processes
+from ros_process import processes
 
 from eschorty_ros.core.base.files import config_folders
-from eschorty_ros.nodes.ros.dds import VARIABLES
+from eschorty_ros.nodes.ros.dds import NETWORK, RANGE, VARIABLES
 
 SWITCH = "ESCHORTY_TWO_HOSTS"
 # In namespaces of their own.
@@ -34,8 +34,8 @@ def instrument(tmp_path_factory):
     if reason:
         pytest.skip(reason)
     log = Path(tmp_path_factory.mktemp("laser")) / "output.log"
-    profile = next(path for folder in config_folders() for path in folder.glob("two_hosts.xml"))
-    chosen = {DISCOVERY: "SUBNET", VARIABLES[0]: str(profile)}
+    profile = next(path for folder in config_folders() for path in folder.glob(NETWORK))
+    chosen = {RANGE: "SUBNET", VARIABLES[0]: str(profile)}
     with contextlib.ExitStack() as ending:
         ending.enter_context(mock.patch.dict(os.environ, chosen))
         hosts = ending.enter_context(TwoHosts())
