@@ -48,6 +48,9 @@ from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
 from eschorty_ros.nodes.ros.spin import run
 
 _STAGE_DEPTH = 2000
+_IDLE_S = 0.02
+# Fewer than the packets that a stream holds.
+_JOBS_PER_STEP = 32
 
 
 class ReconstructionNode(Node):
@@ -209,9 +212,11 @@ class ReconstructionNode(Node):
     def _work(self) -> None:
         while not self._closing.is_set():
             try:
-                job = self._jobs.next(0.02)
-                if job is not None:
+                job, begun = self._jobs.next(_IDLE_S), 0
+                while job is not None:
                     job()
+                    begun += 1
+                    job = self._jobs.next(0.0) if begun < _JOBS_PER_STEP else None
                 self._step()
             except Exception:
                 # After a signal the context is invalid.
