@@ -30,9 +30,10 @@ class SweepCoverage:
             self._steps.append(((t_ns - before[0]) * 1e-9 * share, inside_mm))
 
     def profiles(self, profile_rate_hz: float) -> int:
-        """Return the number of profiles of one pass over the whole distance, 0 without motion.
+        """Return the whole profiles of one pass over the whole distance, 0 without motion.
 
-        The speed is the median over the distance: neither rests nor late samples shift it.
+        The profiles that its ends cut are not counted. The speed is the median over the distance:
+        neither rests nor late samples shift it.
         """
         if not self._steps:
             return 0
@@ -41,4 +42,5 @@ class SweepCoverage:
         order = np.argsort(speed_mm_s)
         covered_mm = np.cumsum(distance_mm[order])
         median_mm_s = speed_mm_s[order[np.searchsorted(covered_mm, 0.5 * covered_mm[-1])]]
-        return round((self._high_mm - self._low_mm) / median_mm_s * profile_rate_hz)
+        profiles = (self._high_mm - self._low_mm) / median_mm_s * profile_rate_hz
+        return max(round(profiles) - 1, 0)

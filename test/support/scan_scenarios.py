@@ -243,7 +243,7 @@ def _positions_mm() -> np.ndarray:
     return 1e3 * (START_M + (STOP_M - START_M) * (np.arange(PERIODS) + 0.5) / PERIODS)
 
 
-def full_scan(bench: Bench, completeness: float = 0.98) -> None:
+def full_scan(bench: Bench, completeness: float = BUT_ONE) -> None:
     """A scan to its end gives the expected cloud."""
     before = len(bench.clouds)
     status, result = bench.scan()
@@ -306,7 +306,7 @@ def cut_off(bench: Bench, cut: Callable[[], Any], join: Callable[[], Any]) -> No
     wait_until(at_rest, "the stage at rest")
     assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
     bench.assert_off_and_at_rest()
-    full_scan(bench, BUT_ONE)
+    full_scan(bench)
 
 
 def cancel_scan(bench: Bench) -> None:

@@ -249,8 +249,10 @@ class Spinning:
 
     def __init__(self, threads: int, context: Context | None = None) -> None:
         make = ThreadsExecutor if _Events is object else EventExecutor
-        # rclpy's executor takes these signals for itself.
-        handlers = {number: signal.getsignal(number) for number in _TAKEN_SIGNALS}
+        # rclpy's executor takes these signals for itself; only a main thread can take them back.
+        main = threading.current_thread() is threading.main_thread()
+        taken = _TAKEN_SIGNALS if main else ()
+        handlers = {number: signal.getsignal(number) for number in taken}
         self.executor: Any = make(threads, context=context or get_default_context())
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -56,7 +56,7 @@ def instrument(tmp_path_factory):
 def test_a_scan_with_metavision_driver_and_five_percent_of_the_heartbeats_lost(instrument):
     bench, _, relay = instrument
     relay.lost["Header"] = 0.05
-    scenarios.full_scan(bench, scenarios.BUT_ONE)
+    scenarios.full_scan(bench)
 
 
 def test_a_lost_packet_costs_at_most_the_points_of_its_period(instrument):

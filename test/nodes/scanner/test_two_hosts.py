@@ -55,7 +55,7 @@ def instrument(tmp_path_factory):
 def test_lost_frames_cost_no_points(instrument, lost):
     bench, hosts = instrument
     hosts.lose(lost)
-    scenarios.full_scan(bench, scenarios.BUT_ONE)
+    scenarios.full_scan(bench)
 
 
 def test_a_cut_link_ends_the_scan_and_the_next_one_works(instrument):
