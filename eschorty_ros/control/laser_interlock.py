@@ -100,8 +100,13 @@ class LaserInterlock:
         """Allow enabling for a while."""
         self._armed_s = self._now_s()
 
-    def receive_contact(self, is_open: bool, source: str = "") -> None:
-        """Take a source's report of the contact; every source counts from its first report on."""
+    def receive_contact(self, is_open: bool, source: str = "", unnamed: str = "") -> None:
+        """Take a source's report of the contact; every source counts from its first report on.
+
+        ``unnamed`` is the source of its reports before its name was known.
+        """
+        if unnamed and unnamed != source:
+            self._closed_s.pop(unnamed, None)
         if is_open:
             self._opened_by = source or "laser/interlock"
         if source in self._closed_s or len(self._closed_s) < _KEPT:

@@ -81,6 +81,16 @@ def test_required_contact_is_open_unless_it_is_reported_closed_repeatedly(clock)
     assert "interlock open" in str(interlock.trip_reason())
 
 
+def test_a_source_whose_name_is_discovered_later_is_one_source(clock):
+    interlock = LaserInterlock(10.0, 60.0, {}, now_s=clock)
+    interlock.receive_contact(True, "0a1b", "0a1b")
+    interlock.receive_contact(True, "door", "0a1b")
+    assert "interlock open (door)" in interlock.contact_fault()
+    interlock.receive_contact(False, "door", "0a1b")
+    assert not interlock.reset_contact()
+    assert not interlock.contact_open
+
+
 def test_every_source_must_be_closed_and_fresh_and_an_opened_one_reset(clock):
     interlock = LaserInterlock(10.0, 60.0, {}, now_s=clock)
     assert not interlock.contact_open

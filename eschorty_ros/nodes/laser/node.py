@@ -215,10 +215,10 @@ class LaserNode(DeviceNode):
 
     def _on_interlock(self, message: Bool, info: Mapping[str, Any]) -> None:
         interlock = self._supervisor.interlock
-        source = self._contacts.name(info)
-        if message.data or source or not self._contacts.id(info):
+        publisher, source = self._contacts.id(info), self._contacts.name(info)
+        if message.data or source or not publisher:
             opens = message.data and not interlock.contact_open
-            interlock.receive_contact(bool(message.data), source)
+            interlock.receive_contact(bool(message.data), source or publisher, publisher)
             # Only at the change; the watchdog checks the contact all the time.
             if opens:
                 self._supervisor.trip(interlock.contact_fault())

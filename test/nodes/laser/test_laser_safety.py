@@ -126,7 +126,13 @@ def test_an_interlock_that_one_source_opened_stays_open_until_it_is_reset(
     door.publish(Bool(data=True))
     doomed.check_off("interlock of another source", sent_ns)
     assert not doomed.contact.reset()
-    assert "interlock open (/eschorty/door)" in doomed.arm().message
+
+    def named() -> bool:
+        # The name of a new node may be discovered after its first message.
+        door.publish(Bool(data=True))
+        return "interlock open (/eschorty/door)" in doomed.arm().message
+
+    wait_until(named, "the source by its name")
     door.publish(Bool(data=False))
     latched = "was opened (/eschorty/door); call laser/reset_interlock"
     wait_until(lambda: latched in doomed.arm().message, "the latch")
