@@ -71,7 +71,11 @@ def test_a_scan_without_points_is_no_success(tmp_path):
     request = ScanJob("leaves", "config_3", 0.0, 20.0, 100.0, 70.0, 0, "paper")
     points = np.empty(0, POINT_DTYPE)
     with pytest.raises(DeviceError, match="no points: no events came"):
-        finish(request, ScanResult(True, "no points: no events came", points, 0, 0, 0, 0), tmp_path)
+        finish(
+            request,
+            ScanResult(True, "no points: no events came", points, 0, 0, 0, 0, "failed", 0.0),
+            tmp_path,
+        )
     assert len(read_cloud(tmp_path / "scan.pcd")) == 0
 
 
@@ -80,5 +84,5 @@ def test_what_a_scan_lost_is_printed(tmp_path, capsys):
     points = np.zeros(4, POINT_DTYPE)
     points["x"] = points["t"] = points["y"] = points["column"] = [1, 2, 3, 4]
     lost = "7 points had no stage position"
-    finish(request, ScanResult(True, lost, points, 4, 100, 0, 0), tmp_path)
+    finish(request, ScanResult(True, lost, points, 4, 100, 0, 0, "complete", 1.0), tmp_path)
     assert lost in capsys.readouterr().out

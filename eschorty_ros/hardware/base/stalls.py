@@ -57,5 +57,5 @@ def process_fault(pid: int) -> str:
 
 
 def process_ended(pid: int) -> bool:
-    """Return whether process ``pid`` has ended, and only its parent may not have noticed yet."""
+    """Return whether process ``pid`` has ended, also while its parent has not waited for it."""
     return process_fault(pid) in ("gone", "dead")

@@ -57,8 +57,8 @@ class ScanResult:
     events: int
     packets_lost: int
     events_dropped: int
-    verdict: str = "complete"
-    completeness: float = 1.0
+    verdict: str
+    completeness: float
 
 
 def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
