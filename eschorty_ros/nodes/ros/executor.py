@@ -147,7 +147,9 @@ class _Redirecting:
 
         def tick() -> None:
             try:
-                callback()
+                # It may have expired once more before its last run canceled it.
+                if not timer.is_canceled():
+                    callback()
             finally:
                 running.release()
 

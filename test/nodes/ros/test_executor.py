@@ -130,3 +130,20 @@ def test_an_error_of_a_timer_ends_the_node(spun):
     wait_until(lambda: spinning.executor.error is not None, "the error")
     with pytest.raises(DeviceError, match="the device is gone"):
         spinning.raise_error()
+
+
+def test_a_canceled_timer_runs_no_more(spun):
+    node, _, _ = spun
+    runs, timers = [], []
+    for _ in range(90):
+
+        def once(number=len(timers)) -> None:
+            runs.append(number)
+            timers[number].cancel()
+
+        timers.append(node.create_timer(1e-3, once, autostart=False))
+    for timer in timers:
+        timer.reset()
+    wait_until(lambda: len(set(runs)) == len(timers), "every timer")
+    time.sleep(0.1)
+    assert sorted(runs) == list(range(len(timers)))
