@@ -29,19 +29,18 @@ from eschorty_ros.msg import LaserState, PositionTrigger
 from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.reconstruction.auto_calibration import AutoCalibration
 from eschorty_ros.nodes.reconstruction.calibrator import Calibrator
+from eschorty_ros.nodes.reconstruction.inputs import (
+    laser_settings,
+    packet_from_message,
+    pulse_train,
+)
 from eschorty_ros.nodes.reconstruction.outputs import Outputs
 from eschorty_ros.nodes.reconstruction.parameters import TABLE, modulation_override
 from eschorty_ros.nodes.reconstruction.reports import Reports
 from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import diagnostics, qos, transforms
 from eschorty_ros.nodes.ros.border import refusals
-from eschorty_ros.nodes.ros.conversions import (
-    laser_settings,
-    ns_from_stamp,
-    packet_from_message,
-    pulse_train,
-    stage_position_mm,
-)
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stage_position_mm
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s

@@ -6,16 +6,9 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
-from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import number, short
-from eschorty_ros.core.clocks import PulseTrain
-from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.live.packet_times import Packet
-from eschorty_ros.nodes.ros.border import check_text
+from eschorty_ros.core.base.numbers import number
 
 _NS_PER_S = 1_000_000_000
-_PACKET_MAX_BYTES = 16_000_000
-_INTERVAL_M = 1e-6, 1.0
 _STAMP_MIN_NS, _STAMP_MAX_NS = -(_NS_PER_S << 31), (_NS_PER_S << 31) - 1
 
 
@@ -41,68 +34,6 @@ def mm_from_m(metres: float) -> float:
 def m_from_mm(millimetres: float) -> float:
     """Return a length in millimetres in metres."""
     return millimetres * 1e-3
-
-
-def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
-    """Return the modulation of a ``LaserState`` and its times.
-
-    Returns
-    -------
-    modulation : Modulation
-        Without ``on_edge_us``, which needs the camera's clock.
-    epoch_ns : int or None
-        ROS time of one rising edge, ``None`` when ``phase_epoch`` is zero, which means unknown.
-    on_since_ns : int or None
-        Since when the laser is on, ``None`` when it is off.
-
-    Raises
-    ------
-    ArgumentError
-        When frequency, duty or waveform is out of range.
-    """
-    check_text("waveform", state.waveform)
-    modulation = Modulation(
-        frequency_hz=float(state.frequency),
-        duty=float(state.duty),
-        waveform=str(state.waveform),
-    )
-    epoch_ns = ns_from_stamp(state.phase_epoch) or None
-    on = state.output == state.OUTPUT_ON
-    return modulation, epoch_ns, ns_from_stamp(state.output_since) if on else None
-
-
-def pulse_train(trigger: Any) -> PulseTrain | None:
-    """Return the stage's pulses that a ``PositionTrigger`` describes, ``None`` without pulses.
-
-    Raises
-    ------
-    ArgumentError
-        When a position is not finite or the interval is not one of a stage.
-    """
-    interval_mm = mm_from_m(float(trigger.interval))
-    count = int(trigger.count)
-    if interval_mm == 0.0 or count == 0:
-        return None
-    number("interval", trigger.interval, *_INTERVAL_M)
-    return PulseTrain(mm_from_m(float(trigger.first)), interval_mm, count)
-
-
-def packet_from_message(message: Any, source: bytes) -> Packet:
-    """Return the packet of an ``EventPacket``.
-
-    Raises
-    ------
-    ArgumentError
-        When it has another encoding or more bytes than a packet may have.
-    """
-    size = len(message.events)
-    if size > _PACKET_MAX_BYTES:
-        raise ArgumentError(
-            f"a packet has {size} bytes; send {_PACKET_MAX_BYTES} at most, at a lower threshold"
-        )
-    if message.encoding != "evt3":
-        raise ArgumentError(f"encoding is {short(message.encoding)}; set the camera to evt3")
-    return Packet(message.seq, ns_from_stamp(message.header.stamp), message.events, source)
 
 
 def stage_position_mm(message: Any) -> float:

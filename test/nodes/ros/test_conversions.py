@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.nodes.reconstruction.inputs import laser_settings
 from eschorty_ros.nodes.ros import transforms
 from eschorty_ros.nodes.ros.cloud_messages import (
     LIVE_DTYPE,
@@ -22,7 +23,7 @@ from eschorty_ros.nodes.ros.cloud_messages import (
     live_points,
     points_from_message,
 )
-from eschorty_ros.nodes.ros.conversions import laser_settings, ns_from_stamp, stamp_from_ns
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stamp_from_ns
 
 
 @settings(derandomize=True, deadline=None)

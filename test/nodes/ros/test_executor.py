@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Iterator
@@ -135,13 +136,13 @@ def test_an_error_of_a_timer_ends_the_node(spun):
 def test_a_canceled_timer_runs_no_more(spun):
     node, _, _ = spun
     runs, timers = [], []
-    for _ in range(90):
 
-        def once(number=len(timers)) -> None:
-            runs.append(number)
-            timers[number].cancel()
+    def once(number: int) -> None:
+        runs.append(number)
+        timers[number].cancel()
 
-        timers.append(node.create_timer(1e-3, once, autostart=False))
+    for number in range(90):
+        timers.append(node.create_timer(1e-3, functools.partial(once, number), autostart=False))
     for timer in timers:
         timer.reset()
     wait_until(lambda: len(set(runs)) == len(timers), "every timer")
