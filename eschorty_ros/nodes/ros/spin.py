@@ -26,6 +26,7 @@ from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.executor import Spinning
 
 _TURN_S = 0.1
+_SIGNALS_MAX = 64
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ending: WeakSet[Node] = WeakSet()
 _REASON_MAX = 240
@@ -154,7 +155,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             while rclpy.ok() and not ending.requested:
                 spinning.raise_error()
                 second.look()
-                select.select([signals], [], [], _TURN_S)
+                if select.select([signals], [], [], _TURN_S)[0]:
+                    os.read(signals, _SIGNALS_MAX)
     except KeyboardInterrupt:
         pass
     except EschortyError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -17,8 +18,11 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import scan_scenarios as scenarios
 from benches import remote_bench
-from ros_process import NAMESPACE, NodeProcess, node_name, processes
+from ros_process import NAMESPACE, NodeProcess, Observer, node_name, processes
+from std_msgs.msg import Header
+from waiting import wait_until
 
+from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
 
 STRAY = ("Traceback", "context is", "Destroyable", "RCLError", "Exception", "not safe", "Invalid")
@@ -83,3 +87,22 @@ def test_all_nodes_in_one_process_scan_and_end(tmp_path: Path) -> None:
             with scenarios.bench(domain, log) as bench:
                 scenarios.full_scan(bench)
             assert_ctrl_c_ends({"instrument": process})
+
+
+def test_a_signal_with_a_handler_of_its_own_costs_nothing() -> None:
+    """SIGUSR1, after which the node goes on."""
+    with Observer() as observer:
+        beats = observer.collect(Header, "laser/heartbeat", qos.heartbeat())
+        topics = {"topics": "laser/heartbeat"}
+        with NodeProcess("heartbeat_sender", topics, domain=observer.domain) as node:
+            wait_until(lambda: beats, "a heartbeat")
+            node.send(signal.SIGUSR1)
+            used_s = cpu_s(node.pid)
+            time.sleep(2.0)
+            assert cpu_s(node.pid) - used_s < 1.0
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
