@@ -140,5 +140,5 @@ def activate(observer: Any, contact: Contact) -> None:
 def assert_alive(running: dict[str, Any]) -> None:
     time.sleep(1.0)
     for name, process in running.items():
-        assert process.running(), f"{name}: {process.output[-3000:]}"
+        assert process.running(), f"{name} ended by {process.wait()}: {process.output[-6000:]}"
         assert "Traceback" not in process.output, f"{name}: {process.output[-6000:]}"

@@ -136,9 +136,10 @@ def node_name(module: str) -> str:
 
 
 def domain_environment(domain: int) -> dict[str, str]:
-    """Of a process in ``domain``, on this host unless chosen otherwise."""
+    """Of a process in ``domain``, on this host unless chosen otherwise; a crash shows where."""
     return {
         **os.environ,
+        "PYTHONFAULTHANDLER": "1",
         "PYTHONPATH": f"{Path(__file__).parent}:{os.environ.get('PYTHONPATH', '')}",
         "ROS_DOMAIN_ID": str(domain),
         "PYTHONUNBUFFERED": "1",

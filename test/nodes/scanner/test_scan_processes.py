@@ -75,7 +75,6 @@ def test_killed_scanner_leaves_the_points_so_far(instrument):
     scenarios.scanner_killed(bench, lambda: running["scanner"].send(signal.SIGKILL))
     running["scanner"].kill()
     running["scanner"] = started(SCANNER, instrument)
-    scenarios.full_scan(bench)
 
 
 def test_scanner_interrupted_mid_scan_leaves_the_laser_off_and_the_next_one_scans(instrument):
