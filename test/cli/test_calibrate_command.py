@@ -140,6 +140,15 @@ def test_roll_and_smile_show_in_a_target_moved_by_the_stage(tmp_path):
     assert made.b_prime_2_px == pytest.approx(5.0, abs=0.5)
 
 
+# Rows of a target that stays where it is, with noise.
+NOT_MOVING = "row,range_mm\n" + "".join(
+    f"{300 + 0.3 * noise:.3f},{range_mm:.1f}\n"
+    for noise, range_mm in zip(
+        np.random.default_rng(1).normal(size=60), np.linspace(900.0, 1500.0, 60), strict=True
+    )
+)
+
+
 def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
     out = tmp_path / "made.yaml"
     out.write_text("old")
@@ -150,6 +159,8 @@ def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
         ("row,range_mm\n100,900\n900,1000\n", "row of target line 3 is 900"),
         ("row,range_mm\n100,900\n,1000\n", "line 3: row is empty"),
         ("row,range_mm\n100,900\n100,900\n", "are the same"),
+        (NOT_MOVING, "rows 299.2 to 300.6 at 900 to 1500 mm"),
+        ("row,range_mm\n500,1000\n300,1300\n100,1500\n", "do not determine the build"),
     ):
         bad.write_text(text)
         done = run(bad, "--out", out)

@@ -43,6 +43,8 @@ METHODS: tuple[Method, ...] = ("paper", "joint")
 # Among fewer targets an outlier cannot be identified.
 _ROBUST_TARGETS_MIN = 5
 _CONTRADICTION_SIGMA = 6.0
+# Standard deviation of k' over k'.
+_SLOPE_SIGMA_MAX = 1 / 3
 _CHANNELS = ("row", "width", "spacing")
 
 
@@ -183,6 +185,7 @@ def calibrate(
         used, rejected = _rejection(targets, design, names, priors)
     kept = targets.select(used)
     found = fit(kept, design, names, prior_sigma=priors)
+    _refuse_unmoved(kept, design, found)
     lines = verdicts(kept, design, found)
     if rejected:
         labels = listed([entry.label for entry in rejected[:LISTED]], len(rejected))
@@ -288,6 +291,21 @@ def _refuse_undetermined(targets: Targets, names: tuple[str, ...]) -> None:
             f"{WIDTH_BIAS} is free without sizes (condition number inf); give width_px and size_mm "
             "of targets, or fix it"
         )
+
+
+def _refuse_unmoved(kept: Targets, design: RangeModel, found: CalibrationFit) -> None:
+    """Refuse targets whose rows do not move with their range as on a sensor."""
+    model = found.model
+    known = found.sigmas.get("k_prime_px", 0.0) < _SLOPE_SIGMA_MAX * -model.k_prime_px
+    if known and model.tilt_sine < 1.0 and model.range_limits_mm[0] > 0.0:
+        return
+    low, high = kept.range_mm.min(), kept.range_mm.max()
+    expected = float(design.row(high) - design.row(low))
+    raise FitError(
+        f"the targets do not determine the build: rows {kept.row.min():.1f} to "
+        f"{kept.row.max():.1f} at {low:g} to {high:g} mm, a difference of {expected:.1f} px by the "
+        f"design, would be k_prime_px = {model.k_prime_px:.4g}; give targets that move in range"
+    )
 
 
 def _rejects_outliers(method: Method, robust: bool | None, size: int) -> bool:

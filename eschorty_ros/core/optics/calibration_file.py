@@ -104,6 +104,17 @@ class Calibration(Schema):
                     "roi_px",
                     (f"write first column, first row, columns, rows within the sensor of {sensor}"),
                 )
+        model = self.model()
+        near_mm, far_mm = model.range_limits_mm
+        if not model.tilt_sine < 1.0:
+            yield (
+                "k_prime_px",
+                f"no tilt of the sensor gives it; a {model.focal_mm:g} mm lens needs less than "
+                f"{model.k_prime_px * model.tilt_sine:.0f}",
+            )
+        elif not near_mm > 0.0:
+            seen = f"the sensor would see {near_mm:.0f} to {far_mm:.0f} mm"
+            yield "b_prime_px", f"{seen}; choose a value at which row 0 has a positive range"
         length = float(np.linalg.norm(self.stage_direction))
         if not abs(length - 1.0) <= 1e-6:
             yield "stage_direction", f"its length is {length:g}; divide it by its length"
@@ -248,7 +259,10 @@ def _read(path: Path, follow_links: bool = True) -> Calibration:
     document = read_yaml(path, CalibrationError, follow_links)
     if isinstance(document.data, str) and _may_be_shipped(document.data):
         document = read_yaml(_find(document.data), CalibrationError)
-    return validate(Calibration, document, CalibrationError)
+    try:
+        return validate(Calibration, document, CalibrationError)
+    except ArgumentError as error:
+        raise CalibrationError(f"{path}: {error}") from error
 
 
 def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> None:

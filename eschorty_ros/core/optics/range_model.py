@@ -174,6 +174,16 @@ class RangeModel:
         return self.k_mm * self.k_prime_px
 
     @property
+    def focal_mm(self) -> float:
+        """Focal length, ``k sin(theta)``, mm."""
+        return self.k_mm * math.sin(math.radians(self.theta_deg))
+
+    @property
+    def tilt_sine(self) -> float:
+        """``sin|theta'|`` that ``k'`` stands for (Eq. 1); 1 or more when no sensor has it."""
+        return self.focal_mm / (self.pixel_um * 1e-3 * -self.k_prime_px)
+
+    @property
     def range_limits_mm(self) -> tuple[float, float]:
         """Range at both ends of the principal column, mm; infinite where the pole is on it."""
         near, far = self.range_mm([0.0, self.rows - 1.0])
@@ -279,16 +289,13 @@ class RangeModel:
         ArgumentError
             When no sensor tilt gives this ``k'`` with this lens.
         """
-        pitch_mm = self.pixel_um * 1e-3
-        theta = math.radians(self.theta_deg)
-        focal_mm = self.k_mm * math.sin(theta)
-        sine = focal_mm / (pitch_mm * -self.k_prime_px)
-        if not sine < 1.0:
+        if not self.tilt_sine < 1.0:
             raise ArgumentError(
                 f"k_prime_px is {self.k_prime_px!r}: no tilt of a {self.pixel_um!r} um sensor "
-                f"gives it behind a {focal_mm:g} mm lens; check k_mm, k_prime_px and pixel_um"
+                f"gives it behind a {self.focal_mm:g} mm lens; check k_mm, k_prime_px and pixel_um"
             )
-        tilt = math.asin(sine)
+        pitch_mm, focal_mm = self.pixel_um * 1e-3, self.focal_mm
+        theta, tilt = math.radians(self.theta_deg), math.asin(self.tilt_sine)
         baseline_mm = focal_mm * (math.cos(theta) / math.sin(theta) + 1.0 / math.tan(tilt))
         depth = self._depth_mm(range_mm)
         axial = focal_mm + depth * math.sin(theta)
