@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
     from eschorty_ros.core.reconstruction import Result
@@ -66,9 +67,12 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     the range), t (seconds since the first event), column; with --reflectance on also reflectance
     and reflectance_sigma.
 
+    A cloud without points is not written: exit code 1, with the reason.
+
     \b
-    --json prints events, dropped_events, profiles, points, seconds, events_per_second and
-    sigma_median_m (null when there is no point).
+    --json prints events, dropped_events, profiles, points, seconds, events_per_second,
+    sigma_median_m (null when there is no point), warnings, points_without_stage and counters
+    (those that are not zero).
 
     \b
     Examples:
@@ -94,10 +98,13 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
         )
     for warning in result.warnings:
         click.echo(f"eschorty: warning: {warning}", err=True)
-    write_cloud(target, result.points)
     facts = summary(result)
     if as_json:
         click.echo(json.dumps(facts))
+    if not len(result.points):
+        raise EschortyError(f"{recording} gives no points; {target} is not written")
+    write_cloud(target, result.points)
+    if as_json:
         return
     sigma = facts["sigma_median_m"]
     pairs(
@@ -114,7 +121,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     )
 
 
-def summary(result: Result) -> dict[str, float | int | None]:
+def summary(result: Result) -> dict[str, Any]:
     """Return the keys of ``--json`` for a reconstruction's result."""
     import numpy as np
 
@@ -127,4 +134,7 @@ def summary(result: Result) -> dict[str, float | int | None]:
         "seconds": result.seconds,
         "events_per_second": result.events_per_second,
         "sigma_median_m": float(np.median(points["sigma"])) if len(points) else None,
+        "warnings": list(result.warnings),
+        "points_without_stage": result.counters["points_without_stage"],
+        "counters": {name: count for name, count in result.counters.items() if count},
     }

@@ -168,12 +168,26 @@ def test_simulate_then_reconstruct_without_ros(recording):
     facts = json.loads(done.stdout)
     assert list(facts) == [
         "events", "dropped_events", "profiles", "points", "seconds", "events_per_second",
-        "sigma_median_m",
+        "sigma_median_m", "warnings", "points_without_stage", "counters",
     ]  # fmt: skip
+    assert facts["warnings"] == []
+    assert facts["counters"]["events"] == facts["events"]
     points = read_cloud(recording / "cloud.pcd")
     assert facts["points"] == len(points) > 0
     assert facts["profiles"] >= 11  # 8 mm at 50 mm/s and 70 Hz
     assert 1e-4 < facts["sigma_median_m"] < 2e-3
+
+
+def test_an_empty_cloud_is_a_failure_and_replaces_nothing(recording, tmp_path):
+    out = tmp_path / "cloud.ply"
+    out.write_text("the last good one")
+    for options, words in (((), "events_min = 1000; lower it"), (("--json",), "gives no points")):
+        done = run("reconstruct", recording, "--events-min", 1000, "--out", out, *options)
+        assert (done.exit_code, out.read_text()) == (1, "the last good one")
+        assert words in done.stderr
+    facts = json.loads(done.stdout)
+    assert (facts["points"], len(facts["warnings"])) == (0, 1)
+    assert facts["counters"]["columns_too_few_events"] > 1000
 
 
 @pytest.mark.parametrize("step", ["world.World.advance", "world.recorder.write_truth_csv"])

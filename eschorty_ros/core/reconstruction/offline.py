@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
+from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import Recording
 from eschorty_ros.core.storage.raw_file import RawReader
@@ -103,6 +104,9 @@ def reconstruct_recording(
         recording.calibration.stage_direction,
         origin_us,
     )
+    newest_us = reconstructor.newest_t_us
+    span_us = None if newest_us is None else (origin_us, newest_us)
+    seconds = time.perf_counter() - began
     counters = reconstructor.counters
     counters["points_without_stage"] = int(known.size - known.sum())
     warnings = [str(line) for line in reader.warnings]
@@ -116,8 +120,8 @@ def reconstruct_recording(
         counters,
         profiles.profile_count,
         counters["events"],
-        time.perf_counter() - began,
-        tuple(warnings),
+        seconds,
+        (*warnings, *recording_warnings(recording, settings, counters, len(points), span_us)),
     )
 
 

@@ -82,24 +82,26 @@ class RawReader:
         if self.size_bytes <= self.header.size_bytes:
             self._warn("holds a header and no events")
 
-    def chunks(self, size: int = CHUNK_BYTES) -> Iterator[bytes]:
+    def chunks(self, size: int = CHUNK_BYTES, begin: int = 0) -> Iterator[bytes]:
         """Iterate over the words' bytes in pieces of ``size`` bytes, the last one shorter.
+
+        ``begin`` is the number of bytes to leave out before them.
 
         Raises
         ------
         ArgumentError
-            When ``size`` is not positive.
+            When ``size`` is not positive or ``begin`` negative.
         """
         integer("size", size, 1, 1 << 40)
-        return self._chunks(size)
+        return self._chunks(size, integer("begin", begin, 0, 1 << 62))
 
     def __iter__(self) -> Iterator[bytes]:
         return self.chunks()
 
-    def _chunks(self, size: int) -> Iterator[bytes]:
-        total = 0
+    def _chunks(self, size: int, begin: int) -> Iterator[bytes]:
+        total = begin
         with open_regular_file(self.path, FormatError) as file:
-            file.seek(self.header.size_bytes)
+            file.seek(self.header.size_bytes + begin)
             while piece := file.read(size):
                 total += len(piece)
                 yield piece

@@ -1,0 +1,96 @@
+"""The modulation frequency that a stream of events shows, by a periodogram of the events' times."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
+
+_BIN_US = 10
+_BINS = 200_000
+_WINDOW_US = _BINS * _BIN_US
+_LENGTH = 1 << 19
+_STEP_HZ = 1e6 / (_LENGTH * _BIN_US)
+# Power of a line over the mean of the power between the lines.
+_LINE_MIN = 50.0
+_STRONG = 0.5
+# Turns between two frequencies over the window, and their relative difference: clocks differ less.
+_TURNS_MAX = 0.25
+_CLOCKS_MAX = 1e-3
+# Turns over which the power of one frequency falls off.
+_LOBE = 2.0
+
+
+class FrequencyEstimate:
+    """Counts events in steps of 10 us and finds the frequency of their bursts.
+
+    The busiest 2 s count. Memory does not depend on the number of events.
+
+    Examples
+    --------
+    >>> t_us = np.arange(100_000) // 1000 * 10_000 + np.arange(100_000) % 1000
+    >>> estimate = FrequencyEstimate()
+    >>> estimate.add(t_us, np.ones(t_us.size, np.uint8))
+    >>> print(f"{estimate.frequency_hz(200.0):.2f} Hz, {estimate.frequency_hz(100.02):.2f} Hz")
+    100.00 Hz, 100.02 Hz
+    """
+
+    def __init__(self) -> None:
+        self._begin_us: int | None = None
+        self._counts = self._busiest = np.zeros((2, _BINS), np.int64)
+
+    def add(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
+        """Add the next events, in time order; ``polarity`` is 1 for ON."""
+        while t_us.size:
+            if self._begin_us is None:
+                self._begin_us, self._counts = int(t_us[0]), np.zeros((2, _BINS), np.int64)
+            size = int(np.searchsorted(t_us, self._begin_us + _WINDOW_US))
+            place = (t_us[:size] - self._begin_us) // _BIN_US + polarity[:size] * np.int64(_BINS)
+            self._counts += np.bincount(place, minlength=2 * _BINS).reshape(2, _BINS)
+            if self._counts.sum() >= self._busiest.sum():
+                self._busiest = self._counts
+            t_us, polarity = t_us[size:], polarity[size:]
+            if t_us.size:
+                self._begin_us = None
+
+    def frequency_hz(self, expected_hz: float) -> float | None:
+        """Return the frequency of the bursts, ``expected_hz`` where the events agree with it.
+
+        ``None`` when no frequency stands out. Bursts show multiples of their frequency, too: it is
+        the lowest one that stands out.
+        """
+        used = np.flatnonzero(self._busiest.any(axis=0))
+        if not used.size:
+            return None
+        span_s = float(used[-1] - used[0] + 1) * _BIN_US * 1e-6
+        counts = self._busiest[:, used[0] : used[-1] + 1]
+        spectrum = np.fft.rfft(counts - counts.mean(axis=1, keepdims=True), _LENGTH, axis=1)
+        power = (np.abs(spectrum) ** 2).sum(axis=0)
+        low, high = round(0.9 * FREQUENCY_MIN_HZ / _STEP_HZ), round(FREQUENCY_MAX_HZ / _STEP_HZ)
+        strongest = float(power[low:high].max())
+        if strongest < _LINE_MIN * float(np.median(power[low:high])):
+            return None
+
+        def strong(frequency_hz: float) -> bool:
+            reach = _TURNS_MAX / span_s
+            first, last = ((frequency_hz + side * reach) / _STEP_HZ for side in (-1, 1))
+            near = power[int(first) : int(last) + 2]
+            return bool(near.max(initial=0.0) >= _STRONG * strongest)
+
+        peak = low + int(np.argmax(power[low:high] >= _STRONG * strongest))
+        while power[peak + 1] > power[peak]:
+            peak += 1
+        before, at, after = np.log(power[peak - 1 : peak + 2])
+        found_hz = float(peak + 0.5 * (before - after) / (before - 2.0 * at + after)) * _STEP_HZ
+        apart_hz = abs(expected_hz - found_hz)
+        tolerance_hz = max(_TURNS_MAX / span_s, _CLOCKS_MAX * expected_hz)
+        if apart_hz <= tolerance_hz:
+            return expected_hz
+        if apart_hz <= _LOBE / span_s or not strong(expected_hz):
+            return found_hz
+        # Another light may blink as well: then the multiples between the two are weak.
+        multiple = round(expected_hz / found_hz)
+        of_found = abs(expected_hz - multiple * found_hz) <= multiple * tolerance_hz
+        between = all(strong(order * found_hz) for order in range(2, multiple))
+        return found_hz if of_found and between else expected_hz

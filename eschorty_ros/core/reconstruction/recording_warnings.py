@@ -1,0 +1,118 @@
+"""What is wrong with a recording or its settings, seen from its events and points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
+from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage.raw_file import RawReader
+
+_PIECE_BYTES = 1 << 26
+_FEW = 10
+_LOSSES = {
+    "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
+    "it, or raise periods_per_profile = {0.periods_per_profile}",
+    "columns_isolated": "columns have no neighbour within isolation_gate_px = "
+    "{0.isolation_gate_px:g}; raise it, or lower isolation_events = {0.isolation_events}",
+    "columns_ambiguous": "columns have two equally strong lines; set returns to all",
+    "points_beyond_pole": "points are beyond the last range of the calibration; check it",
+}
+"""Losses after which no point is left, with what to do; ``{0}`` are the settings."""
+_REMOVED = {
+    "events_filtered": "events are removed by noise_filter = {0.noise_filter}; set it to none",
+    "events_gated": "events are outside phase_gate_us = {0.phase_gate_us}; set it to 0",
+}
+
+
+def recording_warnings(
+    recording: Recording,
+    settings: Settings,
+    counters: Mapping[str, int],
+    points: int,
+    span_us: tuple[int, int] | None,
+) -> list[str]:
+    """Return one line for each contradiction and for the cause of a cloud with few points.
+
+    Parameters
+    ----------
+    recording : Recording
+    settings : Settings
+    counters : mapping of str to int
+        The reconstructor's, and ``points_without_stage``.
+    points : int
+        Points in the cloud.
+    span_us : tuple of int or None
+        Sensor times of the first and the last event, ``None`` without events.
+    """
+    if span_us is None:
+        return ["no points: no events came; look at the camera, its lens cap and the laser"]
+    reader = RawReader(recording.events_path)
+    found = [*_geometry(recording, reader), *_frequency(recording, reader)]
+    without_stage = counters["points_without_stage"]
+    if without_stage:
+        first_us, last_us = recording.stage_samples["t_us"][[0, -1]]
+        found.append(
+            f"stage.csv covers {first_us * 1e-6:.3f} to {last_us * 1e-6:.3f} s of "
+            f"{span_us[0] * 1e-6:.3f} to {span_us[1] * 1e-6:.3f} s: {without_stage:,} of "
+            f"{points + without_stage:,} points have no stage position; give the stage log of "
+            "the same time"
+        )
+    if without_stage + points == 0 or not found:
+        found += _few_points(settings, counters, points + without_stage)
+    return found
+
+
+def _geometry(recording: Recording, reader: RawReader) -> list[str]:
+    """Compare the sensor of the events with that of the calibration."""
+    header, build = reader.header, recording.calibration
+    named = "geometry" in header or "width=" in header.get("format", "")
+    if not named or (header.width, header.height) == (build.columns, build.rows):
+        return []
+    return [
+        f"{recording.events_path.name} is of a sensor of {header.width} x {header.height} and "
+        f"{build.name} of one of {build.columns} x {build.rows}; give the calibration of this "
+        "camera"
+    ]
+
+
+def _frequency(recording: Recording, reader: RawReader) -> list[str]:
+    """Compare the frequency of the middle of the events with that of the laser."""
+    header, estimate = reader.header, FrequencyEstimate()
+    decoder = Decoder(header.width, header.height)
+    begin = max(reader.size_bytes - header.size_bytes - _PIECE_BYTES, 0) // 4 * 2
+    done = 0
+    for chunk in reader.chunks(begin=begin):
+        events = decoder.decode(chunk)
+        estimate.add(events.t, events.p)
+        done += len(chunk)
+        if done >= _PIECE_BYTES:
+            break
+    stated_hz = recording.modulation.frequency_hz
+    shown_hz = estimate.frequency_hz(stated_hz)
+    if shown_hz in (None, stated_hz):
+        return []
+    return [
+        f"frequency_hz is {stated_hz:g} in laser.yaml and the events show {shown_hz:.4g} Hz; "
+        "correct it"
+    ]
+
+
+def _few_points(settings: Settings, counters: Mapping[str, int], points: int) -> list[str]:
+    """Return the largest loss where it left few points or none."""
+    removed = max(_REMOVED, key=lambda name: counters[name])
+    lost = max(_LOSSES, key=lambda name: counters[name])
+    if 2 * counters[removed] > counters["events"]:
+        words, count = _REMOVED[removed], counters[removed]
+    else:
+        words, count = _LOSSES[lost], counters[lost]
+    if points and count <= _FEW * points:
+        return []
+    if not count:
+        return [
+            f"no points: nothing blinks with the laser in {counters['events']:,} events; look at "
+            "the laser's frequency, at the focus and at what the line falls on"
+        ]
+    return [f"{points:,} points: {count:,} {words.format(settings)}"]

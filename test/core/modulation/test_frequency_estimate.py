@@ -1,0 +1,44 @@
+"""The frequency that events show, against the one that is expected."""
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
+
+
+def bursts(frequency_hz, seconds, per_burst=200, width=0.1, seed=5):
+    """Times of ON events after each rising edge, spread over `width` of a period."""
+    rng = np.random.default_rng(seed)
+    edges = np.arange(0.0, seconds, 1.0 / frequency_hz)
+    late = rng.uniform(0.0, width / frequency_hz, (edges.size, per_burst))
+    return ((edges[:, None] + late) * 1e6).ravel().astype(np.int64)
+
+
+def shown_hz(expected_hz, *times):
+    t_us = np.sort(np.concatenate(times))
+    estimate = FrequencyEstimate()
+    for part in np.array_split(t_us, 7):
+        estimate.add(part, np.ones(part.size, np.uint8))
+    return estimate.frequency_hz(expected_hz)
+
+
+NOISE = np.random.default_rng(6).integers(0, 3_000_000, 30_000)
+
+
+@pytest.mark.parametrize("true_hz", [20.0, 70.0, 1003.7, 15_000.0])
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.0005, 71 / 70, 10 / 7, 2.0, 3.0, 10.0])
+def test_events_show_their_frequency(true_hz, factor):
+    expected_hz = factor * true_hz
+    found_hz = shown_hz(expected_hz, bursts(true_hz, 3.0, 20 + int(4000 / true_hz)), NOISE)
+    assert found_hz == pytest.approx(expected_hz if abs(factor - 1) < 1e-3 else true_hz, rel=1e-3)
+
+
+def test_another_light_does_not_hide_the_laser():
+    lamp = bursts(100.0, 3.0, per_burst=800, width=0.5)
+    laser = bursts(300.0, 3.0, per_burst=200)
+    assert shown_hz(300.0, lamp, laser, NOISE) == 300.0
+
+
+def test_events_without_rhythm_show_none():
+    assert shown_hz(70.0, NOISE) is None
+    assert FrequencyEstimate().frequency_hz(70.0) is None

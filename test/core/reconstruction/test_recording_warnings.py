@@ -1,0 +1,56 @@
+"""What a recording says about itself: every contradiction is one line, and a good one has none."""
+
+from dataclasses import replace
+
+import pytest
+
+from eschorty_ros.core.clocks import StageTrack
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import simulate_recording
+
+NARROW = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return simulate_recording(
+        tmp_path_factory.mktemp("warned") / "rec", Plane(1300.0), NARROW, stop_mm=40.0, seed=2
+    )
+
+
+def at_hz(recording, frequency_hz):
+    return replace(recording, modulation=replace(recording.modulation, frequency_hz=frequency_hz))
+
+
+def with_stage(recording, later_us, part=slice(None)):
+    samples = recording.stage_samples[part].copy()
+    samples["t_us"] += later_us
+    track = StageTrack()
+    track.append(samples["t_us"], samples["position_mm"])
+    return replace(recording, stage=track, stage_samples=samples)
+
+
+def test_a_good_recording_has_no_warning(recording):
+    assert reconstruct_recording(recording).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "words", "points"),
+    [
+        *(
+            (lambda r, hz=hz: at_hz(r, hz), {}, f"is {hz} in laser.yaml and the events show 70", 1)
+            for hz in (35, 71, 100, 140, 700)
+        ),
+        (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
+        (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
+        (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
+        (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
+        (lambda r: r, {"phase_gate_us": 1}, "outside phase_gate_us = 1; set it to 0", 0),
+    ],
+)  # fmt: skip
+def test_a_contradiction_is_one_line(recording, change, settings, words, points):
+    result = reconstruct_recording(change(recording), Settings(**settings))
+    assert (len(result.points) > 0, len(result.warnings)) == (points, 1), result.warnings
+    assert words in result.warnings[0]
