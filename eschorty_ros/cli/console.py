@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from eschorty_ros.report.accuracy import Accuracy
+
 Report = Callable[[float, str], None]
 """Called with the share done (0 to 1) and a short text."""
 
@@ -67,3 +69,14 @@ def pairs(title: str, rows: dict[str, str]) -> None:
         made.add_row(name, value)
     made.show_header = False
     show(made)
+
+
+def accuracy_rows(measured: Accuracy) -> dict[str, str]:
+    """Return a cloud's errors as rows of a table."""
+    return {
+        "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
+        "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole periods",
+        "median |range error|": f"{measured.error_median_mm:.3f} mm",
+        "95th percentile": f"{measured.error_p95_mm:.3f} mm",
+        "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, {measured.within_2_sigma:.1%}",
+    }

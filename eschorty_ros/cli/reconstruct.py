@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
@@ -72,7 +72,9 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     \b
     --json prints events, dropped_events, profiles, points, seconds, events_per_second,
     sigma_median_m (null when there is no point), warnings, points_without_stage and counters
-    (those that are not zero).
+    (those that are not zero); for a recording with truth.csv also score: periods, points,
+    completeness, error_median_mm, error_p95_mm, bias_mm, within_1_sigma, within_2_sigma and
+    off_target (points where nothing is), without those that no point gives.
 
     \b
     Examples:
@@ -83,6 +85,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
     from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.reconstruction import Settings, reconstruct_recording, warm_up
     from eschorty_ros.core.storage import load_recording, write_cloud
+    from eschorty_ros.report.accuracy import measure_recorded
 
     target = out or recording / "cloud.pcd"
     if target.suffix not in (".pcd", ".ply"):
@@ -98,7 +101,11 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
         )
     for warning in result.warnings:
         click.echo(f"eschorty: warning: {warning}", err=True)
+    measured = measure_recorded(result.points, result.profiles, loaded)
     facts = summary(result)
+    if measured is not None:
+        known = {name: value for name, value in asdict(measured).items() if value == value}
+        facts["score"] = known
     if as_json:
         click.echo(json.dumps(facts))
     if not len(result.points):
@@ -117,6 +124,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
             "median sigma": "none" if sigma is None else f"{sigma * 1e3:.3f} mm",
             "seconds": f"{facts['seconds']:.2f}",
             "events/s": f"{facts['events_per_second']:.3g}",
+            **({} if measured is None else accuracy_rows(measured)),
         },
     )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.base.errors import DeviceError
@@ -140,12 +140,7 @@ def _print(result: ScanResult, measured: Accuracy, seconds: float, out: Path) ->
         _headline(result, out),
         {
             **_counted(result),
-            "points": f"{measured.points:,} ({measured.off_target:,} where nothing is)",
-            "complete": f"{measured.completeness:.2%} of {measured.periods:,} whole periods",
-            "median |range error|": f"{measured.error_median_mm:.3f} mm",
-            "95th percentile": f"{measured.error_p95_mm:.3f} mm",
-            "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, "
-            f"{measured.within_2_sigma:.1%}",
+            **accuracy_rows(measured),
             "seconds of sweep": f"{seconds:.2f}",
         },
     )

@@ -11,7 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.reconstruction import Profiles
+from eschorty_ros.core.storage import Recording
 from eschorty_ros.report.profiles import profile_index
+
+# Range per stage travel between two periods of one surface.
+_SLOPE_MAX = 2.0
 
 
 class KnownScene(Protocol):
@@ -229,7 +234,57 @@ def measure(
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
     positions, number = complete_periods(points, sweep, stage_direction)
-    lit = lit_columns(scene, model, positions)
+    return _accuracy(points, error_mm, lit_columns(scene, model, positions), number)
+
+
+def measure_recorded(
+    points: NDArray[np.void], profiles: Profiles, recording: Recording
+) -> Accuracy | None:
+    """Compare a cloud with the truth of its recording.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    profiles : Profiles
+        The same points with their sensor times.
+    recording : Recording
+
+    Returns
+    -------
+    Accuracy or None
+        ``None`` without ``truth.csv``.
+    """
+    truth = recording.truth
+    if truth is None or len(truth) == 0:
+        return None
+    model = recording.calibration.model()
+    times, period = np.unique(truth["t_us"], return_inverse=True)
+    true_mm = np.full((len(times), model.columns), np.nan)
+    true_mm[period, np.minimum(truth["column"], model.columns - 1)] = truth["range_mm"]
+    after = np.minimum(np.searchsorted(times, profiles.t_us), len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    share = (profiles.t_us - times[before]) / np.maximum(times[after] - times[before], 1)
+    number = np.where(share < 0.5, before, after)
+    apart_us = np.abs(profiles.t_us - times[number])
+    number[apart_us > recording.modulation.period_us] = -1
+    first, last = true_mm[before, profiles.column], true_mm[after, profiles.column]
+    # Steeper than that is a step: the point is on one of its sides.
+    stage_mm = recording.stage.position_mm(times)
+    flat = np.abs(last - first) <= _SLOPE_MAX * np.abs(stage_mm[after] - stage_mm[before])
+    nearest = np.where(share < 0.5, first, last)
+    expected_mm = np.where(flat, first + np.clip(share, 0.0, 1.0) * (last - first), nearest)
+    error_mm = np.where(number >= 0, profiles.range_mm - expected_mm, np.nan)
+    near_mm, far_mm = model.range_limits_mm
+    return _accuracy(points, error_mm, (true_mm >= near_mm) & (true_mm <= far_mm), number)
+
+
+def _accuracy(
+    points: NDArray[np.void],
+    error_mm: NDArray[np.float64],
+    lit: NDArray[np.bool_],
+    number: NDArray[np.integer[Any]],
+) -> Accuracy:
+    """Return the statistics of points whose periods, lines of ``lit``, are ``number``."""
     with_point = np.zeros_like(lit)
     with_point[number[number >= 0], points["column"][number >= 0]] = True
     expected, found = int(lit.sum()), int(np.count_nonzero(lit & with_point))
@@ -240,7 +295,7 @@ def measure(
     nan = float("nan")
     empty = error.size == 0
     return Accuracy(
-        periods=len(positions),
+        periods=len(lit),
         points=len(points),
         completeness=found / expected if expected else nan,
         error_median_mm=nan if empty else float(np.median(size)),

@@ -168,10 +168,13 @@ def test_simulate_then_reconstruct_without_ros(recording):
     facts = json.loads(done.stdout)
     assert list(facts) == [
         "events", "dropped_events", "profiles", "points", "seconds", "events_per_second",
-        "sigma_median_m", "warnings", "points_without_stage", "counters",
+        "sigma_median_m", "warnings", "points_without_stage", "counters", "score",
     ]  # fmt: skip
     assert facts["warnings"] == []
     assert facts["counters"]["events"] == facts["events"]
+    assert facts["score"]["completeness"] > 0.99
+    assert facts["score"]["error_median_mm"] < 0.4
+    assert "within 1 sigma, 2 sigma" in good("reconstruct", recording)
     points = read_cloud(recording / "cloud.pcd")
     assert facts["points"] == len(points) > 0
     assert facts["profiles"] >= 11  # 8 mm at 50 mm/s and 70 Hz

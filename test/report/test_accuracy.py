@@ -1,12 +1,17 @@
 """Accuracy of a cloud against a scene that is known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.storage import POINT_DTYPE
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.storage import POINT_DTYPE, load_recording
 from eschorty_ros.report import accuracy, profiles
+from eschorty_ros.simulation.scenes import named
+from eschorty_ros.simulation.world import simulate_recording
 
 MODEL = load_calibration("config_3").model()
 PERIOD_S = 1.0 / 70.0
@@ -159,3 +164,21 @@ def test_a_single_profile_has_no_period():
     assert np.isnan(profiles.period_s(cloud(0.0, lines=1)))
     with pytest.raises(ArgumentError, match="period"):
         profiles.profile_index(cloud(0.0, lines=1), float("nan"))
+
+
+@pytest.mark.parametrize("scene", ["steps", "tilted", "leaves"])
+def test_a_recorded_truth_scores_as_its_scene_does(tmp_path, scene):
+    narrow = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
+    recording = simulate_recording(tmp_path, named(scene), narrow, stop_mm=40.0, seed=8)
+    found = reconstruct_recording(recording)
+    scored = accuracy.measure_recorded(found.points, found.profiles, recording)
+    sweep = accuracy.Sweep(10.0, 40.0, 50.0, 70.0)
+    known = accuracy.measure(found.points, named(scene), narrow.model(), sweep)
+    assert scored.points == known.points > 1000
+    assert scored.completeness == pytest.approx(known.completeness, abs=2e-3)
+    assert scored.off_target == pytest.approx(known.off_target, abs=0.01 * known.points)
+    for name in ("error_median_mm", "error_p95_mm", "within_1_sigma", "within_2_sigma"):
+        assert getattr(scored, name) == pytest.approx(getattr(known, name), rel=0.02), name
+    (tmp_path / "truth.csv").unlink()
+    bare = load_recording(tmp_path)
+    assert accuracy.measure_recorded(found.points, found.profiles, bare) is None
