@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from eschorty_ros import __version__
 from eschorty_ros.core.base.errors import EschortyError
 
 COMMANDS = {
@@ -83,6 +84,7 @@ def _unusable(error: OSError) -> str:
     cls=LazyGroup,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
+@click.version_option(__version__)
 def main() -> None:
     """Event-based Scheimpflug LiDAR: simulate, scan, reconstruct, view.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -12,13 +14,19 @@ if TYPE_CHECKING:
 
     from eschorty_ros.report.accuracy import Accuracy
 
+LINE_EVERY_S = 5.0
+LESS_THAN_ALL = 0.99
+
 Report = Callable[[float, str], None]
 """Called with the share done (0 to 1) and a short text."""
 
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Report]:
-    """Show a progress bar on stderr when that is a terminal."""
+    """Show the share done on stderr: a bar on a terminal, else a line every few seconds.
+
+    The share stays below 100 % until the block ends.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -33,9 +41,15 @@ def progress_bar(title: str) -> Iterator[Report]:
         disable=not sys.stderr.isatty(),
     )
     task = bar.add_task(title, total=1.0, note="")
+    next_s = time.monotonic() + LINE_EVERY_S
 
     def report(share: float, note: str) -> None:
-        bar.update(task, completed=share, note=note)
+        nonlocal next_s
+        shown = min(share, LESS_THAN_ALL)
+        bar.update(task, completed=shown, note=note)
+        if bar.disable and time.monotonic() >= next_s:
+            next_s = time.monotonic() + LINE_EVERY_S
+            print(f"{title}: {shown:.0%} {note}".rstrip(), file=sys.stderr, flush=True)
 
     with bar:
         yield report
@@ -60,6 +74,12 @@ def show(made: Table) -> None:
     if not sys.stdout.isatty():
         console = Console(file=sys.stdout, width=110)
     console.print(made)
+
+
+def decimals(values: Iterable[float], digits: int = 3) -> int:
+    """Return the decimals with which each of ``values`` shows that many digits or more."""
+    sizes = [abs(value) for value in values if value and math.isfinite(value)]
+    return max(digits - 1 - math.floor(math.log10(min(sizes))), 0) if sizes else 0
 
 
 def pairs(title: str, rows: dict[str, str]) -> None:

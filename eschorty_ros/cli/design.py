@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.console import decimals, show, table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -102,15 +102,18 @@ def _print(build: Design, range_mm: NDArray[np.float64]) -> None:
         *("range mm", "row px", "mm/row", "mm/column", "± focus mm", "swath mm"),
     )
     at = build.at(range_mm)
+    columns = [
+        (at.range_mm, max(decimals(at.range_mm), 1)),
+        (at.row, 1),
+        *(
+            (values, decimals(values))
+            for values in (
+                at.range_per_row_mm, at.lateral_pitch_mm, at.depth_of_field_mm, at.swath_mm,
+            )
+        ),
+    ]  # fmt: skip
     for index in range(len(range_mm)):
-        made.add_row(
-            f"{at.range_mm[index]:.1f}",
-            f"{at.row[index]:.1f}",
-            f"{at.range_per_row_mm[index]:.2f}",
-            f"{at.lateral_pitch_mm[index]:.3f}",
-            f"{at.depth_of_field_mm[index]:.1f}",
-            f"{at.swath_mm[index]:.0f}",
-        )
+        made.add_row(*(f"{values[index]:.{places}f}" for values, places in columns))
     show(made)
     click.echo(
         f"k {build.model.k_mm:.4f} mm, k' {build.model.k_prime_px:.2f} px, "

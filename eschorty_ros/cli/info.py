@@ -4,54 +4,106 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from eschorty_ros.core.modulation import Modulation
+    from eschorty_ros.core.optics import Calibration
+
 PEAK_WINDOW_US = 10_000
+_SHOWN = (
+    "focal_length_mm", "f_number", "theta_deg", "theta_prime_deg", "k_prime_px", "b_mm",
+    "b_prime_px", "id", "date",
+)  # fmt: skip
 
 
 @click.command("info")
 @click.argument("path", type=click.Path(exists=True, path_type=Path))
 def command(path: Path) -> None:
-    """Show the content of PATH: a .raw file, a .pcd or .ply cloud, or a recording folder.
+    """Show the content of PATH: a recording folder, any file of it, or a .pcd or .ply cloud.
 
     \b
     Examples:
       eschorty info rec
       eschorty info rec/events.raw
+      eschorty info my_calibration.yaml
       eschorty info scan/scan.pcd
     """  # noqa: D301
+    from eschorty_ros.core.optics import load_calibration
+    from eschorty_ros.core.storage import (
+        LASER_FILE,
+        TRUTH_FILE,
+        load_recording,
+        read_laser_yaml,
+        read_stage_csv,
+        read_truth_csv,
+    )
+
     if path.is_dir():
-        _recording(path)
+        recording = load_recording(path)
+        rows = {"calibration": _in_short(recording.calibration)}
+        rows |= _laser(recording.modulation) | _stage(recording.stage_samples)
+        pairs(str(path), rows | _truth(recording.truth))
+        _raw(recording.events_path)
     elif path.suffix in (".pcd", ".ply"):
         _cloud(path)
+    elif path.name == LASER_FILE:
+        pairs(str(path), _laser(read_laser_yaml(path)))
+    elif path.suffix in (".yaml", ".yml"):
+        pairs(str(path), _calibration(load_calibration(path)))
+    elif path.name == TRUTH_FILE:
+        pairs(str(path), _truth(read_truth_csv(path)))
+    elif path.suffix == ".csv":
+        pairs(str(path), _stage(read_stage_csv(path)))
     else:
         _raw(path)
 
 
-def _recording(path: Path) -> None:
-    from eschorty_ros.core.storage import load_recording
+def _in_short(calibration: Calibration) -> str:
+    near, far = calibration.model().range_limits_mm
+    return f"{calibration.name} ({near:.1f} to {far:.1f} mm)"
 
-    recording = load_recording(path)
-    stage, laser = recording.stage_samples, recording.modulation
-    seconds = (int(stage["t_us"][-1]) - int(stage["t_us"][0])) * 1e-6
-    near, far = recording.calibration.model().range_limits_mm
+
+def _calibration(calibration: Calibration) -> dict[str, str]:
+    given = {key: value for key, value in calibration.as_dict().items() if key in _SHOWN}
+    return {
+        "build": _in_short(calibration),
+        "sensor": f"{calibration.columns} x {calibration.rows}, {calibration.pixel_um:g} um",
+        "k_mm": f"{calibration.object_scale_mm:.6g}",
+        **{key: str(value) for key, value in given.items()},
+        "fitted": ", ".join(calibration.parameters_fitted or ("nothing",)),
+    }
+
+
+def _laser(laser: Modulation) -> dict[str, str]:
     edge = "unknown" if laser.on_edge_us is None else f"{laser.on_edge_us} us"
-    truth = recording.truth
-    pairs(
-        str(path),
-        {
-            "calibration": f"{recording.calibration.name} ({near:.1f} to {far:.1f} mm)",
-            "laser": f"{laser.waveform}, {laser.frequency_hz:g} Hz, duty {laser.duty:g}",
-            "rising edge": edge,
-            "stage": f"{stage['position_mm'].min():.3f} to {stage['position_mm'].max():.3f} mm "
-            f"in {seconds:.3f} s, {len(stage):,} samples",
-            "truth": "none" if truth is None else f"{len(truth):,} ranges",
-        },
-    )
-    _raw(recording.events_path)
+    return {
+        "laser": f"{laser.waveform}, {laser.frequency_hz:g} Hz, duty {laser.duty:g}",
+        "rising edge": edge,
+    }
+
+
+def _stage(samples: NDArray[np.void]) -> dict[str, str]:
+    seconds = (int(samples["t_us"][-1]) - int(samples["t_us"][0])) * 1e-6
+    position_mm = samples["position_mm"]
+    return {
+        "stage": f"{position_mm.min():.3f} to {position_mm.max():.3f} mm in {seconds:.3f} s, "
+        f"{len(samples):,} samples",
+    }
+
+
+def _truth(truth: NDArray[np.void] | None) -> dict[str, str]:
+    if truth is None or len(truth) == 0:
+        return {"truth": "none" if truth is None else "0 ranges"}
+    near, far = truth["range_mm"].min(), truth["range_mm"].max()
+    return {"truth": f"{len(truth):,} ranges, {near:.1f} to {far:.1f} mm"}
 
 
 def _cloud(path: Path) -> None:

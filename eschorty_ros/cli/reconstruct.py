@@ -99,9 +99,12 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
         result = reconstruct_recording(
             loaded, chosen, lambda done, total: report(done / max(total, 1), "")
         )
+        report(1.0, "scoring and writing")
+        measured = measure_recorded(result.points, result.profiles, loaded)
+        if len(result.points):
+            write_cloud(target, result.points)
     for warning in result.warnings:
         click.echo(f"eschorty: warning: {warning}", err=True)
-    measured = measure_recorded(result.points, result.profiles, loaded)
     facts = summary(result)
     if measured is not None:
         known = {name: value for name, value in asdict(measured).items() if value == value}
@@ -110,7 +113,6 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
         click.echo(json.dumps(facts))
     if not len(result.points):
         raise EschortyError(f"{recording} gives no points; {target} is not written")
-    write_cloud(target, result.points)
     if as_json:
         return
     sigma = facts["sigma_median_m"]

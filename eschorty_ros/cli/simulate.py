@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
+from eschorty_ros.cli.instrument import ended_by_signals
 from eschorty_ros.cli.options import check_sweep, sweep_options
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import remove_abandoned
@@ -59,7 +60,7 @@ def command(
     from eschorty_ros.simulation.scenes import named
     from eschorty_ros.simulation.world import simulate_recording
 
-    with progress_bar("simulating") as report:
+    with ended_by_signals(), progress_bar("simulating") as report:
         recording = simulate_recording(
             out,
             named(scene),

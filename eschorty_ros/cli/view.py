@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.base.errors import FormatError, OtherFormatError
 
 if TYPE_CHECKING:
     from eschorty_ros.core.storage import Points
@@ -25,7 +25,10 @@ _BOUNDS = {"x": 1e6, "y": 1e6, "z": 1e6, "t": 1e9}
 )
 @click.option("--window", is_flag=True, help="Open an Open3D window instead (needs open3d).")
 def command(cloud: Path, out: Path | None, window: bool) -> None:
-    """Draw CLOUD (.pcd or .ply): depth map over column and stage position, and a 3-D view.
+    """Draw CLOUD (.pcd or .ply): depth map along the line and the stage, and a 3-D view.
+
+    A cloud of another program needs x, y and z, in metres, and open3d to read it; drawn are a
+    view along x and a 3-D view. All proportions are true.
 
     \b
     Examples:
@@ -35,15 +38,38 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
     """  # noqa: D301
     from eschorty_ros.core.storage import read_cloud
 
-    points = _drawable(read_cloud(cloud), cloud)
+    try:
+        points, own = read_cloud(cloud), True
+    except OtherFormatError:
+        points, own = _read_other(cloud), False
+    points = _drawable(points, cloud)
     if window:
         _open_window(points, cloud.name)
         return
     from eschorty_ros.report import figures
 
     target = out or cloud.with_suffix(".png")
-    figures.save(figures.scan_figure(points, title=f"{cloud.name}: {len(points):,} points"), target)
+    draw = figures.scan_figure if own else figures.cloud_figure
+    figures.save(draw(points, title=f"{cloud.name}: {len(points):,} points"), target)
     click.echo(str(target))
+
+
+def _read_other(cloud: Path) -> Points:
+    """Return the points of a cloud in any form that Open3D reads; only x, y and z are known."""
+    import numpy as np
+
+    from eschorty_ros.core.storage import POINT_DTYPE
+    from eschorty_ros.simulation.scenes import load_open3d
+
+    open3d = load_open3d(f"{cloud}: a cloud of another program")
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    xyz = np.asarray(open3d.io.read_point_cloud(str(cloud)).points)
+    if not len(xyz):
+        raise FormatError(f"{cloud}: no points with x, y and z found; give a cloud with points")
+    points = np.zeros(len(xyz), POINT_DTYPE)
+    for axis, values in zip("xyz", xyz.T, strict=True):
+        points[axis] = values
+    return points
 
 
 def _drawable(points: Points, cloud: Path) -> Points:

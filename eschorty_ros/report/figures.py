@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
     from eschorty_ros.core.optics import DesignTable
 
+POINTS_IN_2D = 200_000
 POINTS_IN_3D = 30_000
 TICKS_IN_3D = 5
 SHORT_SIDE = 0.4
+LONG_MAP = 8.0
 SIGMAS_SHOWN = 5.0
 DPI = 110
 PIXELS_MAX = 200_000_000
@@ -77,6 +79,30 @@ def scan_figure(
         )
         axes.set_title("Measured minus true range")
         _histogram(figure.add_subplot(rows, 2, 4), error_mm, points["sigma"] * 1e3)
+    return figure
+
+
+def cloud_figure(points: NDArray[np.void], title: str = "") -> Figure:
+    """Draw points of which only the places are known: a view along x and a 3-D view.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,), at least one
+    title : str
+    """
+    figure = new_figure(12.0, 4.9)
+    figure.suptitle(title, parse_math=False)
+    range_mm = points["x"].astype(np.float64) * 1e3
+    limits = _central(range_mm)
+    axes = figure.add_subplot(1, 2, 1)
+    shown = slice(None, None, max(len(points) // POINTS_IN_2D, 1))
+    artist = axes.scatter(
+        points["z"][shown] * 1e3, points["y"][shown] * 1e3, c=range_mm[shown], s=1.0,
+        linewidths=0.0, cmap="viridis", vmin=limits[0], vmax=limits[1],
+    )  # fmt: skip
+    axes.set(xlabel="z (mm)", ylabel="y (mm)", title="View along x", aspect="equal")
+    figure.colorbar(artist, ax=axes, label="x (mm)", extend="both", location="bottom")
+    _view_3d(figure.add_subplot(1, 2, 2, projection="3d"), points, range_mm, limits)
     return figure
 
 
@@ -141,15 +167,17 @@ class Grid:
 
     Attributes
     ----------
-    columns : int
-        Width of ``values``.
+    along_mm : ndarray of float64, shape (columns + 1,)
+        Edges of the columns along the line, at the mean range; px where the points do not show it.
+    along_label : str
     stage_mm : ndarray of float64, shape (profiles,)
         Median stage position of each line.
     profile : ndarray of int64, shape (n,)
         Line of every point.
     """
 
-    columns: int
+    along_mm: NDArray[np.float64]
+    along_label: str
     stage_mm: NDArray[np.float64]
     profile: NDArray[np.int64]
 
@@ -181,14 +209,26 @@ def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
     index = np.arange(lines)
     known = counts > 0
     positions = np.interp(index, index[known], middle[known])
-    return Grid(columns, positions, profile)
+    edges = np.asarray(np.arange(columns + 1) - 0.5, np.float64)
+    slope, offset = _along_line(points)
+    if not slope > 0.0:
+        return Grid(edges, "column (px)", positions, profile)
+    return Grid(np.asarray(offset + slope * edges), "along the line (mm)", positions, profile)
+
+
+def _along_line(points: NDArray[np.void]) -> tuple[float, float]:
+    """Return slope and offset of z over the column, mm: the lateral scale at the mean range."""
+    column, z_mm = points["column"].astype(np.float64), points["z"].astype(np.float64) * 1e3
+    from_mean = column - column.mean()
+    slope = float(from_mean @ z_mm) / max(float(from_mean @ from_mean), 1.0)
+    return slope, float(z_mm.mean() - slope * column.mean())
 
 
 def image_of(
     grid: Grid, points: NDArray[np.void], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return values of the points as an image, shape (profiles, columns); NaN without a point."""
-    image = np.full((len(grid.stage_mm), grid.columns), np.nan)
+    image = np.full((len(grid.stage_mm), len(grid.along_mm) - 1), np.nan)
     image[grid.profile, points["column"].astype(np.intp)] = values
     return image
 
@@ -226,17 +266,24 @@ def _map(
     colours: str,
     limits: tuple[float, float],
 ) -> None:
+    edges_mm = _line_edges(grid.stage_mm)
     artist = axes.pcolorfast(
-        np.arange(grid.columns + 1) - 0.5,
-        _line_edges(grid.stage_mm),
+        grid.along_mm,
+        edges_mm,
         image if grid.stage_mm[-1] >= grid.stage_mm[0] else image[::-1],
         cmap=colours,
         vmin=limits[0],
         vmax=limits[1],
     )
     axes.set_facecolor("0.85")
-    axes.set(xlabel="column (px)", ylabel="stage position (mm)")
-    axes.figure.colorbar(artist, ax=axes, label=label, extend="both")
+    axes.set(xlabel=grid.along_label, ylabel="stage position (mm)")
+    width, height = np.ptp(grid.along_mm), np.ptp(edges_mm)
+    if max(width, height) < LONG_MAP * min(width, height):
+        axes.set_aspect("equal")
+    below = width > 1.5 * height
+    axes.figure.colorbar(
+        artist, ax=axes, label=label, extend="both", location="bottom" if below else "right"
+    )
 
 
 def _view_3d(

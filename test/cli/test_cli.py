@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from eschorty_ros import __version__
 from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
+from eschorty_ros.cli.console import progress_bar
 from eschorty_ros.core.reconstruction import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, read_cloud, write_cloud
 
@@ -194,14 +197,15 @@ def test_an_empty_cloud_is_a_failure_and_replaces_nothing(recording, tmp_path):
 
 
 @pytest.mark.parametrize("step", ["world.World.advance", "world.recorder.write_truth_csv"])
-def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_path, step, number):
     def interrupted(*_):
         assert list((tmp_path / "rec").rglob("events.raw"))
-        raise KeyboardInterrupt
+        signal.raise_signal(number)
 
     monkeypatch.setattr(f"eschorty_ros.simulation.{step}", interrupted)
     result = run("simulate", "--stop", 18, "--out", tmp_path / "rec")
-    assert result.exit_code == INTERRUPTED
+    assert result.exit_code == 128 + number
     assert "Traceback" not in result.output
     assert list(tmp_path.iterdir()) == []
 
@@ -234,6 +238,21 @@ def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
     for words in ("config_3", "70 Hz", "ranges", "events/s", "1280 x 720"):
         assert words in output
     assert "peak rate" in good("info", recording / "events.raw")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("calibration.yaml", ["config_3 (784.6 to 2116.0 mm)", "-37261.86", "1280 x 720"]),
+        ("laser.yaml", ["square, 70 Hz", "50000 us"]),
+        ("stage.csv", ["10.000 to 18.000 mm", "samples"]),
+        ("truth.csv", ["ranges, 1275.0 to"]),
+    ],
+)
+def test_info_reads_every_file_of_a_recording(recording, name, words):
+    output = good("info", recording / name)
+    for part in words:
+        assert part in output
 
 
 def test_info_gives_the_bounds_of_a_cloud(cloud):
@@ -280,6 +299,58 @@ def test_view_writes_a_picture(cloud, tmp_path):
     assert cloud.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     good("view", cloud, "--out", tmp_path / "flat.svg")
     assert (tmp_path / "flat.svg").stat().st_size > 1000
+
+
+PCD = """# .PCD v0.7
+VERSION 0.7
+FIELDS x y z rgb
+SIZE 4 4 4 4
+TYPE F F F F
+COUNT 1 1 1 1
+WIDTH 2
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 2
+DATA ascii
+1.0 0.1 0.2 0
+1.1 0.2 0.4 0
+"""
+PLY = """ply
+format ascii 1.0
+element vertex 2
+property double x
+property double y
+property double z
+end_header
+1.0 0.1 0.2
+1.1 0.2 0.4
+"""
+
+
+@pytest.mark.parametrize(("name", "text"), [("other.pcd", PCD), ("other.ply", PLY)])
+def test_view_draws_the_clouds_of_other_programs(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    good("view", tmp_path / name)
+    assert (tmp_path / "other.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / name).write_text("nonsense")
+    assert_fails_in_one_line(run("view", tmp_path / name), "no points with x, y and z")
+
+
+def test_the_version_is_that_of_the_package():
+    assert good("--version").split()[-1] == __version__
+
+
+def test_design_shows_digits_at_any_size():
+    row = good("design", "--near-mm", 30, "--far-mm", 40, "--focal-mm", 16).splitlines()[4].split()
+    assert row == ["30.0", "0.0", "0.0104", "0.00909", "0.0270", "11.6"]
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):
+    monkeypatch.setattr("eschorty_ros.cli.console.LINE_EVERY_S", 0.0)
+    with progress_bar("working") as report:
+        report(0.25, "")
+        report(1.0, "writing")
+    assert capsys.readouterr().err == "working: 25%\nworking: 99% writing\n"
 
 
 def test_design_prints_the_nominal_build_and_plots_it(tmp_path):

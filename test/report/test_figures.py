@@ -30,10 +30,14 @@ def png_size(path):
     return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
 
+def labels_of(figure):
+    return {label for axes in figure.axes for label in (axes.get_xlabel(), axes.get_ylabel())}
+
+
 def test_scan_figure_has_every_part_with_units(tmp_path):
     points, error = step_cloud()
     figure = figures.scan_figure(points, error, "a step")
-    labels = {axes.get_ylabel() for axes in figure.axes}
+    labels = labels_of(figure)
     assert {"stage position (mm)", "range (mm)", "range error (mm)", "density"} <= labels
     figures.save(figure, tmp_path / "scan.png")
     width, height = png_size(tmp_path / "scan.png")
@@ -73,15 +77,19 @@ def test_labels_of_the_3d_view_are_inside_and_apart(change):
 
 def test_without_truth_there_is_no_error_map():
     figure = figures.scan_figure(step_cloud()[0])
-    assert "range error (mm)" not in {axes.get_ylabel() for axes in figure.axes}
+    assert "range error (mm)" not in labels_of(figure)
 
 
 def test_the_depth_map_holds_each_point_once():
     points, _ = step_cloud()
-    (image,) = figures.scan_figure(points).axes[0].images
+    axes = figures.scan_figure(points).axes[0]
+    (image,) = axes.images
+    assert (axes.get_xlabel(), axes.get_aspect()) == ("along the line (mm)", 1.0)
     assert image.get_array().shape == (24, 320)
     np.testing.assert_allclose(image.get_array().ravel(), points["x"] * 1e3, rtol=1e-6)
-    np.testing.assert_allclose(image.get_extent(), (-0.5, 319.5, -0.35, 23.5 * 0.7), atol=1e-4)
+    np.testing.assert_allclose(
+        image.get_extent(), (-160.5 * 0.26, 159.5 * 0.26, -0.35, 23.5 * 0.7), atol=1e-3
+    )
 
 
 @pytest.mark.parametrize(("lines", "known"), [(1, True), (3, False)])

@@ -348,6 +348,8 @@ CALLS: dict[str, Call] = {
         lambda path: (storage.write_laser_yaml("laser.yaml", LASER), storage.read_laser_yaml(path)),
         path=("laser.yaml", path()),
     ),
+    "storage.read_stage_csv": Call(storage.read_stage_csv, {}, {"path": path()}),
+    "storage.read_truth_csv": Call(storage.read_truth_csv, {}, {"path": path()}),
     "storage.write_laser_yaml": call(
         partial(storage.write_laser_yaml, modulation=LASER), path=("laser.yaml", path())
     ),

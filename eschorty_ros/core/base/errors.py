@@ -22,6 +22,10 @@ class FormatError(EschortyError):
     """A file or stream that is not what its reader expects."""
 
 
+class OtherFormatError(FormatError):
+    """A file of the expected kind that another program wrote, in a form that is not read."""
+
+
 class CalibrationError(EschortyError):
     """A calibration that is missing, malformed or does not fit the sensor."""
 

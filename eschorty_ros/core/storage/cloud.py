@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import file_path, short
-from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.errors import ArgumentError, FormatError, OtherFormatError
 from eschorty_ros.core.base.files import atomic_write, open_regular_file
 
 POINT_DTYPE = np.dtype(
@@ -103,7 +103,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
             stream.seek(start)
             return np.frombuffer(bytearray(stream.read(expected)), dtype, count)
     if dtype is None:
-        raise FormatError(
+        raise OtherFormatError(
             f"{source}: its header is not that of an eschorty_ros cloud; expected the fields "
             f"{' '.join(POINT_DTYPE.names or ())} in binary form, convert the file first"
         )
@@ -187,7 +187,7 @@ def _parse_header(source: Path, data: bytes) -> tuple[int, int]:
     begin = data.find(key, 0, max(stop, 0))
     digits = data[begin + len(key) : data.find(b"\n", begin)].strip()
     if stop < 0 or begin < 0 or not digits.isdigit():
-        raise FormatError(
+        raise OtherFormatError(
             f"{source}: no binary {'PCD' if pcd else 'PLY'} header found; "
             "give a cloud that eschorty_ros wrote"
         )

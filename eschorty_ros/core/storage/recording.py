@@ -83,7 +83,7 @@ class Recording:
             When ``truth.csv`` is malformed.
         """
         file = self.path / TRUTH_FILE
-        return _read_csv(file, TRUTH_DTYPE) if file.exists() else None
+        return read_truth_csv(file) if file.exists() else None
 
 
 def load_recording(path: str | os.PathLike[str]) -> Recording:
@@ -100,7 +100,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE):
         if not (folder / name).is_file():
             raise FormatError(f"{folder / name} is missing; add it to the recording")
-    samples = _read_stage(folder / STAGE_FILE)
+    samples = read_stage_csv(folder / STAGE_FILE)
     track = StageTrack()
     track.append(samples["t_us"], samples["position_mm"])
     return Recording(
@@ -220,7 +220,15 @@ def _write_csv(path: str | os.PathLike[str], table: NDArray[np.void]) -> None:
             stream.write("".join([pattern % row for row in rows]).encode())
 
 
-def _read_stage(path: Path) -> NDArray[np.void]:
+def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
+    """Read ``stage.csv``: STAGE_DTYPE, shape (n,), at least one sample, in time order.
+
+    Raises
+    ------
+    FormatError
+        One line naming the file, the line and the remedy.
+    """
+    path = file_path("path", path)
     samples = _read_csv(path, STAGE_DTYPE)
     if len(samples) == 0:
         raise FormatError(f"{path}: it has no samples; record at least one stage position")
@@ -233,6 +241,17 @@ def _read_stage(path: Path) -> NDArray[np.void]:
         )
     samples["position_mm"] = quantise_nm(samples["position_mm"]) / NM_PER_MM
     return samples
+
+
+def read_truth_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
+    """Read ``truth.csv``: TRUTH_DTYPE, shape (n,).
+
+    Raises
+    ------
+    FormatError
+        One line naming the file, the line and the remedy.
+    """
+    return _read_csv(file_path("path", path), TRUTH_DTYPE)
 
 
 def _read_csv(path: Path, dtype: np.dtype[Any]) -> NDArray[np.void]:
