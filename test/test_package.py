@@ -99,3 +99,14 @@ def test_imports_without_ros(module: str) -> None:
         "assert 'open3d' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=ROOT)
+
+
+def test_the_public_names_are_there_and_come_on_first_use() -> None:
+    code = (
+        "import sys, eschorty_ros as es\n"
+        "assert not {'numpy', 'numba'} & set(sys.modules)\n"
+        "assert set(es.__all__) <= set(dir(es))\n"
+        "assert all(getattr(es, name) is not None for name in es.__all__)\n"
+        "assert not hasattr(es, 'nonsense')"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=ROOT)

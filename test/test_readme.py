@@ -21,7 +21,7 @@ def test_the_python_examples_run(tmp_path):
         "shutil.copy('rec/events.raw', 'mine')\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", environment_code + code + "load_recording('mine')\n"],
+        [sys.executable, "-c", environment_code + code + "es.load_recording('mine')\n"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
