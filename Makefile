@@ -8,6 +8,7 @@
 # make test-floor the pure tests with the oldest versions, those of Ubuntu 24.04, in a venv of their own
 # make quick  the tests of the pure parts: no processes, no ROS
 # make picture docs/architecture.png again
+# make moving-picture docs/face.gif again: a simulated scan of a face as it grows
 # make check  lint, types, import contracts
 #
 # Everything is set up on the way: .venv with pinned packages, interfaces in .build/install.
@@ -44,7 +45,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report tradeoff faults reference picture test test-floor quick check lint format types contracts clean
+.PHONY: help setup scan report tradeoff faults reference picture moving-picture test test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -96,6 +97,12 @@ $(FLOOR)/stamp: requirements/floor.txt
 
 picture: $(BUILD)/test.stamp
 	@$(VENV)/bin/python docs/architecture.py
+
+moving-picture: $(SETUP)
+	@$(ENTER) folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT \
+	  && eschorty simulate --scene face --start 0 --stop 200 --speed 35 --out "$$folder/rec" \
+	  && eschorty reconstruct "$$folder/rec" \
+	  && eschorty view "$$folder/rec/cloud.pcd" --out docs/face.gif
 
 check: lint types contracts
 

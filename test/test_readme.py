@@ -45,6 +45,7 @@ def test_links_and_the_picture_exist():
             assert file.exists(), f"{document.name}: {target}"
             assert not anchor or anchor in anchors(file), f"{document.name}: {target}#{anchor}"
     assert (ROOT / "docs" / "scan.png").stat().st_size < 500_000
+    assert (ROOT / "docs" / "face.gif").stat().st_size < 2_000_000
 
 
 def test_every_command_it_shows_exists():

@@ -21,7 +21,8 @@ _BOUNDS = {"x": 1e6, "y": 1e6, "z": 1e6, "t": 1e9}
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Picture to write, .png, .pdf or .svg.  [default: CLOUD with .png]",
+    help="Picture to write, .png, .pdf or .svg; .gif shows the scan growing.  "
+    "[default: CLOUD with .png]",
 )
 @click.option("--window", is_flag=True, help="Open an Open3D window instead (needs open3d).")
 def command(cloud: Path, out: Path | None, window: bool) -> None:
@@ -34,6 +35,7 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
     Examples:
       eschorty view scan/scan.pcd
       eschorty view scan/scan.pcd --out depth.pdf
+      eschorty view scan/scan.pcd --out growing.gif
       eschorty view scan/scan.pcd --window
     """  # noqa: D301
     from eschorty_ros.core.storage import read_cloud
@@ -49,9 +51,20 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
     from eschorty_ros.report import figures
 
     target = out or cloud.with_suffix(".png")
-    draw = figures.scan_figure if own else figures.cloud_figure
-    figures.save(draw(points, title=f"{cloud.name}: {len(points):,} points"), target)
+    if target.suffix.lower() == ".gif":
+        _draw_growing(points, own, target)
+    else:
+        draw = figures.scan_figure if own else figures.cloud_figure
+        figures.save(draw(points, title=f"{cloud.name}: {len(points):,} points"), target)
     click.echo(str(target))
+
+
+def _draw_growing(points: Points, own: bool, target: Path) -> None:
+    from eschorty_ros.report.growing_scan import write_growing_scan
+
+    if not own:
+        raise FormatError(f"{target} needs times and columns; give a cloud of this package")
+    write_growing_scan(points, target)
 
 
 def _read_other(cloud: Path) -> Points:

@@ -61,7 +61,7 @@ def scan_figure(
     figure = new_figure(12.0, 4.9 * rows)
     if title:
         figure.suptitle(title, parse_math=False)
-    limits = _central(range_mm)
+    limits = central(range_mm)
     axes = figure.add_subplot(rows, 2, 1)
     _map(axes, grid, image_of(grid, points, range_mm), "range (mm)", "viridis", limits)
     axes.set_title("Depth map")
@@ -93,7 +93,7 @@ def cloud_figure(points: NDArray[np.void], title: str = "") -> Figure:
     figure = new_figure(12.0, 4.9)
     figure.suptitle(title, parse_math=False)
     range_mm = points["x"].astype(np.float64) * 1e3
-    limits = _central(range_mm)
+    limits = central(range_mm)
     axes = figure.add_subplot(1, 2, 1)
     shown = slice(None, None, max(len(points) // POINTS_IN_2D, 1))
     artist = axes.scatter(
@@ -245,7 +245,7 @@ def _line_edges(stage_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate(([2 * at[0] - between[0]], between, [2 * at[-1] - between[-1]]))
 
 
-def _central(values: NDArray[np.float64]) -> tuple[float, float]:
+def central(values: NDArray[np.float64]) -> tuple[float, float]:
     """Return limits that do not depend on a few outliers."""
     low, high = np.nanpercentile(values, [0.5, 99.5])
     margin = max(0.05 * (high - low), 0.5)

@@ -297,6 +297,8 @@ def test_view_and_info_take_a_cloud_of_nothing_but_odd_numbers(tmp_path, value):
 def test_view_writes_a_picture(cloud, tmp_path):
     good("view", cloud)
     assert cloud.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    good("view", cloud, "--out", tmp_path / "flat.gif")
+    assert (tmp_path / "flat.gif").read_bytes().startswith(b"GIF89a")
     good("view", cloud, "--out", tmp_path / "flat.svg")
     assert (tmp_path / "flat.svg").stat().st_size > 1000
 
