@@ -98,7 +98,7 @@ def test_a_missed_finding_is_a_result_and_is_listed(report):
 def test_a_failure_keeps_the_others_and_is_exit_code_1(report):
     result, out = report(("bad", "good"))
     assert result.exit_code == 1
-    assert result.stderr.count("\n") == 1
+    assert result.stderr.count("eschorty: ") == 1
     assert "1 of 2 experiments failed, bad with ValueError: row is -1 choose <0>" in result.stderr
     assert html_check.faults(out / "index.html") == []
     words = html_check.text(out / "index.html")

@@ -184,7 +184,7 @@ def main_test(command, base):
         full += 1
         assert code == 1, f"full at {limit}: {code} {stderr}"
         assert "File too large" in stderr, stderr
-        assert stderr.count("\n") == 1, stderr
+        assert stderr.count("eschorty: ") == 1, stderr
         check(f"full at {limit}")
     print(f"{command}: disk full in {full} of {len(FULL_AT)} runs")
     assert full > 1
