@@ -121,7 +121,7 @@ def reconstruct_recording(
         profiles.profile_count,
         counters["events"],
         seconds,
-        (*warnings, *recording_warnings(recording, settings, counters, len(points), span_us)),
+        (*warnings, *recording_warnings(recording, settings, counters, points, span_us)),
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
-from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
 
 _PIECE_BYTES = 1 << 26
@@ -31,7 +31,7 @@ def recording_warnings(
     recording: Recording,
     settings: Settings,
     counters: Mapping[str, int],
-    points: int,
+    points: Points,
     span_us: tuple[int, int] | None,
 ) -> list[str]:
     """Return one line for each contradiction and for the cause of a cloud with few points.
@@ -42,27 +42,33 @@ def recording_warnings(
     settings : Settings
     counters : mapping of str to int
         The reconstructor's, and ``points_without_stage``.
-    points : int
-        Points in the cloud.
+    points : ndarray of POINT_DTYPE
+        The cloud.
     span_us : tuple of int or None
         Sensor times of the first and the last event, ``None`` without events.
     """
     if span_us is None:
         return ["no points: no events came; look at the camera, its lens cap and the laser"]
     reader = RawReader(recording.events_path)
-    found = [*_geometry(recording, reader), *_frequency(recording, reader)]
+    stated_hz, shown_hz = recording.modulation.frequency_hz, _frequency_hz(recording, reader)
+    found = _geometry(recording, reader)
+    if shown_hz not in (None, stated_hz):
+        found.append(
+            f"frequency_hz is {stated_hz:g} in laser.yaml and the events show {shown_hz:.4g} Hz; "
+            "correct it"
+        )
     without_stage = counters["points_without_stage"]
     if without_stage:
         first_us, last_us = recording.stage_samples["t_us"][[0, -1]]
         found.append(
             f"stage.csv covers {first_us * 1e-6:.3f} to {last_us * 1e-6:.3f} s of "
             f"{span_us[0] * 1e-6:.3f} to {span_us[1] * 1e-6:.3f} s: {without_stage:,} of "
-            f"{points + without_stage:,} points have no stage position; give the stage log of "
-            "the same time"
+            f"{len(points) + without_stage:,} points have no stage position; give the stage log "
+            "of the same time"
         )
-    if without_stage + points == 0 or not found:
-        found += _few_points(settings, counters, points + without_stage)
-    return found
+    if without_stage or (found and len(points)):
+        return found
+    return [*found, *_few_points(settings, counters, points, shown_hz is not None)]
 
 
 def _geometry(recording: Recording, reader: RawReader) -> list[str]:
@@ -78,8 +84,8 @@ def _geometry(recording: Recording, reader: RawReader) -> list[str]:
     ]
 
 
-def _frequency(recording: Recording, reader: RawReader) -> list[str]:
-    """Compare the frequency of the middle of the events with that of the laser."""
+def _frequency_hz(recording: Recording, reader: RawReader) -> float | None:
+    """Return the frequency that the middle of the events shows, ``None`` without any."""
     header, estimate = reader.header, FrequencyEstimate()
     decoder = Decoder(header.width, header.height)
     begin = max(reader.size_bytes - header.size_bytes - _PIECE_BYTES, 0) // 4 * 2
@@ -90,17 +96,12 @@ def _frequency(recording: Recording, reader: RawReader) -> list[str]:
         done += len(chunk)
         if done >= _PIECE_BYTES:
             break
-    stated_hz = recording.modulation.frequency_hz
-    shown_hz = estimate.frequency_hz(stated_hz)
-    if shown_hz in (None, stated_hz):
-        return []
-    return [
-        f"frequency_hz is {stated_hz:g} in laser.yaml and the events show {shown_hz:.4g} Hz; "
-        "correct it"
-    ]
+    return estimate.frequency_hz(recording.modulation.frequency_hz)
 
 
-def _few_points(settings: Settings, counters: Mapping[str, int], points: int) -> list[str]:
+def _few_points(
+    settings: Settings, counters: Mapping[str, int], points: Points, blinking: bool
+) -> list[str]:
     """Return the largest loss where it left few points or none."""
     removed = max(_REMOVED, key=lambda name: counters[name])
     lost = max(_LOSSES, key=lambda name: counters[name])
@@ -108,11 +109,15 @@ def _few_points(settings: Settings, counters: Mapping[str, int], points: int) ->
         words, count = _REMOVED[removed], counters[removed]
     else:
         words, count = _LOSSES[lost], counters[lost]
-    if points and count <= _FEW * points:
+        unused = counters["events_binned"] - float(points["intensity"].sum())
+        # Background alone leaves columns with few events, too.
+        if len(points) and unused < Settings().events_min * count:
+            return []
+    if len(points) and count <= _FEW * len(points):
         return []
-    if not count:
+    if not (blinking and count):
         return [
             f"no points: nothing blinks with the laser in {counters['events']:,} events; look at "
             "the laser's frequency, at the focus and at what the line falls on"
         ]
-    return [f"{points:,} points: {count:,} {words.format(settings)}"]
+    return [f"{len(points):,} points: {count:,} {words.format(settings)}"]

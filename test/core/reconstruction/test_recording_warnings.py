@@ -7,7 +7,7 @@ import pytest
 from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
-from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import simulate_recording
 
 NARROW = replace(load_calibration("config_3"), columns=96, principal_column=47.5)
@@ -32,8 +32,22 @@ def with_stage(recording, later_us, part=slice(None)):
     return replace(recording, stage=track, stage_samples=samples)
 
 
-def test_a_good_recording_has_no_warning(recording):
-    assert reconstruct_recording(recording).warnings == ()
+@pytest.mark.parametrize("scene", ["plane", "posts"])
+def test_a_good_recording_has_no_warning(recording, tmp_path, scene):
+    if scene == "posts":
+        recording = simulate_recording(
+            tmp_path, named(scene), load_calibration("config_3"), stop_mm=14.0, seed=2
+        )
+    found = reconstruct_recording(recording)
+    assert (found.warnings, len(found.points) > 0) == ((), True)
+
+
+def test_a_dark_recording_says_so(tmp_path):
+    """A target beyond the calibration's last range leaves background alone."""
+    dark = simulate_recording(tmp_path, Plane(2900.0), NARROW, stop_mm=40.0, seed=2)
+    found = reconstruct_recording(dark)
+    assert (len(found.points), len(found.warnings)) == (0, 1), found.warnings
+    assert "nothing blinks with the laser" in found.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -47,6 +61,7 @@ def test_a_good_recording_has_no_warning(recording):
         (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
         (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
+        (lambda r: r, {"events_min": 50}, "fewer events than events_min = 50; lower it", 1),
         (lambda r: r, {"phase_gate_us": 1}, "outside phase_gate_us = 1; set it to 0", 0),
     ],
 )  # fmt: skip
