@@ -1,4 +1,4 @@
-"""What a recording says about itself: every contradiction is one line, and a good one has none."""
+"""What a recording says about itself: a line for every contradiction, and none for a good one."""
 
 from dataclasses import replace
 
@@ -65,7 +65,7 @@ def test_a_dark_recording_says_so(tmp_path):
         (lambda r: r, {"phase_gate_us": 1}, "outside phase_gate_us = 1; set it to 0", 0),
     ],
 )  # fmt: skip
-def test_a_contradiction_is_one_line(recording, change, settings, words, points):
+def test_a_contradiction_has_its_line(recording, change, settings, words, points):
     result = reconstruct_recording(change(recording), Settings(**settings))
-    assert (len(result.points) > 0, len(result.warnings)) == (points, 1), result.warnings
-    assert words in result.warnings[0]
+    assert (len(result.points) > 0) == points
+    assert sum(words in line for line in result.warnings) == 1, result.warnings
