@@ -39,8 +39,10 @@ class StampAges:
         age_s = self.least_s()
         if age_s is None or -_AHEAD_MAX_S <= age_s <= _BEHIND_MAX_S:
             return
-        side = "ahead" if age_s < 0.0 else "behind"
+        difference = f"{abs(age_s):.3f} s {'ahead of' if age_s < 0.0 else 'behind'}"
+        # An emulated device on a busy computer is late.
+        late = "" if age_s < 0.0 else ", or run less beside an emulated instrument"
         raise ScanFailure(
-            f"{self._name}: its stamps are {abs(age_s):.3f} s {side} of this host's clock; "
-            "synchronise the hosts' clocks"
+            f"{self._name}: its stamps are {difference} this host's clock; "
+            f"synchronise the hosts' clocks{late}"
         )
