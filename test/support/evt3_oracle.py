@@ -132,7 +132,7 @@ class SlowDecoder:
             step += 4096
         if step < 0:
             self.counts["time_high_back"] += 1
-        elif step > 100:
+        elif step > 3:
             self.counts["time_high_jumps"] += 1
         self.high = q
 
@@ -143,7 +143,7 @@ class SlowDecoder:
             return
         waiting, self.waiting = self.waiting, None
         ahead = (q - self.high) % 4096
-        if ahead <= 100:
+        if ahead <= 3:
             self.counts["time_high_dropped"] += waiting is not None
             if ahead:
                 self.wrapped += (1 << 24) * (q < self.high)
@@ -155,7 +155,7 @@ class SlowDecoder:
                 self.high, self.low = q, 0
         else:
             self.counts["time_high_dropped"] += waiting is not None
-            if ahead >= 3996:
+            if ahead >= 4093:
                 self.counts["time_high_back"] += 1
                 self.wrapped -= (1 << 24) * (q > self.high)
                 self.high = q

@@ -26,8 +26,14 @@ _WORST_CASE_WORDS = 1 << 17
 
 _EVENTS_PER_WORD_MAX = 12
 
-_TIME_HIGH_STEP_MAX = 100
-"""Largest forward step of TIME_HIGH (4096 us each) taken without a second word confirming it."""
+_TIME_HIGH_STEP_MAX = 3
+"""Largest step of TIME_HIGH (4096 us each) taken without a second word confirming it.
+
+A sensor sends every step. A flipped bit puts time off by this much at most.
+"""
+
+_CONFIRMING_STEP_MAX = 100
+"""Largest step from a TIME_HIGH that awaits confirmation to one that confirms it."""
 
 _NO_ROW = -1
 _NO_BASE = 1 << 20
@@ -92,7 +98,7 @@ class Counters:
     legacy_y_words: int = 0
     time_high_back: int = 0
     time_high_jumps: int = 0
-    """Forward jumps of more than 0.4 s that the next TIME_HIGH confirmed."""
+    """Forward jumps of more than 12 ms that the next TIME_HIGH confirmed."""
     time_high_dropped: int = 0
     """Those that it did not confirm."""
     time_low_back: int = 0
@@ -145,7 +151,7 @@ class Decoder:
     Notes
     -----
     A TIME_HIGH that changed zeroes the low bits, a repeated one keeps them. A step back by more
-    than half the range is a wrap; time never falls. A forward jump of more than 0.4 s counts
+    than half the range is a wrap; time never falls. A jump of more than 12 ms either way counts
     only when the next TIME_HIGH confirms it. Nothing is emitted before the first TIME_HIGH.
     """
 
@@ -318,7 +324,7 @@ def _jump(s, c, q):
 def _time_high(s, c, q, floor):
     """Apply TIME_HIGH ``q``; return the new current time, never below ``floor``.
 
-    A word that steps back by up to 0.4 s (events out of order) is followed with time held. One
+    A word that steps back by up to 12 ms (events out of order) is followed with time held. One
     that is further off waits in ``held_high`` for the next to confirm it: a lone outlier would
     otherwise freeze a clamped clock until real time catches up.
     """
@@ -341,7 +347,7 @@ def _time_high(s, c, q, floor):
             s.epoch_us += step << 12
             s.high = q
             s.low = 0
-    elif held >= 0 and ((q - held) & 4095) <= _TIME_HIGH_STEP_MAX:
+    elif held >= 0 and ((q - held) & 4095) <= _CONFIRMING_STEP_MAX:
         low = s.low
         _jump(s, c, held)
         if q == held:
