@@ -11,6 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.arrays import integer, number
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.blinking import (
+    Blink,
+    _follows,
+    _is_concentrated,
+    _without,
+    _without_hot_pixels,
+)
 from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import (
     HALF_PER_SIGMA,
@@ -46,6 +53,7 @@ from eschorty_ros.core.line.window import (
     ROW_BITS,
     ROW_LAST,
     TOO_FEW,
+    UNMODULATED,
     Returns,
     _densest_window,
     _exceeds_background,
@@ -63,6 +71,8 @@ RETURNS = ("strongest", "first", "last", "all")
 # Codes are indices of the tuples above. The methods up to _MEAN are a window's mean.
 _MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID = range(5)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
+# Windows of a column that are tested for the laser's modulation.
+_WINDOWS_MAX = 4
 # A full column wider than this many times the line's variance holds background.
 _BACKGROUND_FREE = 1.5
 
@@ -119,7 +129,8 @@ class Rows(NamedTuple):
     """The returns of each column, shape (returns, columns), NaN where there is none.
 
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
-    neighbours share. ``ambiguous`` has shape (columns,).
+    neighbours share. A ``doubtful`` one may be background that follows the laser by chance.
+    ``ambiguous`` has shape (columns,).
     """
 
     row: NDArray[np.float64]
@@ -129,6 +140,7 @@ class Rows(NamedTuple):
     events: NDArray[np.int64]
     mean_dt_us: NDArray[np.int64]
     truncated: NDArray[np.bool_]
+    doubtful: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
 
 
@@ -147,6 +159,8 @@ class PeriodSums(NamedTuple):
     too_few_events: np.int64
     ambiguous: np.int64
     two_returns: np.int64
+    unmodulated: np.int64
+    events_unmodulated: np.int64
 
 
 def half_width_fixed(fwhm_px: float) -> int:
@@ -185,8 +199,9 @@ def empty_rows(returns: int, columns: int) -> Rows:
     shape = returns, columns
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
-    truncated, ambiguous = np.zeros(shape, np.bool_), np.zeros(columns, np.bool_)
-    return Rows(row, sigma2, common2, variance, events, mean_dt_us, truncated, ambiguous)
+    truncated, doubtful = np.zeros((2, *shape), np.bool_)
+    ambiguous = np.zeros(columns, np.bool_)
+    return Rows(row, sigma2, common2, variance, events, mean_dt_us, truncated, doubtful, ambiguous)
 
 
 def estimate(
@@ -277,7 +292,7 @@ def estimate(
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, scratch = grouped_columns(row_array, offset_array), make_scratch(estimator.half_max)
-    _estimate_columns(columns, estimator.half_max, estimator, found, scratch)
+    _estimate_columns(columns, estimator.half_max, estimator, Blink(), found, scratch)
     by_column = slice(None) if returns == "all" else 0
     row, sigma, width, events, truncated = (
         np.ascontiguousarray(values.T[:, by_column])
@@ -357,6 +372,34 @@ def _find(packed, column, half, estimator, seed):
 
 
 @kernel
+def _modulated(packed, column, found, half, estimator, blink, scratch):
+    """Return the window of events that follow the laser, and the column without other windows.
+
+    The last value is true when the window may be background all the same. The status is
+    ``UNMODULATED`` when no window of the column follows it.
+    """
+    events = column.events
+    for _ in range(_WINDOWS_MAX):
+        window = found.window
+        follows, sure = _follows(packed, column, window.first, window.last, blink)
+        left = _without_hot_pixels(
+            packed, column, window.first, window.last, blink, scratch.row_counts
+        )
+        if left.events == column.events:
+            # A second window is a second chance for background.
+            if follows and (sure or column.events == events):
+                return found, column, not sure or column.events < events
+            left = _without(packed, column, window.first, window.last)
+        column = left
+        found = Returns(TOO_FEW, False, window, window)
+        if column.events >= estimator.events_min:
+            found = _search(packed, column, half, estimator)
+        if found.status == TOO_FEW:
+            break
+    return Returns(UNMODULATED, False, found.window, found.window), column, True
+
+
+@kernel
 def _all_returns(packed, column, half, estimator, found):
     """Search for a second return beside the one that was found.
 
@@ -409,13 +452,18 @@ def _reported(returns, found):
 
 
 @kernel
-def _estimate_columns(columns, half, estimator, out, scratch):
-    """Estimate the rows of every column into ``out`` and empty the columns."""
+def _estimate_columns(columns, half, estimator, blink, out, scratch):
+    """Estimate the rows of every column into ``out`` and empty the columns.
+
+    Events that do not follow the laser are left out, unless ``blink`` is no test.
+    """
     out.row[:] = np.nan
     squares = 0.0
     freedom, few, ambiguous, two = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    unmodulated, events_unmodulated = np.int64(0), np.int64(0)
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
+    testing = windowed and blink.step > 0
     packed, model = columns.packed, estimator.error_model
     line_variance = min((half / HALF_PER_SIGMA) ** 2, estimator.line_variance)
     if estimator.method == _GAUSS_ML:
@@ -433,8 +481,27 @@ def _estimate_columns(columns, half, estimator, out, scratch):
         if windowed and estimator.seeded:
             seed = last if last >= 0 else neighbour
         found = _find(packed, column, half, estimator, seed)
+        doubtful = False
+        if testing and not (
+            found.status == TOO_FEW
+            or (
+                found.status == FOUND
+                and _is_concentrated(packed, column, found.window.first, found.window.last, blink)
+            )
+        ):
+            found, column, doubtful = _modulated(
+                packed, column, found, half, estimator, blink, scratch
+            )
+            events_unmodulated += n - column.events
+            if found.status == UNMODULATED:
+                unmodulated += 1
+                continue
         if estimator.returns != _STRONGEST:
             found = _all_returns(packed, column, half, estimator, found)
+            if testing and found.second:
+                other = found.other
+                if not _follows(packed, column, other.first, other.last, blink)[0]:
+                    found = Returns(FOUND, False, found.window, found.window)
         if found.status != FOUND:
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
@@ -462,10 +529,11 @@ def _estimate_columns(columns, half, estimator, out, scratch):
             out.variance[k, c] = variance
             out.events[k, c] = used
             out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / used))
+            out.doubtful[k, c] = doubtful
             out.truncated[k, c] = estimate.truncated
             narrow = variance <= _BACKGROUND_FREE * estimator.line_variance
             if not estimate.truncated and (windowed or narrow):
                 squares += variance * (used - 1)
                 freedom += used - 1
             window, other = other, window
-    return PeriodSums(squares, freedom, few, ambiguous, two)
+    return PeriodSums(squares, freedom, few, ambiguous, two, unmodulated, events_unmodulated)

@@ -8,40 +8,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US
+from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US, TIME_SHIFT
 from eschorty_ros.core.modulation.phase_gate import _outside
+
+_ROOM = 128
 
 
 class Columns(NamedTuple):
     """Packed events by column: ``counts`` of them from ``starts`` on, with room for padding.
 
-    ``seeds`` are the rows of the lines in the last period, fixed point; -1 for none.
+    The room for events grows up to ``limit``. ``seeds`` are the rows of the lines in the last
+    period, fixed point; -1 for none.
     """
 
     packed: NDArray[np.uint32]
     starts: NDArray[np.int64]
     counts: NDArray[np.uint32]
     seeds: NDArray[np.int64]
+    limit: int
 
 
 class Appended(NamedTuple):
-    """Index of the first event not read, and the numbers of events not appended, by reason."""
+    """Index of the first event not read, and the numbers of events not appended, by reason.
+
+    ``full`` when that event needs more room in its column.
+    """
 
     next: np.int64
+    full: bool
     over_limit: int
     outside: int
     gated: int
 
 
-def empty_columns(columns: int, limit: int) -> Columns:
-    """Return ``columns`` empty columns with room for ``limit`` events each."""
-    stride = limit + BLOCK
+def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
+    """Return ``columns`` empty columns with ``room`` for events each, and ``limit`` at most."""
+    stride = min(room, limit) + BLOCK
     return Columns(
         packed=np.empty(columns * stride, np.uint32),
         starts=np.arange(columns) * stride,
         counts=np.zeros(columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
+        limit=limit,
     )
+
+
+def wider_columns(columns: Columns) -> Columns:
+    """Return the same columns with twice the room, or all that the limit allows."""
+    size = columns.counts.size
+    packed = columns.packed.reshape(size, -1)
+    wider = empty_columns(size, columns.limit, 2 * (packed.shape[1] - BLOCK))
+    wider.packed.reshape(size, -1)[:, : packed.shape[1]] = packed
+    return wider._replace(counts=columns.counts, seeds=columns.seeds)
 
 
 def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Columns:
@@ -51,7 +69,7 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
     starts = np.cumsum(sizes) - sizes
     packed = np.empty(int(sizes.sum()), np.uint32)
     packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
-    return Columns(packed, starts, counts.astype(np.uint32), np.full(counts.size, -1, np.int64))
+    return Columns(packed, starts, counts.astype(np.uint32), np.full(counts.size, -1, np.int64), 0)
 
 
 @kernel
@@ -62,6 +80,8 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
     size = np.uintp(counts.size)
     stride = np.uintp(packed.size) // size
     room = np.uint32(stride - np.uintp(BLOCK))
+    grows = np.int64(room) < columns.limit
+    full = False
     rows_end = np.uint32(rows)
     i = np.uintp(first)
     end = np.uintp(t.size)
@@ -79,12 +99,17 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
                 gated += 1
             elif n < room:
                 packed[c * stride + np.uintp(n)] = np.uint32(
-                    (np.uint32(min(dt, TIME_LIMIT_US - 1)) << np.uint32(ROW_BITS)) | r
+                    (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
+                    | (np.uint32(p[i]) << np.uint32(ROW_BITS))
+                    | r
                 )
                 counts[c] = n + np.uint32(1)
+            elif grows:
+                full = True
+                break
             else:
                 over_limit += 1
         else:
             outside += 1
         i += np.uintp(1)
-    return Appended(np.int64(i), over_limit, outside, gated)
+    return Appended(np.int64(i), full, over_limit, outside, gated)

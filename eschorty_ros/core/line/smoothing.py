@@ -107,16 +107,17 @@ def _is_isolated(row, k, c, gate):
 
 
 @kernel
-def _reject_isolated(row, events, smoothing):
-    """Set weak points without a neighbour at a similar row to NaN; return their number."""
-    isolated = smoothing.isolated
+def _reject_isolated(rows, smoothing):
+    """Set weak and doubtful points without a neighbour near in rows to NaN; return their number."""
+    row, isolated = rows.row, smoothing.isolated
     returns, columns = row.shape
     count = 0
     for k in range(returns):
         for c in range(columns):
             isolated[k, c] = (
                 not np.isnan(row[k, c])
-                and events[k, c] < smoothing.isolation_events
+                and smoothing.isolation_events > 0
+                and (rows.doubtful[k, c] or rows.events[k, c] < smoothing.isolation_events)
                 and _is_isolated(row, k, c, smoothing.isolation_gate_px)
             )
             count += isolated[k, c]

@@ -1,7 +1,8 @@
 """Search for the densest window of a column, and for a second return beside it.
 
-An event is one uint32: the row in the low 10 bits, the time since the period's edge (us) in the
-upper 22. A column's events are padded with ``PAD`` to a multiple of ``BLOCK`` entries, so that the
+An event is one uint32: the row in the low 10 bits, the polarity above them, the time since the
+period's edge (us) in the upper 21. A column's events are padded with ``PAD`` to a multiple of
+``BLOCK`` entries, so that the
 inner loops run on full vector registers without a remainder.
 
 All sums are integers, hence exact and independent of the order of the events and of the origin of
@@ -21,18 +22,20 @@ from eschorty_ros.core.base.kernel import kernel
 ROW_BITS = 10
 ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
 ROW_LAST = 1022
-TIME_LIMIT_US = 1 << (32 - ROW_BITS)
+POLARITY = np.uint32(1 << ROW_BITS)
+TIME_SHIFT = np.uint32(ROW_BITS + 1)
+TIME_LIMIT_US = 1 << (31 - ROW_BITS)
 PAD = np.uint32(0xFFFFFFFF)
 BLOCK = 32
 FRACTION_BITS = 6
 FRACTION = 1 << FRACTION_BITS
-FOUND, TOO_FEW, AMBIGUOUS = 0, 1, 2
+FOUND, TOO_FEW, AMBIGUOUS, UNMODULATED = 0, 1, 2, 3
 
 _ITERATIONS_MAX = 5
 _ONE_BITS = np.uint32(20)
 _ONE = np.uint32(1 << 20)
 # Entries summed in 32 bits: 512 times (row or row squared or time) still fits.
-_CHUNK = np.uintp(512)
+CHUNK = np.uintp(512)
 _PAIRWISE_MAX = 192
 # No event is near this row, so that no row is avoided.
 _NOWHERE = -(1 << 40)
@@ -111,7 +114,7 @@ def _window_sums(packed, column, first, last):
     begin = np.uintp(column.start)
     padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
     while begin < padded:
-        end = min(begin + _CHUNK, padded)
+        end = min(begin + CHUNK, padded)
         both = np.uint32(0)
         d2 = np.uint32(0)
         ts = np.uint32(0)
@@ -121,7 +124,7 @@ def _window_sums(packed, column, first, last):
             inside = d <= span
             both = np.uint32(both + (np.uint32(d + _ONE) if inside else np.uint32(0)))
             d2 = np.uint32(d2 + (np.uint32(d * d) if inside else np.uint32(0)))
-            ts = np.uint32(ts + ((v >> np.uint32(ROW_BITS)) if inside else np.uint32(0)))
+            ts = np.uint32(ts + ((v >> TIME_SHIFT) if inside else np.uint32(0)))
         events += np.int64(both >> _ONE_BITS)
         sum_d += np.int64(both & (_ONE - np.uint32(1)))
         sum_d2 += np.int64(d2)
@@ -139,7 +142,7 @@ def _window_events(packed, column, first, last):
     begin = np.uintp(column.start)
     padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
     while begin < padded:
-        end = min(begin + _CHUNK, padded)
+        end = min(begin + CHUNK, padded)
         inside = np.uint32(0)
         for i in range(begin, end):
             d = np.uint32((packed[i] & ROW_MASK) - base)

@@ -109,11 +109,7 @@ def reconstruct_recording(
     seconds = time.perf_counter() - began
     counters = reconstructor.counters
     counters["points_without_stage"] = int(known.size - known.sum())
-    warnings = [str(line) for line in reader.warnings]
-    if reconstructor.phase_missing:
-        warnings.append(
-            "no modulation phase found in the events; periods are cut from the first event on"
-        )
+    warnings = [str(line) for line in reader.warnings] + reconstructor.warnings
     return Result(
         points,
         profiles,

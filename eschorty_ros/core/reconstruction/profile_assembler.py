@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import EventArrays
+from eschorty_ros.core.line.blinking import Blink, blink
 from eschorty_ros.core.line.centroid import (
     Estimator,
     Rows,
@@ -20,7 +21,7 @@ from eschorty_ros.core.line.centroid import (
     half_width_fixed,
     make_scratch,
 )
-from eschorty_ros.core.line.columns import Columns, _append, empty_columns
+from eschorty_ros.core.line.columns import Columns, _append, empty_columns, wider_columns
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.sigma import CLIPPED, VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
@@ -50,12 +51,16 @@ _COUNTERS = np.dtype(
             "columns_isolated",
             "columns_smoothed",
             "columns_two_returns",
+            "columns_unmodulated",
+            "events_unmodulated",
         )
     ]
 )
 # ``status`` is one of the three below, ``half`` the half width of a window for the open period in
-# fixed point, ``rows`` the number of rows in the output.
-_STATE = np.dtype([(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows")])
+# fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs more room.
+_STATE = np.dtype(
+    [(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows", "full")]
+)
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
 
@@ -85,6 +90,7 @@ class _Memory(NamedTuple):
 
     columns: Columns
     estimator: Estimator
+    blink: Blink
     smoothing: Smoothing
     rows: Rows
     scratch: Scratch
@@ -128,6 +134,7 @@ class ProfileAssembler:
     def restart(self, modulation: Modulation) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``."""
         self._gate = phase_gate(modulation, self._gate_us)
+        self._memory = self._memory._replace(blink=blink(modulation))
         self._state["status"] = _CLOSED
         self._state["half"] = self._memory.estimator.half_max
         self._memory.columns.counts[:] = 0
@@ -168,6 +175,10 @@ class ProfileAssembler:
                 arrays, edges, progress, drain, self._gate, self._memory, self._state,
                 self._counters,
             )  # fmt: skip
+            if self._state["full"]:
+                columns = wider_columns(self._memory.columns)
+                self._memory = self._memory._replace(columns=columns)
+                self._state["full"] = 0
             left = progress.event < arrays.t.size or (drain and progress.edge < edges.t_us.size)
             if not left:
                 return int(progress.edge)
@@ -222,6 +233,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     return _Memory(
         columns=empty_columns(model.columns, settings.column_limit),
         estimator=estimator,
+        blink=Blink(),
         smoothing=Smoothing(
             half_width=settings.smoothing_half_width,
             gate_px=float(settings.smoothing_gate_px),
@@ -273,14 +285,16 @@ def _write(rows, smoothing, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, smoothing, rows, scratch, output = memory
-    sums = _estimate_columns(columns, state.half, estimator, rows, scratch)
+    columns, estimator, blink, smoothing, rows, scratch, output = memory
+    sums = _estimate_columns(columns, state.half, estimator, blink, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.periods_closed += 1
     counters.columns_too_few_events += sums.too_few_events
     counters.columns_ambiguous += sums.ambiguous
     counters.columns_two_returns += sums.two_returns
-    counters.columns_isolated += _reject_isolated(rows.row, rows.events, smoothing)
+    counters.columns_unmodulated += sums.unmodulated
+    counters.events_unmodulated += sums.events_unmodulated
+    counters.columns_isolated += _reject_isolated(rows, smoothing)
     counters.columns_smoothed += _smooth(rows.row, rows.sigma2, rows.common2, smoothing)
     _write(rows, smoothing, state, output)
 
@@ -298,6 +312,7 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
     appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
     refused = appended.over_limit + appended.outside + appended.gated
     counters.events_binned += appended.next - first - refused
+    state.full = appended.full
     counters.events_over_column_limit += appended.over_limit
     counters.events_outside_sensor += appended.outside
     counters.events_gated += appended.gated
@@ -320,6 +335,8 @@ def _merge(events, edges, progress, drain, gate, memory, state, counters):
         limit_us = edges.t_us[edge] if edge < edges.t_us.size else far
         if i < t.size and t[i] < limit_us:
             i = _fill(events, i, limit_us, columns, rows, gate, state, counters)
+            if state.full:
+                return _Progress(i, edge)
         if edge == edges.t_us.size or (i == t.size and not drain):
             return _Progress(i, edge)
         if state.status == _FILLED:

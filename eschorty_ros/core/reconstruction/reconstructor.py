@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import asdict, replace
 
@@ -22,6 +23,8 @@ from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 
 _PIECE_BYTES = 1 << 17
+_EVENTS_WANTED = 16
+"""Events per column and profile that a point should have."""
 _STAGE_EDGES_MAX = 1024
 """Most pieces with edges that are kept until ``take_stage_edges`` is called."""
 
@@ -50,7 +53,7 @@ class Reconstructor:
     Raises
     ------
     ArgumentError
-        When the profile is longer than the 4.19 s that the time within it can count.
+        When the profile is longer than the 2.1 s that the time within it can count.
 
     Examples
     --------
@@ -248,6 +251,38 @@ class Reconstructor:
         return self._periods.lock.missing
 
     @property
+    def warnings(self) -> list[str]:
+        """One line for each reason why most of the events gave no points so far."""
+        counts = self.counters
+        found: list[str] = []
+        every, columns = self.settings.periods_per_profile, self.model.columns
+        if self.phase_missing:
+            found.append(
+                "no modulation phase found in the events; periods are cut from the first event on"
+            )
+        if 2 * counts["events_gated"] > counts["events"]:
+            share = counts["events_gated"] / counts["events"]
+            found.append(
+                f"phase_gate_us removes {share:.0%} of the events; set it to 0, or check the "
+                f"frequency ({self.modulation.frequency_hz:g} Hz) and the polarity of the events"
+            )
+        elif counts["columns_unmodulated"] > counts["points"]:
+            found.append(
+                f"the events of {counts['columns_unmodulated']} columns do not follow the laser at "
+                f"{self.modulation.frequency_hz:g} Hz and gave no points; check the frequency and "
+                "that the laser is on"
+            )
+        per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
+        few = counts["columns_too_few_events"]
+        if few > 10 * counts["points"] and per_column < _EVENTS_WANTED:
+            wanted = min(math.ceil(every * _EVENTS_WANTED / max(per_column, 1e-3)), 1000)
+            found.append(
+                f"{few} columns have too few events for a point, {per_column:.2g} per column and "
+                f"profile on average; set periods_per_profile to about {wanted}"
+            )
+        return found
+
+    @property
     def phase(self) -> PhaseEstimate | None:
         """The first estimate of the phase, ``None`` where it is known or not found yet."""
         return self._periods.lock.estimate
@@ -261,6 +296,8 @@ class Reconstructor:
         ``events_held`` (not assigned yet).
         Of those only ``events_over_column_limit`` and ``events_outside_sensor`` are
         ``events_dropped``: without light there is no phase, and nothing to lose.
+        ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
+        laser.
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
         ``decoder_*`` come from the decoder.
         """

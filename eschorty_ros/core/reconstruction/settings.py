@@ -89,7 +89,7 @@ class Settings:
     events_min: int = _number(
         4, 1, 1000, "events", "fewest events near the line for a column to give a point"
     )
-    column_limit: int = _number(128, 16, 4096, "events", "most events kept per column and profile")
+    column_limit: int = _number(4096, 16, 4096, "events", "most events kept per column and profile")
     periods_per_profile: int = _number(
         1, 1, 1000, "periods", "modulation periods that make one profile"
     )

@@ -1,0 +1,215 @@
+"""Events that follow the laser, and the removal of those that do not.
+
+ON events follow a rising edge of the laser and OFF events a falling one. With the phase of OFF
+events turned back by the duty cycle, a line's events have one direction on the circle of phases,
+and those of background, of hot pixels and of things that move have none. Their vector strength R,
+the length of the mean unit vector, separates the two without knowing the phase itself.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.window import (
+    BLOCK,
+    CHUNK,
+    POLARITY,
+    ROW_BITS,
+    ROW_MASK,
+    TIME_SHIFT,
+    _padded,
+)
+from eschorty_ros.core.modulation import Modulation
+
+# The delays of pixels scatter over a good part of a shorter period.
+PERIOD_MIN_US = 900.0
+# Least vector strength of a point, and least events times its square: Rayleigh's test. Few events
+# reach it only with a square near 1.
+_STRENGTH_MIN = 0.5
+_RAYLEIGH_MIN = 4.0
+_SQUARE_ENOUGH = 0.6
+# Background reaches this statistic once in 160 000 windows.
+_RAYLEIGH_SURE = 12.0
+# Length of a burst behind an edge, of 2**32 per turn.
+_BURST = 1 << 28
+_HOT_EVENTS_MIN = 6
+# Entries counted in 8 bits.
+_BYTE_CHUNK = np.uintp(128)
+# Lengths of the integer unit vectors, and of their sums per event.
+_UNIT = 4096.0
+
+
+class Blink(NamedTuple):
+    """Turns per microsecond and the turn from rising to falling edge, both of 2**32 per turn.
+
+    A ``step`` of 0 is no test.
+    """
+
+    step: np.uint32 = np.uint32(0)
+    duty: np.uint32 = np.uint32(0)
+
+
+class Vector(NamedTuple):
+    """Sum of the unit vectors of ``events`` phases."""
+
+    events: np.int64
+    x: np.int64
+    y: np.int64
+
+
+def blink(modulation: Modulation) -> Blink:
+    """Return the test for a modulation; none where its period is too short for one."""
+    if modulation.period_us < PERIOD_MIN_US:
+        return Blink()
+    turn = 1 << 32
+    return Blink(
+        np.uint32(round(turn / modulation.period_us)), np.uint32(round(turn * modulation.duty))
+    )
+
+
+@kernel
+def _sine(phase):
+    """Return the sine of a phase as a parabola, which is within 6 %, times ``_UNIT``.
+
+    Negative values are those of 32-bit words that wrap.
+    """
+    turn = phase >> np.uint32(16)
+    half = turn & np.uint32(0x7FFF)
+    value = np.uint32(half * (np.uint32(0x8000) - half)) >> np.uint32(16)
+    return value if turn < np.uint32(0x8000) else np.uint32(np.uint32(0) - value)
+
+
+@kernel
+def _vector(packed, column, first, last, blink):
+    """Return the sum of unit vectors over the events of rows first..last."""
+    base = np.uint32(first)
+    span = np.uint32(last - first)
+    step, duty = blink.step, blink.duty
+    quarter = np.uint32(1 << 30)
+    none = np.uint32(0)
+    events, x, y = np.int64(0), np.int64(0), np.int64(0)
+    begin = np.uintp(column.start)
+    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
+    while begin < padded:
+        end = min(begin + CHUNK, padded)
+        n, sum_x, sum_y = none, none, none
+        for i in range(begin, end):
+            v = packed[i]
+            inside = np.uint32((v & ROW_MASK) - base) <= span
+            back = none if v & POLARITY else duty
+            phase = np.uint32(np.uint32((v >> TIME_SHIFT) * step) - back)
+            n = np.uint32(n + np.uint32(inside))
+            sum_x = np.uint32(sum_x + (_sine(np.uint32(phase + quarter)) if inside else none))
+            sum_y = np.uint32(sum_y + (_sine(phase) if inside else none))
+        events += np.int64(n)
+        x += np.int64(np.int32(sum_x))
+        y += np.int64(np.int32(sum_y))
+        begin = end
+    return Vector(events, x, y)
+
+
+@kernel
+def _is_concentrated(packed, column, first, last, blink):
+    """Return true when 9 of 10 events of rows first..last are in one half of the turn.
+
+    Only from 16 events on, which background reaches less often than a vector strength of a half.
+    The counts of the four quarters share one register lane.
+    """
+    base = np.uint32(first)
+    span = np.uint32(last - first)
+    step, duty = blink.step, blink.duty
+    none, byte = np.uint32(0), np.uint32(255)
+    a, b, c, d = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    begin = np.uintp(column.start)
+    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
+    while begin < padded:
+        end = min(begin + _BYTE_CHUNK, padded)
+        quarters = none
+        for i in range(begin, end):
+            v = packed[i]
+            inside = np.uint32((v & ROW_MASK) - base) <= span
+            back = none if v & POLARITY else duty
+            phase = np.uint32(np.uint32((v >> TIME_SHIFT) * step) - back)
+            shift = np.uint32((phase >> np.uint32(27)) & np.uint32(24))
+            one = np.uint32(np.uint32(1) << shift)
+            quarters = np.uint32(quarters + (one if inside else none))
+        a += np.int64(quarters & byte)
+        b += np.int64((quarters >> np.uint32(8)) & byte)
+        c += np.int64((quarters >> np.uint32(16)) & byte)
+        d += np.int64(quarters >> np.uint32(24))
+        begin = end
+    n = a + b + c + d
+    half = max(max(a + b, c + d), max(b + c, d + a))
+    return n >= 16 and 10 * half >= 9 * n
+
+
+@kernel
+def _follows(packed, column, first, last, blink):
+    """Return true when events of rows first..last follow the laser, and true when that is sure."""
+    vector = _vector(packed, column, first, last, blink)
+    length2 = float(vector.x * vector.x + vector.y * vector.y)
+    n = float(vector.events)
+    square = length2 / (n * n * _UNIT * _UNIT)
+    rayleigh = n * square
+    if square > _STRENGTH_MIN**2:
+        follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
+        return follows, rayleigh > _RAYLEIGH_SURE
+    # A line that moves while it is lit has events all the time, and a burst at both edges. What
+    # passes within a part of the period has one at most.
+    bursts = _has_bursts(packed, column, first, last, blink)
+    return bursts, bursts
+
+
+@kernel
+def _has_bursts(packed, column, first, last, blink):
+    """Return true when many ON events are close behind a rising edge and OFF ones a falling one.
+
+    Chernoff's bound limits the probability that background has them.
+    """
+    burst, events = np.zeros(2), np.zeros(2)
+    for i in range(column.start, column.start + column.events):
+        v = packed[i]
+        if first <= np.int64(v & ROW_MASK) <= last:
+            on = np.int64(v & POLARITY) >> ROW_BITS
+            phase = np.uint32((v >> TIME_SHIFT) * blink.step) - (0 if on else blink.duty)
+            events[on] += 1.0
+            burst[on] += np.uint32(phase) < _BURST
+    expected = events * (_BURST / 2.0**32)
+    if burst[0] <= expected[0] or burst[1] <= expected[1]:
+        return False
+    improbable = burst * np.log(burst / np.maximum(expected, 1e-9)) - (burst - expected)
+    return improbable.min() > _RAYLEIGH_MIN and improbable.sum() > _RAYLEIGH_SURE
+
+
+@kernel
+def _without(packed, column, first, last):
+    """Remove the events of rows first..last from a column and return what is left."""
+    n = np.int64(0)
+    for i in range(column.start, column.start + column.events):
+        row = np.int64(packed[i] & ROW_MASK)
+        if not first <= row <= last:
+            packed[column.start + n] = packed[i]
+            n += 1
+    return _padded(packed, column.start, n)
+
+
+@kernel
+def _without_hot_pixels(packed, column, first, last, blink, counts):
+    """Remove from a column the pixels of rows first..last that fire without the laser.
+
+    Those have more than twice the events of an average pixel there. ``counts`` is zeroed scratch,
+    one per row.
+    """
+    for i in range(column.start, column.start + column.events):
+        counts[packed[i] & ROW_MASK] += 1
+    near = counts[first : last + 1]
+    hot = max(2.0 * near.sum() / max(np.count_nonzero(near), 1), _HOT_EVENTS_MIN)
+    left = column
+    for row in range(first, last + 1):
+        if counts[row] >= hot and not _follows(packed, left, row, row, blink)[0]:
+            left = _without(packed, left, row, row)
+    counts[:] = 0
+    return left

@@ -1,0 +1,130 @@
+"""Streams that a second, independent pixel model makes hard: background, defects, full columns."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from independent_pixels import FIRST_EDGE_US, Camera, Events, stream, wavy
+from reconstructing import CALIBRATION, reconstruct
+
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+
+MODEL = CALIBRATION.model()
+
+
+def points(camera: Camera, *parts: Events, **settings) -> tuple[Profiles, Reconstructor]:
+    modulation = Modulation(camera.frequency_hz, camera.duty, on_edge_us=FIRST_EDGE_US)
+    return reconstruct(stream(*parts), modulation, Settings(**settings))
+
+
+def error_px(found: Profiles) -> np.ndarray:
+    return found.row - wavy(found.period, found.column.astype(float))
+
+
+def error_mm(found: Profiles) -> np.ndarray:
+    return found.range_mm - MODEL.range_mm(found.row - error_px(found))
+
+
+def test_a_line_of_other_pixels_is_found_in_every_column():
+    camera = Camera(periods=10)
+    found, _ = points(camera, camera.line(wavy))
+    assert len(found) == 10 * 1280
+    assert np.quantile(np.abs(error_px(found)), 0.6827) < 0.12, f"seed {camera.seed}"
+
+
+def test_a_line_that_moves_while_it_is_lit_keeps_its_points():
+    camera = Camera(periods=12)
+    found, _ = points(camera, camera.moving_line(wavy, 25), camera.scattered(1e6))
+    assert len(found) > 0.998 * 12 * 1280, f"seed {camera.seed}"
+
+
+NO_LINE: dict[str, tuple[int, Callable[[Camera], Events], float]] = {
+    "noise": (140, lambda camera: camera.scattered(5e6), 50),
+    "a thing that moves": (70, lambda camera: camera.moving_object(3e6), 10),
+}
+
+
+@pytest.mark.parametrize("case", NO_LINE)
+def test_what_does_not_follow_the_laser_gives_no_points(case):
+    periods, disturbance, limit = NO_LINE[case]
+    camera = Camera(periods=periods)
+    found, reconstructor = points(camera, disturbance(camera))
+    assert len(found) <= limit, f"seed {camera.seed}"
+    assert reconstructor.counters["columns_unmodulated"] > 1000
+
+
+BESIDE_A_LINE: dict[str, Callable[[Camera], Events]] = {
+    "300 pixels at 20 kHz": lambda camera: camera.hot_pixels(300, 20e3),
+    "2000 pixels at 2 kHz": lambda camera: camera.hot_pixels(2000, 2e3),
+    "a row for 30 ms": lambda camera: camera.firing_row(500, 50e3, 30e3, 3e3),
+    "a row within the line": lambda camera: camera.firing_row(340, 50e3, 30e3, 3e3),
+    "a thing that moves": lambda camera: camera.moving_object(3e6),
+}
+
+
+@pytest.mark.parametrize("case", BESIDE_A_LINE)
+def test_what_does_not_follow_the_laser_moves_no_points(case):
+    camera = Camera(periods=12)
+    found, reconstructor = points(camera, camera.line(wavy), BESIDE_A_LINE[case](camera))
+    assert np.mean(np.abs(error_mm(found)) > 20.0) < 5e-4, f"seed {camera.seed}"
+    assert np.median(np.abs(error_px(found))) < 0.09
+    assert len(found) > 0.99 * 12 * 1280
+    assert reconstructor.counters["events_unmodulated"] > 0
+    assert reconstructor.counters["events_dropped"] == 0
+
+
+@pytest.mark.parametrize(
+    ("camera", "settings"),
+    [
+        (Camera(threshold=0.14, events_max=9, periods=4), {}),
+        (Camera(frequency_hz=1000.0, periods=28), {"periods_per_profile": 14}),
+    ],
+    ids=["220 events per column", "14 periods per profile"],
+)
+def test_no_event_of_a_full_column_is_lost(camera, settings):
+    found, reconstructor = points(camera, camera.line(lambda k, c: wavy(0, c)), **settings)
+    every = settings.get("periods_per_profile", 1)
+    assert reconstructor.counters["events_dropped"] == 0
+    assert reconstructor.counters["events"] > 220 * 1280 * camera.periods / every
+    assert len(found) == camera.periods // every * 1280
+    assert np.abs(found.row - wavy(0, found.column.astype(float))).max() < 1.0
+
+
+def _kept(camera: Camera, share: float) -> Events:
+    t, x, y, p = camera.line(wavy)
+    kept = camera.rng.random(t.size) < share
+    return t[kept], x[kept], y[kept], p[kept]
+
+
+def _swapped(camera: Camera) -> Events:
+    t, x, y, p = camera.line(wavy)
+    return t, x, y, 1 - p
+
+
+REASONS: dict[str, tuple[Camera, float, Callable[[Camera], Events], dict, str]] = {
+    "20 kHz": (
+        Camera(frequency_hz=20e3, periods=200), 20e3, lambda camera: _kept(camera, 0.03), {},
+        "periods_per_profile to about",
+    ),
+    "swapped polarity": (
+        Camera(periods=6), 70.0, _swapped, {"phase_gate_us": 1000}, "phase_gate_us removes",
+    ),
+    "wrong frequency": (
+        Camera(periods=40), 83.0, lambda camera: camera.line(wavy), {"phase_gate_us": 1000},
+        "phase_gate_us removes",
+    ),
+    "no laser": (
+        Camera(periods=40), 70.0, lambda camera: camera.moving_object(3e6), {}, "do not follow",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REASONS)
+def test_a_stream_without_points_has_a_reason(case):
+    camera, frequency_hz, events, settings, reason = REASONS[case]
+    modulation = Modulation(frequency_hz, on_edge_us=FIRST_EDGE_US)
+    _, reconstructor = reconstruct(stream(events(camera)), modulation, Settings(**settings))
+    (warning,) = reconstructor.warnings
+    assert reason in warning
+    assert len(warning) < 300
