@@ -1,6 +1,7 @@
 """From the events of one period to one row per column with its standard deviation."""
 
 from eschorty_ros.core.line.centroid import (
+    CENTROIDS,
     FULL_COLUMN_METHODS,
     METHODS,
     RETURNS,
@@ -19,6 +20,7 @@ from eschorty_ros.core.line.sigma import (
 from eschorty_ros.core.line.window import TIME_LIMIT_US
 
 __all__ = [
+    "CENTROIDS",
     "FULL_COLUMN_METHODS",
     "FWHM_PER_SIGMA",
     "HALF_WIDTH_PER_FWHM",

@@ -30,6 +30,7 @@ from eschorty_ros.core.line.estimators import (
     _variance,
     likelihood_size,
 )
+from eschorty_ros.core.line.learned import _learned_row, make_footprint
 from eschorty_ros.core.line.sigma import (
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
@@ -65,11 +66,13 @@ from eschorty_ros.core.line.window import (
 )
 
 METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
+CENTROIDS = (*METHODS, "learned")
+"""The methods, and the one that follows a stream."""
 FULL_COLUMN_METHODS = ("mean", "median")
 RETURNS = ("strongest", "first", "last", "all")
 
 # Codes are indices of the tuples above. The methods up to _MEAN are a window's mean.
-_MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID = range(5)
+_MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID, _LEARNED = range(6)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 # Windows of a column that are tested for the laser's modulation.
 _WINDOWS_MAX = 4
@@ -116,6 +119,7 @@ class Estimator(NamedTuple):
     """
 
     method: int
+    learns: bool
     returns: int
     seeded: bool
     events_min: int
@@ -176,8 +180,8 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
     ArgumentError
         When there is no such method or choice of returns, or the method does not separate returns.
     """
-    if not isinstance(method, str) or method not in METHODS:
-        raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(METHODS)}")
+    if not isinstance(method, str) or method not in CENTROIDS:
+        raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(CENTROIDS)}")
     if not isinstance(returns, str) or returns not in RETURNS:
         raise ArgumentError(f"returns is {returns!r}; choose one of {', '.join(RETURNS)}")
     if method in FULL_COLUMN_METHODS and returns != "strongest":
@@ -186,7 +190,7 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
             f"returns is {returns!r} and {method!r} averages the full column; choose 'strongest', "
             f"or one of {', '.join(windowed)} as centroid"
         )
-    return METHODS.index(method), RETURNS.index(returns)
+    return CENTROIDS.index(method), RETURNS.index(returns)
 
 
 def make_scratch(half_max: int) -> Scratch:
@@ -280,8 +284,11 @@ def estimate(
         raise ArgumentError(f"line_width_px is {line_width_px!r}; choose 0.5 to {height}")
     integer("events_min", events_min, 1, 1 << 31)
     method_code, returns_code = check_method(method, returns)
+    if method == "learned":
+        raise ArgumentError("centroid 'learned' follows a stream; choose another for columns alone")
     estimator = Estimator(
         method=method_code,
+        learns=False,
         returns=returns_code,
         seeded=False,
         events_min=events_min,
@@ -292,7 +299,8 @@ def estimate(
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, scratch = grouped_columns(row_array, offset_array), make_scratch(estimator.half_max)
-    _estimate_columns(columns, estimator.half_max, estimator, Blink(), found, scratch)
+    footprint = make_footprint(estimator.half_max, columns=0)
+    _estimate_columns(columns, estimator.half_max, estimator, Blink(), footprint, found, scratch)
     by_column = slice(None) if returns == "all" else 0
     row, sigma, width, events, truncated = (
         np.ascontiguousarray(values.T[:, by_column])
@@ -452,7 +460,7 @@ def _reported(returns, found):
 
 
 @kernel
-def _estimate_columns(columns, half, estimator, blink, out, scratch):
+def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     """Estimate the rows of every column into ``out`` and empty the columns.
 
     Events that do not follow the laser are left out, unless ``blink`` is no test.
@@ -513,9 +521,19 @@ def _estimate_columns(columns, half, estimator, blink, out, scratch):
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
             variance = _variance(window.sums)
             row = _mean(window)
-            if estimator.method > _MEAN:
+            learned = -1.0
+            if estimator.method == _LEARNED:
+                best, learned = _learned_row(
+                    packed, column, c, row, estimator.rows, footprint, scratch.row_counts
+                )
+            elif estimator.method > _MEAN:
                 row = _row_in_window(packed, column, window, other, half, estimator, scratch)
-            estimate = _row_estimate(row, variance, line_variance, window, half, estimator)
+            if learned >= 0.0:
+                cut = window.first == 0 or window.last >= estimator.rows - 1.0
+                best = min(max(best, -0.5), estimator.rows - 0.5)
+                estimate = RowEstimate(best, learned, cut)
+            else:
+                estimate = _row_estimate(row, variance, line_variance, window, half, estimator)
             if not windowed:
                 columns.seeds[c] = np.int64(np.rint(FRACTION * row))
             common2 = _shared_variance(columns.seeds[c], last, model)

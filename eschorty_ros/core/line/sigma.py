@@ -67,6 +67,8 @@ METHOD_ERRORS = {
     "median": ErrorModel(0.2, 0.935, 1.48, 0.11, median=True),
     "gauss_ml": ErrorModel(0.2, 0.91, 0.4, 0.20),
     "edge_mid": ErrorModel(0.243, 0.885, 0.42, 0.18),
+    # Before a footprint is learned.
+    "learned": ErrorModel(0.2, 0.89, 0.4, 0.20),
 }
 
 

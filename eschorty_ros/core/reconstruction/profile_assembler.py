@@ -23,6 +23,7 @@ from eschorty_ros.core.line.centroid import (
 )
 from eschorty_ros.core.line.columns import Columns, _append, empty_columns, wider_columns
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
+from eschorty_ros.core.line.learned import Footprint, _learn, make_footprint
 from eschorty_ros.core.line.sigma import CLIPPED, VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
@@ -91,6 +92,7 @@ class _Memory(NamedTuple):
     columns: Columns
     estimator: Estimator
     blink: Blink
+    footprint: Footprint
     smoothing: Smoothing
     rows: Rows
     scratch: Scratch
@@ -212,6 +214,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     method_code, returns_code = check_method(settings.centroid, settings.returns)
     estimator = Estimator(
         method=method_code,
+        learns=settings.centroid == "learned",
         returns=returns_code,
         seeded=True,
         events_min=settings.events_min,
@@ -234,6 +237,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         columns=empty_columns(model.columns, settings.column_limit),
         estimator=estimator,
         blink=Blink(),
+        footprint=make_footprint(estimator.half_max, model.columns),
         smoothing=Smoothing(
             half_width=settings.smoothing_half_width,
             gate_px=float(settings.smoothing_gate_px),
@@ -285,8 +289,8 @@ def _write(rows, smoothing, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, blink, smoothing, rows, scratch, output = memory
-    sums = _estimate_columns(columns, state.half, estimator, blink, rows, scratch)
+    columns, estimator, blink, footprint, smoothing, rows, scratch, output = memory
+    sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.periods_closed += 1
     counters.columns_too_few_events += sums.too_few_events
@@ -296,6 +300,9 @@ def _close(memory, state, counters):
     counters.events_unmodulated += sums.events_unmodulated
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     counters.columns_smoothed += _smooth(rows.row, rows.sigma2, rows.common2, smoothing)
+    if estimator.learns:
+        doubtful, truncated = rows.doubtful[0], rows.truncated[0]
+        _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
     _write(rows, smoothing, state, output)
 
 

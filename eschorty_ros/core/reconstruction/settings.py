@@ -8,7 +8,7 @@ from typing import Any
 from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.line import (
-    METHODS,
+    CENTROIDS,
     RETURNS,
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
@@ -70,7 +70,7 @@ class Settings:
     20.0
     """
 
-    centroid: str = _choice("mode_mean", METHODS, "column estimator")
+    centroid: str = _choice("mode_mean", CENTROIDS, "column estimator")
     returns: str = _choice(
         "strongest", RETURNS, "which of two surfaces in one column to report; first is the nearest"
     )

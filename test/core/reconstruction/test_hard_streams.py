@@ -128,3 +128,34 @@ def test_a_stream_without_points_has_a_reason(case):
     (warning,) = reconstructor.warnings
     assert reason in warning
     assert len(warning) < 300
+
+
+def _sloping(towards: float):
+    return lambda k, c: np.abs(towards - 3.0 - 0.06 * c) + 0.0 * k
+
+
+@pytest.mark.parametrize("edge", [0.0, 719.0])
+def test_a_learned_footprint_finds_a_line_that_the_sensors_edge_cuts(edge):
+    camera = Camera(periods=12)
+    row = _sloping(edge)
+    found, _ = points(camera, camera.line(row), centroid="learned")
+    found = found.select(found.period >= 4)
+    truth = row(0, found.column.astype(float))
+    for low, high in ((3, 5), (5, 9), (9, 14)):
+        near = (np.abs(truth - edge) >= low) & (np.abs(truth - edge) < high)
+        error = (found.row - truth)[near]
+        assert abs(error.mean()) < 0.05, f"seed {camera.seed}, rows {low} to {high}"
+        assert np.mean(np.abs(error) < found.sigma_row[near]) > 0.6
+
+
+def test_a_learned_footprint_reduces_the_error_where_half_of_the_events_are_lost():
+    camera = Camera(periods=30)
+    events = camera.line(wavy)
+    kept = camera.rng.random(events[0].size) < 0.5
+    half = tuple(values[kept] for values in events)
+    plain, learned = (
+        points(camera, half, centroid=method)[0] for method in ("mode_mean", "learned")
+    )
+    error = np.abs(error_px(learned))
+    assert np.quantile(error, 0.6827) < 0.75 * np.quantile(np.abs(error_px(plain)), 0.6827)
+    assert 0.63 < np.mean(error < learned.sigma_row) < 0.9, f"seed {camera.seed}"

@@ -1,0 +1,237 @@
+"""The footprint of the line, learned from the stream, and the row of greatest likelihood.
+
+The footprint is the probability that a pixel gives k events in a period, by its distance from the
+line. It is counted over points found already, made symmetric, which fixes what the centre of the
+line is, and smoothed over a quarter of a row. A row is the mean of its posterior, whose spread is
+its standard deviation. Rows beyond the sensor's edge have no events and count for nothing, so a
+line that the edge cuts has the same centre as any other.
+
+Log-likelihoods are integers: their sums are exact and do not depend on the order of the events.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.window import FRACTION, ROW_MASK
+
+# Places per row, counts that are told apart, candidates to either side of the first row.
+_PLACES = 8
+_COUNTS = 12
+_SIDE = 2 * _PLACES
+_LOG_ONE = 1024
+# Of every so many columns one is learned from in a profile.
+_STRIDE = 4
+# Columns after which the footprint is computed again, doubled from the fourth time on. Rows found
+# with an earlier footprint are less exact, so its counts are forgotten.
+_COLUMNS_MIN = 512
+_ROUNDS = 3
+_DOUBLINGS = 5
+_SMOOTHING_PASSES = 4
+# A prior of so many pixels at each distance, and of so many with each count.
+_PRIOR_PIXELS = 2.0
+_PRIOR_COUNT = 0.02
+_MOVES_MAX = 24
+_OFF_LINE_PX = 1.0
+
+
+class Footprint(NamedTuple):
+    """Counts of pixels by their events and distance, and the logarithms of their shares.
+
+    ``log[k]`` is relative to that of no event but for ``log[0]``; ``empty`` is the sum of
+    ``log[0]`` over all rows, by the line's place in its row. ``rows_seen`` holds the events of
+    the sampled columns' rows from ``first_row`` on, which is -1 where there is none. ``state`` is
+    the number of profiles, of computations and of the columns counted since.
+    """
+
+    pixels: NDArray[np.float64]
+    log: NDArray[np.int32]
+    empty: NDArray[np.int32]
+    likelihood: NDArray[np.int32]
+    rows_seen: NDArray[np.uint8]
+    first_row: NDArray[np.int64]
+    state: NDArray[np.int64]
+    reach: int
+    stride: int
+
+
+def make_footprint(half_max: int, columns: int) -> Footprint:
+    """Return a footprint to be learned, for windows of ``half_max`` and narrower."""
+    reach = half_max // FRACTION + 2
+    size = 2 * (_PLACES * reach + _SIDE) + 1
+    return Footprint(
+        pixels=np.zeros((_COUNTS, size)),
+        log=np.zeros((_COUNTS, size), np.int32),
+        empty=np.zeros(_PLACES, np.int32),
+        likelihood=np.zeros(2 * _SIDE + 1, np.int32),
+        rows_seen=np.zeros((columns // _STRIDE + 1, 2 * reach + 1), np.uint8),
+        first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
+        state=np.zeros(3, np.int64),
+        reach=reach,
+        stride=_STRIDE,
+    )
+
+
+@kernel
+def _is_learned(footprint):
+    return footprint.state[1] > 0
+
+
+@kernel
+def _count_rows(packed, column, low, high, counts):
+    """Count the events of rows low..high into ``counts``."""
+    for i in range(column.start, column.start + column.events):
+        row = np.int64(packed[i] & ROW_MASK)
+        if low <= row <= high:
+            counts[row] += 1
+
+
+@kernel
+def _remember(footprint, c, centre, counts, rows):
+    """Keep the events by row of column ``c`` to learn from, when its turn has come."""
+    stride = footprint.stride
+    if (c - footprint.state[0]) % stride != 0:
+        return
+    slot = c // stride
+    first = max(centre - footprint.reach, np.int64(0))
+    last = min(centre + footprint.reach, rows - 1)
+    footprint.first_row[slot] = first
+    for row in range(first, last + 1):
+        footprint.rows_seen[slot, row - first] = min(counts[row], _COUNTS - 1)
+
+
+@kernel
+def _log_likelihoods(footprint, place, low, high, counts, rows):
+    """Fill the log-likelihoods of the places around ``place``; return the best one's offset."""
+    likelihood, log, reach = footprint.likelihood, footprint.log, footprint.reach
+    middle = log.shape[1] // 2
+    if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (rows - 1 - reach):
+        for m in range(2 * _SIDE + 1):
+            likelihood[m] = footprint.empty[(place - _SIDE + m) % _PLACES]
+    else:
+        for m in range(2 * _SIDE + 1):
+            at = place - _SIDE + m
+            total = np.int32(0)
+            for row in range(max(at // _PLACES - reach, 0), min(at // _PLACES + reach + 2, rows)):
+                if abs(at - _PLACES * row) <= _PLACES * reach:
+                    total += log[0, middle + at - _PLACES * row]
+            likelihood[m] = total
+    for row in range(low, high + 1):
+        k = min(counts[row], _COUNTS - 1)
+        if k > 0:
+            first = middle + place - _SIDE - _PLACES * row
+            for m in range(2 * _SIDE + 1):
+                likelihood[m] += log[k, first + m]
+    best = 0
+    for m in range(1, _SIDE + 1):
+        if likelihood[_SIDE + m] > likelihood[_SIDE + best]:
+            best = m
+        if likelihood[_SIDE - m] > likelihood[_SIDE + best]:
+            best = -m
+    return best
+
+
+@kernel
+def _learned_row(packed, column, c, row, rows, footprint, counts):
+    """Return the row of a line near ``row`` and its variance; 0 and -1 before any is learned.
+
+    ``counts`` is zeroed scratch, one per row.
+    """
+    place = np.int64(np.rint(_PLACES * row))
+    reach = footprint.reach
+    centre = np.int64(np.rint(row))
+    known = _is_learned(footprint)
+    margin = reach + _MOVES_MAX if known else reach
+    all_low, all_high = max(centre - margin, 0), min(centre + margin, rows - 1)
+    _count_rows(packed, column, all_low, all_high, counts)
+    _remember(footprint, c, centre, counts, rows)
+    mean, variance = 0.0, -1.0
+    if known:
+        for _ in range(_MOVES_MAX):
+            low = max(-((_PLACES * reach - place) // _PLACES), all_low)
+            high = min((place + _PLACES * reach) // _PLACES, all_high)
+            best = _log_likelihoods(footprint, place, low, high, counts, rows)
+            if abs(best) <= _SIDE - 2:
+                break
+            place = np.int64(min(max(place + best, -_PLACES), _PLACES * rows))
+        peak = footprint.likelihood[_SIDE + best]
+        total, first, second = 0.0, 0.0, 0.0
+        for m in range(_SIDE + 1):
+            above = np.exp((footprint.likelihood[_SIDE + m] - peak) / _LOG_ONE)
+            below = np.exp((footprint.likelihood[_SIDE - m] - peak) / _LOG_ONE) if m else 0.0
+            total += above + below
+            first += m * (above - below)
+            second += m * m * (above + below)
+        offset = first / total
+        mean = (place + offset) / _PLACES
+        variance = max(second / total - offset * offset, 0.0) / (_PLACES * _PLACES)
+    counts[all_low : all_high + 1] = 0
+    return mean, variance
+
+
+@kernel
+def _learn(footprint, row, smoothed, doubtful, truncated, rows):
+    """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
+
+    Columns in which the sensor's edge cuts the line count where they are the majority.
+    """
+    whole = 2 * np.count_nonzero(truncated) < np.count_nonzero(np.isfinite(row))
+    pixels, stride = footprint.pixels, footprint.stride
+    middle = pixels.shape[1] // 2
+    for slot in range(footprint.first_row.size):
+        first = footprint.first_row[slot]
+        footprint.first_row[slot] = -1
+        c = slot * stride + footprint.state[0] % stride
+        if first < 0 or c >= row.size or doubtful[c] or (whole and truncated[c]):
+            continue
+        if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
+            continue
+        last = min(first + 2 * footprint.reach, rows - 1)
+        for at in range(first, last + 1):
+            place = np.int64(np.rint(_PLACES * (at - smoothed[c])))
+            if abs(place) <= middle:
+                pixels[footprint.rows_seen[slot, at - first], middle + place] += 1.0
+        footprint.state[2] += 1
+    footprint.state[0] += 1
+    doublings = min(max(footprint.state[1] - _ROUNDS, 0), _DOUBLINGS)
+    if footprint.state[2] >= _COLUMNS_MIN << doublings:
+        _compute(footprint)
+        pixels[:] = 0.0
+        footprint.state[2] = 0
+
+
+@kernel
+def _compute(footprint):
+    """Compute the logarithms from the counts of pixels."""
+    pixels, log = footprint.pixels, footprint.log
+    size = pixels.shape[1]
+    shares = pixels + pixels[:, ::-1]
+    if shares.sum() == 0.0:
+        return
+    overall = shares.sum(axis=1) / shares.sum()
+    for k in range(_COUNTS):
+        for _ in range(_SMOOTHING_PASSES):
+            before = shares[k].copy()
+            for b in range(size):
+                low, high = before[max(b - 1, 0)], before[min(b + 1, size - 1)]
+                shares[k, b] = 0.5 * before[b] + 0.25 * (low + high)
+        shares[k] += _PRIOR_PIXELS * overall[k] + _PRIOR_COUNT
+    for b in range(size // 2 + 1):
+        none = np.log(shares[0, b] / shares[:, b].sum())
+        log[0, b] = np.int32(np.rint(_LOG_ONE * none))
+        for k in range(1, _COUNTS):
+            ratio = np.log(shares[k, b] / shares[0, b])
+            log[k, b] = np.int32(np.rint(_LOG_ONE * ratio))
+        log[:, size - 1 - b] = log[:, b]
+    reach, middle = footprint.reach, size // 2
+    for place in range(_PLACES):
+        total = np.int32(0)
+        for row in range(-reach - 1, reach + 2):
+            if abs(place - _PLACES * row) <= _PLACES * reach:
+                total += log[0, middle + place - _PLACES * row]
+        footprint.empty[place] = total
+    footprint.state[1] += 1
