@@ -40,7 +40,7 @@ SCENES: dict[str, Scene] = {
 # Modulation, stage speed, and a travel with enough profiles.
 SWEEPS = ((70.0, 100.0, 50.0), (300.0, 200.0, 30.0), (1000.0, 300.0, 24.0))
 START_MM = 40.0
-ONE_SIGMA, TWO_SIGMA = (0.64, 0.72), (0.93, 0.97)
+ONE_SIGMA, TWO_SIGMA = (0.64, 0.77), (0.93, 0.98)
 THICKNESS_PX = 22.0
 """Full width of the line's footprint, rows."""
 BEND_MM, CONTRAST = 0.8, 1.15

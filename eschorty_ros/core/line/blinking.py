@@ -17,6 +17,7 @@ from eschorty_ros.core.line.window import (
     BLOCK,
     CHUNK,
     POLARITY,
+    POLARITY_SHIFT,
     ROW_BITS,
     ROW_MASK,
     TIME_SHIFT,
@@ -36,8 +37,6 @@ _RAYLEIGH_SURE = 12.0
 # Length of a burst behind an edge, of 2**32 per turn.
 _BURST = 1 << 28
 _HOT_EVENTS_MIN = 6
-# Entries counted in 8 bits.
-_BYTE_CHUNK = np.uintp(128)
 # Lengths of the integer unit vectors, and of their sums per event.
 _UNIT = 4096.0
 
@@ -45,11 +44,13 @@ _UNIT = 4096.0
 class Blink(NamedTuple):
     """Turns per microsecond and the turn from rising to falling edge, both of 2**32 per turn.
 
-    A ``step`` of 0 is no test.
+    A ``step`` of 0 is no test. ``low_us`` is the time from rising to falling edge, 0 where a
+    profile has more periods than one.
     """
 
     step: np.uint32 = np.uint32(0)
     duty: np.uint32 = np.uint32(0)
+    low_us: np.uint32 = np.uint32(0)
 
 
 class Vector(NamedTuple):
@@ -60,13 +61,15 @@ class Vector(NamedTuple):
     y: np.int64
 
 
-def blink(modulation: Modulation) -> Blink:
-    """Return the test for a modulation; none where its period is too short for one."""
+def blink(modulation: Modulation, every: int) -> Blink:
+    """Return the test for profiles of ``every`` periods; none where a period is too short."""
     if modulation.period_us < PERIOD_MIN_US:
         return Blink()
     turn = 1 << 32
     return Blink(
-        np.uint32(round(turn / modulation.period_us)), np.uint32(round(turn * modulation.duty))
+        np.uint32(round(turn / modulation.period_us)),
+        np.uint32(round(turn * modulation.duty)),
+        np.uint32(round(modulation.duty * modulation.period_us) if every == 1 else 0),
     )
 
 
@@ -113,37 +116,26 @@ def _vector(packed, column, first, last, blink):
 
 @kernel
 def _is_concentrated(packed, column, first, last, blink):
-    """Return true when 9 of 10 events of rows first..last are in one half of the turn.
+    """Return true when 9 of 10 events of rows first..last are between their edge and the other one.
 
     Only from 16 events on, which background reaches less often than a vector strength of a half.
-    The counts of the four quarters share one register lane.
+    The numbers of all events and of the others share one register lane.
     """
     base = np.uint32(first)
     span = np.uint32(last - first)
-    step, duty = blink.step, blink.duty
-    none, byte = np.uint32(0), np.uint32(255)
-    a, b, c, d = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    low_us = blink.low_us
+    none, one, high = np.uint32(0), np.uint32(1), np.uint32(1 << 16)
     begin = np.uintp(column.start)
-    padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
-    while begin < padded:
-        end = min(begin + _BYTE_CHUNK, padded)
-        quarters = none
-        for i in range(begin, end):
-            v = packed[i]
-            inside = np.uint32((v & ROW_MASK) - base) <= span
-            back = none if v & POLARITY else duty
-            phase = np.uint32(np.uint32((v >> TIME_SHIFT) * step) - back)
-            shift = np.uint32((phase >> np.uint32(27)) & np.uint32(24))
-            one = np.uint32(np.uint32(1) << shift)
-            quarters = np.uint32(quarters + (one if inside else none))
-        a += np.int64(quarters & byte)
-        b += np.int64((quarters >> np.uint32(8)) & byte)
-        c += np.int64((quarters >> np.uint32(16)) & byte)
-        d += np.int64(quarters >> np.uint32(24))
-        begin = end
-    n = a + b + c + d
-    half = max(max(a + b, c + d), max(b + c, d + a))
-    return n >= 16 and 10 * half >= 9 * n
+    sums = none
+    for i in range(begin, begin + np.uintp(column.blocks) * np.uintp(BLOCK)):
+        v = packed[i]
+        inside = np.uint32((v & ROW_MASK) - base) <= span
+        on = np.uint32((v >> POLARITY_SHIFT) & one)
+        bright = one if np.uint32(v >> TIME_SHIFT) < low_us else none
+        both = np.uint32(np.uint32(np.uint32(on ^ bright) * high) + one)
+        sums = np.uint32(sums + (both if inside else none))
+    events = np.int64(sums & np.uint32(0xFFFF))
+    return events >= 16 and 10 * np.int64(sums >> np.uint32(16)) <= events
 
 
 @kernel

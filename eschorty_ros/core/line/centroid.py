@@ -39,7 +39,6 @@ from eschorty_ros.core.line.sigma import (
     ErrorModel,
     _clipping_variance,
     _own_variance,
-    _shared_variance,
     error_model,
 )
 from eschorty_ros.core.line.truncation import (
@@ -134,7 +133,7 @@ class Rows(NamedTuple):
 
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
     neighbours share. A ``doubtful`` one may be background that follows the laser by chance.
-    ``ambiguous`` has shape (columns,).
+    ``ambiguous`` and ``shift``, the line's way since the last period in px, have shape (columns,).
     """
 
     row: NDArray[np.float64]
@@ -146,6 +145,7 @@ class Rows(NamedTuple):
     truncated: NDArray[np.bool_]
     doubtful: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
+    shift: NDArray[np.float64]
 
 
 class Scratch(NamedTuple):
@@ -204,8 +204,10 @@ def empty_rows(returns: int, columns: int) -> Rows:
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
     truncated, doubtful = np.zeros((2, *shape), np.bool_)
-    ambiguous = np.zeros(columns, np.bool_)
-    return Rows(row, sigma2, common2, variance, events, mean_dt_us, truncated, doubtful, ambiguous)
+    ambiguous, shift = np.zeros(columns, np.bool_), np.full(columns, np.nan)
+    return Rows(
+        row, sigma2, common2, variance, events, mean_dt_us, truncated, doubtful, ambiguous, shift
+    )
 
 
 def estimate(
@@ -466,6 +468,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     Events that do not follow the laser are left out, unless ``blink`` is no test.
     """
     out.row[:] = np.nan
+    out.shift[:] = np.nan
     squares = 0.0
     freedom, few, ambiguous, two = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     unmodulated, events_unmodulated = np.int64(0), np.int64(0)
@@ -516,6 +519,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             few += found.status == TOO_FEW
             continue
         columns.seeds[c] = neighbour = found.window.centre
+        if last >= 0:
+            out.shift[c] = (neighbour - last) / FRACTION
         two += found.second
         window, other = _reported(estimator.returns, found)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
@@ -536,7 +541,9 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
                 estimate = _row_estimate(row, variance, line_variance, window, half, estimator)
             if not windowed:
                 columns.seeds[c] = np.int64(np.rint(FRACTION * row))
-            common2 = _shared_variance(columns.seeds[c], last, model)
+                if last >= 0:
+                    out.shift[c] = (columns.seeds[c] - last) / FRACTION
+            common2 = model.common**2
             # Missing rows are detectable only after a profile has given the line's width.
             if not estimate.truncated and half < estimator.half_max:
                 common2 += _clipping_variance(variance, line_variance, model)

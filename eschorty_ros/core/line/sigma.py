@@ -15,8 +15,9 @@ share the other part::
 
 The last term is for lines that an edge of the scene clips; the line on a surface of low reflectance
 is narrow, too, and its sigma larger than necessary. The constants are fitted to the simulated
-scenes of the report's sigma experiment, at 70, 300 and 1000 Hz; `sigma_factor`, `sigma_floor_px`
-and `sigma_common_px` adapt them to an instrument.
+scenes of the report's sigma experiment, at 70, 300 and 1000 Hz. In a stream the columns' own part
+is scaled by the scatter of near columns (`scatter`), so that only its course over the columns and
+the first profile depend on the constants.
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ import numpy as np
 
 from eschorty_ros.core.base.arrays import number
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.window import FRACTION
 
 SIGMA_FACTOR = 0.05
 SIGMA_FLOOR_PX = 0.28
@@ -132,17 +132,13 @@ def _own_variance(variance, line_variance, count, row, rows, model):
 
 
 @kernel
-def _shared_variance(centre, last, model):
-    """Return the variance that neighbouring columns share, from the line's shift.
+def _motion_variance(shift, model):
+    """Return the variance that neighbouring columns share, from the line's shift in a period, px.
 
-    ``centre`` is the line's row and ``last`` that of the last profile, fixed point, negative when
-    there was none. A pixel's response depends on the last period, too, so points lag on a surface
-    that recedes.
+    A pixel's response depends on the last period, too, so points lag on a surface that recedes.
     """
-    shift = 0.0
-    if last >= 0:
-        shift = min(abs(centre - last) / FRACTION, _SHIFT_MAX_PX)
-    return model.common**2 + model.motion**2 * shift + (_JUMP * shift) ** 2
+    size = min(abs(shift), _SHIFT_MAX_PX)
+    return model.motion**2 * size + (_JUMP * size) ** 2
 
 
 @kernel

@@ -12,6 +12,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import EventArrays
 from eschorty_ros.core.line.blinking import Blink, blink
 from eschorty_ros.core.line.centroid import (
+    FULL_COLUMN_METHODS,
     Estimator,
     Rows,
     Scratch,
@@ -24,6 +25,7 @@ from eschorty_ros.core.line.centroid import (
 from eschorty_ros.core.line.columns import Columns, _append, empty_columns, wider_columns
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import Footprint, _learn, make_footprint
+from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
 from eschorty_ros.core.line.sigma import CLIPPED, VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
@@ -93,6 +95,7 @@ class _Memory(NamedTuple):
     estimator: Estimator
     blink: Blink
     footprint: Footprint
+    scatter: Scatter
     smoothing: Smoothing
     rows: Rows
     scratch: Scratch
@@ -129,6 +132,7 @@ class ProfileAssembler:
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
+        self._every = settings.periods_per_profile
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state = np.zeros(1, _STATE)[0]
         self._memory = _allocate(settings, model)
@@ -136,11 +140,13 @@ class ProfileAssembler:
     def restart(self, modulation: Modulation) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``."""
         self._gate = phase_gate(modulation, self._gate_us)
-        self._memory = self._memory._replace(blink=blink(modulation))
+        self._memory = self._memory._replace(blink=blink(modulation, self._every))
         self._state["status"] = _CLOSED
         self._state["half"] = self._memory.estimator.half_max
         self._memory.columns.counts[:] = 0
         self._memory.columns.seeds[:] = -1
+        for sums in self._memory.scatter[:3]:
+            sums[:] = 0.0
 
     @property
     def counters(self) -> dict[str, int]:
@@ -238,6 +244,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         estimator=estimator,
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
+        scatter=empty_scatter(model.columns, _factor_max(settings)),
         smoothing=Smoothing(
             half_width=settings.smoothing_half_width,
             gate_px=float(settings.smoothing_gate_px),
@@ -251,6 +258,14 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         scratch=make_scratch(estimator.half_max),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
     )
+
+
+def _factor_max(settings: Settings) -> float:
+    """Return the largest factor of a variance by the scatter of rows."""
+    if settings.centroid in FULL_COLUMN_METHODS:
+        return 0.0
+    # The scatter that the compensation of reflectance steps removes does not widen sigma.
+    return 1.0 if settings.reflectance_compensation == "on" else FACTOR_MAX
 
 
 @kernel
@@ -289,7 +304,7 @@ def _write(rows, smoothing, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, blink, footprint, smoothing, rows, scratch, output = memory
+    columns, estimator, blink, footprint, scatter, smoothing, rows, scratch, output = memory
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.periods_closed += 1
@@ -299,6 +314,7 @@ def _close(memory, state, counters):
     counters.columns_unmodulated += sums.unmodulated
     counters.events_unmodulated += sums.events_unmodulated
     counters.columns_isolated += _reject_isolated(rows, smoothing)
+    _scale(rows, scatter, estimator.error_model)
     counters.columns_smoothed += _smooth(rows.row, rows.sigma2, rows.common2, smoothing)
     if estimator.learns:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]

@@ -9,6 +9,8 @@ from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.reconstruction import Settings
 
 COMMON_PX = 0.2
+# Too few columns for their scatter to set sigma.
+FEW = 16
 
 
 def smoothed(row, half_width=2):
@@ -43,20 +45,35 @@ def test_step_is_not_blurred():
 
 
 def test_dark_columns_stay_dark_and_end_the_average():
-    row = np.full(20, 300.0)
-    row[10] = np.nan
+    row = np.full(FEW, 300.0)
+    row[8] = np.nan
     out, sigma = smoothed(row)
     alone = smoothed(row, half_width=0)[1]
     np.testing.assert_array_equal(np.isnan(out), np.isnan(row))
-    assert sigma[9] == pytest.approx(alone[9], rel=1e-12)
-    assert sigma[5] < alone[5]
+    assert sigma[7] == pytest.approx(alone[7], rel=1e-12)
+    assert sigma[4] < alone[4]
 
 
 @pytest.mark.parametrize("half_width", [0, 1, 2, 5])
 def test_the_columns_own_variance_averages_out_and_the_shared_one_stays(half_width):
-    row = np.full(20, 300.0)
+    row = np.full(FEW, 300.0)
     own2 = smoothed(row, half_width=0)[1] ** 2 - COMMON_PX**2
     out, sigma = smoothed(row, half_width)
     np.testing.assert_array_equal(out, row)
-    expected = np.sqrt(COMMON_PX**2 + own2[10] / (2 * half_width + 1))
-    assert sigma[10] == pytest.approx(expected, rel=1e-12)
+    expected = np.sqrt(COMMON_PX**2 + own2[8] / (2 * half_width + 1))
+    assert sigma[8] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("scatter_px", [0.3, 0.6])
+def test_sigma_is_the_scatter_of_the_columns(scatter_px):
+    rng = np.random.default_rng(8)
+    quarters = np.rint(rng.normal(0.0, 4 * scatter_px, 1280))
+    row = 300 + 0.25 * quarters
+    _, sigma = smoothed(row, half_width=0)
+    inner = np.sqrt(sigma[100:-100] ** 2 - COMMON_PX**2)
+    assert np.sqrt(np.mean(inner**2)) == pytest.approx(row.std(), rel=0.1)
+
+
+def test_rows_that_do_not_scatter_have_the_sigma_of_whole_pixels():
+    _, sigma = smoothed(np.full(200, 300.0))
+    np.testing.assert_allclose(sigma[20:-20] ** 2, COMMON_PX**2 + 1 / 24, rtol=1e-12)
