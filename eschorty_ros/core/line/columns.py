@@ -31,7 +31,7 @@ class Columns(NamedTuple):
 class Appended(NamedTuple):
     """Index of the first event not read, and the numbers of events not appended, by reason.
 
-    ``full`` when that event needs more room in its column.
+    ``full`` when a column needs more room: then no event has been read.
     """
 
     next: np.int64
@@ -77,11 +77,10 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
     """Append the events before ``limit_us`` that pass the gate to `empty_columns`."""
     t, x, y, p = events
     packed, counts = columns.packed, columns.counts
+    before = counts.copy()
     size = np.uintp(counts.size)
     stride = np.uintp(packed.size) // size
     room = np.uint32(stride - np.uintp(BLOCK))
-    grows = np.int64(room) < columns.limit
-    full = False
     rows_end = np.uint32(rows)
     i = np.uintp(first)
     end = np.uintp(t.size)
@@ -104,12 +103,12 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
                     | r
                 )
                 counts[c] = n + np.uint32(1)
-            elif grows:
-                full = True
-                break
             else:
                 over_limit += 1
         else:
             outside += 1
         i += np.uintp(1)
-    return Appended(np.int64(i), full, over_limit, outside, gated)
+    if over_limit > 0 and np.int64(room) < columns.limit:
+        counts[:] = before
+        return Appended(np.int64(first), True, 0, 0, 0)
+    return Appended(np.int64(i), False, over_limit, outside, gated)

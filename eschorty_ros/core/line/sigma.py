@@ -148,5 +148,7 @@ def _clipping_variance(variance, line_variance, model):
     An edge of range or reflectance within the line's thickness leaves only a part of it, whose
     middle is off the line's by up to half of the missing rows.
     """
-    missing = np.sqrt(12.0) * (np.sqrt(line_variance) - np.sqrt(variance)) - _WIDTH_SCATTER_PX
-    return (model.clipped * max(missing, 0.0)) ** 2
+    least = np.sqrt(line_variance) - _WIDTH_SCATTER_PX / np.sqrt(12.0)
+    if variance >= least * abs(least):
+        return 0.0
+    return 12.0 * (model.clipped * (least - np.sqrt(variance))) ** 2

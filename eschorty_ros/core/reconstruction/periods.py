@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Events
 from eschorty_ros.core.modulation import Modulation
@@ -80,32 +79,21 @@ class PeriodCutter:
             edges_us, indices = lock.schedule.advance(lock.limit(watermark_us))
             safe_us = lock.schedule.safe_us
             ready = int(np.searchsorted(held.arrays[0], safe_us))
-            edge = 0
-            if ready:
-                part = slice(0, ready)
-                edge = self._merge(held.arrays, part, edges_us, indices, edge, drain=False)
-                held.drop(ready)
             end = first
-            if len(held) == 0:
+            if ready == len(held):
                 end = max(int(np.searchsorted(new[0], safe_us)), first)
-            if end > first or edge < len(edges_us):
-                part = slice(first, end)
-                self._merge(new, part, edges_us, indices, edge, drain=True)
+            if ready or end > first or len(edges_us):
+                before, after = _part(held.arrays, 0, ready), _part(new, first, end)
+                for t, _, _, p in (before, after):
+                    lock.observe(t, p)
+                self._assembler.merge(before, after, Edges(edges_us, indices))
+                held.drop(ready)
                 first = end
             more = len(edges_us) == EDGES_MAX or lock.close_block(watermark_us)
         t, x, y, p = new
         held.append((t[first:], x[first:], y[first:], p[first:]))
 
-    def _merge(
-        self,
-        events: EventArrays,
-        part: slice,
-        edges_us: NDArray[np.int64],
-        indices: NDArray[np.int64],
-        edge: int,
-        drain: bool,
-    ) -> int:
-        t, x, y, p = events
-        ready = t[part], x[part], y[part], p[part]
-        self.lock.observe(t[part], p[part])
-        return self._assembler.merge(ready, Edges(edges_us, indices), edge, drain)
+
+def _part(events: EventArrays, begin: int, end: int) -> EventArrays:
+    t, x, y, p = events
+    return t[begin:end], x[begin:end], y[begin:end], p[begin:end]

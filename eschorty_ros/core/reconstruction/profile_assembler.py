@@ -30,6 +30,7 @@ from eschorty_ros.core.line.sigma import CLIPPED, VARIANCE_PER_WIDTH2, error_mod
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
 from eschorty_ros.core.modulation.phase_gate import phase_gate
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
@@ -153,43 +154,29 @@ class ProfileAssembler:
         """Counts by name."""
         return dict(zip(_COUNTERS.names or (), self._counters.item(), strict=True))
 
-    def merge(
-        self,
-        events: tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8]],
-        edges: Edges,
-        first_edge: int,
-        drain: bool,
-    ) -> int:
+    def merge(self, held: Arrays, new: Arrays, edges: Edges) -> None:
         """Assign events to periods and close the periods whose end is reached.
 
         Parameters
         ----------
-        events : tuple of ndarray
-            Times in us, columns, rows and polarities in time order.
+        held, new : tuple of ndarray
+            Times in us, columns, rows and polarities in time order, first those of ``held``.
         edges : Edges
-            Those before ``first_edge`` are done.
-        drain : bool
-            No more events come before the last edge: all edges are processed.
-
-        Returns
-        -------
-        int
-            First edge not processed yet.
+            No more events come before the last one.
         """
-        arrays = EventArrays(*events)
-        progress = _Progress(0, first_edge)
+        parts = EventArrays(*held), EventArrays(*new)
+        size = held[0].size + new[0].size
+        progress = _Progress(0, 0)
         while True:
             progress = _merge(
-                arrays, edges, progress, drain, self._gate, self._memory, self._state,
-                self._counters,
-            )  # fmt: skip
+                *parts, edges, progress, self._gate, self._memory, self._state, self._counters
+            )
             if self._state["full"]:
                 columns = wider_columns(self._memory.columns)
                 self._memory = self._memory._replace(columns=columns)
                 self._state["full"] = 0
-            left = progress.event < arrays.t.size or (drain and progress.edge < edges.t_us.size)
-            if not left:
-                return int(progress.edge)
+            if progress.event == size and progress.edge == edges.t_us.size:
+                return
             self._collect()
 
     def close(self) -> None:
@@ -197,7 +184,7 @@ class ProfileAssembler:
         if self._state["status"] == _FILLED:
             none = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
             again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
-            self.merge(none, again, first_edge=0, drain=True)
+            self.merge(none, none, again)
 
     def take(self) -> LineRows:
         """Return the rows of the periods closed since the last call."""
@@ -343,15 +330,27 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
 
 
 @kernel
-def _merge(events, edges, progress, drain, gate, memory, state, counters):
-    """Merge events with edges from ``progress`` on.
+def _merge(held, new, edges, progress, gate, memory, state, counters):
+    """Merge events, first those of ``held``, with edges from ``progress`` on.
 
-    A period is closed when an event reaches its end or, with ``drain``, after the last event.
-    Events and edges remain when the output has no room for another profile.
+    A period is closed when an event reaches its end or after the last event. Events and edges
+    remain when the output has no room for another profile.
     """
+    size = held.t.size
+    i, edge = progress
+    if i < size:
+        i, edge = _merge_part(held, edges, i, edge, False, gate, memory, state, counters)
+        if i < size:
+            return _Progress(i, edge)
+    i, edge = _merge_part(new, edges, i - size, edge, True, gate, memory, state, counters)
+    return _Progress(size + i, edge)
+
+
+@kernel
+def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
+    """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
     columns, rows = memory.columns, memory.estimator.rows
     rows_max = memory.output.row.size - memory.rows.row.size
-    i, edge = progress
     t = events.t
     far = np.int64(1 << 62)
     while True:
@@ -359,12 +358,12 @@ def _merge(events, edges, progress, drain, gate, memory, state, counters):
         if i < t.size and t[i] < limit_us:
             i = _fill(events, i, limit_us, columns, rows, gate, state, counters)
             if state.full:
-                return _Progress(i, edge)
+                return i, edge
         if edge == edges.t_us.size or (i == t.size and not drain):
-            return _Progress(i, edge)
+            return i, edge
         if state.status == _FILLED:
             if state.rows > rows_max:
-                return _Progress(i, edge)
+                return i, edge
             _close(memory, state, counters)
         elif state.status == _EMPTY:
             counters.periods_empty += 1

@@ -125,11 +125,12 @@ class Profiles(LineRows):
     @classmethod
     def from_rows(cls, rows: LineRows, model: RangeModel) -> Profiles:
         """Return ``rows`` with their ranges; those at the pole and behind it are left out."""
-        range_mm = model.range_mm(rows.row, rows.column)
+        bent = model.b_prime_1_px != 0.0 or model.b_prime_2_px != 0.0
+        range_mm = model.range_mm(rows.row, rows.column if bent else None)
         known = np.isfinite(range_mm)
         if not known.all():
             rows, range_mm = rows.select(known), range_mm[known]
-        sigma_mm = model.range_sigma_mm(rows.row, rows.sigma_row, rows.column)
+        sigma_mm = model.range_sigma_mm(rows.row, rows.sigma_row, rows.column if bent else None)
         return cls(**rows._values(), range_mm=range_mm, sigma_mm=sigma_mm)
 
     @property
