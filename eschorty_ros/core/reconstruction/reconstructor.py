@@ -266,7 +266,8 @@ class Reconstructor:
                 f"phase_gate_us removes {share:.0%} of the events; set it to 0, or check the "
                 f"frequency ({self.modulation.frequency_hz:g} Hz) and the polarity of the events"
             )
-        elif counts["columns_unmodulated"] > counts["points"]:
+            return found
+        if counts["columns_unmodulated"] > counts["points"]:
             found.append(
                 f"the events of {counts['columns_unmodulated']} columns do not follow the laser at "
                 f"{self.modulation.frequency_hz:g} Hz and gave no points; check the frequency and "

@@ -21,10 +21,7 @@ _LOSSES = {
     "points_beyond_pole": "points are beyond the last range of the calibration; check it",
 }
 """Losses after which no point is left, with what to do; ``{0}`` are the settings."""
-_REMOVED = {
-    "events_filtered": "events are removed by noise_filter = {0.noise_filter}; set it to none",
-    "events_gated": "events are outside phase_gate_us = {0.phase_gate_us}; set it to 0",
-}
+_FILTERED = "events are removed by noise_filter = {0.noise_filter}; set it to none"
 
 
 def recording_warnings(
@@ -103,10 +100,12 @@ def _few_points(
     settings: Settings, counters: Mapping[str, int], points: Points, blinking: bool
 ) -> list[str]:
     """Return the largest loss where it left few points or none."""
-    removed = max(_REMOVED, key=lambda name: counters[name])
+    if 2 * counters["events_gated"] > counters["events"]:
+        # The reconstructor has a line for it.
+        return []
     lost = max(_LOSSES, key=lambda name: counters[name])
-    if 2 * counters[removed] > counters["events"]:
-        words, count = _REMOVED[removed], counters[removed]
+    if 2 * counters["events_filtered"] > counters["events"]:
+        words, count = _FILTERED, counters["events_filtered"]
     else:
         words, count = _LOSSES[lost], counters[lost]
         unused = counters["events_binned"] - float(points["intensity"].sum())

@@ -62,7 +62,7 @@ def test_a_dark_recording_says_so(tmp_path):
         (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
         (lambda r: r, {"events_min": 50}, "fewer events than events_min = 50; lower it", 1),
-        (lambda r: r, {"phase_gate_us": 1}, "outside phase_gate_us = 1; set it to 0", 0),
+        (lambda r: r, {"phase_gate_us": 1}, "phase_gate_us removes 100% of the events; set", 0),
     ],
 )  # fmt: skip
 def test_a_contradiction_has_its_line(recording, change, settings, words, points):
