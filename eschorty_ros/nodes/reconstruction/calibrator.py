@@ -98,12 +98,16 @@ class Calibrator:
         self._idle.wait(2.0)
 
     def _execute(self, goal: Any) -> Any:
+        try:
+            # First: a goal that is refused must not hold up another one.
+            request = request_from_goal(goal.request)
+            check_request(request)
+        except EschortyError as error:
+            return self._refuse(goal, str(error))
         if not self._one.acquire(blocking=False):
             return self._refuse(goal, "a calibration is running; wait for its end or cancel it")
         self._idle.clear()
         try:
-            request = request_from_goal(goal.request)
-            check_request(request)
             with unless_shut_down(self._node):
                 return self._calibrate(goal, request)
             return Calibrate.Result(message="the node was shut down")

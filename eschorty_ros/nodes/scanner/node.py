@@ -128,16 +128,6 @@ class ScannerNode(Node):
         self._idle.wait(2.0)
 
     def _execute(self, goal: Any) -> Any:
-        if not self._one_scan.acquire(blocking=False):
-            return self._refuse(goal, "a scan is running; wait for its end or cancel it")
-        self._idle.clear()
-        try:
-            return self._scan(goal)
-        finally:
-            self._idle.set()
-            self._one_scan.release()
-
-    def _scan(self, goal: Any) -> Any:
         values = goal.request
         request = ScanRequest(
             scan_id=time.strftime("scan-%Y%m%d-%H%M%S-", time.gmtime()) + f"{self._scans + 1}",
@@ -148,9 +138,20 @@ class ScannerNode(Node):
             duty=float(values.duty),
         )
         try:
+            # First: a goal that is refused must not hold up another one.
             check_request(request, self._limits)
         except EschortyError as error:
             return self._refuse(goal, str(error))
+        if not self._one_scan.acquire(blocking=False):
+            return self._refuse(goal, "a scan is running; wait for its end or cancel it")
+        self._idle.clear()
+        try:
+            return self._scan(goal, request)
+        finally:
+            self._idle.set()
+            self._one_scan.release()
+
+    def _scan(self, goal: Any, request: ScanRequest) -> Any:
         self._scans += 1
         self._followed_s = time.monotonic()
         self._client.prepare(partial(self._canceled, goal), self._feedback(goal, request))
