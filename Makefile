@@ -82,7 +82,8 @@ test: $(SETUP) $(BUILD)/test.stamp
 endif
 
 quick: $(SETUP) $(BUILD)/test.stamp
-	@$(ENTER) pytest --numprocesses $(JOBS) test/core test/live test/control
+	@$(ENTER) pytest --numprocesses $(JOBS) --dist worksteal test/core test/live test/control \
+	  --ignore=test/core/base/test_kernel.py
 
 FLOOR_PYTHON ?= $(firstword $(wildcard /usr/bin/python3.11 /usr/bin/python3.12) $(PYTHON))
 FLOOR := $(BUILD)/floor
