@@ -27,12 +27,15 @@ class LossyRelay(Node):
     Attributes
     ----------
     lost : dict of str to float
-        Share of each type's messages that are lost, by name of the type.
+        Share of each type's messages that are lost, by name of the type: of each run of
+        ``1 / share`` messages a random one.
     """
 
     def __init__(self, context: rclpy.Context, heartbeats: tuple[str, ...]) -> None:
         super().__init__(DRIVER, namespace=NAMESPACE, context=context)
         self.lost = {"EventPacket": 0.0, "Header": 0.0}
+        self._passed = dict.fromkeys(self.lost, 0)
+        self._next_lost = dict.fromkeys(self.lost, 0)
         self._random = random.Random(SEED)
         self._carry(EventPacket, "near/events", EVENTS, qos.stream(1000), qos.events())
         for name in heartbeats:
@@ -44,8 +47,18 @@ class LossyRelay(Node):
         self.create_subscription(kind, source, partial(self._pass, publisher), received)
 
     def _pass(self, publisher: Any, message: Any) -> None:
-        if self._random.random() >= self.lost[type(message).__name__]:
+        if not self._is_lost(type(message).__name__):
             publisher.publish(message)
+
+    def _is_lost(self, kind: str) -> bool:
+        if not self.lost[kind]:
+            return False
+        run = round(1.0 / self.lost[kind])
+        place = self._passed[kind] % run
+        if place == 0:
+            self._next_lost[kind] = self._random.randrange(run)
+        self._passed[kind] += 1
+        return place == self._next_lost[kind]
 
 
 @contextmanager
