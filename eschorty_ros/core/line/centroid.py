@@ -118,7 +118,6 @@ class Estimator(NamedTuple):
     """
 
     method: int
-    learns: bool
     returns: int
     seeded: bool
     events_min: int
@@ -290,7 +289,6 @@ def estimate(
         raise ArgumentError("centroid 'learned' follows a stream; choose another for columns alone")
     estimator = Estimator(
         method=method_code,
-        learns=False,
         returns=returns_code,
         seeded=False,
         events_min=events_min,

@@ -56,7 +56,6 @@ class Footprint(NamedTuple):
     first_row: NDArray[np.int64]
     state: NDArray[np.int64]
     reach: int
-    stride: int
 
 
 def make_footprint(half_max: int, columns: int) -> Footprint:
@@ -72,7 +71,6 @@ def make_footprint(half_max: int, columns: int) -> Footprint:
         first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
         state=np.zeros(3, np.int64),
         reach=reach,
-        stride=_STRIDE,
     )
 
 
@@ -93,10 +91,9 @@ def _count_rows(packed, column, low, high, counts):
 @kernel
 def _remember(footprint, c, centre, counts, rows):
     """Keep the events by row of column ``c`` to learn from, when its turn has come."""
-    stride = footprint.stride
-    if (c - footprint.state[0]) % stride != 0:
+    if (c - footprint.state[0]) % _STRIDE != 0:
         return
-    slot = c // stride
+    slot = c // _STRIDE
     first = max(centre - footprint.reach, np.int64(0))
     last = min(centre + footprint.reach, rows - 1)
     footprint.first_row[slot] = first
@@ -180,12 +177,12 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
     Columns in which the sensor's edge cuts the line count where they are the majority.
     """
     whole = 2 * np.count_nonzero(truncated) < np.count_nonzero(np.isfinite(row))
-    pixels, stride = footprint.pixels, footprint.stride
+    pixels = footprint.pixels
     middle = pixels.shape[1] // 2
     for slot in range(footprint.first_row.size):
         first = footprint.first_row[slot]
         footprint.first_row[slot] = -1
-        c = slot * stride + footprint.state[0] % stride
+        c = slot * _STRIDE + footprint.state[0] % _STRIDE
         if first < 0 or c >= row.size or doubtful[c] or (whole and truncated[c]):
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:

@@ -12,6 +12,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import EventArrays
 from eschorty_ros.core.line.blinking import Blink, blink
 from eschorty_ros.core.line.centroid import (
+    _LEARNED,
     FULL_COLUMN_METHODS,
     Estimator,
     Rows,
@@ -207,7 +208,6 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     method_code, returns_code = check_method(settings.centroid, settings.returns)
     estimator = Estimator(
         method=method_code,
-        learns=settings.centroid == "learned",
         returns=returns_code,
         seeded=True,
         events_min=settings.events_min,
@@ -303,7 +303,7 @@ def _close(memory, state, counters):
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     _scale(rows, scatter, estimator.error_model)
     counters.columns_smoothed += _smooth(rows.row, rows.sigma2, rows.common2, smoothing)
-    if estimator.learns:
+    if estimator.method == _LEARNED:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
     _write(rows, smoothing, state, output)

@@ -116,7 +116,8 @@ def _few_points(
         return []
     if not (blinking and count):
         return [
-            f"no points: nothing blinks with the laser in {counters['events']:,} events; look at "
-            "the laser's frequency, at the focus and at what the line falls on"
+            f"{len(points):,} points: nothing blinks with the laser in "
+            f"{counters['events']:,} events; look at the laser's frequency, at the focus and at "
+            "what the line falls on"
         ]
     return [f"{len(points):,} points: {count:,} {words.format(settings)}"]
