@@ -16,7 +16,7 @@ from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ
 _COMPLETE = 0.98
 _FAILED_DRAIN_S = 5.0
 # Longest time for the end of a scan per second of its sweep, on a computer that falls behind.
-_DRAIN_PER_S = 20.0
+_DRAIN_PER_S = 200.0
 SPEED_MIN_MM_S = 1e-3
 """Least speed of a scan or move: a slower one takes days."""
 

@@ -80,7 +80,7 @@ class NodeProcess:
             stdout=self._log,
             stderr=subprocess.STDOUT,
             env=domain_environment(domain),
-            start_new_session=True,
+            process_group=0,
         )
 
     def __enter__(self) -> NodeProcess:

@@ -36,14 +36,15 @@ def bench_process(folder: Path, options: Mapping[str, object]) -> Iterator[subpr
     DeviceError
         When the bench does not start; with the message of the bench.
     """
-    # In a session of its own, so that Ctrl-C reaches the nodes only: they need their devices.
+    # A process group of its own: Ctrl-C reaches the nodes only, which need their devices. No session
+    # of its own: Linux may share the cores by sessions, which starved a bench for seconds.
     process = subprocess.Popen(
         bench_command(folder, options),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        start_new_session=True,
+        process_group=0,
     )
     try:
         _wait_until_ready(process, folder)
