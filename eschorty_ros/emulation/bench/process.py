@@ -36,8 +36,8 @@ def bench_process(folder: Path, options: Mapping[str, object]) -> Iterator[subpr
     DeviceError
         When the bench does not start; with the message of the bench.
     """
-    # A process group of its own: Ctrl-C reaches the nodes only, which need their devices. No session
-    # of its own: Linux may share the cores by sessions, which starved a bench for seconds.
+    # A group of its own: Ctrl-C reaches the nodes only, which need their devices. No session of
+    # its own: Linux may share the cores by sessions, which starved a bench for seconds.
     process = subprocess.Popen(
         bench_command(folder, options),
         stdin=subprocess.DEVNULL,

@@ -19,6 +19,7 @@ from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyEr
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ, FREQUENCY_MIN_HZ, WAVEFORMS, Modulation
 from eschorty_ros.emulation.bench.folder import usb_spec
 from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.hardware.base.usb import open_backend
 from eschorty_ros.hardware.laser.awg_settings import AwgSettings
 from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 from eschorty_ros.msg import LaserState
@@ -302,8 +303,9 @@ class LaserNode(DeviceNode):
 
 def _make_laser(parameters: Mapping[str, Any], _: drivers.ClockNs) -> GuardedLaser:
     settings = {param.name: parameters[param.name] for param in DRIVER_TABLE}
-    # Refused here, before a process is started for it.
-    AwgSettings(**settings)
+    # Refused here, before a process is started for it. What the backend imports is loaded then:
+    # after the end of the guard there is no time for it.
+    open_backend(AwgSettings(**settings).backend)
     return GuardedLaser(
         "eschorty_ros.hardware.laser.awg:open_laser", settings, guard=parameters["guard"]
     )
