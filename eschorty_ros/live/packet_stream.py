@@ -232,7 +232,7 @@ class PacketStream:
             self._source = self._held[0].source
             if not self._ready(self._held[0], now_s):
                 break
-            self._push(self._held.popleft())
+            self._push(self._consecutive())
             self._held_since_s = now_s
         if not self._held:
             self._held_since_s = None
@@ -243,6 +243,18 @@ class PacketStream:
         if self._reconstructor is not None:
             self._collect(self._reconstructor.flush())
         return self._completed()
+
+    def _consecutive(self) -> list[Packet]:
+        """Remove and return the first packet held and those that continue it without a loss."""
+        packets = [self._held.popleft()]
+        while self._held:
+            last, packet = packets[-1], self._held[0]
+            if (packet.source, packet.seq) != (last.source, last.seq + 1):
+                break
+            if packet.stamp_ns - last.stamp_ns > _GAP_NS:
+                break
+            packets.append(self._held.popleft())
+        return packets
 
     def _goes_on(self, packet: Packet) -> bool:
         assert self._next_seq is not None
@@ -273,7 +285,9 @@ class PacketStream:
     def _expected_pulses(self) -> PulseTrain | None:
         return self._pulses if self._settings.trigger_source == "stage" else None
 
-    def _push(self, packet: Packet) -> None:
+    def _push(self, packets: list[Packet]) -> None:
+        """Reconstruct consecutive packets, one piece of the stream."""
+        packet, last = packets[0], packets[-1]
         missing = 0 if self._next_seq is None else packet.seq - self._next_seq
         self.packets_lost += missing
         time_us = self._reconstructor.time_us if self._reconstructor is not None else None
@@ -291,16 +305,19 @@ class PacketStream:
         elif missing:
             self._reconstructor.note_gap()
         reconstructor, before_us = self._reconstructor, self._reconstructor.settled_us
-        profiles = reconstructor.push(packet.data)
+        # One call for all packets that wait: each call costs as much as the events of one packet.
+        profiles = reconstructor.push(
+            b"".join(part.data for part in packets) if len(packets) > 1 else packet.data
+        )
         self._observe(packet, before_us, reconstructor)
         self._collect(profiles)
-        self._next_seq = packet.seq + 1
-        self._last_stamp_ns = packet.stamp_ns
+        self._next_seq = last.seq + 1
+        self._last_stamp_ns = last.stamp_ns
         self._epoch_used = True
-        self.packets += 1
+        self.packets += len(packets)
 
     def _observe(self, packet: Packet, before_us: int | None, after: Reconstructor) -> None:
-        """Add the packet's stamp and edges to the clock."""
+        """Add the stamp of the first packet pushed, and the edges of all, to the clock."""
         assert self._epoch is not None
         shift_us = self._wraps * WRAP_US
         t_us = first_time_us(packet.data, before_us, after.time_us)

@@ -128,7 +128,7 @@ class Pipeline:
         return self._buffer.scan_id if self._buffer is not None else ""
 
     def add_packet(self, packet: Packet, now_s: float) -> None:
-        """Queue a packet and reconstruct the packets that need not wait.
+        """Queue a packet for the next :meth:`process`.
 
         Raises
         ------
@@ -137,9 +137,12 @@ class Pipeline:
         """
         check_span(packet.data)
         self.stream.add(packet, now_s)
-        self._receive(self.stream.process(now_s), now_s)
         if self.capture is not None:
             self.capture.packet(packet)
+
+    def process(self, now_s: float) -> None:
+        """Reconstruct the packets that need not wait."""
+        self._receive(self.stream.process(now_s), now_s)
 
     def add_stage(self, t_ns: int, position_mm: float) -> None:
         """Add one stage sample at ROS time ``t_ns``."""
@@ -149,7 +152,7 @@ class Pipeline:
 
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
         """Return the profiles completed and the points placed since the last call."""
-        self._receive(self.stream.process(now_s), now_s)
+        self.process(now_s)
         self.stream.fit_edges(self.placer.track)
         ready = self.placer.ready(now_s)
         if self.capture is not None:

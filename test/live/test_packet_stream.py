@@ -57,12 +57,16 @@ def plain(data, on_edge_us=EDGE_US):
     return Profiles.concatenate([reconstructor.push(data), reconstructor.flush()])
 
 
-def run(subject, items, now_s=0.0):
+AT_ONCE = pytest.mark.parametrize("at_once", [False, True])
+
+
+def run(subject, items, now_s=0.0, at_once=False):
+    """Profiles of packets that are processed one by one, or all after they have waited."""
     out = []
     for packet in items:
         subject.add(packet, now_s)
-        out += subject.process(now_s)
-    return out + subject.flush()
+        out += [] if at_once else subject.process(now_s)
+    return out + subject.process(now_s) + subject.flush()
 
 
 def announced():
@@ -125,12 +129,13 @@ def test_without_an_announcement_the_stamps_serve_and_the_phase_comes_from_the_e
     assert np.abs(off_us).max() < 0.1 * period_us
 
 
-def test_gap_in_seq_is_counted_and_later_periods_are_the_plain_ones():
+@AT_ONCE
+def test_gap_in_seq_is_counted_and_later_periods_are_the_plain_ones(at_once):
     data = line()
     expected = plain(data)
     items = packets(data, size=20_000)
     subject = announced()
-    seen = joined(run(subject, [*items[:2], *items[3:]]))
+    seen = joined(run(subject, [*items[:2], *items[3:]], at_once=at_once))
     assert subject.packets_lost == 1
     late = seen.edge_us >= EDGE_US + 3 * MODULATION.period_us
     late_expected = expected.edge_us >= EDGE_US + 3 * MODULATION.period_us
@@ -227,14 +232,15 @@ def test_time_goes_on_over_a_gap_of_any_length(gap_us):
         assert part.t_ns.min() > ZERO_NS + shift_us * 1000 - 5_000_000
 
 
+@AT_ONCE
 @pytest.mark.parametrize("gap_us", [12_000_000, 40_000_000])
-def test_a_gap_without_numbers_is_told_from_a_host_that_stood_still(gap_us):
+def test_a_gap_without_numbers_is_told_from_a_host_that_stood_still(gap_us, at_once):
     """A driver numbers only what it sends, and sends nothing while it sees no subscriber."""
     first = sent(line())
     later = sent(line(offset_us=gap_us % WRAP_US), gap_us - gap_us % WRAP_US, seq=len(first))
     subject = unannounced()
     run(subject, first)
-    parts = run(subject, later)
+    parts = run(subject, later, at_once=at_once)
     for part in (parts[0], parts[-1]):
         part = part.retimed()
         true_ns = ZERO_NS + (part.sensor.t_us % WRAP_US + gap_us - gap_us % WRAP_US) * 1000
@@ -245,21 +251,22 @@ def test_a_gap_without_numbers_is_told_from_a_host_that_stood_still(gap_us):
     half = len(first) // 2
     run(stalled, first[:half])
     last_ns = first[-1].stamp_ns + 1000 * gap_us
-    parts = run(stalled, [Packet(p.seq, last_ns, p.data) for p in first[half:]])
+    parts = run(stalled, [Packet(p.seq, last_ns, p.data) for p in first[half:]], at_once=at_once)
     part = parts[-1].retimed()
     assert np.abs(part.t_ns - ZERO_NS - part.sensor.t_us * 1000).max() < 5_000_000
 
 
-def test_packets_twice_or_in_the_wrong_order_are_no_restart_of_the_camera():
+@AT_ONCE
+def test_packets_twice_or_in_the_wrong_order_are_no_restart_of_the_camera(at_once):
     items = packets(line(), size=20_000)
     expected = joined(run(announced(), items))
     subject = announced()
-    seen = joined(run(subject, [*items[:4], items[3], *items[4:]]))
+    seen = joined(run(subject, [*items[:4], items[3], *items[4:]], at_once=at_once))
     assert (subject.restarts, subject.packets_lost, subject.packets_late) == (0, 0, 1)
     np.testing.assert_array_equal(seen.row, expected.row)
 
     subject = announced()
-    run(subject, [*items[:4], items[5], items[4], *items[6:]])
+    run(subject, [*items[:4], items[5], items[4], *items[6:]], at_once=at_once)
     assert (subject.restarts, subject.packets_lost, subject.packets_late) == (0, 1, 1)
     assert subject.epoch.clock.exact
 

@@ -179,18 +179,23 @@ class ReconstructionNode(Node):
     def _on_stage(self, message: Odometry, info: Mapping[str, Any]) -> None:
         self._stage.check(info)
         t_ns, position_mm = ns_from_stamp(message.header.stamp), stage_position_mm(message)
-        self._post(partial(self._pipeline.add_stage, t_ns, position_mm))
+        self._jobs.post(partial(self._pipeline.add_stage, t_ns, position_mm))
         if self.parameters["publish_tf"]:
             x, y, z = self.calibration.stage_direction
             carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
             self._tf.publish(TFMessage(transforms=[carriage]))
 
     def _post(self, job: Callable[[], None]) -> None:
-        self._jobs.post(job)
+        """Queue a job that takes effect between the packets before and after it."""
+        self._jobs.post(partial(self._after_packets, job))
+
+    def _after_packets(self, job: Callable[[], None]) -> None:
+        self._pipeline.process(time.monotonic())
+        job()
 
     def _in_worker(self, job: Callable[[], None], timeout_s: float = 30.0) -> tuple[bool, str]:
         """Run ``job`` after the queued ones; return whether it succeeded, and the reason if not."""
-        return self._jobs.run(job, timeout_s, self._running)
+        return self._jobs.run(partial(self._after_packets, job), timeout_s, self._running)
 
     def _running(self) -> bool:
         """Return whether the worker runs; after a signal it does not."""
@@ -249,11 +254,11 @@ class ReconstructionNode(Node):
         names = Settings.__dataclass_fields__
         settings = Settings(**{name: values[name] for name in names if name in values})
         override = modulation_override(values)
-        self._jobs.post(partial(self._pipeline.stream.set_settings, settings))
+        self._post(partial(self._pipeline.stream.set_settings, settings))
         self._jobs.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
         self._override = override
         if override is not None:
-            self._jobs.post(partial(self._pipeline.stream.set_laser, override, None))
+            self._post(partial(self._pipeline.stream.set_laser, override, None))
 
 
 def main() -> int:
