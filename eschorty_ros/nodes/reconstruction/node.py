@@ -12,7 +12,6 @@ from typing import Any
 
 from event_camera_msgs.msg import EventPacket
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -41,6 +40,7 @@ from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import diagnostics, qos, transforms
 from eschorty_ros.nodes.ros.border import refusals
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stage_position_mm
+from eschorty_ros.nodes.ros.executor import QueueingGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
@@ -49,7 +49,9 @@ from eschorty_ros.nodes.ros.spin import run
 _STAGE_DEPTH = 2000
 _IDLE_S = 0.02
 # Fewer than the packets that a stream holds.
-_JOBS_PER_STEP = 32
+_JOBS_PER_STEP = 256
+# A step costs as much as the events of some packets of 1 ms; they wait for each other this long.
+_STEP_S = 0.004
 
 
 class ReconstructionNode(Node):
@@ -109,9 +111,9 @@ class ReconstructionNode(Node):
 
     def _make_interfaces(self) -> None:
         override = {"qos_overriding_options": qos.overridable()}
-        bulk = MutuallyExclusiveCallbackGroup()
+        arrivals = QueueingGroup()
         self.create_subscription(EventPacket, "camera/events", self._on_packet,
-                                 qos.events(), callback_group=bulk, **override)  # fmt: skip
+                                 qos.events(), callback_group=arrivals, **override)  # fmt: skip
         stream = self._pipeline.stream
         self._announcement = LatchedState(
             self, TimeReference, "camera/clock", self._on_clock,
@@ -125,7 +127,12 @@ class ReconstructionNode(Node):
             LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
         )
         self.create_subscription(
-            Odometry, "stage/odom", self._on_stage, qos.stream(_STAGE_DEPTH), **override
+            Odometry,
+            "stage/odom",
+            self._on_stage,
+            qos.stream(_STAGE_DEPTH),
+            callback_group=arrivals,
+            **override,
         )
         Heartbeat(self, "reconstruction/heartbeat", self._running)
         self._scans = ScanServices(
@@ -214,7 +221,9 @@ class ReconstructionNode(Node):
     # The worker.
 
     def _work(self) -> None:
-        while not self._closing.is_set():
+        stepped_s = 0.0
+        while not self._closing.wait(max(stepped_s + _STEP_S - time.monotonic(), 0.0)):
+            stepped_s = time.monotonic()
             try:
                 job, begun = self._jobs.next(_IDLE_S), 0
                 while job is not None:
