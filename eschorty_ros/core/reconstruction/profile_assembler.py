@@ -37,6 +37,12 @@ from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
 
+WINDOW_EVENTS = 1 << 21
+"""Events after which, with the next profile, the estimate of the line starts again.
+
+A window of the stream so depends on no event before it, and windows can be reconstructed at the
+same time. A footprint that is learned goes on.
+"""
 _OUTPUT_PROFILES = 64
 _HALF_MIN = 3 * FRACTION
 _WIDTH_MIN_DOF = 64
@@ -62,9 +68,10 @@ _COUNTERS = np.dtype(
     ]
 )
 # ``status`` is one of the three below, ``half`` the half width of a window for the open period in
-# fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs more room.
+# fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs more room,
+# ``window`` the number of events since the estimate started.
 _STATE = np.dtype(
-    [(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows", "full")]
+    [(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows", "full", "window")]
 )
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
@@ -144,11 +151,8 @@ class ProfileAssembler:
         self._gate = phase_gate(modulation, self._gate_us)
         self._memory = self._memory._replace(blink=blink(modulation, self._every))
         self._state["status"] = _CLOSED
-        self._state["half"] = self._memory.estimator.half_max
         self._memory.columns.counts[:] = 0
-        self._memory.columns.seeds[:] = -1
-        for sums in self._memory.scatter[:3]:
-            sums[:] = 0.0
+        _begin_window(self._memory, self._state)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -256,6 +260,17 @@ def _factor_max(settings: Settings) -> float:
 
 
 @kernel
+def _begin_window(memory, state):
+    """Drop the last rows, the line's width and the scatter."""
+    state.window = 0
+    state.half = memory.estimator.half_max
+    memory.columns.seeds[:] = -1
+    memory.scatter.squares[:] = 0.0
+    memory.scatter.expected[:] = 0.0
+    memory.scatter.number[:] = 0.0
+
+
+@kernel
 def _adapted_half(half, sums, half_max):
     """Return the half width for the next period: 1.3 x the width of this one's rows, averaged."""
     if sums.freedom < _WIDTH_MIN_DOF:
@@ -307,6 +322,8 @@ def _close(memory, state, counters):
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
     _write(rows, smoothing, state, output)
+    if state.window >= WINDOW_EVENTS and estimator.method != _LEARNED:
+        _begin_window(memory, state)
 
 
 @kernel
@@ -320,6 +337,7 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
         return i
     state.status = _FILLED
     appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
+    state.window += appended.next - first
     refused = appended.over_limit + appended.outside + appended.gated
     counters.events_binned += appended.next - first - refused
     state.full = appended.full
