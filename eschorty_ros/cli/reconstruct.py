@@ -59,8 +59,11 @@ def setting_options() -> list[click.Parameter]:
     type=click.Path(dir_okay=False, path_type=Path),
     help="Cloud to write, .pcd or .ply.  [default: RECORDING/cloud.pcd]",
 )
+@click.option("--jobs", type=click.IntRange(1, 256), help="Threads.  [default: one per core]")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -> None:
+def command(
+    recording: Path, out: Path | None, jobs: int | None, as_json: bool, **settings: Any
+) -> None:
     """Turn the folder RECORDING into a point cloud.
 
     The cloud is in eschorty_base, in metres: x y z, intensity (events used), sigma (one sigma of
@@ -97,7 +100,7 @@ def command(recording: Path, out: Path | None, as_json: bool, **settings: Any) -
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)
         result = reconstruct_recording(
-            loaded, chosen, lambda done, total: report(done / max(total, 1), "")
+            loaded, chosen, lambda done, total: report(done / max(total, 1), ""), jobs
         )
         report(1.0, "scoring and writing")
         measured = measure_recorded(result.points, result.profiles, loaded)

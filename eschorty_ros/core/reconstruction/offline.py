@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -58,6 +59,7 @@ def reconstruct_recording(
     recording: Recording,
     settings: Settings | None = None,
     progress: Callable[[int, int], Any] | None = None,
+    jobs: int | None = None,
 ) -> Result:
     """Return the points of a recording, placed along the stage's travel.
 
@@ -68,6 +70,8 @@ def reconstruct_recording(
         ``stage_speed_mm_s`` is taken from the recording instead.
     progress : callable, optional
         Called with bytes read so far and bytes in all.
+    jobs : int, optional
+        Threads; one per core at hand when left out. The points do not depend on it.
 
     Returns
     -------
@@ -80,7 +84,8 @@ def reconstruct_recording(
     """
     began = time.perf_counter()
     settings = replace(settings or Settings(), stage_speed_mm_s=stage_speed_mm_s(recording))
-    reconstructor = Reconstructor(recording.calibration, recording.modulation, settings)
+    jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
     reader = RawReader(recording.events_path)
     parts: list[Profiles] = []

@@ -10,6 +10,7 @@ from eschorty_ros.core.modulation.edges import EDGES_MAX
 from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler
+from eschorty_ros.core.reconstruction.windows import WindowAssembler
 
 
 class PeriodCutter:
@@ -20,7 +21,7 @@ class PeriodCutter:
     modulation : Modulation
     every : int
         Periods per profile.
-    assembler : ProfileAssembler
+    assembler : ProfileAssembler or WindowAssembler
         Takes the events and the periods' beginnings.
 
     Attributes
@@ -28,11 +29,13 @@ class PeriodCutter:
     lock : PhaseLock
     """
 
-    def __init__(self, modulation: Modulation, every: int, assembler: ProfileAssembler) -> None:
+    def __init__(
+        self, modulation: Modulation, every: int, assembler: ProfileAssembler | WindowAssembler
+    ) -> None:
         self.lock = PhaseLock(modulation, every)
         self._held = HeldEvents()
         self._assembler = assembler
-        assembler.restart(modulation)
+        assembler.restart(modulation, every)
 
     @property
     def counters(self) -> dict[str, int]:

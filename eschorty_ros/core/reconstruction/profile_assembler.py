@@ -109,6 +109,7 @@ class _Memory(NamedTuple):
     rows: Rows
     scratch: Scratch
     output: _Output
+    window_events: int
 
 
 class _Progress(NamedTuple):
@@ -141,15 +142,17 @@ class ProfileAssembler:
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
-        self._every = settings.periods_per_profile
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state = np.zeros(1, _STATE)[0]
         self._memory = _allocate(settings, model)
 
-    def restart(self, modulation: Modulation) -> None:
-        """Drop the open period, the last rows and the line's width; gate by ``modulation``."""
+    def restart(self, modulation: Modulation, every: int) -> None:
+        """Drop the open period, the last rows and the line's width; gate by ``modulation``.
+
+        ``every`` is the number of periods in a profile.
+        """
         self._gate = phase_gate(modulation, self._gate_us)
-        self._memory = self._memory._replace(blink=blink(modulation, self._every))
+        self._memory = self._memory._replace(blink=blink(modulation, every))
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
         _begin_window(self._memory, self._state)
@@ -248,6 +251,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         rows=empty_rows(*shape),
         scratch=make_scratch(estimator.half_max),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
+        window_events=WINDOW_EVENTS,
     )
 
 
@@ -306,7 +310,7 @@ def _write(rows, smoothing, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, blink, footprint, scatter, smoothing, rows, scratch, output = memory
+    columns, estimator, blink, footprint, scatter, smoothing, rows, scratch, output, _ = memory
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.periods_closed += 1
@@ -322,7 +326,7 @@ def _close(memory, state, counters):
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
     _write(rows, smoothing, state, output)
-    if state.window >= WINDOW_EVENTS and estimator.method != _LEARNED:
+    if state.window >= memory.window_events and estimator.method != _LEARNED:
         _begin_window(memory, state)
 
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view
+from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import TIME_LIMIT_US, relative_reflectance
@@ -21,6 +21,7 @@ from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
+from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 
 _PIECE_BYTES = 1 << 17
 _EVENTS_WANTED = 16
@@ -40,6 +41,8 @@ class Reconstructor:
         from ``on_edge_us``, else at a phase estimated from the first events (which are held back
         meanwhile, not lost).
     settings : Settings
+    jobs : int
+        Threads that turn events into rows; with more than one, ``flush`` ends the stream.
 
     Attributes
     ----------
@@ -78,7 +81,11 @@ class Reconstructor:
     """
 
     def __init__(
-        self, calibration: Calibration, modulation: Modulation, settings: Settings | None = None
+        self,
+        calibration: Calibration,
+        modulation: Modulation,
+        settings: Settings | None = None,
+        jobs: int = 1,
     ) -> None:
         self.settings = settings = settings or Settings()
         self.model = model = calibration.model()
@@ -88,7 +95,12 @@ class Reconstructor:
         self._filter: ActivityFilter | None = None
         if settings.noise_filter == "activity":
             self._filter = ActivityFilter(model.columns, model.rows)
-        self._assembler = ProfileAssembler(settings, model)
+        self._assembler: ProfileAssembler | WindowAssembler
+        # A learned footprint follows the whole stream.
+        if integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned":
+            self._assembler = ProfileAssembler(settings, model)
+        else:
+            self._assembler = WindowAssembler(settings, model, jobs)
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_beyond_pole=0, columns_compensated=0

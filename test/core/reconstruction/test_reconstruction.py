@@ -1,6 +1,6 @@
 """Bytes to profiles: rows against the truth, splits, phase, scenes and counters."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,14 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder, sort_readout
 from eschorty_ros.core.line import METHOD_ERRORS, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings, place, place_link
+from eschorty_ros.core.reconstruction import (
+    Profiles,
+    Reconstructor,
+    Settings,
+    place,
+    place_link,
+    profile_assembler,
+)
 
 SEED = 77
 MODEL = CALIBRATION.model()
@@ -79,6 +86,21 @@ def test_any_split_gives_the_same_points_and_counts(case):
         parts, b = reconstruct(stream, modulation, settings, cuts)
         assert_same(whole, parts)
         assert a.counters == b.counters
+
+
+@pytest.mark.parametrize("case", [*SPLIT_CASES, "returns", "compensation"])
+def test_threads_give_the_same_points_and_counts(case, monkeypatch):
+    """With windows of a few periods each, so that there are many."""
+    monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 20_000)
+    more = {"returns": {"returns": "all"}, "compensation": {"reflectance_compensation": "on"}}
+    stream, modulation, settings = SPLIT_CASES.get(case, SPLIT_CASES["edge"])
+    settings = replace(settings, **more.get(case, {}))
+    serial, a = reconstruct(stream, modulation, settings, range(0, len(stream), 9973))
+    for jobs in (2, 5):
+        parallel = Reconstructor(CALIBRATION, modulation, settings, jobs)
+        parts = [parallel.push(stream[k : k + 7001]) for k in range(0, len(stream), 7001)]
+        assert_same(serial, Profiles.concatenate([*parts, parallel.flush()]))
+        assert a.counters == parallel.counters
 
 
 def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():
