@@ -73,10 +73,10 @@ def command(
     A cloud without points is not written: exit code 1, with the reason.
 
     \b
-    --json prints events, dropped_events, profiles, points, seconds, events_per_second,
-    sigma_median_m (null when there is no point), warnings, points_without_stage and counters
-    (those that are not zero); for a recording with truth.csv also score: periods, points,
-    completeness, error_median_mm, error_p95_mm, bias_mm, within_1_sigma, within_2_sigma and
+    --json prints events, dropped_events, profiles, periods_per_profile, points, seconds,
+    events_per_second, sigma_median_m (null when there is no point), warnings, points_without_stage
+    and counters (those that are not zero); for a recording with truth.csv also score: periods,
+    points, completeness, error_median_mm, error_p95_mm, bias_mm, within_1_sigma, within_2_sigma and
     off_target (points where nothing is), without those that no point gives.
 
     \b
@@ -125,6 +125,7 @@ def command(
             "events": f"{facts['events']:,}",
             "events dropped": f"{facts['dropped_events']:,}",
             "profiles": f"{facts['profiles']:,}",
+            "periods per profile": f"{facts['periods_per_profile']}",
             "points": f"{facts['points']:,}",
             "median sigma": "none" if sigma is None else f"{sigma * 1e3:.3f} mm",
             "seconds": f"{facts['seconds']:.2f}",
@@ -143,6 +144,7 @@ def summary(result: Result) -> dict[str, Any]:
         "events": result.events,
         "dropped_events": result.counters["events_dropped"],
         "profiles": result.profile_count,
+        "periods_per_profile": result.periods_per_profile,
         "points": len(points),
         "seconds": result.seconds,
         "events_per_second": result.events_per_second,

@@ -170,8 +170,9 @@ def test_simulate_then_reconstruct_without_ros(recording):
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert list(facts) == [
-        "events", "dropped_events", "profiles", "points", "seconds", "events_per_second",
-        "sigma_median_m", "warnings", "points_without_stage", "counters", "score",
+        "events", "dropped_events", "profiles", "periods_per_profile", "points", "seconds",
+        "events_per_second", "sigma_median_m", "warnings", "points_without_stage", "counters",
+        "score",
     ]  # fmt: skip
     assert facts["warnings"] == []
     assert facts["counters"]["events"] == facts["events"]

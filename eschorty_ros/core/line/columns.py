@@ -12,13 +12,15 @@ from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US, TIME_S
 from eschorty_ros.core.modulation.phase_gate import _outside
 
 _ROOM = 128
+_ALL_ROWS = np.empty(0, np.uint32)
 
 
 class Columns(NamedTuple):
     """Packed events by column: ``counts`` of them from ``starts`` on, with room for padding.
 
     The room for events grows up to ``limit``. ``seeds`` are the rows of the lines in the last
-    period, fixed point; -1 for none.
+    period, fixed point; -1 for none. In a region of interest column ``c`` takes ``row_first[c]``
+    and the ``row_span[c]`` rows behind it; without one both are empty.
     """
 
     packed: NDArray[np.uint32]
@@ -26,6 +28,8 @@ class Columns(NamedTuple):
     counts: NDArray[np.uint32]
     seeds: NDArray[np.int64]
     limit: int
+    row_first: NDArray[np.uint32]
+    row_span: NDArray[np.uint32]
 
 
 class Appended(NamedTuple):
@@ -38,6 +42,7 @@ class Appended(NamedTuple):
     full: bool
     over_limit: int
     outside: int
+    outside_region: int
     gated: int
 
 
@@ -50,6 +55,8 @@ def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
         counts=np.zeros(columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
         limit=limit,
+        row_first=_ALL_ROWS,
+        row_span=_ALL_ROWS,
     )
 
 
@@ -59,7 +66,7 @@ def wider_columns(columns: Columns) -> Columns:
     packed = columns.packed.reshape(size, -1)
     wider = empty_columns(size, columns.limit, 2 * (packed.shape[1] - BLOCK))
     wider.packed.reshape(size, -1)[:, : packed.shape[1]] = packed
-    return wider._replace(counts=columns.counts, seeds=columns.seeds)
+    return columns._replace(packed=wider.packed, starts=wider.starts)
 
 
 def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Columns:
@@ -69,7 +76,8 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
     starts = np.cumsum(sizes) - sizes
     packed = np.empty(int(sizes.sum()), np.uint32)
     packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
-    return Columns(packed, starts, counts.astype(np.uint32), np.full(counts.size, -1, np.int64), 0)
+    seeds = np.full(counts.size, -1, np.int64)
+    return Columns(packed, starts, counts.astype(np.uint32), seeds, 0, _ALL_ROWS, _ALL_ROWS)
 
 
 @kernel
@@ -86,7 +94,10 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
     end = np.uintp(t.size)
     over_limit = 0
     outside = 0
+    outside_region = 0
     gated = 0
+    row_first, row_span = columns.row_first, columns.row_span
+    bounded = row_first.size > 0
     gating = gate.length_us > 0.0
     while i < end and t[i] < limit_us:
         c = np.uintp(x[i])
@@ -94,7 +105,9 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
         dt = t[i] - edge_us
         if c < size and r < rows_end:
             n = counts[c]
-            if gating and _outside(dt, p[i], gate):
+            if bounded and np.uint32(r - row_first[c]) > row_span[c]:
+                outside_region += 1
+            elif gating and _outside(dt, p[i], gate):
                 gated += 1
             elif n < room:
                 packed[c * stride + np.uintp(n)] = np.uint32(
@@ -110,5 +123,5 @@ def _append(events, first, limit_us, edge_us, columns, rows, gate):
         i += np.uintp(1)
     if over_limit > 0 and np.int64(room) < columns.limit:
         counts[:] = before
-        return Appended(np.int64(first), True, 0, 0, 0)
-    return Appended(np.int64(i), False, over_limit, outside, gated)
+        return Appended(np.int64(first), True, 0, 0, 0, 0)
+    return Appended(np.int64(i), False, over_limit, outside, outside_region, gated)

@@ -58,7 +58,7 @@ class EdgeSchedule:
     ----------
     modulation : Modulation
     every : int
-        Return only each ``every``-th edge.
+        Return only each ``every``-th edge; 0 while that is not known, until ``anchor``.
 
     Attributes
     ----------
@@ -89,6 +89,15 @@ class EdgeSchedule:
         self.anchored = False
         self.safe_us = 0
         self.periods_jumped = 0
+
+    @property
+    def every(self) -> int:
+        """Periods from one returned edge to the next."""
+        return self._parts.every
+
+    @every.setter
+    def every(self, every: int) -> None:
+        self._parts = self._parts._replace(every=every)
 
     @property
     def counters(self) -> dict[str, int]:

@@ -17,8 +17,8 @@ from eschorty_ros.core.modulation.phase_estimate import (
 END_OF_STREAM_US = 1 << 61
 _HELD_EVENTS_MAX = 1 << 22
 # Length of a block: 100 ppm are then at most 0.2 % of a period up to 1 kHz, and 3 % at 20 kHz.
-_BLOCK_PERIODS = 8
-_BLOCK_US = 16_000
+BLOCK_PERIODS = 8
+BLOCK_US = 16_000
 _EVENTS_MIN = 128
 _EVENTS_MAX = 4096
 _GAIN = 0.5
@@ -63,7 +63,7 @@ class PhaseLock:
         self.missing = False
         self.refused = 0
         self._modulation = modulation
-        self._block = max(_BLOCK_PERIODS, round(_BLOCK_US / modulation.period_us))
+        self._block = max(BLOCK_PERIODS, round(BLOCK_US / modulation.period_us))
         self._block_end_us: int | None = None
         self._difference: float | None = None
         self._corrections = 0

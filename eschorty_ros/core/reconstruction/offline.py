@@ -35,6 +35,7 @@ class Result:
     counters : dict
         The reconstructor's, and ``points_without_stage``.
     profile_count, events : int
+    periods_per_profile : int
     seconds : float
         Wall time of reconstruction and placing, reading of the file included.
     warnings : tuple of str
@@ -45,6 +46,7 @@ class Result:
     profiles: Profiles
     counters: dict[str, int]
     profile_count: int
+    periods_per_profile: int
     events: int
     seconds: float
     warnings: tuple[str, ...]
@@ -114,15 +116,17 @@ def reconstruct_recording(
     seconds = time.perf_counter() - began
     counters = reconstructor.counters
     counters["points_without_stage"] = int(known.size - known.sum())
+    used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
     warnings = [str(line) for line in reader.warnings] + reconstructor.warnings
     return Result(
         points,
         profiles,
         counters,
         profiles.profile_count,
+        reconstructor.periods_per_profile,
         counters["events"],
         seconds,
-        (*warnings, *recording_warnings(recording, settings, counters, points, span_us)),
+        (*warnings, *recording_warnings(recording, used, counters, points, span_us)),
     )
 
 

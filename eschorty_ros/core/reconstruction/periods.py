@@ -10,6 +10,7 @@ from eschorty_ros.core.modulation.edges import EDGES_MAX
 from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler
+from eschorty_ros.core.reconstruction.profile_length import ProfileLength
 from eschorty_ros.core.reconstruction.windows import WindowAssembler
 
 
@@ -20,7 +21,7 @@ class PeriodCutter:
     ----------
     modulation : Modulation
     every : int
-        Periods per profile.
+        Periods per profile; 0 chooses them from the first events.
     assembler : ProfileAssembler or WindowAssembler
         Takes the events and the periods' beginnings.
 
@@ -30,12 +31,16 @@ class PeriodCutter:
     """
 
     def __init__(
-        self, modulation: Modulation, every: int, assembler: ProfileAssembler | WindowAssembler
+        self,
+        modulation: Modulation,
+        every: int,
+        assembler: ProfileAssembler | WindowAssembler,
     ) -> None:
         self.lock = PhaseLock(modulation, every)
+        self._modulation = modulation
+        self._length = ProfileLength(modulation)
         self._held = HeldEvents()
         self._assembler = assembler
-        assembler.restart(modulation, every)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -54,17 +59,27 @@ class PeriodCutter:
             self._assign(arrays, watermark_us)
             return
         self._held.append(arrays)
-        if self.lock.find(self._held, watermark_us):
+        if self._begin(watermark_us):
             self._assign_held(watermark_us)
 
     def finish(self, newest_us: int | None) -> None:
         """Assign the events held back, up to ``newest_us``, and close the open period."""
         lock = self.lock
-        if not lock.schedule.anchored and not lock.find(self._held, END_OF_STREAM_US, last=True):
+        if not lock.schedule.anchored and not self._begin(END_OF_STREAM_US, last=True):
             return
         if newest_us is not None:
             self._assign_held(lock.schedule.watermark_after(newest_us))
         self._assembler.close()
+
+    def _begin(self, watermark_us: int, last: bool = False) -> bool:
+        """Begin with the first period as soon as the held events allow it; return whether."""
+        schedule = self.lock.schedule
+        if schedule.every == 0 and len(self._held):
+            schedule.every = self._length.choose(self._held, watermark_us, last)
+        if schedule.every == 0 or not self.lock.find(self._held, watermark_us, last):
+            return False
+        self._assembler.restart(self._modulation, schedule.every)
+        return True
 
     def _assign_held(self, watermark_us: int) -> None:
         t, x, y, p = self._held.arrays

@@ -35,6 +35,7 @@ from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
 from eschorty_ros.core.modulation.phase_gate import phase_gate
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
+from eschorty_ros.core.reconstruction.region import region
 from eschorty_ros.core.reconstruction.settings import Settings
 
 WINDOW_EVENTS = 1 << 21
@@ -53,6 +54,7 @@ _COUNTERS = np.dtype(
             "events_binned",
             "events_before_first_edge",
             "events_outside_sensor",
+            "events_outside_roi",
             "events_over_column_limit",
             "events_gated",
             "periods_closed",
@@ -234,7 +236,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     shape = returns, model.columns
     size, none = _OUTPUT_PROFILES * returns * model.columns, LineRows.empty()
     return _Memory(
-        columns=empty_columns(model.columns, settings.column_limit),
+        columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
         estimator=estimator,
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
@@ -342,11 +344,12 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
     state.status = _FILLED
     appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
     state.window += appended.next - first
-    refused = appended.over_limit + appended.outside + appended.gated
+    refused = appended.over_limit + appended.outside + appended.outside_region + appended.gated
     counters.events_binned += appended.next - first - refused
     state.full = appended.full
     counters.events_over_column_limit += appended.over_limit
     counters.events_outside_sensor += appended.outside
+    counters.events_outside_roi += appended.outside_region
     counters.events_gated += appended.gated
     return appended.next
 

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import TIME_LIMIT, byte_view, integer
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
-from eschorty_ros.core.line import TIME_LIMIT_US, relative_reflectance
+from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.periods import PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
+from eschorty_ros.core.reconstruction.profile_length import periods_max
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
+from eschorty_ros.core.reconstruction.region import within_ranges
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
@@ -103,9 +105,11 @@ class Reconstructor:
             self._assembler = WindowAssembler(settings, model, jobs)
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
-            events=0, events_filtered=0, points=0, points_beyond_pole=0, columns_compensated=0
-        )
+            events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
+            columns_compensated=0,
+        )  # fmt: skip
         self._watermark_us = -TIME_LIMIT
+        self._periods_before = 0
         self._before_restart: list[Profiles] = []
         self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         self._begin(modulation)
@@ -186,16 +190,24 @@ class Reconstructor:
         return replace(rows, reflectance=reflectance, reflectance_sigma=sigma)
 
     def _compensated(self, rows: LineRows, last: bool = False) -> LineRows:
-        if self._compensator is None:
+        settings, every = self.settings, self._periods.lock.schedule.every
+        if settings.reflectance_compensation == "off" or not settings.stage_speed_mm_s or not every:
             return rows
+        if self._compensator is None:
+            settings = replace(settings, periods_per_profile=every)
+            self._compensator = StepCompensator(settings, self.model, self.modulation)
         rows = self._compensator.push(rows)
         return LineRows.concatenate([rows, self._compensator.flush()]) if last else rows
 
     def _with_ranges(self, rows: LineRows) -> Profiles:
         """Return ``rows`` with their ranges, after the profiles of a restart."""
         profiles = Profiles.from_rows(rows, self.model)
-        self._counts["points"] += len(profiles)
         self._counts["points_beyond_pole"] += len(rows) - len(profiles)
+        within = within_ranges(profiles.range_mm, self.settings)
+        if not within.all():
+            self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
+            profiles = profiles.select(within)
+        self._counts["points"] += len(profiles)
         before, self._before_restart = self._before_restart, []
         return Profiles.concatenate([*before, profiles]) if before else profiles
 
@@ -214,6 +226,7 @@ class Reconstructor:
 
     def _restart(self, modulation: Modulation) -> None:
         self._before_restart = [self.flush()]
+        self._periods_before = self.periods_per_profile
         periods, compensator = self._periods, self._compensator
         self._begin(modulation)
         self._counts.update(periods.counters)
@@ -223,15 +236,14 @@ class Reconstructor:
     def _begin(self, modulation: Modulation) -> None:
         """Start with another modulation; counters and the decoder are kept."""
         every = self.settings.periods_per_profile
-        if modulation.period_us * (every + 1) >= TIME_LIMIT_US:
+        if every > periods_max(modulation):
             raise ArgumentError(
                 f"periods_per_profile is {every}; {modulation.frequency_hz:g} Hz allows "
-                f"{int(TIME_LIMIT_US / modulation.period_us) - 1}"
+                f"{periods_max(modulation)}"
             )
         self.modulation = modulation
         self._periods = PeriodCutter(modulation, every, self._assembler)
-        if self.settings.reflectance_compensation == "on" and self.settings.stage_speed_mm_s:
-            self._compensator = StepCompensator(self.settings, self.model, modulation)
+        self._compensator = None
 
     def note_gap(self) -> None:
         """Note that bytes were lost before the next ``push``; periods and sensor time are kept."""
@@ -263,11 +275,16 @@ class Reconstructor:
         return self._periods.lock.missing
 
     @property
+    def periods_per_profile(self) -> int:
+        """Periods that make a profile; those before a restart until new ones are chosen, else 0."""
+        return self._periods.lock.schedule.every or self._periods_before
+
+    @property
     def warnings(self) -> list[str]:
         """One line for each reason why most of the events gave no points so far."""
         counts = self.counters
         found: list[str] = []
-        every, columns = self.settings.periods_per_profile, self.model.columns
+        every, columns = self.periods_per_profile, self.model.columns
         if self.phase_missing:
             found.append(
                 "no modulation phase found in the events; periods are cut from the first event on"
@@ -293,6 +310,11 @@ class Reconstructor:
                 f"{few} columns have too few events for a point, {per_column:.2g} per column and "
                 f"profile on average; set periods_per_profile to about {wanted}"
             )
+        if self.settings.periods_per_profile == 0 and every > 1:
+            found.append(
+                f"a column has too few events for a point in one period; {every} periods make a "
+                f"profile, {self.modulation.frequency_hz / every:.4g} profiles per second"
+            )
         return found
 
     @property
@@ -305,8 +327,8 @@ class Reconstructor:
         """Counts since construction, by name.
 
         ``events`` (decoded) = ``events_filtered`` + ``events_gated`` + ``events_binned`` +
-        ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_phase`` +
-        ``events_held`` (not assigned yet).
+        ``events_over_column_limit`` + ``events_outside_sensor`` + ``events_outside_roi`` +
+        ``events_outside_phase`` + ``events_held`` (not assigned yet).
         Of those only ``events_over_column_limit`` and ``events_outside_sensor`` are
         ``events_dropped``: without light there is no phase, and nothing to lose.
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the

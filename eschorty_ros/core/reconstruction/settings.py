@@ -56,8 +56,11 @@ class Settings:
     The compensation of reflectance steps is off by default, since it needs the stage's speed and
     delays profiles by the time that a step takes to cross the line.
 
-    ``periods_per_profile`` is for frequencies at which a column gives fewer than ``events_min``
-    events per period (above about 5 kHz).
+    At high frequencies (above about 5 kHz) a column gives fewer than ``events_min`` events per
+    period: ``periods_per_profile`` 0 then takes more periods for a profile, as `profile_length`
+    describes.
+
+    Columns and ranges are the region of interest. Events elsewhere are counted and not used.
 
     Raises
     ------
@@ -91,7 +94,18 @@ class Settings:
     )
     column_limit: int = _number(4096, 16, 4096, "events", "most events kept per column and profile")
     periods_per_profile: int = _number(
-        1, 1, 1000, "periods", "modulation periods that make one profile"
+        0,
+        0,
+        1000,
+        "periods",
+        "modulation periods that make one profile; 0 takes as many as give "
+        "a column enough events for a point",
+    )
+    column_first: int = _number(0, 0, 2047, "columns", "first column to reconstruct")
+    column_last: int = _number(2047, 0, 2047, "columns", "last column to reconstruct")
+    range_min: float = _number(0.0, 0.0, 1000.0, "m", "nearest range to reconstruct; 0 is no limit")
+    range_max: float = _number(
+        0.0, 0.0, 1000.0, "m", "furthest range to reconstruct; 0 is no limit"
     )
     smoothing_half_width: int = _number(
         2, 0, 20, "columns", "neighbours averaged on either side; 0 is off"
@@ -146,6 +160,16 @@ class Settings:
         for item in fields(self):
             _check(item.name, getattr(self, item.name), item.default, item.metadata)
         check_method(self.centroid, self.returns)
+        if self.column_last < self.column_first:
+            raise ArgumentError(
+                f"column_last is {self.column_last} and column_first {self.column_first}; choose "
+                "a larger column_last"
+            )
+        if 0.0 < self.range_max <= self.range_min:
+            raise ArgumentError(
+                f"range_max is {self.range_max:g} m and range_min {self.range_min:g} m; choose a "
+                "larger range_max"
+            )
         if self.returns == "all" and self.reflectance_compensation == "on":
             raise ArgumentError(
                 "returns is 'all' and reflectance_compensation 'on', which follows one surface per "

@@ -104,7 +104,8 @@ def _swapped(camera: Camera) -> Events:
 
 REASONS: dict[str, tuple[Camera, float, Callable[[Camera], Events], dict, str]] = {
     "20 kHz": (
-        Camera(frequency_hz=20e3, periods=200), 20e3, lambda camera: _kept(camera, 0.03), {},
+        Camera(frequency_hz=20e3, periods=200), 20e3, lambda camera: _kept(camera, 0.03),
+        {"periods_per_profile": 1},
         "periods_per_profile to about",
     ),
     "swapped polarity": (

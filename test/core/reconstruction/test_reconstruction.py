@@ -319,6 +319,46 @@ def test_several_periods_per_profile():
     assert np.abs(found.row - 350).max() < 3
 
 
+@pytest.mark.parametrize("phase", ["known", "estimated"])
+def test_a_profile_has_as_many_periods_as_give_points(phase):
+    """1.5 events per column and period, with background from 50 ms before."""
+    rng = np.random.default_rng(SEED)
+    fast = {"periods": 3000, "columns": 300, "events": 1.5, "fwhm_px": 4.0, "edge_us": 50_000}
+    line = lines(frequency_hz=20_000.0, background=0.0, **fast)
+    t_us = np.sort(rng.integers(0, 200_000, 20_000))
+    noise = t_us, *rng.integers(0, 300, (2, t_us.size)), t_us % 2
+    stream = encoded(sort_readout(*(np.concatenate(v) for v in zip(line, noise, strict=True))))
+    modulation = Modulation(20_000.0, on_edge_us=50_000 if phase == "known" else None)
+    found, whole = reconstruct(stream, modulation)
+    every = whole.periods_per_profile
+    assert every in (5, 6), f"seed {SEED}"
+    lit = found.select(found.edge_us >= 50_000)
+    assert len(lit) > 0.9 * 300 * 3000 / every
+    assert np.median(np.abs(lit.row - 350)) < 1.0
+    assert f"{every} periods make a profile" in " ".join(whole.warnings)
+    parts, split = reconstruct(stream, modulation, None, rng.integers(0, len(stream), 30).tolist())
+    assert_same(found, parts)
+    assert whole.counters == split.counters
+    assert_same(found, reconstruct(stream, modulation, Settings(periods_per_profile=every))[0])
+
+
+def test_the_region_of_interest_keeps_the_points_inside_and_counts_the_events_outside():
+    slope = lines(lambda k, c: 100 + 0.4 * c, events=60.0, fwhm_px=6.0, background=0.05)
+    near_mm, far_mm = MODEL.range_mm([250.0, 450.0])
+    whole, a = reconstruct(encoded(slope), settings=RAW)
+    region = {"column_first": 300, "column_last": 800, "range_min": near_mm * 1e-3}
+    part, b = reconstruct(encoded(slope), settings=replace(RAW, range_max=far_mm * 1e-3, **region))
+    inside = (whole.column >= 300) & (whole.column <= 800)
+    expected = whole.select(inside & (whole.range_mm >= near_mm) & (whole.range_mm <= far_mm))
+    assert len(part) == pytest.approx(len(expected), abs=0.005 * len(expected))
+    assert part.column.min() >= 300
+    assert near_mm <= part.range_mm.min() < part.range_mm.max() <= far_mm
+    error, before = (np.abs(v.row - 100 - 0.4 * v.column) for v in (part, expected))
+    assert error.mean() <= 1.01 * before.mean(), f"seed {SEED}"
+    assert b.counters["events_outside_roi"] > 0.5 * b.counters["events"]
+    assert a.counters["events_outside_roi"] == 0
+
+
 def test_twenty_kilohertz_periods_are_closed_without_loss():
     fast = {"periods": 2000, "columns": 20, "events": 10.0, "fwhm_px": 3.0, "edge_us": 0}
     data = encoded(lines(frequency_hz=20_000.0, **fast))

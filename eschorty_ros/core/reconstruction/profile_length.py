@@ -1,0 +1,87 @@
+"""How many periods make a profile: as many as give a column enough events for a point."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.line import TIME_LIMIT_US
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.held_events import HeldEvents
+from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
+from eschorty_ros.core.modulation.phase_lock import BLOCK_PERIODS, BLOCK_US
+from eschorty_ros.core.reconstruction.settings import Settings
+
+PERIODS_MAX = 1000
+_HELD_EVENTS_MAX = 1 << 22
+
+
+def periods_max(modulation: Modulation) -> int:
+    """Return the most periods of a profile: the time within it is limited."""
+    return min(PERIODS_MAX, math.ceil(TIME_LIMIT_US / modulation.period_us) - 2)
+
+
+class ProfileLength:
+    """Chooses the periods of a profile from the first events that follow the laser.
+
+    They are those of `BLOCK_US`, or of `BLOCK_PERIODS`, behind the first estimation window that is
+    modulated: the choice does not depend on how the stream is split, nor on the background before
+    the laser is on. Of their columns, weighted by events, one has ``sum n^2 / sum n - 1`` events,
+    with ``n`` the events of each column. One period is a profile where it has 4 of them, the
+    default of ``events_min``; else a profile gets twice as many: of Poisson counts with a mean of
+    8, one in 24 is less than 4.
+
+    Parameters
+    ----------
+    modulation : Modulation
+    """
+
+    def __init__(self, modulation: Modulation) -> None:
+        self._modulation = modulation
+        self._span_us = max(BLOCK_US, round(BLOCK_PERIODS * modulation.period_us))
+        self._seen = 0
+        self._end_us: int | None = None
+
+    def choose(self, held: HeldEvents, watermark_us: int, last: bool = False) -> int:
+        """Return the periods of a profile, 0 while the held events do not give them.
+
+        1 where too many events do not follow the laser, or none do and these are the ``last``.
+        """
+        t, x, _, p = held.arrays
+        while self._end_us is None:
+            begin = self._seen
+            window = estimation_window(t[begin:], watermark_us, self._modulation)
+            if window is None and not last:
+                return 0
+            end = t.size if window is None else begin + window.size
+            found = False
+            if begin < end:
+                found = estimate_phase(t[begin:end], p[begin:end], self._modulation).found
+            if not found and (window is None or end > _HELD_EVENTS_MAX):
+                return 1
+            if found:
+                self._end_us = int(t[end - 1]) + self._span_us
+            # The first window may begin before the laser is on. Behind a short stream is nothing.
+            self._seen = begin if found and end == t.size else end
+        if watermark_us <= self._end_us and not last:
+            return 0
+        chosen = slice(self._seen, int(np.searchsorted(t, self._end_us)))
+        return self._periods(t[chosen], x[chosen])
+
+    def _periods(self, t_us: NDArray[np.int64], columns: NDArray[np.uint16]) -> int:
+        turns = ((t_us - t_us[0]) / self._modulation.period_us).astype(np.int64)
+        periods = _participating(np.bincount(turns))
+        counts = np.bincount(columns).astype(np.float64)
+        events = (float(counts @ counts) / t_us.size - 1.0) / periods
+        if events >= Settings().events_min:
+            return 1
+        wanted = math.ceil(2.0 * Settings().events_min / max(events, 1e-9))
+        return min(wanted, periods_max(self._modulation))
+
+
+def _participating(counts: NDArray[np.int64]) -> float:
+    """Return how many entries the counts are spread over: the number of equal ones."""
+    total = float(counts.sum())
+    return total * total / float(counts @ counts)
