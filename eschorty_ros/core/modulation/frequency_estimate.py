@@ -18,6 +18,8 @@ _STRONG = 0.5
 # Turns between two frequencies over the window, and their relative difference: clocks differ less.
 _TURNS_MAX = 0.25
 _CLOCKS_MAX = 1e-3
+# Fewest turns in the window: the light's switching on and off has power at few.
+_TURNS_MIN = 8.0
 # Turns over which the power of one frequency falls off.
 _LOBE = 2.0
 
@@ -83,6 +85,8 @@ class FrequencyEstimate:
             peak += 1
         before, at, after = np.log(power[peak - 1 : peak + 2])
         found_hz = float(peak + 0.5 * (before - after) / (before - 2.0 * at + after)) * _STEP_HZ
+        if found_hz * span_s < _TURNS_MIN:
+            return None
         apart_hz = abs(expected_hz - found_hz)
         tolerance_hz = max(_TURNS_MAX / span_s, _CLOCKS_MAX * expected_hz)
         if apart_hz <= tolerance_hz:

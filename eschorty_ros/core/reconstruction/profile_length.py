@@ -16,6 +16,9 @@ from eschorty_ros.core.reconstruction.settings import Settings
 
 PERIODS_MAX = 1000
 _HELD_EVENTS_MAX = 1 << 22
+# Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
+_CELL_BITS = 4
+_LINE_CELLS_MAX = 8.0
 
 
 def periods_max(modulation: Modulation) -> int:
@@ -27,11 +30,12 @@ class ProfileLength:
     """Chooses the periods of a profile from the first events that follow the laser.
 
     They are those of `BLOCK_US`, or of `BLOCK_PERIODS`, behind the first estimation window that is
-    modulated: the choice does not depend on how the stream is split, nor on the background before
-    the laser is on. Of their columns, weighted by events, one has ``sum n^2 / sum n - 1`` events,
-    with ``n`` the events of each column. One period is a profile where it has 4 of them, the
-    default of ``events_min``; else a profile gets twice as many: of Poisson counts with a mean of
-    8, one in 24 is less than 4.
+    modulated, or has a line where pixels are too slow to follow: the choice does not depend on how
+    the stream is split, nor on the background before the laser is on. Of their columns, weighted
+    by events, one has ``sum n^2 / sum n - 1`` events, with ``n`` the events of each column. One
+    period is a profile where it has 4 of them, the default of ``events_min``. Else a profile gets
+    twice as many, by the events of the next block, since pixels give more when the laser is
+    switched on. Of Poisson counts with a mean of 8, one in 24 is less than 4.
 
     Parameters
     ----------
@@ -49,7 +53,7 @@ class ProfileLength:
 
         1 where too many events do not follow the laser, or none do and these are the ``last``.
         """
-        t, x, _, p = held.arrays
+        t, x, y, p = held.arrays
         while self._end_us is None:
             begin = self._seen
             window = estimation_window(t[begin:], watermark_us, self._modulation)
@@ -59,29 +63,47 @@ class ProfileLength:
             found = False
             if begin < end:
                 found = estimate_phase(t[begin:end], p[begin:end], self._modulation).found
+                found = found or _is_line(x[begin:end], y[begin:end])
             if not found and (window is None or end > _HELD_EVENTS_MAX):
                 return 1
             if found:
                 self._end_us = int(t[end - 1]) + self._span_us
             # The first window may begin before the laser is on. Behind a short stream is nothing.
             self._seen = begin if found and end == t.size else end
-        if watermark_us <= self._end_us and not last:
-            return 0
-        chosen = slice(self._seen, int(np.searchsorted(t, self._end_us)))
-        return self._periods(t[chosen], x[chosen])
-
-    def _periods(self, t_us: NDArray[np.int64], columns: NDArray[np.uint16]) -> int:
-        turns = ((t_us - t_us[0]) / self._modulation.period_us).astype(np.int64)
-        periods = _participating(np.bincount(turns))
-        counts = np.bincount(columns).astype(np.float64)
-        events = (float(counts @ counts) / t_us.size - 1.0) / periods
-        if events >= Settings().events_min:
-            return 1
+        begin, events = self._seen, 0.0
+        for end_us in (self._end_us, self._end_us + self._span_us):
+            if watermark_us <= end_us and not last:
+                return 0
+            end = int(np.searchsorted(t, end_us))
+            if begin < end:
+                events = self._events(t[begin:end], x[begin:end])
+            if events >= Settings().events_min:
+                return 1
+            begin = end
         wanted = math.ceil(2.0 * Settings().events_min / max(events, 1e-9))
         return min(wanted, periods_max(self._modulation))
+
+    def _events(self, t_us: NDArray[np.int64], columns: NDArray[np.uint16]) -> float:
+        """Return the events of a lit column in a period."""
+        turns = ((t_us - t_us[0]) / self._modulation.period_us).astype(np.int64)
+        counts = np.bincount(columns).astype(np.float64)
+        return (float(counts @ counts) / t_us.size - 1.0) / _participating(np.bincount(turns))
 
 
 def _participating(counts: NDArray[np.int64]) -> float:
     """Return how many entries the counts are spread over: the number of equal ones."""
     total = float(counts.sum())
     return total * total / float(counts @ counts)
+
+
+def _is_line(columns: NDArray[np.uint16], rows: NDArray[np.uint16]) -> bool:
+    """Return true when the events of near columns are in few rows."""
+    column, row = columns >> _CELL_BITS, rows >> _CELL_BITS
+    cells = np.bincount(column.astype(np.int64) << _CELL_BITS * 2 | row)
+    return _distinct(cells) < _LINE_CELLS_MAX * _distinct(np.bincount(column))
+
+
+def _distinct(counts: NDArray[np.int64]) -> float:
+    """Return the number of equally likely cells in which as many pairs of events would meet."""
+    total = float(counts.sum())
+    return total * (total - 1.0) / max(float(counts @ (counts - 1)), 1.0)

@@ -42,3 +42,9 @@ def test_another_light_does_not_hide_the_laser():
 def test_events_without_rhythm_show_none():
     assert shown_hz(70.0, NOISE) is None
     assert FrequencyEstimate().frequency_hz(70.0) is None
+
+
+def test_a_light_that_is_switched_on_and_off_has_no_frequency():
+    background = np.random.default_rng(7).integers(0, 230_000, 10_000)
+    lit = np.random.default_rng(8).integers(48_000, 180_000, 700_000)
+    assert shown_hz(20_000.0, background, lit) is None

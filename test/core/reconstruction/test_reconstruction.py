@@ -319,16 +319,18 @@ def test_several_periods_per_profile():
     assert np.abs(found.row - 350).max() < 3
 
 
-@pytest.mark.parametrize("phase", ["known", "estimated"])
+@pytest.mark.parametrize("phase", ["known", "estimated", "too fast for the pixels"])
 def test_a_profile_has_as_many_periods_as_give_points(phase):
     """1.5 events per column and period, with background from 50 ms before."""
     rng = np.random.default_rng(SEED)
     fast = {"periods": 3000, "columns": 300, "events": 1.5, "fwhm_px": 4.0, "edge_us": 50_000}
     line = lines(frequency_hz=20_000.0, background=0.0, **fast)
+    if phase == "too fast for the pixels":
+        line = np.sort(rng.integers(50_000, 200_000, line[0].size)), *line[1:]
     t_us = np.sort(rng.integers(0, 200_000, 20_000))
     noise = t_us, *rng.integers(0, 300, (2, t_us.size)), t_us % 2
     stream = encoded(sort_readout(*(np.concatenate(v) for v in zip(line, noise, strict=True))))
-    modulation = Modulation(20_000.0, on_edge_us=50_000 if phase == "known" else None)
+    modulation = Modulation(20_000.0, on_edge_us=None if phase == "estimated" else 50_000)
     found, whole = reconstruct(stream, modulation)
     every = whole.periods_per_profile
     assert every in (5, 6), f"seed {SEED}"
