@@ -99,4 +99,7 @@ def accuracy_rows(measured: Accuracy) -> dict[str, str]:
         "median |range error|": f"{measured.error_median_mm:.3f} mm",
         "95th percentile": f"{measured.error_p95_mm:.3f} mm",
         "within 1 sigma, 2 sigma": f"{measured.within_1_sigma:.1%}, {measured.within_2_sigma:.1%}",
+        "points with a flag": f"{measured.flagged:,}",
+        "without them": f"{measured.good_median_mm:.3f} mm, {measured.good_p95_mm:.3f} mm; "
+        f"{measured.good_within_1_sigma:.1%}, {measured.good_within_2_sigma:.1%}",
     }

@@ -67,17 +67,20 @@ def command(
     """Turn the folder RECORDING into a point cloud.
 
     The cloud is in eschorty_base, in metres: x y z, intensity (events used), sigma (one sigma of
-    the range), t (seconds since the first event), column; with --reflectance on also reflectance
-    and reflectance_sigma.
+    the range), t (seconds since the first event), column, flags (1: on two surfaces, 2: cut by the
+    sensor's edge, 4: few events; 0: good); with --reflectance on also reflectance and
+    reflectance_sigma.
 
     A cloud without points is not written: exit code 1, with the reason.
 
     \b
     --json prints events, dropped_events, profiles, periods_per_profile, points, seconds,
-    events_per_second, sigma_median_m (null when there is no point), warnings, points_without_stage
-    and counters (those that are not zero); for a recording with truth.csv also score: periods,
-    points, completeness, error_median_mm, error_p95_mm, bias_mm, within_1_sigma, within_2_sigma and
-    off_target (points where nothing is), without those that no point gives.
+    events_per_second, sigma_median_m (null when there is no point), warnings,
+    points_without_stage and counters (those that are not zero); for a recording with truth.csv also score: periods, points,
+    completeness, error_median_mm, error_p95_mm, bias_mm, within_1_sigma, within_2_sigma and
+    off_target (points where nothing is), flagged, and good_median_mm, good_p95_mm,
+    good_within_1_sigma and good_within_2_sigma of the points without a flag; without those that no
+    point gives.
 
     \b
     Examples:

@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 @click.command("scan")
 @sweep_options
 @click.option(
+    "--keep",
+    type=click.Choice(["all", "good"]),
+    default="all",
+    show_default=True,
+    help="Points to keep; good ones have no flag.",
+)
+@click.option(
     "--hardware",
     metavar="CONFIG",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
@@ -41,6 +48,7 @@ def command(
     calibration: str,
     pixels: str,
     seed: int,
+    keep: str,
     hardware: Path | None,
     out: Path,
 ) -> None:
@@ -68,7 +76,7 @@ def command(
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     job = one_scan.ScanJob(
-        scene, calibration, start, stop, speed, frequency, seed, pixels, hardware=tables
+        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, hardware=tables
     )
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")

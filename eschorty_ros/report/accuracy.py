@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -79,6 +80,10 @@ class Accuracy:
         Share of points whose error is within one and two of their own sigma.
     off_target : int
         Points where the scene has no surface; they enter no error statistic.
+    flagged : int
+        Points with a flag.
+    good_median_mm, good_p95_mm, good_within_1_sigma, good_within_2_sigma : float
+        The same statistics of the points without a flag.
     """
 
     periods: int
@@ -90,6 +95,11 @@ class Accuracy:
     within_1_sigma: float
     within_2_sigma: float
     off_target: int
+    flagged: int
+    good_median_mm: float
+    good_p95_mm: float
+    good_within_1_sigma: float
+    good_within_2_sigma: float
 
 
 def stage_and_range_mm(
@@ -292,16 +302,29 @@ def _accuracy(
     error = error_mm[known]
     size = np.abs(error)
     ratio = size / (points["sigma"][known].astype(np.float64) * 1e3)
-    nan = float("nan")
-    empty = error.size == 0
+    good = points["flags"][known] == 0
     return Accuracy(
         periods=len(lit),
         points=len(points),
-        completeness=found / expected if expected else nan,
-        error_median_mm=nan if empty else float(np.median(size)),
-        error_p95_mm=nan if empty else float(np.percentile(size, 95.0)),
-        bias_mm=nan if empty else float(np.median(error)),
-        within_1_sigma=nan if empty else float(np.mean(ratio <= 1.0)),
-        within_2_sigma=nan if empty else float(np.mean(ratio <= 2.0)),
+        completeness=found / expected if expected else math.nan,
+        error_median_mm=_or_nan(np.median, size),
+        error_p95_mm=_or_nan(_p95, size),
+        bias_mm=_or_nan(np.median, error),
+        within_1_sigma=_or_nan(np.mean, ratio <= 1.0),
+        within_2_sigma=_or_nan(np.mean, ratio <= 2.0),
         off_target=int(np.count_nonzero(~known)),
+        flagged=int(np.count_nonzero(points["flags"])),
+        good_median_mm=_or_nan(np.median, size[good]),
+        good_p95_mm=_or_nan(_p95, size[good]),
+        good_within_1_sigma=_or_nan(np.mean, ratio[good] <= 1.0),
+        good_within_2_sigma=_or_nan(np.mean, ratio[good] <= 2.0),
     )
+
+
+def _p95(size: NDArray[np.float64]) -> Any:
+    return np.percentile(size, 95.0)
+
+
+def _or_nan(statistic: Callable[[Any], Any], values: NDArray[Any]) -> float:
+    """Return a statistic of ``values``, NaN without any."""
+    return float(statistic(values)) if values.size else math.nan

@@ -58,8 +58,16 @@ class Camera:
         u = np.abs(distance_px) / self.half_width_px
         return 0.97 * np.exp(-0.693 * u**3) + 0.03 / (1.0 + u * u)
 
-    def line(self, row: Callable[[int, NDArray[Any]], NDArray[Any]], power: float = 1.0) -> Events:
-        """Return the events of a line at ``row(period, columns)``; NaN is dark."""
+    def line(
+        self,
+        row: Callable[[int, NDArray[Any]], NDArray[Any]],
+        power: float = 1.0,
+        part: Callable[[int], tuple[float, float]] = lambda _: (-REACH, REACH),
+    ) -> Events:
+        """Return the events of a line at ``row(period, columns)``; NaN is dark.
+
+        Only the ``part`` of its thickness, rows from its centre, falls on this surface.
+        """
         column = np.arange(COLUMNS)
         offset = np.arange(-REACH, REACH + 1)
         parts: list[Events] = []
@@ -70,7 +78,9 @@ class Camera:
             x = np.broadcast_to(column, y.shape)
             seen = lit & (y >= 0) & (y < ROWS)
             y, x, centre = y[seen], x[seen], np.broadcast_to(true_row, y.shape)[seen]
-            brighter = self.contrast * power * self.light(y - centre)
+            low, high = part(k)
+            inside = (y - centre >= low) & (y - centre < high)
+            brighter = self.contrast * power * self.light(y - centre) * inside
             swing = np.log1p(brighter)
             for polarity in (1, 0):
                 wanted = swing * (1.0 + 0.05 * self.rng.standard_normal(swing.size))

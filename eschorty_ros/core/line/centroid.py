@@ -37,7 +37,6 @@ from eschorty_ros.core.line.sigma import (
     SIGMA_FLOOR_PX,
     VARIANCE_PER_WIDTH2,
     ErrorModel,
-    _clipping_variance,
     _own_variance,
     error_model,
 )
@@ -131,7 +130,8 @@ class Rows(NamedTuple):
     """The returns of each column, shape (returns, columns), NaN where there is none.
 
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
-    neighbours share. A ``doubtful`` one may be background that follows the laser by chance.
+    neighbours share. A ``doubtful`` one may be background that follows the laser by chance, a
+    ``mixed`` one is on two surfaces.
     ``ambiguous`` and ``shift``, the line's way since the last period in px, have shape (columns,).
     """
 
@@ -143,6 +143,7 @@ class Rows(NamedTuple):
     mean_dt_us: NDArray[np.int64]
     truncated: NDArray[np.bool_]
     doubtful: NDArray[np.bool_]
+    mixed: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
     shift: NDArray[np.float64]
 
@@ -202,11 +203,10 @@ def empty_rows(returns: int, columns: int) -> Rows:
     shape = returns, columns
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
-    truncated, doubtful = np.zeros((2, *shape), np.bool_)
+    truncated, doubtful, mixed = np.zeros((3, *shape), np.bool_)
     ambiguous, shift = np.zeros(columns, np.bool_), np.full(columns, np.nan)
-    return Rows(
-        row, sigma2, common2, variance, events, mean_dt_us, truncated, doubtful, ambiguous, shift
-    )
+    flags = truncated, doubtful, mixed
+    return Rows(row, sigma2, common2, variance, events, mean_dt_us, *flags, ambiguous, shift)
 
 
 def estimate(
@@ -541,14 +541,10 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
                 columns.seeds[c] = np.int64(np.rint(FRACTION * row))
                 if last >= 0:
                     out.shift[c] = (columns.seeds[c] - last) / FRACTION
-            common2 = model.common**2
-            # Missing rows are detectable only after a profile has given the line's width.
-            if not estimate.truncated and half < estimator.half_max:
-                common2 += _clipping_variance(variance, line_variance, model)
             used = window.sums.events
             out.row[k, c] = estimate.row
             out.sigma2[k, c] = estimate.sigma2
-            out.common2[k, c] = common2
+            out.common2[k, c] = model.common**2
             out.variance[k, c] = variance
             out.events[k, c] = used
             out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / used))

@@ -11,10 +11,8 @@ last term is for events that are not the line's, which scatter independently. Ne
 share the other part::
 
     common^2 + motion^2 * shift of the line since the last profile + (jump * that shift)^2
-             + (clipped * rows missing to the line's full width)^2
 
-The last term is for lines that an edge of the scene clips; the line on a surface of low reflectance
-is narrow, too, and its sigma larger than necessary. The constants are fitted to the simulated
+The constants are fitted to the simulated
 scenes of the report's sigma experiment, at 70, 300 and 1000 Hz. In a stream the columns' own part
 is scaled by the scatter of near columns (`scatter`), so that only its course over the columns and
 the first profile depend on the constants.
@@ -23,8 +21,6 @@ the first profile depend on the constants.
 from __future__ import annotations
 
 from typing import NamedTuple
-
-import numpy as np
 
 from eschorty_ros.core.base.arrays import number
 from eschorty_ros.core.base.kernel import kernel
@@ -35,14 +31,11 @@ SIGMA_COMMON_PX = 0.045
 _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
-CLIPPED = 0.6
 
 # A line that moves further is on another surface: its last row carries no information.
 _SHIFT_MAX_PX = 8.0
 # Standard deviation over the shift of a line that jumps.
 _JUMP = 0.2
-# Scatter of the full width of a line that is not clipped, rows.
-_WIDTH_SCATTER_PX = 0.7
 
 
 class ErrorModel(NamedTuple):
@@ -58,7 +51,6 @@ class ErrorModel(NamedTuple):
     motion: float
     median: bool = False
     common: float = 0.0
-    clipped: float = 0.0
 
 
 METHOD_ERRORS = {
@@ -77,9 +69,8 @@ def error_model(
     sigma_factor: float,
     sigma_floor_px: float,
     sigma_common_px: float,
-    clipped: float = CLIPPED,
 ) -> ErrorModel:
-    """Return the error model of an estimator; ``clipped`` is its coefficient of missing rows.
+    """Return the error model of an estimator.
 
     Raises
     ------
@@ -91,7 +82,6 @@ def error_model(
         factor=own.factor * number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),
         floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, _SIGMA_LIMIT),
         common=number("sigma_common_px", sigma_common_px, 0.0, _SIGMA_LIMIT),
-        clipped=clipped,
     )
 
 
@@ -139,16 +129,3 @@ def _motion_variance(shift, model):
     """
     size = min(abs(shift), _SHIFT_MAX_PX)
     return model.motion**2 * size + (_JUMP * size) ** 2
-
-
-@kernel
-def _clipping_variance(variance, line_variance, model):
-    """Return the variance of a row whose events spread less than the line.
-
-    An edge of range or reflectance within the line's thickness leaves only a part of it, whose
-    middle is off the line's by up to half of the missing rows.
-    """
-    least = np.sqrt(line_variance) - _WIDTH_SCATTER_PX / np.sqrt(12.0)
-    if variance >= least * abs(least):
-        return 0.0
-    return 12.0 * (model.clipped * (least - np.sqrt(variance))) ** 2

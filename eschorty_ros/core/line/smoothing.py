@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.unusual import Widths
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
 
 
 class Smoothing(NamedTuple):
-    """Settings of smoothing and isolation, and the smoothed rows with their variance."""
+    """Settings of smoothing and isolation, and the smoothed rows with their variance and width."""
 
     half_width: int
     gate_px: float
@@ -26,6 +27,7 @@ class Smoothing(NamedTuple):
     isolated: NDArray[np.bool_]
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
+    widths: Widths
 
 
 @kernel
@@ -52,7 +54,7 @@ def _partner(row, k, c, other):
 
 
 @kernel
-def _smooth(row, sigma2, common2, smoothing):
+def _smooth(rows, smoothing):
     """Average each point with symmetric pairs of neighbours; return the number of averaged points.
 
     The pairs are added outwards up to the first one that is incomplete or beyond the gate: a slope
@@ -62,7 +64,8 @@ def _smooth(row, sigma2, common2, smoothing):
     place, and is not reduced.
     """
     half_width, gate = smoothing.half_width, smoothing.gate_px
-    out_row, out_sigma2 = smoothing.row, smoothing.sigma2
+    out_row, out_sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
+    row, sigma2, common2, spread2 = rows.row, rows.sigma2, rows.common2, rows.variance
     returns, columns = row.shape
     smoothed = 0
     for k in range(returns):
@@ -71,9 +74,11 @@ def _smooth(row, sigma2, common2, smoothing):
             out_sigma2[k, c] = sigma2[k, c] + common2[k, c]
             centre = row[k, c]
             if np.isnan(centre):
+                widths.smoothed[k, c] = np.nan
                 continue
             total = 0.0
             variance = sigma2[k, c]
+            width2 = spread2[k, c]
             used = 1
             for j in range(1, half_width + 1):
                 if c < j or c + j >= columns:
@@ -88,7 +93,10 @@ def _smooth(row, sigma2, common2, smoothing):
                     break
                 total += left + right
                 variance += sigma2[before, c - j] + sigma2[after, c + j]
+                width2 += spread2[before, c - j] + spread2[after, c + j]
                 used += 2
+            widths.smoothed[k, c] = np.sqrt(width2 / used)
+            widths.used[k, c] = used
             if used > 1:
                 out_row[k, c] = centre + total / used
                 out_sigma2[k, c] = common2[k, c] + variance / (used * used)

@@ -157,5 +157,6 @@ def _window(
         events=n.astype(np.uint32),
         width_px=sigma * np.sqrt(n / np.maximum(n - 1.0, 1.0)),
         return_index=np.zeros(lit.size, dtype=np.uint8),
+        flags=np.zeros(lit.size, dtype=np.uint16),
     )
     return Profiles.from_rows(rows_found, model)

@@ -27,8 +27,9 @@ from eschorty_ros.core.line.columns import Columns, _append, empty_columns, wide
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import Footprint, _learn, make_footprint
 from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
-from eschorty_ros.core.line.sigma import CLIPPED, VARIANCE_PER_WIDTH2, error_model
+from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
+from eschorty_ros.core.line.unusual import _mark_unusual, _restart_widths, empty_widths
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
@@ -37,6 +38,7 @@ from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.region import region
 from eschorty_ros.core.reconstruction.settings import Settings
+from eschorty_ros.core.storage import FEW_EVENTS, MIXED, SENSOR_EDGE
 
 WINDOW_EVENTS = 1 << 21
 """Events after which, with the next profile, the estimate of the line starts again.
@@ -97,6 +99,7 @@ class _Output(NamedTuple):
     width_px: NDArray[np.float64]
     events: NDArray[np.uint32]
     return_index: NDArray[np.uint8]
+    flags: NDArray[np.uint16]
 
 
 class _Memory(NamedTuple):
@@ -228,8 +231,6 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             settings.sigma_factor,
             settings.sigma_floor_px,
             settings.sigma_common_px,
-            # The effect of an edge of reflectance is compensated, that of one of range is not.
-            0.5 * CLIPPED if settings.reflectance_compensation == "on" else CLIPPED,
         ),
     )
     returns = 2 if settings.returns == "all" else 1
@@ -249,6 +250,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             isolated=np.zeros(shape, np.bool_),
             row=np.zeros(shape),
             sigma2=np.zeros(shape),
+            widths=empty_widths(*shape),
         ),
         rows=empty_rows(*shape),
         scratch=make_scratch(estimator.half_max),
@@ -267,13 +269,14 @@ def _factor_max(settings: Settings) -> float:
 
 @kernel
 def _begin_window(memory, state):
-    """Drop the last rows, the line's width and the scatter."""
+    """Drop the last rows, the line's width, the scatter and the usual widths."""
     state.window = 0
     state.half = memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.scatter.squares[:] = 0.0
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0
+    _restart_widths(memory.smoothing.widths)
 
 
 @kernel
@@ -304,6 +307,11 @@ def _write(rows, smoothing, state, output):
             output.width_px[i] = np.sqrt(rows.variance[k, c])
             output.events[i] = rows.events[k, c]
             output.return_index[i] = index
+            output.flags[i] = (
+                (MIXED if rows.mixed[k, c] else 0)
+                | (SENSOR_EDGE if rows.truncated[k, c] else 0)
+                | (FEW_EVENTS if rows.events[k, c] < smoothing.isolation_events else 0)
+            )
             index += 1
             i += 1
     state.rows = i
@@ -323,7 +331,8 @@ def _close(memory, state, counters):
     counters.events_unmodulated += sums.events_unmodulated
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     _scale(rows, scatter, estimator.error_model)
-    counters.columns_smoothed += _smooth(rows.row, rows.sigma2, rows.common2, smoothing)
+    counters.columns_smoothed += _smooth(rows, smoothing)
+    _mark_unusual(rows, smoothing.row, smoothing.sigma2, smoothing.widths)
     if estimator.method == _LEARNED:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
@@ -355,23 +364,6 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
 
 
 @kernel
-def _merge(held, new, edges, progress, gate, memory, state, counters):
-    """Merge events, first those of ``held``, with edges from ``progress`` on.
-
-    A period is closed when an event reaches its end or after the last event. Events and edges
-    remain when the output has no room for another profile.
-    """
-    size = held.t.size
-    i, edge = progress
-    if i < size:
-        i, edge = _merge_part(held, edges, i, edge, False, gate, memory, state, counters)
-        if i < size:
-            return _Progress(i, edge)
-    i, edge = _merge_part(new, edges, i - size, edge, True, gate, memory, state, counters)
-    return _Progress(size + i, edge)
-
-
-@kernel
 def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
     """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
     columns, rows = memory.columns, memory.estimator.rows
@@ -396,3 +388,20 @@ def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
         state.edge_us = edges.t_us[edge]
         state.period = edges.period[edge]
         edge += 1
+
+
+@kernel
+def _merge(held, new, edges, progress, gate, memory, state, counters):
+    """Merge events, first those of ``held``, with edges from ``progress`` on.
+
+    A period is closed when an event reaches its end or after the last event. Events and edges
+    remain when the output has no room for another profile.
+    """
+    size = held.t.size
+    i, edge = progress
+    if i < size:
+        i, edge = _merge_part(held, edges, i, edge, False, gate, memory, state, counters)
+        if i < size:
+            return _Progress(i, edge)
+    i, edge = _merge_part(new, edges, i - size, edge, True, gate, memory, state, counters)
+    return _Progress(size + i, edge)

@@ -24,6 +24,7 @@ _DTYPES = {
     "events": np.uint32,
     "width_px": np.float64,
     "return_index": np.uint8,
+    "flags": np.uint16,
     "range_mm": np.float64,
     "sigma_mm": np.float64,
 }
@@ -50,6 +51,8 @@ class LineRows:
         Sample standard deviation of the rows used; 0 for a single event.
     return_index : uint8
         Place among the rows of the same profile and column, nearest range first.
+    flags : uint16
+        Bits of ``FLAGS``: what makes a point worse than its neighbours; 0 for a good one.
     reflectance, reflectance_sigma : float64, optional
         Relative reflectance and its standard deviation; ``None`` where it is not estimated.
     """
@@ -63,6 +66,7 @@ class LineRows:
     events: NDArray[np.uint32]
     width_px: NDArray[np.float64]
     return_index: NDArray[np.uint8]
+    flags: NDArray[np.uint16]
     reflectance: NDArray[np.float64] | None = None
     reflectance_sigma: NDArray[np.float64] | None = None
 
@@ -164,6 +168,7 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
     points["sigma"] = profiles.sigma_mm * 1e-3
     points["t"] = (profiles.t_us - np.int64(origin_us)) * 1e-6
     points["column"] = profiles.column
+    points["flags"] = profiles.flags
     if known:
         points["reflectance"] = profiles.reflectance
         points["reflectance_sigma"] = profiles.reflectance_sigma

@@ -106,7 +106,7 @@ class Reconstructor:
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
-            columns_compensated=0,
+            points_flagged=0, columns_compensated=0,
         )  # fmt: skip
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
@@ -207,6 +207,10 @@ class Reconstructor:
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
             profiles = profiles.select(within)
+        flagged = profiles.flags != 0
+        self._counts["points_flagged"] += int(np.count_nonzero(flagged))
+        if self.settings.keep == "good":
+            profiles = profiles.select(~flagged)
         self._counts["points"] += len(profiles)
         before, self._before_restart = self._before_restart, []
         return Profiles.concatenate([*before, profiles]) if before else profiles
@@ -333,6 +337,7 @@ class Reconstructor:
         ``events_dropped``: without light there is no phase, and nothing to lose.
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
         laser.
+        ``points_flagged`` are some of ``points``, or with ``keep`` good left out.
         ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
         ``decoder_*`` come from the decoder.
         """

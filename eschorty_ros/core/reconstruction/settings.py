@@ -19,6 +19,7 @@ from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US
 
 NOISE_FILTERS = ("none", "activity")
 SWITCH = ("off", "on")
+KEEP = ("all", "good")
 TRIGGER_SOURCES = ("laser", "stage", "none")
 
 
@@ -77,6 +78,7 @@ class Settings:
     returns: str = _choice(
         "strongest", RETURNS, "which of two surfaces in one column to report; first is the nearest"
     )
+    keep: str = _choice("all", KEEP, "points to keep; good ones have no flag")
     noise_filter: str = _choice("none", NOISE_FILTERS, "filter before the events are binned")
     phase_gate_us: int = _number(
         0, 0, GATE_MAX_US, "us", "keep only events this soon after their laser edge; 0 is off"

@@ -39,7 +39,7 @@ _AHEAD_SHARE = 0.8
 """Part of the line's width to look ahead: the rest shifts little, and holding back costs time."""
 
 _SIGMA_SHARE = 0.2
-_SIGMA_PX = 0.3
+_SIGMA_PX = 0.35
 """Standard deviation of a correction: a share of it, and what half the error of a width gives."""
 
 _REACH_COLUMNS = 2

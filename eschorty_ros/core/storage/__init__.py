@@ -1,8 +1,12 @@
 """Recordings and clouds; Prophesee RAW files in ``raw_file``, which brings the decoder with it."""
 
 from eschorty_ros.core.storage.cloud import (
+    FEW_EVENTS,
+    FLAGS,
+    MIXED,
     POINT_DTYPE,
     REFLECTANCE_DTYPE,
+    SENSOR_EDGE,
     Points,
     join_points,
     read_cloud,
@@ -28,9 +32,13 @@ from eschorty_ros.core.storage.recording import (
 __all__ = [
     "CALIBRATION_FILE",
     "EVENTS_FILE",
+    "FEW_EVENTS",
+    "FLAGS",
     "LASER_FILE",
+    "MIXED",
     "POINT_DTYPE",
     "REFLECTANCE_DTYPE",
+    "SENSOR_EDGE",
     "STAGE_FILE",
     "TRUTH_DTYPE",
     "TRUTH_FILE",

@@ -23,18 +23,30 @@ POINT_DTYPE = np.dtype(
         ("sigma", "<f4"),
         ("t", "<f8"),
         ("column", "<u2"),
+        ("flags", "<u2"),
     ]
 )
-"""Packed, 30 bytes: x y z sigma in metres, intensity in events, t in seconds, column in px."""
+"""Packed, 32 bytes: x y z sigma in metres, intensity in events, t in seconds, column in px.
+
+``flags`` are bits of ``FLAGS``, 0 for a good point.
+"""
+
+MIXED, SENSOR_EDGE, FEW_EVENTS = 1, 2, 4
+FLAGS = {"mixed": MIXED, "sensor_edge": SENSOR_EDGE, "few_events": FEW_EVENTS}
+"""Bits of a point's flags: the line is on two surfaces, cut by the sensor's edge, or weak."""
 
 REFLECTANCE_DTYPE = np.dtype(
     [*POINT_DTYPE.descr, ("reflectance", "<f4"), ("reflectance_sigma", "<f4")]
 )
-"""POINT_DTYPE with the relative reflectance and its standard deviation, 38 bytes."""
+"""POINT_DTYPE with the relative reflectance and its standard deviation, 40 bytes."""
 
 Points = NDArray[np.void]
 
 _DTYPES = (POINT_DTYPE, REFLECTANCE_DTYPE)
+# Clouds written before points had flags.
+_UNFLAGGED = {
+    np.dtype([item for item in kind.descr if item[0] != "flags"]): kind for kind in _DTYPES
+}
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u2": "ushort"}
 _HEADER_LIMIT = 4096
@@ -78,7 +90,7 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
 
 
 def read_cloud(path: str | os.PathLike[str]) -> Points:
-    """Read a cloud that :func:`write_cloud` wrote.
+    """Read a cloud that :func:`write_cloud` wrote; without flags in the file they are 0.
 
     Returns
     -------
@@ -96,12 +108,14 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
     with open_regular_file(source, FormatError) as stream:
         head = stream.read(_HEADER_LIMIT)
         count, start = _parse_header(source, head)
-        dtype = next((kind for kind in _DTYPES if header(kind, count) == head[:start]), None)
+        kinds = (*_DTYPES, *_UNFLAGGED)
+        dtype = next((kind for kind in kinds if header(kind, count) == head[:start]), None)
         expected = 0 if dtype is None else count * dtype.itemsize
         found = os.fstat(stream.fileno()).st_size - start
         if dtype is not None and found == expected:
             stream.seek(start)
-            return np.frombuffer(bytearray(stream.read(expected)), dtype, count)
+            points = np.frombuffer(bytearray(stream.read(expected)), dtype, count)
+            return _widened(points, _UNFLAGGED.get(dtype, dtype))
     if dtype is None:
         raise OtherFormatError(
             f"{source}: its header is not that of an eschorty_ros cloud; expected the fields "
@@ -114,7 +128,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
 
 
 def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return all points of ``parts``; a field that some of them lack is NaN in theirs.
+    """Return all points of ``parts``; a field that some of them lack is NaN in theirs, flags 0.
 
     Parameters
     ----------
@@ -138,7 +152,8 @@ def _widened(points: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     wide = np.empty(len(points), dtype)
     known = points.dtype.names or ()
     for name in dtype.names or ():
-        wide[name] = points[name] if name in known else np.nan
+        missing = 0 if name == "flags" else np.nan
+        wide[name] = points[name] if name in known else missing
     return wide
 
 

@@ -40,6 +40,7 @@ class ScanJob:
     frequency_hz: float
     seed: int = 0
     pixels: str = "paper"
+    keep: str = "all"
     hardware: Tables | None = None
 
 
@@ -70,7 +71,8 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         When a node fails, or the scanner refuses the goal or takes far too long.
     """
     tables = bench_parameters() if job.hardware is None else {**job.hardware}
-    tables["reconstruction"] = {"calibration": job.calibration, **tables.get("reconstruction", {})}
+    own = {"calibration": job.calibration, "keep": job.keep}
+    tables["reconstruction"] = {**own, **tables.get("reconstruction", {})}
     bench = None
     if job.hardware is None:
         bench = bench_options(job.scene, job.calibration, job.seed, job.pixels)

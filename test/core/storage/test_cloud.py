@@ -38,9 +38,33 @@ def open3d() -> ModuleType:
 
 
 def test_point_layout():
-    assert POINT_DTYPE.names == ("x", "y", "z", "intensity", "sigma", "t", "column")
-    assert POINT_DTYPE.itemsize == 30
-    assert [POINT_DTYPE[name].str for name in POINT_DTYPE.names] == ["<f4"] * 5 + ["<f8", "<u2"]
+    assert POINT_DTYPE.names == ("x", "y", "z", "intensity", "sigma", "t", "column", "flags")
+    assert POINT_DTYPE.itemsize == 32
+    kinds = [POINT_DTYPE[name].str for name in POINT_DTYPE.names]
+    assert kinds == ["<f4"] * 5 + ["<f8", "<u2", "<u2"]
+
+
+@pytest.mark.parametrize(
+    ("extension", "lines"),
+    [
+        (".pcd", [(b" flags", b""), (b" 2\nTYPE", b"\nTYPE"), (b" U U\n", b" U\n"),
+                  (b" 1 1\nWIDTH", b" 1\nWIDTH")]),
+        (".ply", [(b"property ushort flags\n", b"")]),
+    ],
+)  # fmt: skip
+def test_a_cloud_written_before_there_were_flags_has_good_points(tmp_path, extension, lines):
+    file, points = tmp_path / f"cloud{extension}", cloud(20)
+    write_cloud(file, points)
+    head = file.read_bytes()[: -points.nbytes]
+    for new, old in lines:
+        assert head.count(new) == 1
+        head = head.replace(new, old)
+    names = list(points.dtype.names[:-1])
+    old_points = np.zeros(20, [(name, POINT_DTYPE[name]) for name in names])
+    for name in names:
+        old_points[name] = points[name]
+    file.write_bytes(head + old_points.tobytes())
+    assert read_cloud(file).tobytes() == points.tobytes()
 
 
 @pytest.mark.parametrize("extension", [*EXTENSIONS, ".PCD"])
@@ -82,15 +106,15 @@ def test_open3d_sees_the_same_points(tmp_path, extension, open3d):
 def test_headers_as_written(tmp_path):
     write_cloud(tmp_path / "c.pcd", cloud(2))
     write_cloud(tmp_path / "c.ply", cloud(2))
-    assert (tmp_path / "c.pcd").read_bytes()[:-60].decode() == (
+    assert (tmp_path / "c.pcd").read_bytes()[:-64].decode() == (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
-        "FIELDS x y z intensity sigma t column\nSIZE 4 4 4 4 4 8 2\nTYPE F F F F F F U\n"
-        "COUNT 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
+        "FIELDS x y z intensity sigma t column flags\nSIZE 4 4 4 4 4 8 2 2\nTYPE F F F F F F U U\n"
+        "COUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA binary\n"
     )
-    assert (tmp_path / "c.ply").read_bytes()[:-60].decode() == (
+    assert (tmp_path / "c.ply").read_bytes()[:-64].decode() == (
         "ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
         "property float y\nproperty float z\nproperty float intensity\nproperty float sigma\n"
-        "property double t\nproperty ushort column\nend_header\n"
+        "property double t\nproperty ushort column\nproperty ushort flags\nend_header\n"
     )
 
 

@@ -1,0 +1,148 @@
+"""Points whose line is narrower or wider than the lines of its stream: they are on two surfaces.
+
+An edge of range or reflectance within the line's thickness leaves a part of the line, or two parts
+side by side, and moves the row by up to half of the change of the full width. A width is unusual
+when few lines of the stream have it for longer than a profile: the width of a line that a step
+crosses changes, that on a dark surface stays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+
+_PER_ROW = 16
+_BINS = 1 << 10
+# A width is usual when this share of the stream's points is within one standard deviation of it: a
+# normal distribution alone leaves out 3 in 1000.
+_USUAL_SHARE = 0.02
+# Mixed ones count less, even less where the row moves. A width or row is steady when it changes by
+# so many deviations at most.
+_MIXED_WEIGHT = 0.25
+_MOVING_WEIGHT = 0.05
+_STEADY = 2.0 * np.sqrt(2.0)
+_POINTS_MIN = 512.0
+# Points that are remembered, in profiles of all columns.
+_PROFILES_KEPT = 256
+_APART = 5
+# Steps of the running median of differences are this share of it, larger ones at first; standard
+# deviation over that median.
+_STEP = 1.0 / 1024.0
+_SIGMA_PER_MEDIAN = 1.0 / 0.954
+_ROOT_3 = np.sqrt(3.0)
+
+
+class Widths(NamedTuple):
+    """Widths (standard deviations of the rows) of a stream's smoothed points.
+
+    ``number`` has the points by width and ``below`` their sums; ``state`` the median width and the
+    median difference of widths near each other. ``smoothed`` holds those of a profile, ``before``
+    widths and rows of the last one, and ``used`` the columns that each is the mean of.
+    """
+
+    number: NDArray[np.float64]
+    below: NDArray[np.float64]
+    state: NDArray[np.float64]
+    before: NDArray[np.float64]
+    smoothed: NDArray[np.float64]
+    used: NDArray[np.int64]
+
+
+def empty_widths(returns: int, columns: int) -> Widths:
+    """Return no widths."""
+    return Widths(
+        number=np.zeros(_BINS),
+        below=np.zeros(_BINS + 1),
+        state=np.zeros(2),
+        before=np.full((2, returns, columns), np.nan),
+        smoothed=np.full((returns, columns), np.nan),
+        used=np.ones((returns, columns), np.int64),
+    )
+
+
+@kernel
+def _bin(width):
+    return min(np.int64(width * _PER_ROW), _BINS - 1)
+
+
+@kernel
+def _restart_widths(widths):
+    """Forget all widths."""
+    widths.number[:] = 0.0
+    widths.below[:] = 0.0
+    widths.state[:] = 0.0
+    widths.before[:] = np.nan
+
+
+@kernel
+def _is_usual(widths, width, reach):
+    place = _bin(width)
+    low, high = max(place - reach, 0), min(place + reach + 1, _BINS)
+    return widths.below[high] - widths.below[low] >= _USUAL_SHARE * widths.below[_BINS]
+
+
+@kernel
+def _unusual_variance(width, usual):
+    """Return the variance of a row, px squared, whose line has not the ``usual`` width.
+
+    A line with missing rows is off by half of them at most, one with more by what they scatter.
+    """
+    if width < usual:
+        return (_ROOT_3 * (usual - width)) ** 2
+    return width * width - usual * usual
+
+
+@kernel
+def _update(widths, columns):
+    """Bring the sums and the median up to date, and halve what is remembered when it is much."""
+    number, below = widths.number, widths.below
+    if below[_BINS] > _PROFILES_KEPT * columns:
+        number *= 0.5
+    total = 0.0
+    for b in range(_BINS):
+        total += number[b]
+        below[b + 1] = total
+    median = 0
+    while median < _BINS - 1 and 2.0 * below[median + 1] < total:
+        median += 1
+    widths.state[0] = (median + 0.5) / _PER_ROW
+
+
+@kernel
+def _mark_unusual(rows, row, sigma2, widths):
+    """Mark the mixed points of a profile's smoothed rows and widen their variance ``sigma2``."""
+    returns, columns = row.shape
+    smoothed, before, state = widths.smoothed, widths.before, widths.state
+    known = widths.below[_BINS] >= _POINTS_MIN
+    usual, sigma = state[0], _SIGMA_PER_MEDIAN * state[1]
+    pairs = widths.below[_BINS] + 1.0
+    for k in range(returns):
+        for c in range(columns):
+            width, last_width, last_row = smoothed[k, c], before[0, k, c], before[1, k, c]
+            before[0, k, c], before[1, k, c] = width, row[k, c]
+            rows.mixed[k, c] = False
+            if np.isnan(width) or rows.truncated[k, c]:
+                continue
+            weight = 1.0
+            reach = sigma * np.sqrt(5.0 / widths.used[k, c]) * _PER_ROW
+            if known and not _is_usual(widths, width, max(np.int64(np.rint(reach)), 1)):
+                way = row[k, c] - last_row
+                own2 = sigma2[k, c] - rows.common2[k, c]
+                steady = not way * way > _STEADY**2 * own2
+                weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
+                rows.mixed[k, c] = True
+                sigma2[k, c] += _unusual_variance(width, usual)
+            if not abs(width - last_width) > _STEADY * sigma:
+                widths.number[_bin(width)] += weight
+            if c >= _APART and not np.isnan(smoothed[k, c - _APART]):
+                difference = abs(width - smoothed[k, c - _APART])
+                if state[1] == 0.0:
+                    state[1] = difference
+                pairs += 1.0
+                step = max(1.0 / pairs, _STEP)
+                state[1] *= 1.0 + (step if difference > state[1] else -step)
+    _update(widths, columns)
