@@ -10,7 +10,6 @@ from reconstructing import reconstruct
 
 from eschorty_ros.core.evt3 import sort_readout
 from eschorty_ros.core.line import METHOD_ERRORS, METHODS, SIGMA_FLOOR_PX, estimate
-from eschorty_ros.core.line.truncation import _fit_truncated
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Settings
 
@@ -169,47 +168,6 @@ def test_line_cut_in_half_is_off_by_the_truncated_normal(edge, sigma_px, measure
     assert found.edge.all()
     assert (np.abs(found.row - edge) < 3.0 * found.sigma_row).all()
     assert (np.abs(found.row - edge) > 0.5 * found.sigma_row).all()
-
-
-@pytest.mark.parametrize("sigma_px", [0.8, 4.0, 25.0])
-@pytest.mark.hard_case(24)
-def test_truncated_normal_is_inverted(sigma_px, measured):
-    """Mean and variance of the visible part, with 50 digits, give the centre back."""
-    worst = 0.0
-    with mpmath.workdps(50):
-        for share in np.linspace(0.02, 1.5, 40):
-            alpha = -mpmath.mpf(float(share))
-            hazard = mpmath.npdf(alpha) / (1 - mpmath.ncdf(alpha))
-            mean = sigma_px * (hazard - alpha)
-            variance = sigma_px**2 * (1 + alpha * hazard - hazard**2)
-            fit = _fit_truncated(float(mean), float(variance), 20.0, sigma_px)
-            assert (fit.sigma, fit.moved) == (sigma_px, 0.0)
-            worst = max(worst, abs(fit.centre - float(share) * sigma_px) / sigma_px)
-    measured("centre of a cut Gaussian from its visible part, sigma", worst, 1e-12)
-
-
-@pytest.mark.parametrize("method", ["mode_mean", "gauss_ml", "edge_mid"])
-@pytest.mark.parametrize(("row", "bias_px"), [(704.0, 0.3), (707.0, 0.6), (712.0, 1.5)])
-@pytest.mark.hard_case(24)
-def test_flat_line_narrower_than_its_window(method, row, bias_px):
-    """Rows as bright pixels fire: equally often across the line, which ends 10 rows off its middle.
-
-    From row 710 on the sensor cuts it. As a Gaussian of the window's width it would be 0.7, 1.6 and
-    2.7 rows too far out.
-    """
-    rng = np.random.default_rng(SEED)
-    rows, offsets = [], [0]
-    for _ in range(400):
-        line = np.rint(rng.uniform(row - 10.0, row + 10.0, 40))
-        rows.append(line[line < 720.0].astype(int))
-        offsets.append(offsets[-1] + rows[-1].size)
-    # Independent events: their mean scatters by s/sqrt(N), hence a factor of 1.
-    independent = 1.0 / METHOD_ERRORS["mode_mean"].factor
-    found = estimate(np.concatenate(rows), offsets, method, sigma_factor=independent)
-    error = found.row - row
-    print(f"seed {SEED}: bias {np.median(error):.2f} px, sigma {np.median(found.sigma_row):.2f} px")
-    assert abs(np.median(error)) < bias_px
-    assert np.mean(np.abs(error) < 2.0 * found.sigma_row) > 0.93
 
 
 @every_method

@@ -30,7 +30,7 @@ from eschorty_ros.core.line.estimators import (
     _variance,
     likelihood_size,
 )
-from eschorty_ros.core.line.learned import _learned_row, make_footprint
+from eschorty_ros.core.line.learned import _bias_left, _learned_row, _sample, make_footprint
 from eschorty_ros.core.line.sigma import (
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
@@ -39,11 +39,6 @@ from eschorty_ros.core.line.sigma import (
     ErrorModel,
     _own_variance,
     error_model,
-)
-from eschorty_ros.core.line.truncation import (
-    RowEstimate,
-    _correct_truncation,
-    _full_column_estimate,
 )
 from eschorty_ros.core.line.window import (
     AMBIGUOUS,
@@ -76,6 +71,10 @@ _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 _WINDOWS_MAX = 4
 # A full column wider than this many times the line's variance holds background.
 _BACKGROUND_FREE = 1.5
+# Half the width of a line in standard deviations: 1.7 for a flat one, about 3 for a Gaussian.
+_HALF_SPAN = 2.5
+# Bias of the mean of half a Gaussian, squared, over the variance of that half.
+_HALF_BIAS2 = 1.7519
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +145,14 @@ class Rows(NamedTuple):
     mixed: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
     shift: NDArray[np.float64]
+
+
+class RowEstimate(NamedTuple):
+    """A row and its variance; ``truncated`` where the edge of the sensor cuts the line."""
+
+    row: float
+    sigma2: float
+    truncated: bool
 
 
 class Scratch(NamedTuple):
@@ -265,9 +272,8 @@ def estimate(
     narrower one; overlapping ones are merged; of two separate equal ones the strongest is NaN,
     since any choice would prefer a direction, while the other ``returns`` report them both.
 
-    A window that the sensor's edge cuts contains part of a Gaussian: the three windowed methods
-    return the row of the full line (truncated normal), ``mean`` and ``median`` a sigma that covers
-    the difference.
+    Where the sensor's edge cuts the line ``sigma_row`` covers the bias of the part that is left. A
+    stream corrects it, with the footprint of the line elsewhere.
 
     Examples
     --------
@@ -438,15 +444,15 @@ def _row_in_window(packed, column, window, other, half, estimator, scratch):
 
 
 @kernel
-def _row_estimate(row, variance, line_variance, window, half, estimator):
-    """Return the row with its own variance, corrected where the edge of the sensor cuts it."""
-    events, rows, model = window.sums.events, estimator.rows, estimator.error_model
-    if not _is_windowed(estimator.method):
-        return _full_column_estimate(row, variance, line_variance, events, rows, model)
-    sigma2 = _own_variance(variance, line_variance, events, row, rows, model)
-    if window.first == 0 or window.last >= rows - 1.0:
-        return _correct_truncation(row, sigma2, variance, window, half, rows, model)
-    return RowEstimate(row, sigma2, False)
+def _row_estimate(row, variance, line_variance, events, estimator):
+    """Return a row with its own variance, which covers its bias where the sensor cuts the line."""
+    rows = estimator.rows
+    sigma2 = _own_variance(variance, line_variance, events, row, rows, estimator.error_model)
+    # Background widens a column without moving the line to the edge.
+    line = min(variance, _BACKGROUND_FREE * line_variance)
+    reach = _HALF_SPAN * np.sqrt(line)
+    truncated = row < reach or rows - 1.0 - row < reach
+    return RowEstimate(row, sigma2 + _HALF_BIAS2 * line if truncated else sigma2, truncated)
 
 
 @kernel
@@ -473,6 +479,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
     testing = windowed and blink.step > 0
+    learning = estimator.method == _LEARNED or footprint.state[3] > 0
+    near_edge = False
     packed, model = columns.packed, estimator.error_model
     line_variance = min((half / HALF_PER_SIGMA) ** 2, estimator.line_variance)
     if estimator.method == _GAUSS_ML:
@@ -524,24 +532,27 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
             variance = _variance(window.sums)
             row = _mean(window)
+            cut = windowed and (window.first == 0 or window.last >= estimator.rows - 1.0)
+            near_edge |= cut
             learned = -1.0
-            if estimator.method == _LEARNED:
+            if learning:
+                _sample(packed, column, c, row, estimator.rows, footprint, scratch.row_counts)
+            if cut or estimator.method == _LEARNED:
                 best, learned = _learned_row(
-                    packed, column, c, row, estimator.rows, footprint, scratch.row_counts
+                    packed, column, row, estimator.rows, footprint, scratch.row_counts
                 )
-            elif estimator.method > _MEAN:
+            if learned < 0.0 and _MEAN < estimator.method < _LEARNED:
                 row = _row_in_window(packed, column, window, other, half, estimator, scratch)
+            used = window.sums.events
+            estimate = _row_estimate(row, variance, line_variance, used, estimator)
             if learned >= 0.0:
-                cut = window.first == 0 or window.last >= estimator.rows - 1.0
                 best = min(max(best, -0.5), estimator.rows - 0.5)
-                estimate = RowEstimate(best, learned, cut)
-            else:
-                estimate = _row_estimate(row, variance, line_variance, window, half, estimator)
+                bias2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
+                estimate = RowEstimate(best, learned + bias2, estimate.truncated)
             if not windowed:
                 columns.seeds[c] = np.int64(np.rint(FRACTION * row))
                 if last >= 0:
                     out.shift[c] = (columns.seeds[c] - last) / FRACTION
-            used = window.sums.events
             out.row[k, c] = estimate.row
             out.sigma2[k, c] = estimate.sigma2
             out.common2[k, c] = model.common**2
@@ -555,4 +566,5 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
                 squares += variance * (used - 1)
                 freedom += used - 1
             window, other = other, window
+    footprint.state[3] = near_edge
     return PeriodSums(squares, freedom, few, ambiguous, two, unmodulated, events_unmodulated)

@@ -36,6 +36,8 @@ _SMOOTHING_PASSES = 4
 _PRIOR_PIXELS = 2.0
 _PRIOR_COUNT = 0.02
 _MOVES_MAX = 24
+# Where every line is cut, a computation from rows that are off leaves this part of their bias.
+_BIAS_KEPT = 0.85
 _OFF_LINE_PX = 1.0
 
 
@@ -45,7 +47,9 @@ class Footprint(NamedTuple):
     ``log[k]`` is relative to that of no event but for ``log[0]``; ``empty`` is the sum of
     ``log[0]`` over all rows, by the line's place in its row. ``rows_seen`` holds the events of
     the sampled columns' rows from ``first_row`` on, which is -1 where there is none. ``state`` is
-    the number of profiles, of computations and of the columns counted since.
+    the number of profiles, of computations and of the columns counted since; 1 while the sensor's
+    edge cuts a line, which other estimators need a footprint for; and the number of computations
+    from lines that are all cut.
     """
 
     pixels: NDArray[np.float64]
@@ -69,14 +73,28 @@ def make_footprint(half_max: int, columns: int) -> Footprint:
         likelihood=np.zeros(2 * _SIDE + 1, np.int32),
         rows_seen=np.zeros((columns // _STRIDE + 1, 2 * reach + 1), np.uint8),
         first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
-        state=np.zeros(3, np.int64),
+        state=np.zeros(5, np.int64),
         reach=reach,
     )
 
 
 @kernel
-def _is_learned(footprint):
-    return footprint.state[1] > 0
+def _forget(footprint):
+    """Begin to learn again."""
+    footprint.pixels[:] = 0.0
+    footprint.log[:] = 0
+    footprint.empty[:] = 0
+    footprint.likelihood[:] = 0
+    footprint.rows_seen[:] = 0
+    footprint.first_row[:] = -1
+    footprint.state[:] = 0
+
+
+@kernel
+def _bias_left(footprint):
+    """Return the share of a cut line's bias that is left, 0 where whole lines are learned from."""
+    rounds = footprint.state[4]
+    return _BIAS_KEPT**rounds if rounds > 0 else 0.0
 
 
 @kernel
@@ -89,16 +107,22 @@ def _count_rows(packed, column, low, high, counts):
 
 
 @kernel
-def _remember(footprint, c, centre, counts, rows):
-    """Keep the events by row of column ``c`` to learn from, when its turn has come."""
-    if (c - footprint.state[0]) % _STRIDE != 0:
-        return
+def _sample(packed, column, c, row, rows, footprint, counts):
+    """Keep the events by row of column ``c`` to learn from, when its turn has come.
+
+    ``counts`` is zeroed scratch, one per row.
+    """
     slot = c // _STRIDE
+    if (c - footprint.state[0]) % _STRIDE != 0 or slot >= footprint.first_row.size:
+        return
+    centre = np.int64(np.rint(row))
     first = max(centre - footprint.reach, np.int64(0))
     last = min(centre + footprint.reach, rows - 1)
+    _count_rows(packed, column, first, last, counts)
     footprint.first_row[slot] = first
-    for row in range(first, last + 1):
-        footprint.rows_seen[slot, row - first] = min(counts[row], _COUNTS - 1)
+    for at in range(first, last + 1):
+        footprint.rows_seen[slot, at - first] = min(counts[at], _COUNTS - 1)
+    counts[first : last + 1] = 0
 
 
 @kernel
@@ -133,39 +157,37 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
 
 
 @kernel
-def _learned_row(packed, column, c, row, rows, footprint, counts):
+def _learned_row(packed, column, row, rows, footprint, counts):
     """Return the row of a line near ``row`` and its variance; 0 and -1 before any is learned.
 
     ``counts`` is zeroed scratch, one per row.
     """
+    if footprint.state[1] == 0:
+        return 0.0, -1.0
     place = np.int64(np.rint(_PLACES * row))
     reach = footprint.reach
     centre = np.int64(np.rint(row))
-    known = _is_learned(footprint)
-    margin = reach + _MOVES_MAX if known else reach
+    margin = reach + _MOVES_MAX
     all_low, all_high = max(centre - margin, 0), min(centre + margin, rows - 1)
     _count_rows(packed, column, all_low, all_high, counts)
-    _remember(footprint, c, centre, counts, rows)
-    mean, variance = 0.0, -1.0
-    if known:
-        for _ in range(_MOVES_MAX):
-            low = max(-((_PLACES * reach - place) // _PLACES), all_low)
-            high = min((place + _PLACES * reach) // _PLACES, all_high)
-            best = _log_likelihoods(footprint, place, low, high, counts, rows)
-            if abs(best) <= _SIDE - 2:
-                break
-            place = np.int64(min(max(place + best, -_PLACES), _PLACES * rows))
-        peak = footprint.likelihood[_SIDE + best]
-        total, first, second = 0.0, 0.0, 0.0
-        for m in range(_SIDE + 1):
-            above = np.exp((footprint.likelihood[_SIDE + m] - peak) / _LOG_ONE)
-            below = np.exp((footprint.likelihood[_SIDE - m] - peak) / _LOG_ONE) if m else 0.0
-            total += above + below
-            first += m * (above - below)
-            second += m * m * (above + below)
-        offset = first / total
-        mean = (place + offset) / _PLACES
-        variance = max(second / total - offset * offset, 0.0) / (_PLACES * _PLACES)
+    for _ in range(_MOVES_MAX):
+        low = max(-((_PLACES * reach - place) // _PLACES), all_low)
+        high = min((place + _PLACES * reach) // _PLACES, all_high)
+        best = _log_likelihoods(footprint, place, low, high, counts, rows)
+        if abs(best) <= _SIDE - 2:
+            break
+        place = np.int64(min(max(place + best, -_PLACES), _PLACES * rows))
+    peak = footprint.likelihood[_SIDE + best]
+    total, first, second = 0.0, 0.0, 0.0
+    for m in range(_SIDE + 1):
+        above = np.exp((footprint.likelihood[_SIDE + m] - peak) / _LOG_ONE)
+        below = np.exp((footprint.likelihood[_SIDE - m] - peak) / _LOG_ONE) if m else 0.0
+        total += above + below
+        first += m * (above - below)
+        second += m * m * (above + below)
+    offset = first / total
+    mean = (place + offset) / _PLACES
+    variance = max(second / total - offset * offset, 0.0) / (_PLACES * _PLACES)
     counts[all_low : all_high + 1] = 0
     return mean, variance
 
@@ -195,8 +217,9 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
         footprint.state[2] += 1
     footprint.state[0] += 1
     doublings = min(max(footprint.state[1] - _ROUNDS, 0), _DOUBLINGS)
-    if footprint.state[2] >= _COLUMNS_MIN << doublings:
+    if footprint.state[2] >= _COLUMNS_MIN << (doublings if whole else 0):
         _compute(footprint)
+        footprint.state[4] = 0 if whole else footprint.state[4] + 1
         pixels[:] = 0.0
         footprint.state[2] = 0
 

@@ -25,7 +25,7 @@ from eschorty_ros.core.line.centroid import (
 )
 from eschorty_ros.core.line.columns import Columns, _append, empty_columns, wider_columns
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
-from eschorty_ros.core.line.learned import Footprint, _learn, make_footprint
+from eschorty_ros.core.line.learned import Footprint, _forget, _learn, make_footprint
 from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
 from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
@@ -269,7 +269,7 @@ def _factor_max(settings: Settings) -> float:
 
 @kernel
 def _begin_window(memory, state):
-    """Drop the last rows, the line's width, the scatter and the usual widths."""
+    """Drop the last rows, and what was learned of the line, but for the footprint of `learned`."""
     state.window = 0
     state.half = memory.estimator.half_max
     memory.columns.seeds[:] = -1
@@ -277,6 +277,8 @@ def _begin_window(memory, state):
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0
     _restart_widths(memory.smoothing.widths)
+    if memory.estimator.method != _LEARNED:
+        _forget(memory.footprint)
 
 
 @kernel
@@ -333,7 +335,7 @@ def _close(memory, state, counters):
     _scale(rows, scatter, estimator.error_model)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _mark_unusual(rows, smoothing.row, smoothing.sigma2, smoothing.widths)
-    if estimator.method == _LEARNED:
+    if estimator.method == _LEARNED or footprint.state[3] > 0:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
     _write(rows, smoothing, state, output)

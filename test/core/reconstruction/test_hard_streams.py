@@ -158,10 +158,10 @@ def _sloping(towards: float):
 
 
 @pytest.mark.parametrize("edge", [0.0, 719.0])
-def test_a_learned_footprint_finds_a_line_that_the_sensors_edge_cuts(edge):
+def test_the_row_of_a_line_that_the_sensors_edge_cuts_is_that_of_the_full_line(edge):
     camera = Camera(periods=12)
     row = _sloping(edge)
-    found, _ = points(camera, camera.line(row), centroid="learned")
+    found, _ = points(camera, camera.line(row))
     found = found.select(found.period >= 4)
     truth = row(0, found.column.astype(float))
     for low, high in ((3, 5), (5, 9), (9, 14)):
@@ -169,6 +169,15 @@ def test_a_learned_footprint_finds_a_line_that_the_sensors_edge_cuts(edge):
         error = (found.row - truth)[near]
         assert abs(error.mean()) < 0.05, f"seed {camera.seed}, rows {low} to {high}"
         assert np.mean(np.abs(error) < found.sigma_row[near]) > 0.6
+
+
+@pytest.mark.parametrize("at", [3.0, 10.0, 714.0])
+def test_a_line_that_is_cut_in_every_column_has_an_honest_sigma_and_a_small_bias(at):
+    camera = Camera(periods=48)
+    found, _ = points(camera, camera.line(lambda k, c: at + 0.6 * np.sin(c / 40.0)))
+    error = found.row - (at + 0.6 * np.sin(found.column / 40.0))
+    assert np.mean(np.abs(error) < 2.0 * found.sigma_row) > 0.93, f"seed {camera.seed}"
+    assert abs(error[found.period >= 44].mean()) < 0.15
 
 
 def test_a_learned_footprint_reduces_the_error_where_half_of_the_events_are_lost():
