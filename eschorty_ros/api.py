@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.reconstruction import Profiles, Settings, reconstruct_recording
+from eschorty_ros.core.reconstruction import (
+    Profiles,
+    Settings,
+    reconstruct_recording,
+    recorded_settings,
+)
 from eschorty_ros.core.storage import Recording, load_recording, write_cloud
 from eschorty_ros.report.accuracy import Accuracy, measure_recorded
 
@@ -64,7 +69,8 @@ def reconstruct(
     progress : callable, optional
         Called with bytes read so far and bytes in all.
     **settings
-        Fields of `Settings`, such as ``centroid="median"``.
+        Fields of `Settings`, such as ``centroid="median"``; the others are those of the recorded
+        scan, or the defaults.
 
     Raises
     ------
@@ -79,5 +85,6 @@ def reconstruct(
             f"there is no setting {unknown[0]!r}; `eschorty reconstruct --help` lists them"
         )
     loaded = recording if isinstance(recording, Recording) else load_recording(recording)
-    found = reconstruct_recording(loaded, Settings(**settings), progress)
+    chosen = replace(recorded_settings(loaded), **settings)
+    found = reconstruct_recording(loaded, chosen, progress)
     return Cloud(found.points, found.profiles, found.warnings, found.counters, loaded)

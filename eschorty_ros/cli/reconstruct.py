@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +71,8 @@ def command(
     sensor's edge, 4: few events; 0: good); with --reflectance on also reflectance and
     reflectance_sigma.
 
+    The settings are those of the recorded scan, or the defaults, where no option is given.
+
     A cloud without points is not written: exit code 1, with the reason.
 
     \b
@@ -89,7 +91,11 @@ def command(
       eschorty reconstruct rec --json --smoothing-half-width 0
     """  # noqa: D301
     from eschorty_ros.core.base.files import check_writable
-    from eschorty_ros.core.reconstruction import Settings, reconstruct_recording, warm_up
+    from eschorty_ros.core.reconstruction import (
+        reconstruct_recording,
+        recorded_settings,
+        warm_up,
+    )
     from eschorty_ros.core.storage import load_recording, write_cloud
     from eschorty_ros.report.accuracy import measure_recorded
 
@@ -97,8 +103,8 @@ def command(
     if target.suffix not in (".pcd", ".ply"):
         raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
     check_writable(target)
-    chosen = Settings(**settings)
     loaded = load_recording(recording)
+    chosen = replace(recorded_settings(loaded), **_given(settings))
     with progress_bar("reconstructing") as report:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)
@@ -136,6 +142,13 @@ def command(
             **({} if measured is None else accuracy_rows(measured)),
         },
     )
+
+
+def _given(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that stand on the command line."""
+    source = click.get_current_context().get_parameter_source
+    default = click.core.ParameterSource.DEFAULT
+    return {name: value for name, value in settings.items() if source(name) is not default}
 
 
 def summary(result: Result) -> dict[str, Any]:

@@ -39,6 +39,11 @@ if TYPE_CHECKING:
     show_default=True,
     help="Folder for scan.pcd and scan.png.",
 )
+@click.option(
+    "--record",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="New folder for a recording, which `eschorty reconstruct` turns into the same points.",
+)
 def command(
     scene: str,
     frequency: float,
@@ -51,6 +56,7 @@ def command(
     keep: str,
     hardware: Path | None,
     out: Path,
+    record: Path | None,
 ) -> None:
     """Scan a scene with camera, laser, stage, reconstruction and scanner nodes.
 
@@ -65,9 +71,11 @@ def command(
       eschorty scan
       eschorty scan --scene sphere --speed 20 --out sphere
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
+      eschorty scan --record rec && eschorty reconstruct rec
       eschorty scan --hardware lab.yaml --calibration my.yaml
     """  # noqa: D301
     from eschorty_ros.core.base.files import check_writable
+    from eschorty_ros.core.storage.recording_writer import make_recording_folder
 
     check_sweep(start, stop)
     one_scan = nodes_module("one_process.scan", make="scan")
@@ -76,10 +84,12 @@ def command(
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     job = one_scan.ScanJob(
-        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, hardware=tables
+        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record
     )
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")
+    if record is not None:
+        make_recording_folder(record)
     with ended_by_signals(), progress_bar("scanning") as feedback:
         result = one_scan.scan_once(job, feedback)
     finish(job, result, out)
@@ -134,12 +144,14 @@ def _headline(result: ScanResult, out: Path) -> str:
 
 def _counted(result: ScanResult) -> dict[str, str]:
     note = {"note": result.message} if result.message else {}
+    recorded = {"recording": result.recording} if result.recording else {}
     return {
         "profiles": f"{result.profiles:,}",
         "points": f"{len(result.points):,}",
         "events": f"{result.events:,} ({result.events_dropped:,} dropped, "
         f"{result.packets_lost:,} packets lost)",
         **note,
+        **recorded,
     }
 
 

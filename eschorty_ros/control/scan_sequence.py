@@ -76,6 +76,7 @@ class ScanSummary:
     sigma_median_m: float = math.nan
     message: str = ""
     completeness: float = 0.0
+    recording: str = ""
 
     @property
     def verdict(self) -> str:

@@ -18,6 +18,7 @@ from eschorty_ros.live.packet_times import (
     overtaken,
     skips_time,
 )
+from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 
 _GAP_NS = WRAP_US * NS_PER_US // 2
@@ -96,6 +97,7 @@ class PacketStream:
         self._epoch: SensorEpoch | None = None
         self._epoch_used = False
         self._zero_ended = False
+        self._recorder: ScanRecorder | None = None
         self._laser: tuple[Modulation, int | None] | None = None
         self._on_since_ns: int | None = None
         self._reconstructor: Reconstructor | None = None
@@ -167,12 +169,19 @@ class PacketStream:
         """Forget an announced zero before the next scan: its sender has ended."""
         self._zero_ended = True
 
-    def begin_scan(self) -> None:
-        """Drop the state that senders have left behind."""
+    def begin_scan(self, recorder: ScanRecorder | None = None) -> None:
+        """Drop the state that senders have left behind; record the packets from here on."""
+        self._recorder = recorder
+        if recorder is not None:
+            self._renew()
         if self._zero_ended and self._epoch is not None and self._epoch.clock.exact:
             self._retire()
             self._epoch = None
         self._zero_ended = False
+
+    def end_recording(self) -> None:
+        """Record no more packets."""
+        self._recorder = None
 
     def set_laser(
         self, modulation: Modulation, epoch_ns: int | None, on_since_ns: int | None = None
@@ -190,6 +199,8 @@ class PacketStream:
             self._reconstructor.set_modulation(self._modulation())
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
+        if self._recorder is not None and switched_on:
+            self._recorder.laser_on()
 
     def set_pulses(self, pulses: PulseTrain | None) -> None:
         """Expect these pulses, or none, if the trigger input is wired to the stage."""
@@ -308,6 +319,10 @@ class PacketStream:
             )
         elif missing:
             self._reconstructor.note_gap()
+        if self._recorder is not None:
+            assert self._epoch is not None
+            run = self._reconstructor, self._epoch
+            self._recorder.packet(packet, missing, run, self._wraps)
         reconstructor, before_us = self._reconstructor, self._reconstructor.settled_us
         # One call for all packets that wait: each call costs as much as the events of one packet.
         profiles = reconstructor.push(

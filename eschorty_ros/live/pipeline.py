@@ -10,16 +10,20 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Settings, add_stage, place
+from eschorty_ros.core.storage import Points
 from eschorty_ros.live.calibration_capture import Capture
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import Packet, check_span
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints, ScanBuffer
+from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.live.stage_placement import StagePlacer
 from eschorty_ros.live.sweep_coverage import SweepCoverage
 
 # At the ends of a sweep a period may be cut.
 _FEW = 0.98
+# Packets wait for the camera's clock and for the worker; a recording begins with one of these.
+_STAGE_BEFORE_US = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +123,7 @@ class Pipeline:
         self.capture: Capture | None = None
         self._fresh: list[TimedProfiles] = []
         self._buffer: ScanBuffer | None = None
+        self._recorder: ScanRecorder | None = None
         self._coverage = SweepCoverage(0.0, 0.0)
         self._losses_at_begin: tuple[int, ...] = (0,) * 5
 
@@ -149,6 +154,8 @@ class Pipeline:
         self.placer.add_stage(t_ns, position_mm)
         if self._buffer is not None:
             self._coverage.add(t_ns, position_mm)
+        if self._recorder is not None:
+            self._recorder.stage(t_ns, position_mm)
 
     def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
         """Return the profiles completed and the points placed since the last call."""
@@ -183,8 +190,14 @@ class Pipeline:
         self.calibration = calibration
         self.model = calibration.model()
 
-    def begin_scan(self, scan_id: str, start_mm: float, stop_mm: float) -> None:
-        """Start collecting; a repeated request, as after a lost answer, changes nothing.
+    def begin_scan(
+        self,
+        scan_id: str,
+        start_mm: float,
+        stop_mm: float,
+        recorder: ScanRecorder | None = None,
+    ) -> None:
+        """Start collecting, and recording; a repeated request, after a lost answer, does nothing.
 
         Raises
         ------
@@ -202,7 +215,12 @@ class Pipeline:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
         self._coverage = SweepCoverage(start_mm, stop_mm)
-        self.stream.begin_scan()
+        self._recorder = recorder
+        if recorder is not None and self.placer.track.last_us is not None:
+            since_us = self.placer.track.last_us - _STAGE_BEFORE_US
+            for t_us, position_mm in zip(*self.placer.track.samples_from(since_us), strict=True):
+                recorder.stage(int(t_us) * NS_PER_US, float(position_mm))
+        self.stream.begin_scan(recorder)
         self._losses_at_begin = self._losses()
 
     def set_capture(self, capture: Capture | None) -> None:
@@ -234,6 +252,7 @@ class Pipeline:
                 + "begin it first"
             )
         self._receive(self.stream.flush(), now_s)
+        self.stream.end_recording()
 
     def end_scan(self) -> ScanReport:
         """Return the scan that was collected.
@@ -244,6 +263,7 @@ class Pipeline:
         buffer, self._buffer = self._buffer, None
         self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
+        self.end_recording(scan.points)
         events, packets, lost, dropped, without = (
             now - before for now, before in zip(self._losses(), self._losses_at_begin, strict=True)
         )
@@ -258,6 +278,13 @@ class Pipeline:
             buffer.points_over_limit,
             self._coverage.profiles(self.stream.profile_rate_hz),
         )
+
+    def end_recording(self, points: Points | None, reason: str = "") -> None:
+        """Let the recorder of the scan write its last files; ``reason`` see ``ScanRecorder``."""
+        recorder, self._recorder = self._recorder, None
+        self.stream.end_recording()
+        if recorder is not None:
+            recorder.end(points, reason)
 
     def _receive(self, timed: list[TimedProfiles], now_s: float) -> None:
         for part in timed:

@@ -20,7 +20,9 @@ from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
 
 
 def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
-    with LoggedCommand(tmp_path, "scan", "--stop", 40, "--out", tmp_path / "scan") as command:
+    rec = tmp_path / "rec"
+    options = ("--stop", 40, "--out", tmp_path / "scan", "--record", rec)
+    with LoggedCommand(tmp_path, "scan", *options) as command:
         code, stdout, stderr = command.end()
         assert code == 0, stderr
         assert "on" in command.outputs()
@@ -30,6 +32,23 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     assert f"{measured.error_median_mm:.3f} mm" in stdout
     assert f"{measured.error_p95_mm:.3f} mm" in stdout
     assert (tmp_path / "scan" / "scan.png").read_bytes().startswith(b"\x89PNG")
+    done = CliRunner().invoke(main, ["reconstruct", str(rec)])
+    assert done.exit_code == 0, done.output
+    assert "warning" not in done.stderr
+    again = read_cloud(rec / "cloud.pcd")
+    for name in ("x", "z", "intensity", "sigma", "column"):
+        np.testing.assert_array_equal(again[name], points[name], err_msg=name)
+    # The stage's times are rounded to 1 us.
+    np.testing.assert_allclose(again["y"], points["y"], atol=1e-7, rtol=0)
+
+
+def test_a_scan_records_into_a_new_folder_only(tmp_path):
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "mine").touch()
+    options = ["scan", "--out", str(tmp_path / "scan"), "--record", str(tmp_path / "rec")]
+    done = CliRunner().invoke(main, options)
+    assert done.exit_code == 1
+    assert "rec: it is not empty" in done.output
 
 
 @pytest.mark.parametrize(

@@ -49,12 +49,12 @@ def prepare(folder):
     points = read_cloud("again/cloud.pcd")
     result = SimpleNamespace(
         success=True, message="", points=points, profiles=9, events=9, events_dropped=0,
-        packets_lost=0, verdict="complete", completeness=1.0,
+        packets_lost=0, verdict="complete", completeness=1.0, recording="",
     )  # fmt: skip
     module = SimpleNamespace(
-        ScanJob=lambda *values, hardware: SimpleNamespace(
+        ScanJob=lambda *values: SimpleNamespace(
             scene=values[0], calibration=values[1], start_mm=10.0, stop_mm=13.0, speed_mm_s=200.0,
-            frequency_hz=70.0, sweep_s=0.015, hardware=hardware,
+            frequency_hz=70.0, sweep_s=0.015, hardware=None,
         ),
         scan_once=lambda *_: result,
     )  # fmt: skip

@@ -127,6 +127,12 @@ class StageTrack:
             unknown |= (gap > self.max_gap_us) & (since > 0)
         return np.where(unknown, np.nan, position)
 
+    def samples_from(self, t_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return times and positions (mm) of the samples kept, those before ``t_us`` left out."""
+        kept = self._t_us[self._begin : self._end] >= t_us
+        nm = self._nm[self._begin : self._end][kept]
+        return self._t_us[self._begin : self._end][kept], nm / NM_PER_MM
+
     def forget_before(self, t_us: int) -> None:
         """Drop samples that no query at ``t_us`` or later needs."""
         integer("t_us", t_us, -TIME_LIMIT, TIME_LIMIT)

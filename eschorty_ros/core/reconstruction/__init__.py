@@ -1,6 +1,11 @@
 """From the camera's bytes to profiles and points."""
 
-from eschorty_ros.core.reconstruction.offline import Result, reconstruct_recording, stage_speed_mm_s
+from eschorty_ros.core.reconstruction.offline import (
+    Result,
+    reconstruct_recording,
+    recorded_settings,
+    stage_speed_mm_s,
+)
 from eschorty_ros.core.reconstruction.profiles import (
     Profiles,
     add_stage,
@@ -22,6 +27,7 @@ __all__ = [
     "place",
     "place_link",
     "reconstruct_recording",
+    "recorded_settings",
     "stage_offset_m",
     "stage_speed_mm_s",
     "warm_up",

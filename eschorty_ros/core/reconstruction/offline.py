@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import Recording
 from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.core.storage.recording import SETTINGS_FILE
 
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
@@ -69,7 +72,8 @@ def reconstruct_recording(
     ----------
     recording : Recording
     settings : Settings, optional
-        ``stage_speed_mm_s`` is taken from the recording instead.
+        Those of the recorded scan when left out; ``stage_speed_mm_s`` is taken from the stage's
+        samples instead.
     progress : callable, optional
         Called with bytes read so far and bytes in all.
     jobs : int, optional
@@ -85,7 +89,8 @@ def reconstruct_recording(
         When the event file is not EVT3.
     """
     began = time.perf_counter()
-    settings = replace(settings or Settings(), stage_speed_mm_s=stage_speed_mm_s(recording))
+    settings = settings or recorded_settings(recording)
+    settings = replace(settings, stage_speed_mm_s=stage_speed_mm_s(recording))
     jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
@@ -93,7 +98,7 @@ def reconstruct_recording(
     parts: list[Profiles] = []
     done = 0
     for chunk in reader.chunks(1 << 20):
-        parts.append(reconstructor.push(chunk))
+        parts.extend(_pushed(reconstructor, memoryview(chunk), done, recording.marks))
         done += len(chunk)
         if progress is not None:
             progress(done, total)
@@ -101,6 +106,9 @@ def reconstruct_recording(
     profiles = Profiles.concatenate(parts)
     position = recording.stage.position_mm(profiles.t_us)
     known = np.isfinite(position)
+    without_stage = int(known.size - known.sum())
+    if recording.scan is not None:
+        known &= recording.scan.between(position)
     if not known.all():
         profiles = profiles.select(known)
     origin_us = reconstructor.first_t_us or 0
@@ -115,7 +123,7 @@ def reconstruct_recording(
     span_us = None if newest_us is None else (origin_us, newest_us)
     seconds = time.perf_counter() - began
     counters = reconstructor.counters
-    counters["points_without_stage"] = int(known.size - known.sum())
+    counters["points_without_stage"] = without_stage
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
     warnings = [str(line) for line in reader.warnings] + reconstructor.warnings
     return Result(
@@ -128,6 +136,41 @@ def reconstruct_recording(
         seconds,
         (*warnings, *recording_warnings(recording, used, counters, points, span_us)),
     )
+
+
+def recorded_settings(recording: Recording) -> Settings:
+    """Return the settings of the recorded scan, the defaults where the recording has none.
+
+    Raises
+    ------
+    FormatError
+        When the recording's settings are not those of a reconstruction.
+    """
+    known = {item.name for item in fields(Settings)}
+    unknown = sorted(str(name) for name in recording.settings.keys() - known)
+    file = recording.path / SETTINGS_FILE
+    if unknown:
+        raise FormatError(f"{file}: {short(unknown[0])} is no setting; remove it")
+    try:
+        return Settings(**recording.settings)
+    except ArgumentError as error:
+        raise FormatError(f"{file}: {error}") from error
+
+
+def _pushed(
+    reconstructor: Reconstructor, chunk: memoryview, begin: int, marks: NDArray[np.void]
+) -> Iterator[Profiles]:
+    """Push a chunk that begins at a byte of the stream, with what the marks in it say."""
+    first, last = np.searchsorted(marks["byte"], (begin, begin + len(chunk)))
+    at = 0
+    for byte, lost, laser_on in marks[first:last].tolist():
+        yield reconstructor.push(chunk[at : byte - begin])
+        at = byte - begin
+        if lost:
+            reconstructor.note_gap()
+        if laser_on:
+            reconstructor.restart_phase()
+    yield reconstructor.push(chunk[at:])
 
 
 def stage_speed_mm_s(recording: Recording) -> float:

@@ -44,6 +44,17 @@ def recording_warnings(
     span_us : tuple of int or None
         Sensor times of the first and the last event, ``None`` without events.
     """
+    faults = recording.scan.faults if recording.scan is not None else []
+    return faults + _contradictions(recording, settings, counters, points, span_us)
+
+
+def _contradictions(
+    recording: Recording,
+    settings: Settings,
+    counters: Mapping[str, int],
+    points: Points,
+    span_us: tuple[int, int] | None,
+) -> list[str]:
     if span_us is None:
         return ["no points: no events came; look at the camera, its lens cap and the laser"]
     reader = RawReader(recording.events_path)

@@ -11,7 +11,6 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
 
 from eschorty_ros.core.base.arrays import byte_view, file_path, integer
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
@@ -243,19 +242,33 @@ class RawWriter:
         }
         lines = "".join(f"% {key} {value}\n" for key, value in header.items()) + "% end\n"
         try:
-            self._file: BinaryIO = self.path.open("wb")
-            self._file.write(lines.encode("ascii"))
+            self._file = self.path.open("wb", buffering=0)
+            self._append(memoryview(lines.encode("ascii")))
         except OSError as error:
             raise FormatError(f"{self.path}: {error.strerror or error}; choose another") from error
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Append bytes of the stream; raises ``FormatError`` when they cannot be written."""
+        """Append bytes of the stream; raises ``FormatError`` when they cannot be written.
+
+        Either all of ``data`` is in the file afterwards, also when the process is killed, or the
+        file ends where it ended before.
+        """
         view = byte_view("data", data)
         try:
-            self._file.write(view)
+            self._append(view)
         except OSError as error:
             raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
         self.bytes_written += len(view)
+
+    def _append(self, view: memoryview) -> None:
+        end = self._file.tell()
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError:
+            self._file.truncate(end)
+            self._file.seek(end)
+            raise
 
     def close(self) -> None:
         """Finish the file; idempotent. Raises ``FormatError`` when it cannot be written."""

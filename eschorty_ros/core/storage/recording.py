@@ -1,18 +1,19 @@
 """A recording: a folder with the camera's bytes and what is needed to turn them into points.
 
 ``events.raw``, ``stage.csv``, ``laser.yaml``, ``calibration.yaml`` and, when simulated,
-``truth.csv``.
+``truth.csv``. That of a scan of the nodes also has ``scan.yaml``, ``settings.yaml`` and
+``marks.csv``.
 """
 
 from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
@@ -32,12 +33,19 @@ STAGE_FILE = "stage.csv"
 LASER_FILE = "laser.yaml"
 CALIBRATION_FILE = "calibration.yaml"
 TRUTH_FILE = "truth.csv"
+SCAN_FILE = "scan.yaml"
+SETTINGS_FILE = "settings.yaml"
+MARKS_FILE = "marks.csv"
 
 STAGE_DTYPE = np.dtype([("t_us", "<i8"), ("position_mm", "<f8")])
 TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")])
 """One row per modulation period and lit column: the time is the middle of the lit phase."""
 
+MARK_DTYPE = np.dtype([("byte", "<i8"), ("packets_lost", "<i8"), ("laser_on", "<i8")])
+"""Before the word at ``byte`` packets are missing, or the laser was switched on (``laser_on``)."""
+
 _LINES_AT_ONCE = 65_536
+_HALF_NM_MM = 0.5e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +54,45 @@ class _LaserFile(Schema):
     duty: float
     waveform: str
     on_edge_us: Annotated[int, Within(-(2**63), 2**63 - 1)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanLog(Schema):
+    """The scan that a recording is of, and what the recording lacks.
+
+    ``state`` is ``recording`` while it is written, and stays so when the process is killed.
+    ``packets_lost`` did not arrive, ``packets_left_out`` arrived and were not written, for the
+    ``reason``. A gap of the stage's samples longer than ``stage_gap_s`` is not bridged; 0 bridges
+    any.
+    """
+
+    scan_id: str
+    start_mm: float
+    stop_mm: float
+    stage_gap_s: float = 0.0
+    state: Literal["recording", "ended"] = "recording"
+    packets_lost: Annotated[int, Within(0)] = 0
+    packets_left_out: Annotated[int, Within(0)] = 0
+    reason: str | None = None
+
+    def between(self, stage_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return a mask of the stage positions between start and stop, both included."""
+        low_mm, high_mm = sorted((self.start_mm, self.stop_mm))
+        return (stage_mm >= low_mm - _HALF_NM_MM) & (stage_mm <= high_mm + _HALF_NM_MM)
+
+    @property
+    def faults(self) -> list[str]:
+        """One line for each thing that the recording lacks."""
+        found = []
+        if self.state == "recording":
+            found.append("the recording was not ended: its process was killed or still writes")
+        if self.packets_lost:
+            found.append(f"{self.packets_lost:,} packets of the recording were lost on the way")
+        if self.packets_left_out:
+            found.append(f"{self.packets_left_out:,} packets are not recorded: {self.reason}")
+        elif self.reason:
+            found.append(self.reason)
+        return found
 
 
 @dataclass(frozen=True)
@@ -64,6 +111,12 @@ class Recording:
         The samples of ``stage``, positions rounded to nanometres.
     modulation : Modulation
     calibration : Calibration
+    scan : ScanLog or None
+        ``None`` unless the nodes recorded a scan.
+    settings : dict
+        Settings of the reconstruction at that scan.
+    marks : ndarray of MARK_DTYPE, shape (n,)
+        Where bytes are missing and where the laser was switched on.
     """
 
     path: Path
@@ -72,6 +125,9 @@ class Recording:
     stage_samples: NDArray[np.void]
     modulation: Modulation
     calibration: Calibration
+    scan: ScanLog | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    marks: NDArray[np.void] = field(default_factory=lambda: np.empty(0, MARK_DTYPE))
 
     @cached_property
     def truth(self) -> NDArray[np.void] | None:
@@ -101,7 +157,9 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
         if not (folder / name).is_file():
             raise FormatError(f"{folder / name} is missing; add it to the recording")
     samples = read_stage_csv(folder / STAGE_FILE)
-    track = StageTrack()
+    scan = read_scan_yaml(folder / SCAN_FILE) if (folder / SCAN_FILE).exists() else None
+    settings, marks = folder / SETTINGS_FILE, folder / MARKS_FILE
+    track = StageTrack(round(scan.stage_gap_s * 1e6) or None if scan is not None else None)
     track.append(samples["t_us"], samples["position_mm"])
     return Recording(
         path=folder,
@@ -110,7 +168,39 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
         stage_samples=samples,
         modulation=read_laser_yaml(folder / LASER_FILE),
         calibration=load_calibration(folder / CALIBRATION_FILE),
+        scan=scan,
+        settings=_read_settings(settings) if settings.exists() else {},
+        marks=_read_marks(marks) if marks.exists() else np.empty(0, MARK_DTYPE),
     )
+
+
+def read_scan_yaml(path: str | os.PathLike[str]) -> ScanLog:
+    """Read ``scan.yaml``.
+
+    Raises
+    ------
+    FormatError
+        One line naming the file, the key, the value and the remedy.
+    """
+    return validate(ScanLog, read_yaml(path, FormatError), FormatError)
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    data = read_yaml(path, FormatError).data
+    if not isinstance(data, dict):
+        raise FormatError(f"{path}: it has {short(data)} instead of settings; remove it")
+    return data
+
+
+def _read_marks(path: Path) -> NDArray[np.void]:
+    marks = _read_csv(path, MARK_DTYPE)
+    back = np.flatnonzero(np.diff(marks["byte"], prepend=0) < 0)
+    if back.size:
+        raise FormatError(
+            f"{path} line {_line_number(path, back[0])}: byte is {marks['byte'][back[0]]}; "
+            "write marks in order"
+        )
+    return marks
 
 
 def read_laser_yaml(path: str | os.PathLike[str]) -> Modulation:
@@ -211,13 +301,22 @@ def _columns(dtype: np.dtype[Any], **values: ArrayLike) -> NDArray[np.void]:
 
 
 def _write_csv(path: str | os.PathLike[str], table: NDArray[np.void]) -> None:
-    names = table.dtype.names or ()
-    pattern = ",".join("%.6f" if table.dtype[name].kind == "f" else "%d" for name in names) + "\n"
     with atomic_write(path) as stream:
-        stream.write((",".join(names) + "\n").encode())
+        stream.write(csv_header(table.dtype))
         for start in range(0, len(table), _LINES_AT_ONCE):
-            rows = table[start : start + _LINES_AT_ONCE].tolist()
-            stream.write("".join([pattern % row for row in rows]).encode())
+            stream.write(csv_lines(table[start : start + _LINES_AT_ONCE]))
+
+
+def csv_header(dtype: np.dtype[Any]) -> bytes:
+    """Return the first line of a table."""
+    return (",".join(dtype.names or ()) + "\n").encode()
+
+
+def csv_lines(table: NDArray[np.void]) -> bytes:
+    """Return the lines of a table, lengths to the nanometre."""
+    kinds = [table.dtype[name].kind for name in table.dtype.names or ()]
+    pattern = ",".join("%.6f" if kind == "f" else "%d" for kind in kinds) + "\n"
+    return "".join([pattern % row for row in table.tolist()]).encode()
 
 
 def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ class ScanJob:
     """A scan; mm and mm/s.
 
     ``hardware`` holds the parameters of the nodes of real devices, as ``read_hardware`` returns
-    them; without it the devices are emulated.
+    them; without it the devices are emulated. ``record`` is a folder for the recording.
     """
 
     scene: str
@@ -42,6 +43,7 @@ class ScanJob:
     pixels: str = "paper"
     keep: str = "all"
     hardware: Tables | None = None
+    record: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ class ScanResult:
     events_dropped: int
     verdict: str
     completeness: float
+    recording: str = ""
 
 
 def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
@@ -72,6 +75,9 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
     """
     tables = bench_parameters() if job.hardware is None else {**job.hardware}
     own = {"calibration": job.calibration, "keep": job.keep}
+    if job.record is not None:
+        parent, name = str(job.record.resolve().parent), job.record.resolve().name
+        own |= {"record": parent, "record_name": name}
     tables["reconstruction"] = {**own, **tables.get("reconstruction", {})}
     bench = None
     if job.hardware is None:
@@ -108,6 +114,7 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         int(ended.events_dropped),
         str(ended.verdict),
         float(ended.completeness),
+        str(ended.recording),
     )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from event_camera_msgs.msg import EventPacket
@@ -21,9 +23,11 @@ from tf2_msgs.msg import TFMessage
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
+from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline
+from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.msg import LaserState, PositionTrigger
 from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.reconstruction.auto_calibration import AutoCalibration
@@ -143,6 +147,7 @@ class ReconstructionNode(Node):
             self._running,
             self.parameters["stage_timeout"],
             self._outputs.scan,
+            self._recorder,
         )
         if self.parameters["publish_tf"]:
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
@@ -162,6 +167,7 @@ class ReconstructionNode(Node):
         self._closing.set()
         if self._worker.is_alive():
             self._worker.join(timeout=5.0)
+            self._scans.end_recording()
         super().destroy_node()
 
     # Callbacks: queue and return.
@@ -217,6 +223,21 @@ class ReconstructionNode(Node):
         done, reason = self._in_worker(use)
         if not done:
             raise ArgumentError(f"calibration not exchanged: {reason}")
+
+    def _recorder(self, scan_id: str, start_mm: float, stop_mm: float) -> ScanRecorder | None:
+        """Return a recorder of a scan, ``None`` unless the parameter ``record`` is set."""
+        values = self.parameters
+        if not values["record"]:
+            return None
+        folder = Path(values["record"]).expanduser() / (values["record_name"] or scan_id)
+        log = ScanLog(
+            scan_id=scan_id,
+            start_mm=start_mm,
+            stop_mm=stop_mm,
+            stage_gap_s=float(values["stage_gap"]),
+        )
+        settings = dataclasses.asdict(values.settings(Settings))
+        return ScanRecorder(folder, log, self.calibration, settings)
 
     # The worker.
 

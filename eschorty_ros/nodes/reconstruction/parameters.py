@@ -27,6 +27,9 @@ TABLE = (
     Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
     Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
+    Param("record", "", "folder into which every scan is recorded, one folder each; empty: no "
+          "recordings", dynamic=True),
+    Param("record_name", "", "name of the next recording; empty: the scan's", dynamic=True),
     Param("calibration_folder", "", "folder for calibrations; empty: eschorty in ROS's home"),
     Param("calibration_paths", False, "load_calibration and save_calibration take paths, too: of "
           "any file that the node may read or write"),

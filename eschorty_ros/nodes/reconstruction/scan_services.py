@@ -18,6 +18,7 @@ from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
+from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import UINT32_MAX, check_text, saturated
 from eschorty_ros.nodes.ros.conversions import mm_from_m
@@ -30,6 +31,8 @@ _FOLLOWED_S = 5.0
 _CONNECT_S = 3.0
 _WORKER_S = 10.0
 _ASSEMBLE_S = 30.0
+# A recording that a disk takes longer for goes on without the client.
+_RECORD_S = 5.0
 
 
 class ScanServices:
@@ -50,6 +53,8 @@ class ScanServices:
         Longest wait of points for the stage after the end.
     publish : callable
         Publishes a finished scan, given the ROS time (ns) for one without points.
+    recorder : callable
+        Returns a recorder for a scan's log, ``None`` when scans are not recorded.
     """
 
     def __init__(
@@ -61,11 +66,14 @@ class ScanServices:
         running: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
+        recorder: Callable[[str, float, float], ScanRecorder | None],
     ) -> None:
         self._node, self._pipeline, self._topics = node, pipeline, topics
         self._in_worker, self._running = in_worker, running
         self._timeout_s = stage_timeout_s + _ASSEMBLE_S
         self._publish = publish
+        self._make_recorder = recorder
+        self._recorder: ScanRecorder | None = None
         self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
         group = MutuallyExclusiveCallbackGroup()
@@ -102,14 +110,22 @@ class ScanServices:
         if fault:
             response.success, response.message = False, fault
             return response
-        begin = partial(
-            self._pipeline.begin_scan,
-            request.scan_id,
-            mm_from_m(request.start),
-            mm_from_m(request.stop),
-        )
+        limits_mm = mm_from_m(request.start), mm_from_m(request.stop)
+        if self._pipeline.scan_id != request.scan_id:
+            self._recorder = self._make_recorder(request.scan_id, *limits_mm)
+        recorder = self._recorder
+        if recorder is not None and (fault := recorder.made(_RECORD_S)):
+            response.success, response.message = False, fault
+            return response
+        begin = partial(self._pipeline.begin_scan, request.scan_id, *limits_mm, recorder)
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         return response
+
+    def end_recording(self) -> None:
+        """Write what a scan under way has recorded; called after the worker's end."""
+        self._pipeline.end_recording(None, "the node ended during the scan")
+        if self._recorder is not None:
+            self._recorder.wait(_RECORD_S)
 
     def _fault(self) -> str:
         faults = (publishers_fault(self._node, topic) for topic in self._topics())
@@ -168,7 +184,10 @@ class ScanServices:
         response.events_dropped = saturated(report.events_dropped)
         response.sigma_median = report.scan.sigma_median_m
         response.completeness = report.completeness
-        response.message = report.message
+        recorder = self._recorder
+        fault = "" if recorder is None else recorder.wait(_RECORD_S)
+        response.recording = "" if recorder is None else str(recorder.folder)
+        response.message = "; ".join(text for text in (report.message, fault) if text)
         return response
 
     def _awaited(self, event: threading.Event) -> bool:

@@ -356,7 +356,7 @@ class ScanClient(InstrumentClient):
             raise ScanFailure(f"reconstruction: {answer.message}")
         return ScanSummary(answer.profiles, answer.points, answer.events, answer.packets_lost,
                            answer.events_dropped, answer.sigma_median, answer.message,
-                           answer.completeness)  # fmt: skip
+                           answer.completeness, answer.recording)  # fmt: skip
 
 
 class _LifecycleState:

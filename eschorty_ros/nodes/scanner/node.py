@@ -238,6 +238,7 @@ class ScannerNode(Node):
             sigma_median=summary.sigma_median_m,
             verdict=summary.verdict,
             completeness=summary.completeness,
+            recording=summary.recording,
         )
         samples = list(self._client.monitor.samples)
         if samples:

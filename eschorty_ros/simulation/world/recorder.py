@@ -28,6 +28,7 @@ from eschorty_ros.core.storage import (
     write_truth_csv,
 )
 from eschorty_ros.core.storage.raw_file import RawWriter
+from eschorty_ros.core.storage.recording import MARKS_FILE, SCAN_FILE, SETTINGS_FILE
 from eschorty_ros.simulation.pixels import PixelParameters
 from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World
@@ -113,6 +114,8 @@ def simulate_recording(
         save_calibration(calibration, made / CALIBRATION_FILE)
         truth = world.truth
         write_truth_csv(made / TRUTH_FILE, truth["t_us"], truth["column"], truth["range_mm"])
+        for name in (SCAN_FILE, SETTINGS_FILE, MARKS_FILE):
+            (folder / name).unlink(missing_ok=True)
     return load_recording(folder)
 
 

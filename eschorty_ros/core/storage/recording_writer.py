@@ -1,0 +1,189 @@
+"""A recording as it grows: at every moment what has been written is a valid one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import file_path
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
+from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration, save_calibration
+from eschorty_ros.core.storage.cloud import Points, write_cloud
+from eschorty_ros.core.storage.raw_file import RawWriter
+from eschorty_ros.core.storage.recording import (
+    CALIBRATION_FILE,
+    EVENTS_FILE,
+    LASER_FILE,
+    MARK_DTYPE,
+    MARKS_FILE,
+    SCAN_FILE,
+    SETTINGS_FILE,
+    STAGE_DTYPE,
+    STAGE_FILE,
+    ScanLog,
+    csv_header,
+    csv_lines,
+    write_laser_yaml,
+    write_stage_csv,
+)
+
+SCAN_CLOUD_FILE = "scan.pcd"
+"""The cloud that the nodes published; `eschorty reconstruct` writes ``cloud.pcd`` beside it."""
+
+
+class RecordingWriter:
+    """Writes the files of a recording; each call either writes all of its data or nothing.
+
+    Parameters
+    ----------
+    folder : path
+        Made here; it must not exist, or be empty.
+    calibration : Calibration
+    modulation : Modulation
+    scan : ScanLog, optional
+    settings : mapping, optional
+        Settings of the reconstruction, written with ``scan``.
+
+    Attributes
+    ----------
+    path : Path
+    event_bytes : int
+        Bytes of the stream in ``events.raw``.
+
+    Raises
+    ------
+    ArgumentError, FormatError
+        When the folder holds files already or cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        calibration: Calibration,
+        modulation: Modulation,
+        scan: ScanLog | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.path = file_path("folder", folder)
+        make_recording_folder(self.path)
+        self._files = contextlib.ExitStack()
+        try:
+            save_calibration(calibration, self.path / CALIBRATION_FILE)
+            write_laser_yaml(self.path / LASER_FILE, modulation)
+            if scan is not None:
+                write_scan_yaml(self.path / SCAN_FILE, scan)
+                with atomic_write(self.path / SETTINGS_FILE) as stream:
+                    stream.write(yaml.safe_dump(dict(settings or {}), sort_keys=False).encode())
+            events = self.path / EVENTS_FILE
+            raw = RawWriter(events, width=calibration.columns, height=calibration.rows)
+            self._raw = self._files.enter_context(raw)
+            self._stage, self._marks = self._table(STAGE_DTYPE, STAGE_FILE), None
+            if scan is not None:
+                self._marks = self._table(MARK_DTYPE, MARKS_FILE)
+        except BaseException:
+            self._files.close()
+            raise
+        self._stage_us: int | None = None
+
+    @property
+    def event_bytes(self) -> int:
+        """Bytes of the stream in ``events.raw``."""
+        return self._raw.bytes_written
+
+    def events(self, data: Any) -> None:
+        """Append bytes of the stream."""
+        self._raw.write(data)
+
+    def mark(self, packets_lost: int, laser_on: bool) -> None:
+        """Note lost packets, or that the laser was switched on, before the next ``events``."""
+        assert self._marks is not None
+        row = np.array([(self.event_bytes, packets_lost, laser_on)], MARK_DTYPE)
+        self._marks.append(row)
+
+    def stage(self, t_us: int, position_mm: float) -> None:
+        """Append a stage sample; one that is not later than the one before is left out."""
+        if self._stage_us is None or t_us > self._stage_us:
+            self._stage.append(np.array([(t_us, position_mm)], STAGE_DTYPE))
+            self._stage_us = t_us
+
+    def replace_stage(self, samples: NDArray[np.void]) -> None:
+        """Write all stage samples (STAGE_DTYPE) again, by a clock that is known better now."""
+        write_stage_csv(self.path / STAGE_FILE, samples["t_us"], samples["position_mm"])
+
+    def end(self, scan: ScanLog, points: Points | None = None) -> None:
+        """Write what is known at the end of a scan: its log and its cloud."""
+        write_scan_yaml(self.path / SCAN_FILE, scan)
+        if points is not None and len(points):
+            write_cloud(self.path / SCAN_CLOUD_FILE, points)
+
+    def close(self) -> None:
+        """Close the files; idempotent."""
+        self._files.close()
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _table(self, dtype: np.dtype[Any], name: str) -> _Table:
+        return self._files.enter_context(_Table(self.path / name, dtype))
+
+
+class _Table:
+    """A CSV file that grows by whole lines."""
+
+    def __init__(self, path: Path, dtype: np.dtype[Any]) -> None:
+        self._path = path
+        try:
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise FormatError(f"{path}: {error.strerror or error}; choose another") from error
+        self._write(csv_header(dtype))
+
+    def append(self, rows: NDArray[np.void]) -> None:
+        self._write(csv_lines(rows))
+
+    def _write(self, text: bytes) -> None:
+        end = self._file.tell()
+        try:
+            if self._file.write(text) != len(text):
+                raise OSError("no space left on device")
+        except OSError as error:
+            self._file.truncate(end)
+            self._file.seek(end)
+            raise FormatError(f"{self._path}: {error.strerror or error}; free some space") from None
+
+    def __enter__(self) -> _Table:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+def make_recording_folder(folder: Path) -> None:
+    """Make a recording's folder; ArgumentError when it holds files or cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        filled = any(folder.iterdir())
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot record into {folder}: {error.strerror or error}; choose another folder"
+        ) from error
+    if filled:
+        raise ArgumentError(f"cannot record into {folder}: it is not empty; choose another folder")
+
+
+def write_scan_yaml(path: str | os.PathLike[str], scan: ScanLog) -> None:
+    """Write ``scan.yaml`` at ``path``."""
+    with atomic_write(path) as stream:
+        stream.write(yaml.safe_dump(scan.as_dict(), sort_keys=False).encode())
