@@ -40,6 +40,13 @@ if TYPE_CHECKING:
     help="Folder for scan.pcd and scan.png.",
 )
 @click.option(
+    "--passes",
+    type=click.IntRange(1, 255),
+    default=1,
+    show_default=True,
+    help="Sweeps, every second one back; their points are joined.",
+)
+@click.option(
     "--record",
     type=click.Path(file_okay=False, path_type=Path),
     help="New folder for a recording, which `eschorty reconstruct` turns into the same points.",
@@ -56,6 +63,7 @@ def command(
     keep: str,
     hardware: Path | None,
     out: Path,
+    passes: int,
     record: Path | None,
 ) -> None:
     """Scan a scene with camera, laser, stage, reconstruction and scanner nodes.
@@ -84,7 +92,7 @@ def command(
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     job = one_scan.ScanJob(
-        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record
+        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record, passes
     )
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")
@@ -127,7 +135,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     truth = scenes.named(job.scene)
     model, direction = calibration.model(), calibration.stage_direction
     error_mm = accuracy.range_error_mm(result.points, truth, model, direction)
-    sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz)
+    sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, job.passes)
     measured = accuracy.measure(result.points, truth, model, sweep, direction, error_mm)
     title = (
         f"{job.scene}: {job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, "

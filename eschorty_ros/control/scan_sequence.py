@@ -19,6 +19,8 @@ _FAILED_DRAIN_S = 5.0
 _DRAIN_PER_S = 200.0
 SPEED_MIN_MM_S = 1e-3
 """Least speed of a scan or move: a slower one takes days."""
+PASSES_MAX = 255
+"""Most passes of a scan, as the action's goal can state them."""
 
 
 class ScanFailure(EschortyError):  # noqa: N818 - reported like the other failures
@@ -39,7 +41,10 @@ class End(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ScanRequest:
-    """A scan's parameters; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting."""
+    """A scan's parameters; ``frequency_hz`` or ``duty`` 0 keeps the laser's setting.
+
+    Every second one of ``passes`` sweeps goes back.
+    """
 
     scan_id: str
     start_mm: float
@@ -47,6 +52,12 @@ class ScanRequest:
     speed_mm_s: float
     frequency_hz: float = 0.0
     duty: float = 0.0
+    passes: int = 1
+
+    @property
+    def last_mm(self) -> float:
+        """Return where the last pass ends."""
+        return self.stop_mm if self.passes % 2 else self.start_mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +195,8 @@ def check_request(request: ScanRequest, limits: ScanLimits) -> None:
             f"speed is {request.speed_mm_s * 1e-3:g} m/s; choose {SPEED_MIN_MM_S * 1e-3:g} to "
             f"{limits.speed_max_mm_s * 1e-3:g} m/s"
         )
+    if not 1 <= request.passes <= PASSES_MAX:
+        raise ArgumentError(f"passes is {request.passes}; choose 1 to {PASSES_MAX}")
     check_laser(request.frequency_hz, request.duty)
 
 
@@ -225,14 +238,26 @@ def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | 
     return None
 
 
-def sweep_progress(phase: str, position_mm: float, request: ScanRequest) -> float:
-    """Return the share of the sweep that is done in ``phase``, 0 to 1."""
-    if phase == "finishing":
-        return 1.0
-    if phase != "sweeping" or math.isnan(position_mm):
-        return 0.0
-    share = (position_mm - request.start_mm) / (request.stop_mm - request.start_mm)
-    return min(max(share, 0.0), 1.0)
+class SweepProgress:
+    """The share of a scan's way between start and stop that the stage has gone, of all passes."""
+
+    def __init__(self, request: ScanRequest) -> None:
+        self._ends_mm = sorted((request.start_mm, request.stop_mm))
+        self._way_mm = request.passes * (self._ends_mm[1] - self._ends_mm[0])
+        self._gone_mm = 0.0
+        self._last_mm: float | None = None
+
+    def share(self, phase: str, position_mm: float) -> float:
+        """Return the share, 0 to 1, when the stage is at a position in ``phase``."""
+        if phase == "finishing":
+            return 1.0
+        if phase != "sweeping" or math.isnan(position_mm):
+            return 0.0
+        position_mm = min(max(position_mm, self._ends_mm[0]), self._ends_mm[1])
+        if self._last_mm is not None:
+            self._gone_mm += abs(position_mm - self._last_mm)
+        self._last_mm = position_mm
+        return min(self._gone_mm / self._way_mm, 1.0)
 
 
 def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimits) -> ScanOutcome:
@@ -251,7 +276,8 @@ def run_scan(instrument: ScanInstrument, request: ScanRequest, limits: ScanLimit
         instrument.laser_on()
         instrument.watch(True)
         instrument.report("sweeping")
-        instrument.move(end_mm, request.speed_mm_s)
+        for number in range(request.passes):
+            instrument.move(begin_mm if number % 2 else end_mm, request.speed_mm_s)
         outcome.end = End.SUCCEEDED
     except ScanCanceled:
         outcome.end, outcome.message = End.CANCELED, "canceled"
@@ -281,7 +307,7 @@ def _finish(
     # After a failure the last events are kept, without a long wait for a camera that may be lost.
     failed = outcome.end is End.ABORTED
     timeout_s = 1.0 if failed else limits.drain_timeout_s
-    sweep_s = abs(request.stop_mm - request.start_mm) / request.speed_mm_s
+    sweep_s = request.passes * abs(request.stop_mm - request.start_mm) / request.speed_mm_s
     within_s = _FAILED_DRAIN_S if failed else limits.drain_timeout_s + _DRAIN_PER_S * sweep_s
     outcome.attempt(lambda: instrument.drain(timeout_s, within_s))
 

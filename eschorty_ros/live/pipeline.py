@@ -196,6 +196,7 @@ class Pipeline:
         start_mm: float,
         stop_mm: float,
         recorder: ScanRecorder | None = None,
+        passes: int = 1,
     ) -> None:
         """Start collecting, and recording; a repeated request, after a lost answer, does nothing.
 
@@ -214,7 +215,7 @@ class Pipeline:
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
         self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
-        self._coverage = SweepCoverage(start_mm, stop_mm)
+        self._coverage = SweepCoverage(start_mm, stop_mm, passes)
         self._recorder = recorder
         if recorder is not None and self.placer.track.last_us is not None:
             since_us = self.placer.track.last_us - _STAGE_BEFORE_US

@@ -11,9 +11,12 @@ class SweepCoverage:
     Parameters
     ----------
     start_mm, stop_mm : float
+    passes : int
+        Times that the stage goes from one to the other.
     """
 
-    def __init__(self, start_mm: float, stop_mm: float) -> None:
+    def __init__(self, start_mm: float, stop_mm: float, passes: int = 1) -> None:
+        self._passes = passes
         self._low_mm, self._high_mm = min(start_mm, stop_mm), max(start_mm, stop_mm)
         self._last: tuple[int, float] | None = None
         self._steps: list[tuple[float, float]] = []
@@ -30,7 +33,7 @@ class SweepCoverage:
             self._steps.append(((t_ns - before[0]) * 1e-9 * share, inside_mm))
 
     def profiles(self, profile_rate_hz: float) -> int:
-        """Return the whole profiles of one pass over the whole distance, 0 without motion.
+        """Return the whole profiles of all passes over the whole distance, 0 without motion.
 
         The profiles that its ends cut are not counted. The speed is the median over the distance:
         neither rests nor late samples shift it.
@@ -43,4 +46,4 @@ class SweepCoverage:
         covered_mm = np.cumsum(distance_mm[order])
         median_mm_s = speed_mm_s[order[np.searchsorted(covered_mm, 0.5 * covered_mm[-1])]]
         profiles = (self._high_mm - self._low_mm) / median_mm_s * profile_rate_hz
-        return max(round(profiles) - 1, 0)
+        return self._passes * max(round(profiles) - 1, 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -31,7 +31,7 @@ class KnownScene(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A sweep of the stage at constant speed under a modulated laser.
+    """A sweep of the stage at constant speed under a modulated laser, or several to and fro.
 
     Raises
     ------
@@ -43,6 +43,7 @@ class Sweep:
     stop_mm: float
     speed_mm_s: float
     frequency_hz: float
+    passes: int = 1
 
     def __post_init__(self) -> None:
         for name in ("speed_mm_s", "frequency_hz"):
@@ -56,8 +57,8 @@ class Sweep:
 
     @property
     def seconds(self) -> float:
-        """Time from start to stop."""
-        return abs(self.stop_mm - self.start_mm) / self.speed_mm_s
+        """Time from start to stop in all passes."""
+        return self.passes * abs(self.stop_mm - self.start_mm) / self.speed_mm_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,8 +244,53 @@ def measure(
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
-    positions, number = complete_periods(points, sweep, stage_direction)
-    return _accuracy(points, error_mm, lit_columns(scene, model, positions), number)
+    lit: list[NDArray[np.bool_]] = []
+    number = np.full(len(points), -1, dtype=np.int64)
+    turned = replace(sweep, start_mm=sweep.stop_mm, stop_mm=sweep.start_mm)
+    of_pass = pass_index(points, sweep, stage_direction)
+    for index in range(sweep.passes):
+        mine = of_pass == index
+        one = turned if index % 2 else sweep
+        positions, within = complete_periods(points[mine], one, stage_direction)
+        before = sum(len(mask) for mask in lit)
+        number[mine] = np.where(within >= 0, within + before, -1)
+        lit.append(lit_columns(scene, model, positions))
+    return _accuracy(points, error_mm, np.concatenate(lit), number)
+
+
+def pass_index(
+    points: NDArray[np.void],
+    sweep: Sweep,
+    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
+) -> NDArray[np.int64]:
+    """Return the number of each point's pass, from the stage's direction in each period.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    sweep : Sweep
+    stage_direction : tuple of float
+
+    Returns
+    -------
+    ndarray of int64, shape (n,)
+    """
+    if sweep.passes == 1 or len(points) == 0:
+        return np.zeros(len(points), dtype=np.int64)
+    stage_mm, _ = stage_and_range_mm(points, stage_direction)
+    period = profile_index(points, 1.0 / sweep.frequency_hz)
+    count = np.maximum(np.bincount(period), 1)
+    t_s = points["t"] - (np.bincount(period, points["t"]) / count)[period]
+    forth = np.sign(np.bincount(period, t_s * stage_mm)) * np.sign(sweep.pitch_mm)
+    of_period = np.zeros(len(forth), dtype=np.int64)
+    begin = 0
+    for number in range(1, sweep.passes):
+        # The turn is where most periods before and after it go their way.
+        two = 2 * (len(forth) - begin) // (sweep.passes - number + 1)
+        way = np.cumsum(forth[begin : begin + two]) * (1 if number % 2 else -1)
+        begin += int(np.argmax(way)) + 1 if two else 0
+        of_period[begin:] = number
+    return of_period[period]
 
 
 def measure_recorded(

@@ -1,6 +1,7 @@
 """The steps of a scan: after any failure the laser is off, the stage rests, points are kept."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from recording_instrument import RecordingInstrument
@@ -12,6 +13,7 @@ from eschorty_ros.control.scan_sequence import (
     ScanLimits,
     ScanRequest,
     ScanSummary,
+    SweepProgress,
     check_request,
     crossing_ns,
     run_scan,
@@ -29,6 +31,19 @@ def test_order_of_a_scan():
     outcome = run_scan(instrument, REQUEST, LIMITS)
     assert (outcome.end, outcome.message, outcome.summary.points) == (End.SUCCEEDED, "", 5)
     assert instrument.steps() == [*STEPS, "laser_off", "drain", "end_scan"]
+
+
+def test_passes_go_forth_and_back_under_one_light():
+    instrument, moves = RecordingInstrument(), []
+    request = replace(REQUEST, passes=3)
+    instrument.move = lambda *values: moves.append(values)
+    assert run_scan(instrument, request, LIMITS).end is End.SUCCEEDED
+    begin, end = sweep_ends_mm(request, LIMITS)
+    assert moves == [(begin, LIMITS.approach_mm_s), (end, 50.0), (begin, 50.0), (end, 50.0)]
+    assert instrument.calls.count("laser_on") == instrument.calls.count("end_scan") == 1
+    progress = SweepProgress(replace(request, passes=2))
+    shares = [progress.share("sweeping", at_mm) for at_mm in (18.0, 30.0, 41.0, 30.0, 18.0)]
+    assert shares == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("move", 1),
@@ -109,6 +124,7 @@ def test_run_up_gives_constant_speed_between_start_and_stop_within_travel():
         ({"speed_mm_s": math.inf}, "speed is inf m/s"),
         ({"frequency_hz": 15.9}, "frequency is 15.9 Hz"),
         ({"duty": 1.0}, "duty is 1"),
+        ({"passes": 256}, "passes is 256"),
     ],
 )
 def test_bad_requests_are_named(change, words):

@@ -6,8 +6,8 @@ import pytest
 from eschorty_ros.live.sweep_coverage import SweepCoverage
 
 
-def swept(positions_mm, start_mm=20.0, stop_mm=40.0):
-    coverage = SweepCoverage(start_mm, stop_mm)
+def swept(positions_mm, start_mm=20.0, stop_mm=40.0, passes=1):
+    coverage = SweepCoverage(start_mm, stop_mm, passes)
     for k, position_mm in enumerate(positions_mm):
         coverage.add(k * 10_000_000, float(position_mm))
     return coverage.profiles(70.0)
@@ -25,6 +25,13 @@ def test_profiles_of_a_sweep_with_run_up_and_rest_inside(back):
 
 def test_a_part_of_a_sweep_counts_for_the_whole():
     assert swept(np.arange(10.0, 25.0, 0.5)) == 27
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_every_pass_counts_also_one_that_is_missing(turns):
+    there = np.arange(10.0, 50.0, 0.5)
+    way = np.concatenate([there[:: (-1) ** k] for k in range(turns)])
+    assert swept(way, passes=2) == 2 * 27
 
 
 def test_a_late_sample_does_not_count():

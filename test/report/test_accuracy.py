@@ -62,6 +62,29 @@ def test_statistics_of_a_known_error():
     assert result.within_2_sigma == pytest.approx(np.mean(np.abs(error) <= 1.0), abs=1e-3)
 
 
+@pytest.mark.parametrize("back", [False, True])
+def test_passes_are_scored_like_one_and_each_counts(back):
+    sweep = accuracy.Sweep(*(SWEEP.stop_mm, SWEEP.start_mm), 50.0, 70.0, 3) if back else replace(
+        SWEEP, passes=3
+    )  # fmt: skip
+    parts = [cloud(0.3, seed=seed) for seed in range(3)]
+    for number, part in enumerate(parts):
+        if (number % 2 == 1) != back:
+            part["t"] = 19 * PERIOD_S - part["t"]
+        part["t"] += number * 25 * PERIOD_S
+    points = np.concatenate(parts)
+    rng = np.random.default_rng(5)
+    points = points[rng.permutation(len(points))]
+    expected = np.rint(points["t"] / PERIOD_S).astype(int) // 25
+    np.testing.assert_array_equal(accuracy.pass_index(points, sweep), expected)
+    result = accuracy.measure(points, Wedge(), MODEL, sweep)
+    assert (result.periods, result.completeness) == (60, 1.0)
+    assert result.error_median_mm == pytest.approx(0.3, abs=1e-3)
+    first = points[expected == 0]
+    without = accuracy.measure(first, Wedge(), MODEL, replace(sweep, passes=2))
+    assert (without.periods, without.completeness) == (40, 0.5)
+
+
 def test_points_where_the_scene_is_empty_are_counted_not_measured():
     points = cloud(0.0)
     points["column"][:50] = 1100

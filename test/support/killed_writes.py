@@ -54,7 +54,7 @@ def prepare(folder):
     module = SimpleNamespace(
         ScanJob=lambda *values: SimpleNamespace(
             scene=values[0], calibration=values[1], start_mm=10.0, stop_mm=13.0, speed_mm_s=200.0,
-            frequency_hz=70.0, sweep_s=0.015, hardware=None,
+            frequency_hz=70.0, sweep_s=0.015, hardware=None, passes=1,
         ),
         scan_once=lambda *_: result,
     )  # fmt: skip

@@ -44,6 +44,7 @@ class ScanJob:
     keep: str = "all"
     hardware: Tables | None = None
     record: Path | None = None
+    passes: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +76,10 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
     """
     tables = bench_parameters() if job.hardware is None else {**job.hardware}
     own = {"calibration": job.calibration, "keep": job.keep}
+    tables["reconstruction"] = {**own, **tables.get("reconstruction", {})}
     if job.record is not None:
         parent, name = str(job.record.resolve().parent), job.record.resolve().name
-        own |= {"record": parent, "record_name": name}
-    tables["reconstruction"] = {**own, **tables.get("reconstruction", {})}
+        tables["reconstruction"] |= {"record": parent, "record_name": name}
     bench = None
     if job.hardware is None:
         bench = bench_options(job.scene, job.calibration, job.seed, job.pixels)
@@ -87,6 +88,7 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         stop=job.stop_mm * 1e-3,
         speed=job.speed_mm_s * 1e-3,
         frequency=job.frequency_hz,
+        passes=job.passes,
     )
 
     def on_feedback(message: Any) -> None:

@@ -117,7 +117,8 @@ class ScanServices:
         if recorder is not None and (fault := recorder.made(_RECORD_S)):
             response.success, response.message = False, fault
             return response
-        begin = partial(self._pipeline.begin_scan, request.scan_id, *limits_mm, recorder)
+        passes = request.passes or 1
+        begin = partial(self._pipeline.begin_scan, request.scan_id, *limits_mm, recorder, passes)
         response.success, response.message = self._in_worker(begin, _WORKER_S)
         return response
 

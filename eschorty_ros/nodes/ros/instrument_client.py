@@ -341,6 +341,7 @@ class ScanClient(InstrumentClient):
             scan_id=request.scan_id,
             start=m_from_mm(request.start_mm),
             stop=m_from_mm(request.stop_mm),
+            passes=request.passes,
         )
         # A cancel before the answer would leave a scan that is never ended.
         with self.shielded():

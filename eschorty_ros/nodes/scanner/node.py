@@ -18,15 +18,16 @@ from rclpy.node import Node
 
 from eschorty_ros.action import Scan
 from eschorty_ros.control.scan_sequence import (
+    PASSES_MAX,
     End,
     ScanFailure,
     ScanLimits,
     ScanOutcome,
     ScanRequest,
+    SweepProgress,
     check_request,
     crossing_ns,
     run_scan,
-    sweep_progress,
 )
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.core.modulation import FREQUENCY_MAX_HZ
@@ -44,6 +45,7 @@ TABLE = (
     Param("frequency", 0.0, "auto_scan: modulation frequency; 0 keeps the laser's", "Hz",
           0.0, FREQUENCY_MAX_HZ),
     Param("duty", 0.0, "auto_scan: duty; 0 keeps the laser's", "", 0.0, 0.999),
+    Param("passes", 1, "auto_scan: sweeps forth and back", "", 1, PASSES_MAX),
     Param("travel_min", 0.0, "lower end of the stage's travel", "m", -1.0, 1.0),
     Param("travel_max", 0.22, "upper end of the stage's travel", "m", -1.0, 1.0),
     Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),
@@ -136,6 +138,7 @@ class ScannerNode(Node):
             speed_mm_s=mm_from_m(values.speed),
             frequency_hz=float(values.frequency),
             duty=float(values.duty),
+            passes=values.passes or 1,
         )
         try:
             # First: a goal that is refused must not hold up another one.
@@ -194,6 +197,7 @@ class ScannerNode(Node):
         sent_s = -math.inf
         sent_phase = ""
         points_before = profiles_before = 0
+        progress = SweepProgress(request)
 
         def send(phase: str) -> None:
             nonlocal sent_s, sent_phase, points_before, profiles_before
@@ -202,9 +206,7 @@ class ScannerNode(Node):
                 return
             sent_s, sent_phase = now_s, phase
             position_mm = self._client.monitor.position_mm
-            feedback = Scan.Feedback(
-                phase=phase, progress=sweep_progress(phase, position_mm, request)
-            )
+            feedback = Scan.Feedback(phase=phase, progress=progress.share(phase, position_mm))
             feedback.position = m_from_mm(position_mm)
             feedback.waits_for = self._client.waits_for
             state = self._client.monitor.reconstruction
@@ -243,7 +245,7 @@ class ScannerNode(Node):
         samples = list(self._client.monitor.samples)
         if samples:
             start_ns = crossing_ns(samples, request.start_mm)
-            stop_ns = crossing_ns(samples, request.stop_mm)
+            stop_ns = crossing_ns(samples[::-1], request.last_mm)
             result.sweep_start = stamp_from_ns(start_ns if start_ns is not None else samples[0][0])
             result.sweep_stop = stamp_from_ns(stop_ns if stop_ns is not None else samples[-1][0])
         return result
@@ -255,8 +257,8 @@ class ScannerNode(Node):
             return
         self.waiting = ""
         self._auto_timer.cancel()
-        values = {name: self.parameters[name]
-                  for name in ("start", "stop", "speed", "frequency", "duty")}  # fmt: skip
+        names = ("start", "stop", "speed", "frequency", "duty", "passes")
+        values = {name: self.parameters[name] for name in names}
         self._self_client.send_goal_async(Scan.Goal(**values))
 
     def _wait_for(self, missing: str) -> None:
