@@ -34,6 +34,8 @@ setup(
     install_requires=REQUIREMENTS,
     extras_require={
         "report": [f"eschorty-experiments @ {(HERE / 'experiments').absolute().as_uri()}"],
+        # Apache-2.0: rosbag2 files without ROS, for `eschorty convert` and `reconstruct BAG`.
+        "bags": ["rosbags>=0.11"],
         "mesh": ["open3d>=0.19", "libusb-package"],
         # LGPL: several transfers in flight; without it the camera is read one transfer at a time.
         "usb-async": ["libusb1>=3.1"],

@@ -16,6 +16,7 @@ COMMANDS = {
     "scan": "Scan a simulated scene through the ROS 2 nodes; cloud, picture and error.",
     "simulate": "Simulate a recording with its truth; needs no ROS.",
     "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
+    "convert": "Make a rosbag2 of a recording, or a recording of a rosbag2; needs no ROS.",
     "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
     "view": "Draw a cloud, or open it in a window.",
     "info": "Show the content of a file or recording.",

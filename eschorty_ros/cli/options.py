@@ -63,6 +63,23 @@ def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
+def bag_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that replace topics which a bag lacks to a command."""
+    for option in (
+        click.option(
+            "--calibration",
+            help="For a bag without reconstruction/calibration: a build's name or file.",
+        ),
+        click.option(
+            "--frequency",
+            type=click.FloatRange(16, 20_000),
+            help="For a bag without laser/state: modulation frequency, Hz.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
 def check_sweep(start_mm: float, stop_mm: float) -> None:
     """Refuse a sweep without length as wrong usage."""
     if start_mm == stop_mm:

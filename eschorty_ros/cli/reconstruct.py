@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
+from eschorty_ros.cli.convert import recording_of
+from eschorty_ros.cli.options import bag_options
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
     from eschorty_ros.core.reconstruction import Result
+    from eschorty_ros.core.storage import Recording
 
 
 class SettingsCommand(click.Command):
@@ -53,18 +56,25 @@ def setting_options() -> list[click.Parameter]:
 
 
 @click.command("reconstruct", cls=SettingsCommand)
-@click.argument("recording", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("recording", type=click.Path(exists=True, path_type=Path))
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
     help="Cloud to write, .pcd or .ply.  [default: RECORDING/cloud.pcd]",
 )
 @click.option("--jobs", type=click.IntRange(1, 256), help="Threads.  [default: one per core]")
+@bag_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def command(
-    recording: Path, out: Path | None, jobs: int | None, as_json: bool, **settings: Any
+    recording: Path,
+    out: Path | None,
+    jobs: int | None,
+    as_json: bool,
+    frequency: float | None,
+    calibration: str | None,
+    **settings: Any,
 ) -> None:
-    """Turn the folder RECORDING into a point cloud.
+    """Turn RECORDING, a folder or a rosbag2, into a point cloud.
 
     The cloud is in eschorty_base, in metres: x y z, intensity (events used), sigma (one sigma of
     the range), t (seconds since the first event), column, flags (1: on two surfaces, 2: cut by the
@@ -89,22 +99,45 @@ def command(
       eschorty reconstruct rec
       eschorty reconstruct rec --out rec.ply --centroid median
       eschorty reconstruct rec --json --smoothing-half-width 0
+      eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
     """  # noqa: D301
-    from eschorty_ros.core.base.files import check_writable
+    from eschorty_ros.core.base.files import check_writable, temporary_folder
+    from eschorty_ros.core.storage import load_recording
+    from eschorty_ros.live.bag_files import is_bag
+
+    bag = is_bag(recording)
+    if recording.is_file() and not bag:
+        raise click.BadParameter(f"{recording} is a file; give a recording's folder or a bag")
+    if not bag and (frequency is not None or calibration is not None):
+        raise click.UsageError("--frequency and --calibration are for a bag; RECORDING is none")
+    folder = recording if recording.is_dir() else recording.parent
+    target = out or folder / ("cloud.pcd" if recording.is_dir() else f"{recording.stem}.pcd")
+    if target.suffix not in (".pcd", ".ply"):
+        raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
+    check_writable(target)
+    given = _given(settings)
+    if not bag:
+        _reconstruct(load_recording(recording), recording, target, as_json, given)
+        return
+    with temporary_folder() as made:
+        recording_of(recording, made / recording.stem, frequency, calibration, given)
+        loaded = load_recording(made / recording.stem)
+        _reconstruct(loaded, recording, target, as_json, given)
+
+
+def _reconstruct(
+    loaded: Recording, recording: Path, target: Path, as_json: bool, given: dict[str, Any]
+) -> None:
+    """Write the cloud of ``loaded``, which the user calls ``recording``; print its figures."""
     from eschorty_ros.core.reconstruction import (
         reconstruct_recording,
         recorded_settings,
         warm_up,
     )
-    from eschorty_ros.core.storage import load_recording, write_cloud
+    from eschorty_ros.core.storage import write_cloud
     from eschorty_ros.report.accuracy import measure_recorded
 
-    target = out or recording / "cloud.pcd"
-    if target.suffix not in (".pcd", ".ply"):
-        raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
-    check_writable(target)
-    loaded = load_recording(recording)
-    chosen = replace(recorded_settings(loaded), **_given(settings))
+    chosen = replace(recorded_settings(loaded), **given)
     with progress_bar("reconstructing") as report:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)

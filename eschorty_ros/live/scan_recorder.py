@@ -52,6 +52,8 @@ class ScanRecorder:
         Settings of the reconstruction.
     queue_bytes : int
         Most bytes of packets that wait for the disk.
+    waits : bool
+        Whether ``packet`` waits for the disk instead of leaving packets out.
     """
 
     def __init__(
@@ -61,10 +63,12 @@ class ScanRecorder:
         calibration: Calibration,
         settings: Mapping[str, Any],
         queue_bytes: int = QUEUE_BYTES,
+        waits: bool = False,
     ) -> None:
         self.folder = folder
         self._log, self._calibration, self._settings = scan, calibration, dict(settings)
         self._queue_bytes, self._waiting_bytes = queue_bytes, 0
+        self._waits = waits
         self._jobs: deque[tuple[Job, int]] = deque()
         self._arrived = threading.Condition()
         self._made, self._ended = threading.Event(), threading.Event()
@@ -115,6 +119,9 @@ class ScanRecorder:
             self._stream_ended = "a gap was longer than 8 s"
         self._lost += lost
         self._missing += lost
+        if self._waits:
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._waiting_bytes <= self._queue_bytes)
         if self._stream_ended or self._waiting_bytes > self._queue_bytes:
             self._left_out += 1
             self._missing += 1
@@ -163,7 +170,7 @@ class ScanRecorder:
         with self._arrived:
             self._jobs.append((job, size))
             self._waiting_bytes += size
-            self._arrived.notify()
+            self._arrived.notify_all()
 
     # The recorder's thread.
 
@@ -179,6 +186,7 @@ class ScanRecorder:
                 job()
             with self._arrived:
                 self._waiting_bytes -= size
+                self._arrived.notify_all()
             # It holds a packet.
             del job
 

@@ -40,6 +40,12 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
         np.testing.assert_array_equal(again[name], points[name], err_msg=name)
     # The stage's times are rounded to 1 us.
     np.testing.assert_allclose(again["y"], points["y"], atol=1e-7, rtol=0)
+    for command in (["convert", str(rec), str(tmp_path / "bag")],
+                    ["reconstruct", str(tmp_path / "bag")]):  # fmt: skip
+        done = CliRunner().invoke(main, command)
+        assert done.exit_code == 0, done.output
+        assert done.stderr == "" or "warning" not in done.stderr
+    np.testing.assert_array_equal(read_cloud(tmp_path / "bag" / "cloud.pcd"), again)
 
 
 def test_a_scan_records_into_a_new_folder_only(tmp_path):

@@ -197,7 +197,6 @@ class InstrumentClient(PacedWaiting):
 
     def move(self, position_mm: float, speed_mm_s: float) -> None:
         """See ``Instrument``."""
-        self.monitor.samples.clear()
         goal = MoveStage.Goal(position=m_from_mm(position_mm), speed=m_from_mm(speed_mm_s))
         # Kept before waiting: a cancel while the answer is on its way must still stop the stage.
         self._sent = self._stage.send_goal_async(goal)
@@ -343,6 +342,7 @@ class ScanClient(InstrumentClient):
             stop=m_from_mm(request.stop_mm),
             passes=request.passes,
         )
+        self.monitor.samples.clear()
         # A cancel before the answer would leave a scan that is never ended.
         with self.shielded():
             answer = self._call("reconstruction/begin_scan", begin, within_s=_BEGIN_S)

@@ -1,0 +1,277 @@
+"""Bags to recordings, by the way of live packets, and recordings to bags."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from eschorty_ros.core.base.arrays import file_path
+from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, FormatError
+from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.base.schema import validate
+from eschorty_ros.core.base.yaml_file import parse_yaml
+from eschorty_ros.core.clocks import NS_PER_US, POSITION_LIMIT_MM, PulseTrain, StageTrack
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import Calibration
+from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.core.storage import Recording, ScanLog
+from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.live.bag_files import (
+    CALIBRATION,
+    CLOCK,
+    EVENTS,
+    LASER,
+    ODOMETRY,
+    TRIGGER,
+    BagReader,
+    BagWriter,
+    ns,
+    stamp,
+)
+from eschorty_ros.live.packet_stream import PacketStream
+from eschorty_ros.live.packet_times import Packet, check_span
+from eschorty_ros.live.recorded_packets import timed_packets
+from eschorty_ros.live.scan_recorder import ScanRecorder
+
+_SCAN, _SETTINGS = "eschorty_scan", "eschorty_settings"
+_MM_PER_M = 1e3
+_OUTPUT_ON = 1
+_DISK_S = 600.0
+
+Progress = Callable[[float], Any]
+
+
+def bag_to_recording(
+    bag: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    calibration: Calibration | None = None,
+    frequency_hz: float | None = None,
+    settings: dict[str, Any] | None = None,
+    packet_period_s: float = 0.0,
+) -> str:
+    """Write a recording with the packets, stage and laser of a bag; return what it lacks.
+
+    The clock of the sensor is estimated as the nodes do: announced on ``camera/clock``, else from
+    the stage's edges, else from the packets' stamps.
+
+    Parameters
+    ----------
+    bag : path
+        Folder of a rosbag2, or one ``.mcap`` or ``.db3`` file.
+    folder : path
+        The recording, made here.
+    calibration : Calibration, optional
+        That of the bag when left out.
+    frequency_hz : float, optional
+        Of the laser, for a bag without ``laser/state``.
+    settings : dict, optional
+        Settings of the reconstruction; the others are those of the recorded scan. Where the stage
+        gives pulses, ``trigger_source`` is ``stage`` if neither has it.
+    packet_period_s : float
+        Time over which the camera collects events before it sends them.
+
+    Raises
+    ------
+    FormatError, ArgumentError, CalibrationError
+        When the bag cannot be read or lacks something.
+    """
+    path = file_path("bag", bag)
+    with BagReader(path) as source:
+        _check(source, calibration, frequency_hz)
+        custom = source.custom
+        chosen = _from_custom(path, custom, _SETTINGS) | (settings or {})
+        if any(message.fields.count for message in source.messages(TRIGGER)):
+            chosen.setdefault("trigger_source", "stage")
+        limits = {"start_mm": -POSITION_LIMIT_MM, "stop_mm": POSITION_LIMIT_MM}
+        log = ScanLog(**{"scan_id": path.stem, **limits, **_from_custom(path, custom, _SCAN)})
+        build = calibration or _calibration(source)
+        stream = PacketStream(build, Settings(**chosen), 0.0, packet_period_s)
+        stream.announcement_expected = False
+        if frequency_hz is not None:
+            stream.set_laser(Modulation(frequency_hz), None)
+        _latched(source, stream, frequency_hz is None)
+        recorder = ScanRecorder(file_path("folder", folder), log, build, chosen, waits=True)
+        if fault := recorder.made(_DISK_S):
+            raise ArgumentError(fault)
+        stream.begin_scan(recorder)
+        try:
+            _play(source, stream, recorder, frequency_hz is None)
+        except BaseException:
+            recorder.end(None, "the bag was not read to its end")
+            recorder.wait(_DISK_S)
+            raise
+    if not stream.packets:
+        recorder.end(None)
+        raise FormatError(f"{path} has no packet with a laser state; give --frequency")
+    recorder.end(None)
+    return recorder.wait(_DISK_S)
+
+
+def _check(source: BagReader, calibration: Calibration | None, frequency_hz: float | None) -> None:
+    for kind, missing, remedy in (
+        (EVENTS, True, "record the camera's events"),
+        (ODOMETRY, True, "record stage/odom"),
+        (LASER, frequency_hz is None, "record laser/state, or give --frequency"),
+        (CALIBRATION, calibration is None, "record reconstruction/calibration, or give "
+         "--calibration"),
+    ):  # fmt: skip
+        if missing and kind not in source:
+            raise FormatError(f"{source.path} has no {kind}; {remedy}")
+
+
+def _from_custom(path: Path, custom: dict[str, str], key: str) -> dict[str, Any]:
+    data = parse_yaml(custom.get(key, "{}").encode(), path / "metadata.yaml", FormatError).data
+    if not isinstance(data, dict):
+        raise FormatError(f"{path}: {key} is {short(data)}; remove it from metadata.yaml")
+    return data
+
+
+def _calibration(source: BagReader) -> Calibration:
+    text = [message.fields.yaml for message in source.messages(CALIBRATION)][-1]
+    document = parse_yaml(text.encode(), source.path, CalibrationError)
+    return validate(Calibration, document, CalibrationError)
+
+
+def _latched(source: BagReader, stream: PacketStream, laser: bool) -> None:
+    """Set what was latched before the bag began: its first messages."""
+    kinds = (CLOCK, TRIGGER, LASER) if laser else (CLOCK, TRIGGER)
+    for message in source.messages(*kinds):
+        fields = message.fields
+        if message.kind == CLOCK:
+            stream.announce_zero(ns(fields.header.stamp) - ns(fields.time_ref))
+        elif message.kind == TRIGGER and fields.interval and fields.count:
+            ends = fields.first * _MM_PER_M, fields.interval * _MM_PER_M
+            stream.set_pulses(PulseTrain(*ends, int(fields.count)))
+        elif message.kind == LASER and stream.waits_for == "modulation":
+            stream.set_laser(*_laser(fields)[:2])
+
+
+def _play(source: BagReader, stream: PacketStream, recorder: ScanRecorder, laser: bool) -> None:
+    track = StageTrack()
+    kinds = (EVENTS, ODOMETRY, LASER) if laser else (EVENTS, ODOMETRY)
+    for message in source.messages(*kinds):
+        fields = message.fields
+        if message.kind == ODOMETRY:
+            t_ns, position_mm = ns(fields.header.stamp), fields.pose.pose.position.y * _MM_PER_M
+            track.append(t_ns // NS_PER_US, position_mm)
+            recorder.stage(t_ns, position_mm)
+        elif message.kind == LASER:
+            stream.set_laser(*_laser(fields))
+        else:
+            if fields.encoding != "evt3":
+                raise FormatError(
+                    f"{source.path}: encoding is {short(fields.encoding)}; record evt3"
+                )
+            check_span(fields.events)
+            packet = Packet(int(fields.seq), ns(fields.header.stamp), memoryview(fields.events))
+            stream.add(packet, message.t_ns * 1e-9)
+            stream.process(message.t_ns * 1e-9)
+            stream.fit_edges(track)
+    stream.fit_edges(track, now=True)
+
+
+def _laser(state: Any) -> tuple[Modulation, int | None, int | None]:
+    """Return modulation, an edge's time and the time since which the laser is on, ns."""
+    modulation = Modulation(float(state.frequency), float(state.duty), str(state.waveform))
+    on = state.output == _OUTPUT_ON
+    return modulation, ns(state.phase_epoch) or None, ns(state.output_since) if on else None
+
+
+def recording_to_bag(
+    recording: Recording,
+    bag: str | os.PathLike[str],
+    storage: str = "mcap",
+    progress: Progress | None = None,
+) -> None:
+    """Write a recording as a bag with the topics of camera, stage and laser.
+
+    The camera's clock is announced, so that the way back is exact. Sensor time 0 is the time at
+    which the recording's events were written, less their length.
+
+    Parameters
+    ----------
+    recording : Recording
+    bag : path
+        Folder of the bag, made here.
+    storage : str
+        ``mcap`` or ``sqlite3``.
+    progress : callable, optional
+        Called with the share done.
+
+    Raises
+    ------
+    ArgumentError
+        When the bag exists or cannot be written.
+    """
+    path = file_path("bag", bag)
+    custom = {}
+    if recording.scan is not None:
+        custom[_SCAN] = yaml.safe_dump(recording.scan.as_dict())
+        custom[_SETTINGS] = yaml.safe_dump(recording.settings)
+    try:
+        with BagWriter(path, storage, custom) as target:
+            _write(recording, target, progress)
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot write {path}: {error.strerror or error}; choose another folder"
+        ) from error
+
+
+def _write(recording: Recording, target: BagWriter, progress: Progress | None) -> None:
+    rows = recording.stage_samples
+    written_us = recording.events_path.stat().st_mtime_ns // NS_PER_US
+    zero_ns = (written_us - int(np.ptp(rows["t_us"]))) * NS_PER_US
+    begin_ns = zero_ns + min(int(rows["t_us"][0]), 0) * NS_PER_US
+    total = recording.events_path.stat().st_size
+    build, modulation = recording.calibration, recording.modulation
+    target.write(CLOCK, begin_ns, header={"stamp": stamp(zero_ns)})
+    target.write(
+        CALIBRATION, begin_ns, header={"stamp": stamp(begin_ns)}, name=build.name,
+        columns=build.columns, rows=build.rows, yaml=yaml.safe_dump(build.as_dict()),
+    )  # fmt: skip
+
+    def laser(t_ns: int, on: bool) -> None:
+        edge_us = modulation.on_edge_us
+        target.write(
+            LASER, t_ns, header={"stamp": stamp(t_ns)}, requested=on, output=on,
+            output_since=stamp(t_ns), waveform=modulation.waveform,
+            frequency=modulation.frequency_hz, duty=modulation.duty, reason="a recording",
+            phase_epoch=stamp(0 if edge_us is None else zero_ns + edge_us * NS_PER_US),
+        )  # fmt: skip
+
+    laser(begin_ns, not recording.marks["laser_on"].any())
+    reader, row, seq, done = RawReader(recording.events_path), 0, 0, 0
+
+    def stage(until_us: int) -> None:
+        nonlocal row
+        while row < len(rows) and rows["t_us"][row] <= until_us:
+            t_ns = zero_ns + int(rows["t_us"][row]) * NS_PER_US
+            position = {"position": {"y": float(rows["position_mm"][row]) / _MM_PER_M}}
+            target.write(
+                ODOMETRY, t_ns, header={"stamp": stamp(t_ns), "frame_id": "eschorty_base"},
+                child_frame_id="eschorty_stage",
+                pose={"pose": position | {"orientation": {"w": 1.0}}},
+            )  # fmt: skip
+            row += 1
+
+    for packet in timed_packets(reader, recording.marks):
+        stage(packet.until_us)
+        t_ns = zero_ns + packet.from_us * NS_PER_US
+        if packet.laser_on:
+            laser(t_ns, True)
+        seq += packet.packets_lost
+        target.write(
+            EVENTS, t_ns, header={"stamp": stamp(t_ns), "frame_id": "eschorty_optical"},
+            height=reader.header.height, width=reader.header.width, seq=seq, encoding="evt3",
+            events=np.frombuffer(packet.data, np.uint8),
+        )  # fmt: skip
+        seq += 1
+        done += len(packet.data)
+        if progress is not None:
+            progress(done / total)
+    stage(int(rows["t_us"][-1]))

@@ -1,0 +1,94 @@
+"""Bags of both storages: to a recording and back, the points stay the same."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import recorded_scan
+from recorded_scan import LiveScan
+from rosbags.typesys import get_types_from_msg
+
+from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.storage import load_recording
+from eschorty_ros.live import bag_files
+from eschorty_ros.live.bag_conversion import bag_to_recording, recording_to_bag
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    return recorded_scan.source(tmp_path_factory.mktemp("source") / "rec")
+
+
+@pytest.fixture(scope="module")
+def scanned(source, tmp_path_factory):
+    """A recorded scan without some packets: its phase is estimated, from the laser's start on."""
+    folder = tmp_path_factory.mktemp("scanned") / "rec"
+    scan = LiveScan(source, folder, lost=(40, 41, 46))
+    scan.run()
+    scan.recorder.wait(10.0)
+    return load_recording(folder)
+
+
+def points(recording):
+    return reconstruct_recording(recording).points
+
+
+@pytest.mark.parametrize("storage", bag_files.STORAGES)
+@pytest.mark.parametrize("which", ["source", "scanned"])
+def test_a_recording_a_bag_and_back(tmp_path, request, which, storage):
+    recording = request.getfixturevalue(which)
+    recording_to_bag(recording, tmp_path / "bag", storage)
+    assert bag_files.is_bag(tmp_path / "bag")
+    lost = "3 packets of the recording were lost on the way" if which == "scanned" else ""
+    assert lost in bag_to_recording(tmp_path / "bag", tmp_path / "again")
+    again = load_recording(tmp_path / "again")
+    expected = points(recording)
+    assert len(expected) > 500
+    np.testing.assert_array_equal(points(again), expected)
+    assert again.modulation == recording.modulation
+    assert again.calibration == recording.calibration
+
+
+def test_another_camera_driver_s_bag_needs_frequency_and_calibration(tmp_path, source):
+    """Only the driver's events and an odometry, and no clock but the packets' stamps."""
+    recording = replace(source, modulation=replace(source.modulation, on_edge_us=None))
+    recording_to_bag(recording, tmp_path / "all")
+    topics = {bag_files.EVENTS: "/event_camera/events", bag_files.ODOMETRY: "/rail/odometry"}
+    with bag_files.BagReader(tmp_path / "all") as bag:
+        messages = list(bag.messages(*topics))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bag_files, "TOPICS", bag_files.TOPICS | topics)
+        with bag_files.BagWriter(tmp_path / "bag", "mcap", {}) as target:
+            for message in messages:
+                names = message.fields.__dataclass_fields__.keys() - {"__msgtype__"}
+                fields = {name: getattr(message.fields, name) for name in names}
+                target.write(message.kind, message.t_ns, **fields)
+    for options, words in (({}, "give --frequency"), ({"frequency_hz": 70.0}, "--calibration")):
+        with pytest.raises(EschortyError, match=words):
+            bag_to_recording(tmp_path / "bag", tmp_path / "none", **options)
+    build = source.calibration
+    bag_to_recording(tmp_path / "bag", tmp_path / "rec", build, 70.0)
+    found, expected = points(load_recording(tmp_path / "rec")), points(recording)
+    np.testing.assert_array_equal(found["x"], expected["x"])
+    # A stamp is that of the packet's first bytes, exact here but for its 10 ms rhythm.
+    np.testing.assert_allclose(found["y"], expected["y"], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", bytes(1000)])
+def test_a_damaged_bag_is_one_line(tmp_path, content):
+    for name in ("bag.mcap", "bag.db3"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(EschortyError, match=name):
+            bag_to_recording(tmp_path / name, tmp_path / "rec")
+
+
+def test_the_definitions_are_those_of_the_message_files():
+    for kind, text in bag_files.DEFINITIONS.items():
+        package, _, name = kind.split("/")
+        folder = ROOT if package == "eschorty_ros" else ROOT / "external_msgs" / package
+        file = (folder / "msg" / f"{name}.msg").read_text()
+        assert get_types_from_msg(text, kind) == get_types_from_msg(file, kind)
