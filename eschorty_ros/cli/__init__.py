@@ -19,6 +19,7 @@ COMMANDS = {
     "convert": "Make a rosbag2 of a recording, or a recording of a rosbag2; needs no ROS.",
     "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
     "view": "Draw a cloud, or open it in a window.",
+    "measure": "Measure planes in a cloud: flatness, distance, step, gap and flush.",
     "info": "Show the content of a file or recording.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",

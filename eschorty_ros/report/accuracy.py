@@ -14,7 +14,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.storage import Recording
-from eschorty_ros.report.profiles import profile_index
+from eschorty_ros.surfaces.profiles import profile_index
 
 # Range per stage travel between two periods of one surface.
 _SLOPE_MAX = 2.0

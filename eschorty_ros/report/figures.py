@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.report.accuracy import stage_and_range_mm
-from eschorty_ros.report.profiles import period_s, profile_index
+from eschorty_ros.surfaces.profiles import period_s, profile_index
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,13 +63,13 @@ def scan_figure(
         figure.suptitle(title, parse_math=False)
     limits = central(range_mm)
     axes = figure.add_subplot(rows, 2, 1)
-    _map(axes, grid, image_of(grid, points, range_mm), "range (mm)", "viridis", limits)
+    draw_map(axes, grid, image_of(grid, points, range_mm), "range (mm)", "viridis", limits)
     axes.set_title("Depth map")
     _view_3d(figure.add_subplot(rows, 2, 2, projection="3d"), points, range_mm, limits)
     if error_mm is not None:
         bound = _error_bound(error_mm)
         axes = figure.add_subplot(rows, 2, 3)
-        _map(
+        draw_map(
             axes,
             grid,
             image_of(grid, points, error_mm),
@@ -258,7 +258,7 @@ def _error_bound(error_mm: NDArray[np.float64]) -> float:
     return max(3.0 * float(np.percentile(size_mm, 68.0)), 1e-3) if size_mm.size else 1.0
 
 
-def _map(
+def draw_map(
     axes: Axes,
     grid: Grid,
     image: NDArray[np.float64],
@@ -266,6 +266,7 @@ def _map(
     colours: str,
     limits: tuple[float, float],
 ) -> None:
+    """Draw an image of a grid, with its proportions and a colour bar."""
     edges_mm = _line_edges(grid.stage_mm)
     artist = axes.pcolorfast(
         grid.along_mm,

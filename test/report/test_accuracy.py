@@ -9,9 +9,10 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import POINT_DTYPE, load_recording
-from eschorty_ros.report import accuracy, profiles
+from eschorty_ros.report import accuracy
 from eschorty_ros.simulation.scenes import named
 from eschorty_ros.simulation.world import simulate_recording
+from eschorty_ros.surfaces import profiles
 
 MODEL = load_calibration("config_3").model()
 PERIOD_S = 1.0 / 70.0

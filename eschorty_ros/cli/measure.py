@@ -1,0 +1,137 @@
+"""`eschorty measure`."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from eschorty_ros.cli.console import show, table
+
+if TYPE_CHECKING:
+    from eschorty_ros.surfaces.measure import Measured, Pair, Surface
+    from eschorty_ros.surfaces.plane import Value
+
+
+@click.command("measure")
+@click.argument("cloud", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--region",
+    "regions",
+    multiple=True,
+    metavar="COLUMNS,SWEEP",
+    help="Columns in px and sweep position y in mm, such as 100:400,20:60; an end may be left "
+    "out. Again for further surfaces.  [default: the surfaces between steps of the range]",
+)
+@click.option(
+    "--common-mm",
+    type=click.FloatRange(0.0),
+    help="Sigma of a range error that all points of one surface share.  [default: 0.1 of the "
+    "points' own sigma]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Also draw the surfaces and their residuals here, .png, .pdf or .svg.",
+)
+def command(
+    cloud: Path,
+    regions: tuple[str, ...],
+    common_mm: float | None,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Measure planes in CLOUD (.pcd or .ply of this package), every value with its sigma.
+
+    Each surface gets a plane: range at its middle, slopes, and flatness (peak to valley of 8 by 8
+    cells; a perfect plane shows some at this noise, too). Sigmas hold the scatter, correlations and
+    a common error, not the calibration's. Every further surface is measured
+    against the first one: distance (of two parallel planes), angle, flush (step where the two face
+    each other) and gap (space between the facing edges; along the sweep the laser line's thickness
+    shifts an edge by up to half of it).
+
+    \b
+    Examples:
+      eschorty measure scan/scan.pcd
+      eschorty measure scan/scan.pcd --region 20:140,:30 --region 180:300,:30 --out step.png
+      eschorty measure rec/cloud.pcd --json
+    """  # noqa: D301
+    from eschorty_ros.core.storage import read_cloud
+    from eschorty_ros.surfaces.measure import measure, parse_region
+
+    chosen = tuple(parse_region(text) for text in regions)
+    points = read_cloud(cloud)
+    measured = measure(points, chosen, common_mm)
+    if as_json:
+        click.echo(json.dumps(_facts(measured)))
+    else:
+        _print(measured, cloud.name)
+    if out is not None:
+        from eschorty_ros.report import figures
+        from eschorty_ros.report.surface_figures import measured_figure
+
+        figures.save(measured_figure(points, measured, cloud.name), out)
+        click.echo(str(out), err=as_json)
+
+
+def _facts(measured: Measured) -> dict[str, Any]:
+    surfaces = [
+        {
+            "points": len(surface.part.line),
+            "left_out": int((~surface.plane.kept).sum()),
+            "columns": [int(edge) + measured.grid.first_column for edge in _ends(surface, 1)],
+            "range_mm": surface.range_mm._asdict(),
+            "slope_sweep": surface.plane.slope(0)._asdict(),
+            "slope_column": surface.plane.slope(1)._asdict(),
+            "rms_mm": surface.plane.rms_mm,
+            "flatness_mm": surface.flat.value_mm._asdict(),
+            "flatness_of_plane_mm": surface.flat.of_plane_mm,
+        }
+        for surface in measured.surfaces
+    ]
+    pairs = [
+        {"surface": number, **{name: value._asdict() for name, value in pair._asdict().items()}}
+        for number, pair in enumerate(measured.pairs, 2)
+    ]
+    return {"surfaces": surfaces, "pairs": pairs}
+
+
+def _ends(surface: Surface, axis: int) -> tuple[int, int]:
+    numbers = surface.part[axis]
+    return int(numbers.min()), int(numbers.max())
+
+
+def _text(value: Value) -> str:
+    """Return a value and its sigma, one or two digits of the latter."""
+    if not math.isfinite(value.value + value.sigma):
+        return "-"
+    places = max(math.ceil(-math.log10(value.sigma / 2.0)), 0) if value.sigma > 0.0 else 3
+    return f"{value.value:.{places}f} ± {value.sigma:.{places}f}"
+
+
+def _print(measured: Measured, title: str) -> None:
+    first = table(
+        title, "surface", "points", "range mm", "slope y", "slope z", "rms mm", "flatness mm",
+        "if perfect",
+    )  # fmt: skip
+    for number, surface in enumerate(measured.surfaces, 1):
+        plane, flat = surface.plane, surface.flat
+        first.add_row(
+            str(number), f"{len(surface.part.line):,}", _text(surface.range_mm),
+            _text(plane.slope(0)), _text(plane.slope(1)), f"{plane.rms_mm:.2f}",
+            _text(flat.value_mm), f"{flat.of_plane_mm:.2f}",
+        )  # fmt: skip
+    show(first)
+    if measured.pairs:
+        second = table("", "to surface 1", "distance mm", "angle °", "flush mm", "gap mm")
+        for number, pair in enumerate(measured.pairs, 2):
+            second.add_row(str(number), *_pair_texts(pair))
+        show(second)
+
+
+def _pair_texts(pair: Pair) -> list[str]:
+    return [_text(value) for value in pair]

@@ -1,0 +1,1 @@
+"""The geometry of clouds: organised grid, planes and distances, meshes, registration."""

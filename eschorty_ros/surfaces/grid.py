@@ -1,0 +1,148 @@
+"""A cloud as a grid of modulation periods and columns, and where its surface is interrupted."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import Array, positive
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.surfaces.profiles import period_s, profile_index
+
+CELLS_MAX = 50_000_000
+# Smoothing over columns spreads a step over up to 4 differences: the median of 9 ignores it.
+_SLOPE_WINDOW = 9
+_LINES_AT_ONCE = 256
+
+
+class CloudGrid(NamedTuple):
+    """A cloud as an image, one line per modulation period; a cell without a point holds NaN.
+
+    Attributes
+    ----------
+    point : ndarray of int64, shape (lines, columns)
+        Place of the cell's point in the cloud, -1 for none; of several the one of most events.
+    first_column : int
+        Column of the image's first one.
+    xyz : ndarray of float64, shape (lines, columns, 3)
+        mm.
+    sigma : ndarray of float64, shape (lines, columns)
+        mm.
+    """
+
+    point: NDArray[np.int64]
+    first_column: int
+    xyz: Array
+    sigma: Array
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Return where a cell has a point."""
+        return self.point >= 0
+
+
+class Links(NamedTuple):
+    """Where neighbours are on one surface: along, (lines - 1, columns); across, one column less."""
+
+    along: NDArray[np.bool_]
+    across: NDArray[np.bool_]
+
+
+def organise(points: NDArray[np.void]) -> CloudGrid:
+    """Return a cloud as a grid; points without finite place, time or positive sigma are left out.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+
+    Raises
+    ------
+    ArgumentError
+        When no two periods have a point, or the grid would be too large.
+    """
+    kept = np.flatnonzero(
+        np.all([np.abs(points[axis]) < 1e6 for axis in "xyz"], axis=0)
+        & (np.abs(points["t"]) < 1e9)
+        & (points["sigma"] > 0.0)
+        & (points["sigma"] < 1e6)
+    )
+    chosen = points[kept]
+    period = period_s(chosen) if len(chosen) else float("nan")
+    if not period > 0.0:
+        raise ArgumentError(
+            f"the cloud has {len(chosen):,} points with place, time and sigma in fewer than two "
+            "modulation periods; give a cloud of a sweep"
+        )
+    line = profile_index(chosen, period)
+    first = int(chosen["column"].min())
+    shape = int(line.max()) + 1, int(chosen["column"].max()) - first + 1
+    if shape[0] * shape[1] > CELLS_MAX:
+        raise ArgumentError(
+            f"the cloud spans {shape[0]:,} periods of {shape[1]:,} columns; give a part of at most "
+            f"{CELLS_MAX:,} cells"
+        )
+    index = np.full(shape, -1, np.int64)
+    order = np.argsort(chosen["intensity"], kind="stable")
+    index[line[order], chosen["column"][order].astype(np.int64) - first] = kept[order]
+    known = index >= 0
+    xyz, sigma = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
+    for k, axis in enumerate("xyz"):
+        xyz[known, k] = points[axis][index[known]].astype(np.float64) * 1e3
+    sigma[known] = points["sigma"][index[known]].astype(np.float64) * 1e3
+    return CloudGrid(index, first, xyz, sigma)
+
+
+def links(grid: CloudGrid, sigmas: float) -> Links:
+    """Return which neighbours are on one surface.
+
+    The range between two neighbours may differ from the local slope by ``sigmas`` standard
+    deviations of the difference. The slope is the median of the differences around, which a
+    single step does not change.
+    """
+    positive("sigmas", sigmas)
+    range_mm, variance = grid.xyz[..., 0], grid.sigma**2
+    return Links(_joined(range_mm, variance, sigmas), _joined(range_mm.T, variance.T, sigmas).T)
+
+
+def _joined(range_mm: Array, variance: Array, sigmas: float) -> NDArray[np.bool_]:
+    """Return which cells continue in the next line."""
+    step = np.diff(range_mm, axis=0)
+    limit = sigmas * np.sqrt(variance[1:] + variance[:-1])
+    with np.errstate(invalid="ignore"):
+        return np.abs(step - _slopes(step)) <= limit
+
+
+def _slopes(step: Array) -> Array:
+    """Return the median of the known values within the window along the first axis."""
+    half = _SLOPE_WINDOW // 2
+    padded = np.pad(step, ((half, half), (0, 0)), constant_values=np.nan)
+    slopes = np.empty_like(step)
+    for begin in range(0, len(step), _LINES_AT_ONCE):
+        part = padded[begin : begin + _LINES_AT_ONCE + 2 * half]
+        windows = np.lib.stride_tricks.sliding_window_view(part, _SLOPE_WINDOW, axis=0)
+        # NaN is sorted to the end.
+        ordered = np.sort(windows, axis=-1)
+        middle = np.maximum(np.count_nonzero(ordered == ordered, axis=-1) - 1, 0) // 2
+        values = np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0]
+        slopes[begin : begin + _LINES_AT_ONCE] = values
+    return slopes
+
+
+def smoothed(grid: CloudGrid, half: int) -> CloudGrid:
+    """Return a grid with the median range of ``2 half + 1`` lines and columns, its sigma reduced.
+
+    The sigma is that of a median of independent Gaussian errors.
+    """
+    from scipy.ndimage import median_filter, uniform_filter
+
+    known = grid.known
+    size = 2 * half + 1
+    # A missing neighbour counts as far away, on either side in turn, so that the median stays.
+    sign = np.where(np.indices(known.shape).sum(axis=0) % 2, np.inf, -np.inf)
+    middle = median_filter(np.where(known, grid.xyz[..., 0], sign), size)
+    count = np.maximum(uniform_filter(known.astype(np.float64), size) * size**2, 1.0)
+    xyz = grid.xyz.copy()
+    xyz[known, 0] = np.where(np.isfinite(middle[known]), middle[known], xyz[known, 0])
+    return grid._replace(xyz=xyz, sigma=grid.sigma * np.sqrt(np.pi / 2.0 / count))

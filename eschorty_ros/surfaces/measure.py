@@ -1,0 +1,269 @@
+"""Regions of a cloud and what lies between them: distance, angle, step, gap and flush."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.surfaces.grid import CloudGrid, links, organise, smoothed
+from eschorty_ros.surfaces.plane import (
+    Flatness,
+    Part,
+    Plane,
+    Value,
+    check_part,
+    fit_plane,
+    flatness,
+    solve,
+)
+
+SURFACES_MAX = 8
+COMMON_SHARE = 0.1
+"""Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
+# Smaller pieces are no surfaces to measure: share of the points.
+_PIECE_MIN = 0.02
+# Neighbouring medians share most of their points, so that 5 of these sigmas are many.
+_STEP_SIGMAS, _MEDIAN_HALF = 5.0, 2
+# Points near a step are on both sides of the line's thickness: cells taken off each surface.
+_RIM = 3
+
+
+class Region(NamedTuple):
+    """A part of a cloud: first and last column, sweep position y from and to, mm."""
+
+    columns: tuple[float, float]
+    sweep_mm: tuple[float, float]
+
+
+class Surface(NamedTuple):
+    """A plane of a part and its flatness.
+
+    Attributes
+    ----------
+    mask : ndarray of bool
+        Its cells in the grid.
+    common_mm : float
+        Standard deviation of the range error that its points share.
+    """
+
+    mask: NDArray[np.bool_]
+    part: Part
+    plane: Plane
+    flat: Flatness
+    common_mm: float
+
+    @property
+    def range_mm(self) -> Value:
+        """Return the range at the middle."""
+        return self.plane.range_at(*self.plane.centre[1:])
+
+
+class Pair(NamedTuple):
+    """A surface against the first one.
+
+    Attributes
+    ----------
+    distance_mm : Value
+        Along the common normal of two parallel planes; farther is positive.
+    angle_deg : Value
+        Between the two planes, each with its own slopes.
+    flush_mm : Value
+        Step where the surfaces face each other, along the first one's normal.
+    gap_mm : Value
+        Space between the facing edges in the first surface; NaN where they overlap.
+    """
+
+    distance_mm: Value
+    angle_deg: Value
+    flush_mm: Value
+    gap_mm: Value
+
+
+class Measured(NamedTuple):
+    """A cloud's surfaces, each but the first against the first."""
+
+    grid: CloudGrid
+    surfaces: tuple[Surface, ...]
+    pairs: tuple[Pair, ...]
+
+
+def parse_region(text: str) -> Region:
+    """Return the region of a text such as ``100:400,20:60``; an empty end is open.
+
+    >>> parse_region("100:400,:60")
+    Region(columns=(100.0, 400.0), sweep_mm=(-inf, 60.0))
+    """
+    spans: list[tuple[float, float]] = []
+    for span in text.split(","):
+        ends = span.split(":")
+        try:
+            low, high = (
+                float(end) if end.strip() else default
+                for end, default in zip(ends, (-math.inf, math.inf), strict=True)
+            )
+        except ValueError:
+            low, high = 1.0, 0.0
+        if not low <= high:
+            spans = []
+            break
+        spans.append((low, high))
+    if len(spans) != 2:
+        raise ArgumentError(
+            f"region {text!r} is not COLUMNS,SWEEP in px and mm; write it as 100:400,20:60"
+        )
+    return Region(*spans)
+
+
+def measure(
+    points: NDArray[np.void],
+    regions: tuple[Region, ...] = (),
+    common_mm: float | None = None,
+) -> Measured:
+    """Return planes, flatness and what lies between them.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    regions : tuple of Region
+        Without one, the pieces that steps of the range separate, without their rims.
+    common_mm : float, optional
+        Standard deviation of a range error that all points of a surface share, and by which its
+        two ends differ; by default a tenth of the points' own sigma.
+
+    Raises
+    ------
+    ArgumentError
+        When the cloud is no sweep, or a region has too few points.
+    """
+    grid = organise(points)
+    masks = [_mask(grid, region) for region in regions] or _found(grid)
+    surfaces = tuple(_surface(grid, mask, common_mm) for mask in masks)
+    pairs = tuple(_pair(surfaces[0], other) for other in surfaces[1:])
+    return Measured(grid, surfaces, pairs)
+
+
+def _mask(grid: CloudGrid, region: Region) -> NDArray[np.bool_]:
+    column = np.arange(grid.point.shape[1]) + grid.first_column
+    inside = (column >= region.columns[0]) & (column <= region.columns[1])
+    low, high = region.sweep_mm
+    with np.errstate(invalid="ignore"):
+        return inside & (grid.xyz[..., 1] >= low) & (grid.xyz[..., 1] <= high)
+
+
+def _found(grid: CloudGrid) -> list[NDArray[np.bool_]]:
+    """Return the surfaces between steps, the largest first."""
+    from scipy.ndimage import binary_erosion, binary_fill_holes, label
+
+    known, joined = grid.known, links(smoothed(grid, _MEDIAN_HALF), _STEP_SIGMAS)
+    whole = binary_fill_holes(known)
+    along = known[1:] & known[:-1] & ~joined.along
+    across = known[:, 1:] & known[:, :-1] & ~joined.across
+    for part, broken in (
+        (whole[1:], along), (whole[:-1], along), (whole[:, 1:], across), (whole[:, :-1], across),
+    ):  # fmt: skip
+        part &= ~broken
+    # Wide rims close the leaks where noise joins the two sides of a step.
+    number, _ = label(binary_erosion(whole, iterations=_RIM, border_value=1))
+    sizes = np.bincount(number[known], minlength=2)[1:]
+    large = np.argsort(-sizes, kind="stable")[:SURFACES_MAX]
+    masks = [number == at + 1 for at in large if sizes[at] >= _PIECE_MIN * known.sum()]
+    if not masks:
+        raise ArgumentError(
+            f"no surface holds {_PIECE_MIN:.0%} of the {np.count_nonzero(known):,} points; "
+            "choose regions"
+        )
+    return masks
+
+
+def _surface(grid: CloudGrid, mask: NDArray[np.bool_], common_mm: float | None) -> Surface:
+    part = Part.of(grid, mask)
+    check_part(part)
+    common = COMMON_SHARE * float(np.median(part.sigma)) if common_mm is None else common_mm
+    plane = fit_plane(part, common)
+    return Surface(mask, part, plane, flatness(part, plane), common)
+
+
+def _pair(first: Surface, other: Surface) -> Pair:
+    gap, place = _joint(first.part, other.part)
+    near, near_sigma = first.plane.range_at(*place)
+    far, far_sigma = other.plane.range_at(*place)
+    cosine = first.plane.cosine
+    common_mm = math.hypot(first.common_mm, other.common_mm)
+    return Pair(
+        _distance(first.part, other.part, common_mm),
+        _angle(first.plane, other.plane),
+        Value(
+            (far - near) * cosine,
+            math.hypot(near_sigma, far_sigma) * cosine,
+        ),
+        gap,
+    )
+
+
+def _distance(first: Part, other: Part, common_mm: float) -> Value:
+    """Return the distance of two parallel planes fitted together."""
+    both = Part(*(np.concatenate(fields) for fields in zip(first, other, strict=True)))
+    second = np.repeat([0.0, 1.0], [len(first.line), len(other.line)])
+    middle = np.median(both.xyz[:, 1:], axis=0)
+    design = np.column_stack([np.ones_like(second), second, both.xyz[:, 1:] - middle])
+    values, covariance, _, _ = solve(design, both)
+    step, slopes = values[1], values[2:]
+    cosine = 1.0 / math.sqrt(1.0 + slopes @ slopes)
+    gradient = np.array([0.0, cosine, *(-step * slopes * cosine**3)])
+    # The shared error of the slopes acts over the way from one surface to the other.
+    apart = np.median(other.xyz[:, 1:], axis=0) - np.median(first.xyz[:, 1:], axis=0)
+    lever = apart / np.ptp(both.xyz[:, 1:], axis=0)
+    variance = float(gradient @ covariance @ gradient)
+    variance += (common_mm * cosine) ** 2 * (1.0 + float(lever @ lever))
+    return Value(float(step) * cosine, math.sqrt(variance))
+
+
+def _angle(first: Plane, other: Plane) -> Value:
+    """Return the angle between two planes; its sigma is along the difference of the slopes."""
+    one, two = (np.array([1.0, *-plane.slopes]) * plane.cosine for plane in (first, other))
+    angle = math.atan2(float(np.linalg.norm(np.cross(one, two))), float(one @ two))
+    apart = other.slopes - first.slopes
+    covariance = (first.covariance + other.covariance)[1:, 1:]
+    length = float(np.linalg.norm(apart))
+    direction = apart / length if length > 0.0 else np.array([1.0, 0.0])
+    sigma = math.sqrt(float(direction @ covariance @ direction))
+    return Value(math.degrees(angle), math.degrees(sigma * first.cosine * other.cosine))
+
+
+def _joint(first: Part, other: Part) -> tuple[Value, tuple[float, float]]:
+    """Return the gap between the facing edges, and y and z of the middle between them."""
+    ends = [np.quantile(part.xyz[:, 1:], (0.0, 1.0), axis=0) for part in (first, other)]
+    spaces = np.maximum(ends[1][0] - ends[0][1], ends[0][0] - ends[1][1])
+    axis = int(np.argmax(spaces))
+    after = ends[1][0, axis] + ends[1][1, axis] >= ends[0][0, axis] + ends[0][1, axis]
+    low, high = (first, other) if after else (other, first)
+    across = ("line", "column")[1 - axis]
+    edges, pitch = _edges(low, high, axis, across)
+    middle = np.array([np.median(np.concatenate([ends[0][:, k], ends[1][:, k]])) for k in (0, 1)])
+    if not len(edges):
+        return Value(math.nan, math.nan), (float(middle[0]), float(middle[1]))
+    middle[axis] = float(np.median(edges.mean(axis=1)))
+    space = edges[:, 1] - edges[:, 0]
+    value = float(space.mean()) - pitch
+    # An edge is anywhere within one pitch behind the last point.
+    sigma = math.sqrt(float(space.var()) / len(space) + pitch**2 / 6.0)
+    gap = Value(value, sigma) if value > -pitch else Value(math.nan, math.nan)
+    return gap, (float(middle[0]), float(middle[1]))
+
+
+def _edges(low: Part, high: Part, axis: int, across: str) -> tuple[Array, float]:
+    """Return the last place of ``low`` and the first of ``high`` in each row, and the pitch."""
+    rows, columns = (getattr(part, across) for part in (low, high))
+    count = int(max(rows.max(), columns.max())) + 1
+    last, first = np.full(count, -np.inf), np.full(count, np.inf)
+    np.maximum.at(last, rows, low.xyz[:, 1 + axis])
+    np.minimum.at(first, columns, high.xyz[:, 1 + axis])
+    edges = np.column_stack([last, first])[np.isfinite(last) & np.isfinite(first)]
+    order = np.lexsort((low.xyz[:, 1 + axis], rows))
+    steps = np.diff(low.xyz[order, 1 + axis])[np.diff(rows[order]) == 0]
+    return edges, float(np.median(steps)) if len(steps) else 0.0

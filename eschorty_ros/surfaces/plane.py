@@ -1,0 +1,239 @@
+"""Planes through parts of a grid, with the covariance that the scatter and the own sigmas show.
+
+Neighbouring points share errors: smoothing over columns, the pattern of the pixels, the phase of a
+period. The covariance is clustered by strips of columns, by strips of lines and by both (Cameron,
+Gelbach and Miller, "Robust inference with multiway clustering", J. Bus. Econ. Stat. 29, 2011), and
+nowhere below that of independent errors of the points' own sigmas.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.surfaces.grid import CloudGrid
+
+POINTS_MIN = 30
+_CUT_SIGMA = 4.0
+# Median absolute deviation to standard deviation of Gaussian errors.
+_MAD = 1.4826
+_ITERATIONS = 20
+# Errors of columns closer than 5 and of lines closer than 4 are alike; fewer than 4 strips show no
+# scatter.
+_STRIP_COLUMNS, _STRIP_LINES = 12, 6
+_STRIPS = 4, 16
+_FLAT_CELLS = 8
+
+
+class Value(NamedTuple):
+    """A measured value and its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+class Part(NamedTuple):
+    """Points of a grid: line, column, x y z in mm as (n, 3), sigma in mm."""
+
+    line: NDArray[np.int64]
+    column: NDArray[np.int64]
+    xyz: Array
+    sigma: Array
+
+    @classmethod
+    def of(cls, grid: CloudGrid, mask: NDArray[np.bool_]) -> Part:
+        """Return the points of the cells in a mask."""
+        line, column = np.nonzero(mask & grid.known)
+        return cls(line, column, grid.xyz[line, column], grid.sigma[line, column])
+
+
+class Plane(NamedTuple):
+    """The plane ``x = centre[0] + slope_y (y - centre[1]) + slope_z (z - centre[2])``, mm.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+    slopes : ndarray, shape (2,)
+        mm of range per mm of y and of z.
+    covariance : ndarray, shape (3, 3)
+        Of the range at the centre and of both slopes.
+    residual : ndarray, shape (n,)
+        Measured minus fitted range, mm.
+    kept : ndarray of bool, shape (n,)
+        Points of the fit; the others are beyond 4 robust sigma.
+    """
+
+    centre: Array
+    slopes: Array
+    covariance: Array
+    residual: Array
+    kept: NDArray[np.bool_]
+
+    @property
+    def cosine(self) -> float:
+        """Cosine between range and normal: a distance along x times it is along the normal."""
+        return float(1.0 / np.sqrt(1.0 + self.slopes @ self.slopes))
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the kept residuals."""
+        return float(np.sqrt(np.mean(self.residual[self.kept] ** 2)))
+
+    def slope(self, axis: int) -> Value:
+        """Return the slope along y (0) or z (1)."""
+        return Value(float(self.slopes[axis]), float(np.sqrt(self.covariance[axis + 1, axis + 1])))
+
+    def range_at(self, y: float, z: float) -> Value:
+        """Return the range at a place, mm."""
+        row = np.array([1.0, y - self.centre[1], z - self.centre[2]])
+        value = self.centre[0] + self.slopes @ row[1:]
+        return Value(float(value), float(np.sqrt(row @ self.covariance @ row)))
+
+
+class Flatness(NamedTuple):
+    """Peak to valley of the mean residual in cells, along the normal, mm.
+
+    ``of_plane_mm`` is what a perfect plane shows at this noise.
+    """
+
+    value_mm: Value
+    of_plane_mm: float
+
+
+def fit_plane(part: Part, common_mm: float = 0.0) -> Plane:
+    """Return the weighted least-squares plane of range over y and z, outliers left out.
+
+    ``common_mm`` is the standard deviation of an error that the points share; from one end of the
+    part to the other it differs by as much. `check_part` refuses too few points.
+    """
+    middle = np.median(part.xyz[:, 1:], axis=0)
+    design = np.column_stack([np.ones(len(part.line)), part.xyz[:, 1:] - middle])
+    values, covariance, residual, kept = solve(design, part)
+    extent = np.ptp(part.xyz[:, 1:], axis=0)
+    covariance += np.diag((common_mm / np.array([1.0, *extent])) ** 2)
+    return Plane(np.array([values[0], *middle]), values[1:], covariance, residual, kept)
+
+
+def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return values, covariance, residuals and kept points of a linear model of the range."""
+    kept = np.ones(len(part.line), bool)
+    for _ in range(_ITERATIONS):
+        root = 1.0 / part.sigma[kept]
+        values = np.linalg.lstsq(
+            design[kept] * root[:, None], part.xyz[kept, 0] * root, rcond=None
+        )[0]
+        residual = part.xyz[:, 0] - design @ values
+        ratio = residual / part.sigma
+        scale = max(_MAD * float(np.median(np.abs(ratio[kept]))), 1.0)
+        before, kept = kept, np.abs(ratio) <= _CUT_SIGMA * scale
+        if np.array_equal(kept, before):
+            break
+    return values, _covariance(design[kept], residual[kept], part, kept), residual, kept
+
+
+def _covariance(design: Array, residual: Array, part: Part, kept: NDArray[np.bool_]) -> Array:
+    weight = 1.0 / part.sigma[kept] ** 2
+    own = np.linalg.inv(design.T @ (design * weight[:, None]))
+    score = design * (weight * residual)[:, None]
+    lines, columns = (
+        _strips(part.line[kept], _STRIP_LINES),
+        _strips(part.column[kept], _STRIP_COLUMNS),
+    )
+    both = lines * (int(columns.max()) + 1) + columns
+    spread = _spread(score, lines) + _spread(score, columns) - _spread(score, both)
+    root = np.linalg.cholesky(own)
+    factors, axes = np.linalg.eigh(root.T @ spread @ root)
+    turned = root @ axes
+    return np.asarray((turned * np.maximum(factors, 1.0)) @ turned.T)
+
+
+def _strips(number: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    first, span = int(number.min()), int(np.ptp(number)) + 1
+    count = min(max(span // width, _STRIPS[0]), _STRIPS[1], span)
+    return (number - first) * count // span
+
+
+def _spread(score: Array, group: NDArray[np.int64]) -> Array:
+    """Return the sum of squares of the groups' sums; a mean and a slope are fitted to them."""
+    count = int(group.max()) + 1
+    sums = np.stack([np.bincount(group, column, count) for column in score.T])
+    return np.asarray(sums @ sums.T * (count / max(count - 2, 1)))
+
+
+def check_part(part: Part) -> None:
+    """Refuse points that are too few for a plane or on one line with an ArgumentError."""
+    lines = len(np.unique(part.line))
+    columns = len(np.unique(part.column))
+    if len(part.line) < POINTS_MIN or lines < 3 or columns < 3:
+        raise ArgumentError(
+            f"a surface has {len(part.line):,} points in {lines} periods and {columns} columns; "
+            f"choose a region with {POINTS_MIN} points or more in 3 of each"
+        )
+
+
+def flatness(part: Part, plane: Plane) -> Flatness:
+    """Return the flatness of a part about its plane; NaN when it is too small for two cells."""
+    line, column = part.line[plane.kept], part.column[plane.kept]
+    residual = plane.residual[plane.kept]
+    fine = 4
+    cells, down, aside = (_cells(line, column, count) for count in ((1, 1), (fine, 1), (1, fine)))
+    total = int(cells.max()) + 1
+    count = np.bincount(cells, minlength=total)
+    mean = np.bincount(cells, residual, total) / np.maximum(count, 1)
+    used = count >= 0.25 * np.median(count[count > 0])
+    own = np.bincount(cells, part.sigma[plane.kept] ** 2, total) / np.maximum(count, 1) ** 2
+    variance = own * max(1.0, *(_excess(residual, at, cells, used, own) for at in (down, aside)))
+    if np.count_nonzero(used) < 2:
+        return Flatness(Value(np.nan, np.nan), np.nan)
+    from scipy.special import ndtri
+
+    mean, sigma = mean[used] * plane.cosine, np.sqrt(variance[used]) * plane.cosine
+    high, low = int(np.argmax(mean)), int(np.argmin(mean))
+    # Blom's mean of the largest of n Gaussian numbers, on both sides.
+    largest = float(ndtri((len(mean) - 0.375) / (len(mean) + 0.25)))
+    return Flatness(
+        Value(float(mean[high] - mean[low]), float(np.hypot(sigma[high], sigma[low]))),
+        2.0 * largest * float(np.median(sigma)),
+    )
+
+
+def _cells(
+    line: NDArray[np.int64], column: NDArray[np.int64], fine: tuple[int, int]
+) -> NDArray[np.int64]:
+    """Return the cell of every point, of 8 x 8 times ``fine``."""
+    parts = []
+    for number, times in zip((line, column), fine, strict=True):
+        first, span = int(number.min()), int(np.ptp(number)) + 1
+        # No cell is narrower than 4 lines or columns, so that it can be divided.
+        coarse = min(_FLAT_CELLS, max(span // 4, 1))
+        parts.append(((number - first) * coarse * times // span, coarse * times))
+    (down, _), (aside, width) = parts
+    return down * width + aside
+
+
+def _excess(
+    residual: Array, fine: NDArray[np.int64], cells: NDArray[np.int64], used: NDArray[np.bool_],
+    own: Array,
+) -> float:  # fmt: skip
+    """Return by how much the means of cells scatter more than their own sigmas state.
+
+    Each cell is divided into four strips, and the variance of its mean is a quarter of theirs.
+    """
+    total = int(fine.max()) + 1
+    count = np.bincount(fine, minlength=total)
+    at = count > 0
+    mean = np.bincount(fine, residual, total)[at] / count[at]
+    cell = np.zeros(total, np.int64)
+    cell[fine] = cells
+    cell = cell[at]
+    strips = np.bincount(cell, minlength=len(used))
+    inside = np.bincount(cell, mean, len(used)) / np.maximum(strips, 1)
+    square = np.bincount(cell, (mean - inside[cell]) ** 2, len(used))
+    whole = used & (strips == 4)
+    if not whole.any():
+        return 1.0
+    return float((square[whole] / 3.0 / 4.0).sum() / own[whole].sum())

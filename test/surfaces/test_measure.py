@@ -1,0 +1,131 @@
+"""Planes in clouds: true values within the reported sigmas, and answers where there is no plane."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import eschorty_ros as es
+from eschorty_ros.cli import main
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
+from eschorty_ros.simulation.scenes import Steps
+from eschorty_ros.simulation.world import simulate_recording
+from eschorty_ros.surfaces.measure import Region, measure, parse_region
+
+ALL = (-np.inf, np.inf)
+PITCH_Y, PITCH_Z = 0.7, 0.25
+
+
+def cloud(range_mm, sigma_mm=0.3, smooth=5, seed=1):
+    """A cloud of 60 lines and 400 columns; errors of ``smooth`` neighbouring columns are alike."""
+    rng = np.random.default_rng(seed)
+    line, column = np.mgrid[0:60, 0:400]
+    y, z = line * PITCH_Y, (column - 200) * PITCH_Z
+    noise = rng.normal(0.0, sigma_mm * np.sqrt(smooth), (60, 400 + smooth - 1))
+    error = np.lib.stride_tricks.sliding_window_view(noise, smooth, axis=1).mean(axis=-1)
+    x = np.broadcast_to(range_mm(y, z), y.shape) + error
+    known = np.isfinite(x)
+    points = np.zeros(np.count_nonzero(known), POINT_DTYPE)
+    for name, values in (("x", x), ("y", y), ("z", z)):
+        points[name] = values[known] * 1e-3
+    points["t"], points["column"] = line[known] / 70.0, column[known]
+    points["sigma"], points["intensity"] = sigma_mm * 1e-3, 20
+    return points
+
+
+def test_the_sigmas_of_simulated_levels_cover_the_truth(tmp_path):
+    """Four levels at random ranges, 20 mm of sweep each; seeds 0 to 5."""
+    build = load_calibration("config_3")
+    ratios = {name: [] for name in ("range", "slope", "distance", "flush")}
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        base_mm, levels_mm = rng.uniform(1250.0, 1400.0), tuple(rng.uniform(-60.0, 60.0, 4))
+        recording = simulate_recording(
+            tmp_path / str(seed), Steps(base_mm, levels_mm, (0.0,)), build,
+            modulation=Modulation(70.0), start_mm=10.0, stop_mm=30.0, speed_mm_s=50.0, seed=seed,
+        )  # fmt: skip
+        regions = tuple(Region((320 * k + 10, 320 * k + 309), ALL) for k in range(4))
+        found = measure(es.reconstruct(recording).points, regions)
+        for surface, level_mm in zip(found.surfaces, levels_mm, strict=True):
+            value = surface.range_mm
+            ratios["range"].append((value.value - base_mm - level_mm) / value.sigma)
+            slopes = [surface.plane.slope(axis) for axis in (0, 1)]
+            ratios["slope"] += [slope.value / slope.sigma for slope in slopes]
+            # A flat level is as flat as noise lets a perfect plane look.
+            assert surface.flat.value_mm.value < 2.5 * surface.flat.of_plane_mm
+        for pair, level_mm in zip(found.pairs, levels_mm[1:], strict=True):
+            for name, value in (("distance", pair.distance_mm), ("flush", pair.flush_mm)):
+                ratios[name].append((value.value - level_mm + levels_mm[0]) / value.sigma)
+    for name, values in ratios.items():
+        inside = [np.mean(np.abs(values) < sigmas) for sigmas in (1.0, 2.0)]
+        print(name, len(values), *np.round(inside, 2))
+        assert 0.5 <= inside[0] <= 0.97, name
+        assert inside[1] >= 0.85, name
+
+
+@pytest.mark.parametrize("smooth", [1, 5])
+def test_the_sigma_of_a_plane_follows_the_errors_that_neighbours_share(smooth):
+    """Slopes of 40 noisy planes scatter as their sigmas state, with and without smoothing."""
+    planes = [
+        measure(cloud(lambda y, z: 1300.0 + 0.2 * y - 0.1 * z, smooth=smooth, seed=seed),
+                (Region(ALL, ALL),), 0.0).surfaces[0].plane for seed in range(40)
+    ]  # fmt: skip
+    for axis, true in ((0, 0.2), (1, -0.1)):
+        slopes = [plane.slope(axis) for plane in planes]
+        stated = np.sqrt(np.mean([slope.sigma**2 for slope in slopes]))
+        seen = np.sqrt(np.mean([(slope.value - true) ** 2 for slope in slopes]))
+        assert 0.75 < seen / stated < 1.3, axis
+
+
+def test_surfaces_gap_step_and_flatness_are_found_without_regions():
+    """Two panels, 10 mm apart along z, one 4 mm farther and with a dent of 1.5 mm."""
+
+    def panels(y, z):
+        dent = 1.5 * np.exp(-((y - 20.0) ** 2 + (z - 30.0) ** 2) / 72.0)
+        right = 1304.0 + dent
+        return np.where(z < 0.0, 1300.0, np.where(z < 10.0, np.nan, right)) + 0.05 * y
+
+    found = measure(cloud(panels))
+    assert len(found.surfaces) == 2
+    pair = found.pairs[0]
+    sign = 1.0 if found.surfaces[0].part.column.mean() < 200 else -1.0
+    assert abs(pair.flush_mm.value - sign * 4.0) < 3.0 * pair.flush_mm.sigma + 0.1
+    assert pair.flush_mm.sigma < 0.2
+    # The rims of automatic surfaces are 3 cells narrower on either side.
+    assert pair.gap_mm.value == pytest.approx(10.0 + 2 * 3 * PITCH_Z, abs=0.6)
+    flat = {surface.part.column.mean() < 200: surface.flat for surface in found.surfaces}
+    assert 0.8 < flat[False].value_mm.value < 1.5
+    assert flat[False].value_mm.value > 3.0 * flat[False].of_plane_mm
+    assert flat[True].value_mm.value < 2.0 * flat[True].of_plane_mm
+    regions = (parse_region("0:199,:"), parse_region("240:,:"))
+    assert measure(cloud(panels), regions).pairs[0].gap_mm.value == pytest.approx(10.0, abs=0.4)
+
+
+def test_a_cloud_without_surfaces_and_bad_regions_have_one_line():
+    points = cloud(lambda y, z: 1300.0 + 0.0 * z)
+    with pytest.raises(ArgumentError, match="write it as 100:400,20:60"):
+        parse_region("100-400")
+    with pytest.raises(ArgumentError, match="choose a region with 30 points"):
+        measure(points, (parse_region("1000:,:"),))
+    with pytest.raises(ArgumentError, match="give a cloud of a sweep"):
+        measure(points[points["t"] == 0.0])
+    points["x"] = np.random.default_rng(0).uniform(1.0, 2.0, len(points))
+    with pytest.raises(ArgumentError, match="choose regions"):
+        measure(points)
+
+
+def test_the_command_prints_values_with_their_sigma(tmp_path):
+    write_cloud(tmp_path / "c.ply", cloud(lambda y, z: np.where(z < 0, 1300.0, 1310.0)))
+    arguments = ["measure", str(tmp_path / "c.ply"), "--out", str(tmp_path / "c.png")]
+    done = CliRunner().invoke(main, arguments)
+    assert done.exit_code == 0, done.output
+    assert "flatness mm" in done.output
+    assert "gap mm" in done.output
+    assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
+    facts = json.loads(CliRunner().invoke(main, [*arguments[:2], "--json"]).stdout)
+    distance = facts["pairs"][0]["distance_mm"]
+    assert abs(abs(distance["value"]) - 10.0) < 4.0 * distance["sigma"] < 1.0
