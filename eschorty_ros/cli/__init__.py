@@ -20,6 +20,7 @@ COMMANDS = {
     "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
     "view": "Draw a cloud, or open it in a window.",
     "measure": "Measure planes in a cloud: flatness, distance, step, gap and flush.",
+    "mesh": "Make a triangle mesh of a cloud, decimated to the points' errors.",
     "info": "Show the content of a file or recording.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",

@@ -1,4 +1,4 @@
-"""Pictures of measured surfaces."""
+"""Pictures of measured surfaces and of meshes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.report.figures import central, draw_map, grid_of, image_of, new_figure
 from eschorty_ros.surfaces.measure import Measured
+from eschorty_ros.surfaces.mesh import Mesh
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+TRIANGLES_WITH_EDGES = 3_000
 
 
 def measured_figure(points: NDArray[np.void], measured: Measured, title: str) -> Figure:
@@ -49,4 +52,35 @@ def measured_figure(points: NDArray[np.void], measured: Measured, title: str) ->
                 middle_mm[column], surface.plane.centre[1], str(number), ha="center", va="center",
                 bbox={"facecolor": "white", "alpha": 0.7, "linewidth": 0},
             )  # fmt: skip
+    return figure
+
+
+def mesh_figure(mesh: Mesh, sigmas: float, title: str) -> Figure:
+    """Draw the mesh as the sensor sees it, and its levels: vertices kept against error."""
+    figure = new_figure(12.0, 5.0)
+    figure.suptitle(title, parse_math=False)
+    axes = figure.add_subplot(1, 2, 1)
+    x, y, z = mesh.vertices.T
+    middle = x[mesh.triangles].mean(axis=1)
+    low, high = central(middle)
+    few = len(mesh.triangles) <= TRIANGLES_WITH_EDGES
+    artist = axes.tripcolor(
+        z, y, mesh.triangles, facecolors=middle, cmap="viridis", vmin=low, vmax=high,
+        edgecolors="white" if few else "none", linewidth=0.3 if few else 0.0,
+    )  # fmt: skip
+    axes.set(xlabel="z (mm)", ylabel="y (mm)", aspect="equal")
+    axes.set_title(f"{len(x):,} vertices, {len(mesh.triangles):,} triangles")
+    axes.set_facecolor("0.85")
+    figure.colorbar(artist, ax=axes, label="range (mm)", location="bottom")
+    axes = figure.add_subplot(1, 2, 2)
+    kept = [level.vertices / mesh.points for level in mesh.levels]
+    errors = [level.error_sigmas for level in mesh.levels]
+    axes.semilogx(kept, errors, "o-")
+    axes.plot(kept[mesh.chosen], errors[mesh.chosen], "o", markersize=12, fillstyle="none")
+    axes.axhline(sigmas, color="black", linestyle="--")
+    axes.set(
+        xlabel="share of the points kept", ylabel="95 % of the points within (sigma)",
+        title="Points kept against error",
+    )  # fmt: skip
+    axes.grid(alpha=0.3)
     return figure

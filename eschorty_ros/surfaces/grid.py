@@ -12,6 +12,8 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.surfaces.profiles import period_s, profile_index
 
 CELLS_MAX = 50_000_000
+STEP_SIGMAS = 5.0
+"""Of medians: neighbours share most of their points, so that this is a large difference."""
 # Smoothing over columns spreads a step over up to 4 differences: the median of 9 ignores it.
 _SLOPE_WINDOW = 9
 _LINES_AT_ONCE = 256
@@ -94,22 +96,28 @@ def organise(points: NDArray[np.void]) -> CloudGrid:
     return CloudGrid(index, first, xyz, sigma)
 
 
-def links(grid: CloudGrid, sigmas: float) -> Links:
+def links(grid: CloudGrid, sigmas: float, steepness: float = 0.0) -> Links:
     """Return which neighbours are on one surface.
 
     The range between two neighbours may differ from the local slope by ``sigmas`` standard
-    deviations of the difference. The slope is the median of the differences around, which a
-    single step does not change.
+    deviations of the difference, or by ``steepness`` times their distance across. The slope is the
+    median of the differences around, which a single step does not change.
     """
     positive("sigmas", sigmas)
-    range_mm, variance = grid.xyz[..., 0], grid.sigma**2
-    return Links(_joined(range_mm, variance, sigmas), _joined(range_mm.T, variance.T, sigmas).T)
+    range_mm, y, z = np.moveaxis(grid.xyz, -1, 0)
+    variance = grid.sigma**2
+    return Links(
+        _joined(range_mm, variance, y * steepness, sigmas),
+        _joined(range_mm.T, variance.T, z.T * steepness, sigmas).T,
+    )
 
 
-def _joined(range_mm: Array, variance: Array, sigmas: float) -> NDArray[np.bool_]:
-    """Return which cells continue in the next line."""
+def _joined(range_mm: Array, variance: Array, steep: Array, sigmas: float) -> NDArray[np.bool_]:
+    """Return which cells continue in the next line; ``steep`` is a surface of the largest slope."""
     step = np.diff(range_mm, axis=0)
-    limit = sigmas * np.sqrt(variance[1:] + variance[:-1])
+    limit = np.maximum(
+        sigmas * np.sqrt(variance[1:] + variance[:-1]), np.abs(np.diff(steep, axis=0))
+    )
     with np.errstate(invalid="ignore"):
         return np.abs(step - _slopes(step)) <= limit
 

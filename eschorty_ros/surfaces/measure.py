@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.surfaces.grid import CloudGrid, links, organise, smoothed
+from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, links, organise, smoothed
 from eschorty_ros.surfaces.plane import (
     Flatness,
     Part,
@@ -27,8 +27,7 @@ COMMON_SHARE = 0.1
 """Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
 # Smaller pieces are no surfaces to measure: share of the points.
 _PIECE_MIN = 0.02
-# Neighbouring medians share most of their points, so that 5 of these sigmas are many.
-_STEP_SIGMAS, _MEDIAN_HALF = 5.0, 2
+_MEDIAN_HALF = 2
 # Points near a step are on both sides of the line's thickness: cells taken off each surface.
 _RIM = 3
 
@@ -159,7 +158,7 @@ def _found(grid: CloudGrid) -> list[NDArray[np.bool_]]:
     """Return the surfaces between steps, the largest first."""
     from scipy.ndimage import binary_erosion, binary_fill_holes, label
 
-    known, joined = grid.known, links(smoothed(grid, _MEDIAN_HALF), _STEP_SIGMAS)
+    known, joined = grid.known, links(smoothed(grid, _MEDIAN_HALF), STEP_SIGMAS)
     whole = binary_fill_holes(known)
     along = known[1:] & known[:-1] & ~joined.along
     across = known[:, 1:] & known[:, :-1] & ~joined.across

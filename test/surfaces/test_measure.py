@@ -5,36 +5,19 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from grid_clouds import PITCH_Z, cloud
 
 import eschorty_ros as es
 from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
+from eschorty_ros.core.storage import write_cloud
 from eschorty_ros.simulation.scenes import Steps
 from eschorty_ros.simulation.world import simulate_recording
 from eschorty_ros.surfaces.measure import Region, measure, parse_region
 
 ALL = (-np.inf, np.inf)
-PITCH_Y, PITCH_Z = 0.7, 0.25
-
-
-def cloud(range_mm, sigma_mm=0.3, smooth=5, seed=1):
-    """A cloud of 60 lines and 400 columns; errors of ``smooth`` neighbouring columns are alike."""
-    rng = np.random.default_rng(seed)
-    line, column = np.mgrid[0:60, 0:400]
-    y, z = line * PITCH_Y, (column - 200) * PITCH_Z
-    noise = rng.normal(0.0, sigma_mm * np.sqrt(smooth), (60, 400 + smooth - 1))
-    error = np.lib.stride_tricks.sliding_window_view(noise, smooth, axis=1).mean(axis=-1)
-    x = np.broadcast_to(range_mm(y, z), y.shape) + error
-    known = np.isfinite(x)
-    points = np.zeros(np.count_nonzero(known), POINT_DTYPE)
-    for name, values in (("x", x), ("y", y), ("z", z)):
-        points[name] = values[known] * 1e-3
-    points["t"], points["column"] = line[known] / 70.0, column[known]
-    points["sigma"], points["intensity"] = sigma_mm * 1e-3, 20
-    return points
 
 
 def test_the_sigmas_of_simulated_levels_cover_the_truth(tmp_path):

@@ -1,0 +1,75 @@
+"""`eschorty mesh`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from eschorty_ros.cli.console import show, table
+
+if TYPE_CHECKING:
+    from eschorty_ros.surfaces.mesh import Mesh
+
+
+@click.command("mesh")
+@click.argument("cloud", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--sigmas",
+    type=click.FloatRange(0.0, min_open=True),
+    default=2.0,
+    show_default=True,
+    help="95 % of the points are within this multiple of their own sigma from the mesh.",
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Mesh to write, .ply, .obj or .stl, in m; beside it a picture, .png.  "
+    "[default: CLOUD with _mesh.ply]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None:
+    """Make a triangle mesh of CLOUD (.pcd or .ply of this package); needs open3d.
+
+    Neighbouring periods and columns become triangles, none across a step of the range. The mesh
+    is decimated as far as the points' own errors allow; the table shows vertices against error.
+
+    \b
+    Examples:
+      eschorty mesh scan/scan.pcd
+      eschorty mesh scan/scan.pcd --sigmas 1.9 --out part.stl
+    """  # noqa: D301
+    from eschorty_ros.core.base.files import check_writable
+    from eschorty_ros.core.storage import read_cloud
+    from eschorty_ros.report import figures
+    from eschorty_ros.report.surface_figures import mesh_figure
+    from eschorty_ros.surfaces.mesh import check_format, mesh, write_mesh
+
+    target = out or cloud.with_name(f"{cloud.stem}_mesh.ply")
+    check_format(target)
+    check_writable(target)
+    made = mesh(read_cloud(cloud), sigmas)
+    write_mesh(target, made)
+    figures.save(mesh_figure(made, sigmas, cloud.name), target.with_suffix(".png"))
+    if as_json:
+        levels = [level._asdict() for level in made.levels]
+        facts = {"mesh": str(target), "points": made.points, "chosen": made.chosen}
+        click.echo(json.dumps({**facts, "levels": levels}))
+    else:
+        _print(made, target)
+
+
+def _print(made: Mesh, target: Path) -> None:
+    rows = table(
+        f"{target}: {len(made.vertices):,} of {made.points:,} points",
+        "vertices", "kept", "triangles", "95 % within mm", "within sigmas", "",
+    )  # fmt: skip
+    for number, level in enumerate(made.levels):
+        rows.add_row(
+            f"{level.vertices:,}", f"{level.vertices / made.points:.2%}", f"{level.triangles:,}",
+            f"{level.error_mm:.3f}", f"{level.error_sigmas:.2f}",
+            "written" if number == made.chosen else "",
+        )  # fmt: skip
+    show(rows)

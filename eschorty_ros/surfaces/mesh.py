@@ -1,0 +1,196 @@
+"""A triangle mesh of a cloud's organised grid, with as few vertices as the points' errors allow."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import Array, file_path, positive
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.simulation.scenes import load_open3d
+from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, Links, links, organise, smoothed
+
+FORMATS = (".ply", ".obj", ".stl")
+_WITHIN = 0.95
+_LEVELS_MAX = 24
+_TRIANGLES_MIN = 64
+_SMOOTH_HALF = 2
+# A step of less than this over the distance of two neighbours is a slope as well.
+_STEEPNESS = 2.0
+
+
+class Level(NamedTuple):
+    """One step of the decimation.
+
+    Attributes
+    ----------
+    vertices, triangles : int
+    error_mm : float
+        Distance to the mesh within which 95 % of the cloud's points are.
+    error_sigmas : float
+        The same as a multiple of each point's own sigma.
+    """
+
+    vertices: int
+    triangles: int
+    error_mm: float
+    error_sigmas: float
+
+
+class Mesh(NamedTuple):
+    """The coarsest mesh within the errors.
+
+    Attributes
+    ----------
+    vertices : ndarray of float64, shape (n, 3)
+        mm.
+    triangles : ndarray of int64, shape (m, 3)
+        Their front faces the sensor.
+    levels : tuple of Level
+        From the finest to the first one beyond the errors.
+    chosen : int
+        Index of the mesh's level.
+    points : int
+        Points of the cloud that the finest mesh holds.
+    """
+
+    vertices: Array
+    triangles: NDArray[np.int64]
+    levels: tuple[Level, ...]
+    chosen: int
+    points: int
+
+
+def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
+    """Return the coarsest mesh from which 95 % of the points are within ``sigmas`` of their own.
+
+    The finest mesh joins neighbours of the grid, at the median range of 5 by 5; none over a step
+    of the range. Each further level has half the triangles (Garland and Heckbert's quadrics).
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+    sigmas : float
+        Gaussian errors alone need 1.96.
+
+    Raises
+    ------
+    ArgumentError
+        When the cloud is no sweep, or the finest mesh is beyond the errors.
+    EschortyError
+        Without Open3D.
+    """
+    positive("sigmas", sigmas)
+    open3d = load_open3d("a mesh")
+    grid = organise(points)
+    smooth = smoothed(grid, _SMOOTH_HALF)
+    triangles = _triangles(smooth, links(smooth, STEP_SIGMAS, _STEEPNESS))
+    if not len(triangles):
+        raise ArgumentError("no three neighbouring points are on one surface; give another cloud")
+    used = np.unique(triangles)
+    place = np.full(grid.point.size, -1, np.int64)
+    place[used] = np.arange(len(used))
+    measured = grid.xyz.reshape(-1, 3)[used], grid.sigma.ravel()[used]
+    shape = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(smooth.xyz.reshape(-1, 3)[used]),
+        open3d.utility.Vector3iVector(place[triangles].astype(np.int32)),
+    )
+    levels = [_level(open3d, shape, *measured)]
+    if levels[0].error_sigmas > sigmas:
+        raise ArgumentError(
+            f"sigmas is {sigmas:g} and the finest mesh is {levels[0].error_sigmas:.2f} sigma from "
+            "its points; allow more"
+        )
+    chosen = shape
+    while len(levels) < _LEVELS_MAX and levels[-1].triangles > _TRIANGLES_MIN:
+        coarser = chosen.simplify_quadric_decimation(levels[-1].triangles // 2)
+        if not 0 < len(coarser.triangles) < levels[-1].triangles:
+            break
+        levels.append(_level(open3d, coarser, *measured))
+        if levels[-1].error_sigmas > sigmas:
+            break
+        chosen = coarser
+    last = len(levels) - 1 if levels[-1].error_sigmas <= sigmas else len(levels) - 2
+    return Mesh(
+        np.asarray(chosen.vertices),
+        np.asarray(chosen.triangles).astype(np.int64),
+        tuple(levels),
+        last,
+        len(used),
+    )
+
+
+def write_mesh(path: str | os.PathLike[str], made: Mesh) -> None:
+    """Write a mesh in metres as ``.ply``, ``.obj`` or ``.stl``; it appears complete or not at all.
+
+    Raises
+    ------
+    ArgumentError
+        For another extension, or a path that cannot be written.
+    """
+    target = check_format(path)
+    open3d = load_open3d("a mesh")
+    shape = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(made.vertices * 1e-3),
+        open3d.utility.Vector3iVector(made.triangles.astype(np.int32)),
+    )
+    shape.compute_vertex_normals()
+    part = Path(target.parent, f".{target.stem}.part{target.suffix.lower()}")
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    try:
+        if not open3d.io.write_triangle_mesh(str(part), shape):
+            raise ArgumentError(f"cannot write {target}; check folder and disk")
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def check_format(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a mesh; another extension than those of ``FORMATS`` is refused."""
+    target = file_path("path", path)
+    if target.suffix.lower() not in FORMATS:
+        raise ArgumentError(f"{target} ends in {target.suffix!r}; choose {', '.join(FORMATS)}")
+    return target
+
+
+def _triangles(grid: CloudGrid, joined: Links) -> NDArray[np.int64]:
+    """Return the triangles between neighbouring cells, as flat indices, their front to the sensor.
+
+    Four cells on one surface make two triangles, three make one.
+    """
+    cell = np.arange(grid.point.size).reshape(grid.point.shape)
+    corner = cell[:-1, :-1], cell[:-1, 1:], cell[1:, 1:], cell[1:, :-1]
+    side = joined.across[:-1], joined.along[:, 1:], joined.across[1:], joined.along[:, :-1]
+    whole = np.logical_and.reduce(side)
+    parts = [np.column_stack([corner[k][whole] for k in three]) for three in ((0, 1, 2), (0, 2, 3))]
+    free = ~whole
+    for k in range(4):
+        # The corner k with the sides before and after it.
+        single = free & side[k - 1] & side[k]
+        free &= ~single
+        parts.append(np.column_stack([corner[at % 4][single] for at in (k - 1, k, k + 1)]))
+    triangles = np.concatenate(parts)
+    xyz = grid.xyz.reshape(-1, 3)[triangles]
+    normal_x = np.cross(xyz[:, 1] - xyz[:, 0], xyz[:, 2] - xyz[:, 0])[:, 0]
+    return triangles if normal_x.sum() <= 0.0 else triangles[:, ::-1]
+
+
+def _level(open3d: Any, shape: Any, xyz: Array, sigma: Array) -> Level:
+    # Its single precision has its digits near the origin.
+    middle = xyz.mean(axis=0)
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        (np.asarray(shape.vertices) - middle).astype(np.float32),
+        np.asarray(shape.triangles).astype(np.uint32),
+    )
+    distance = scene.compute_distance((xyz - middle).astype(np.float32), nthreads=1).numpy()
+    return Level(
+        len(shape.vertices),
+        len(shape.triangles),
+        float(np.quantile(distance, _WITHIN)),
+        float(np.quantile(distance / sigma, _WITHIN)),
+    )
