@@ -21,6 +21,7 @@ COMMANDS = {
     "view": "Draw a cloud, or open it in a window.",
     "measure": "Measure planes in a cloud: flatness, distance, step, gap and flush.",
     "mesh": "Make a triangle mesh of a cloud, decimated to the points' errors.",
+    "register": "Join clouds of several passes or poses in one frame.",
     "info": "Show the content of a file or recording.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",

@@ -1,7 +1,8 @@
-"""Pictures of measured surfaces and of meshes."""
+"""Pictures of measured surfaces, of meshes and of joined clouds."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRIANGLES_WITH_EDGES = 3_000
+POINTS_SHOWN = 20_000
 
 
 def measured_figure(points: NDArray[np.void], measured: Measured, title: str) -> Figure:
@@ -83,4 +85,23 @@ def mesh_figure(mesh: Mesh, sigmas: float, title: str) -> Figure:
         title="Points kept against error",
     )  # fmt: skip
     axes.grid(alpha=0.3)
+    return figure
+
+
+def joined_figure(points: NDArray[np.void], sizes: Sequence[int], title: str) -> Figure:
+    """Draw joined clouds along x and along z, each in its colour; ``sizes`` are their points."""
+    figure = new_figure(12.0, 5.0)
+    figure.suptitle(title, parse_math=False)
+    for place, across in ((1, "z"), (2, "x")):
+        axes = figure.add_subplot(1, 2, place)
+        begin = 0
+        for number, size in enumerate(sizes, 1):
+            part = points[begin : begin + size : max(size // POINTS_SHOWN, 1)]
+            begin += size
+            axes.plot(
+                part[across] * 1e3, part["y"] * 1e3, ".", markersize=1.5, alpha=0.5,
+                label=f"cloud {number}",
+            )  # fmt: skip
+        axes.set(xlabel=f"{across} (mm)", ylabel="y (mm)", aspect="equal")
+        axes.legend(markerscale=8)
     return figure

@@ -12,6 +12,7 @@ from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, links, organise, smoothed
 from eschorty_ros.surfaces.plane import (
+    COMMON_SHARE,
     Flatness,
     Part,
     Plane,
@@ -23,8 +24,6 @@ from eschorty_ros.surfaces.plane import (
 )
 
 SURFACES_MAX = 8
-COMMON_SHARE = 0.1
-"""Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
 # Smaller pieces are no surfaces to measure: share of the points.
 _PIECE_MIN = 0.02
 _MEDIAN_HALF = 2

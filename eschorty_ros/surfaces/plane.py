@@ -18,6 +18,8 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.surfaces.grid import CloudGrid
 
 POINTS_MIN = 30
+COMMON_SHARE = 0.1
+"""Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
 _CUT_SIGMA = 4.0
 # Median absolute deviation to standard deviation of Gaussian errors.
 _MAD = 1.4826
@@ -49,6 +51,10 @@ class Part(NamedTuple):
         """Return the points of the cells in a mask."""
         line, column = np.nonzero(mask & grid.known)
         return cls(line, column, grid.xyz[line, column], grid.sigma[line, column])
+
+    def select(self, which: NDArray[np.bool_] | slice) -> Part:
+        """Return the points of a mask or slice."""
+        return Part(self.line[which], self.column[which], self.xyz[which], self.sigma[which])
 
 
 class Plane(NamedTuple):
@@ -132,17 +138,25 @@ def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bo
         before, kept = kept, np.abs(ratio) <= _CUT_SIGMA * scale
         if np.array_equal(kept, before):
             break
-    return values, _covariance(design[kept], residual[kept], part, kept), residual, kept
+    covariance = clustered_covariance(design[kept], residual[kept], part.select(kept))
+    return values, covariance, residual, kept
 
 
-def _covariance(design: Array, residual: Array, part: Part, kept: NDArray[np.bool_]) -> Array:
-    weight = 1.0 / part.sigma[kept] ** 2
+def clustered_covariance(design: Array, residual: Array, part: Part) -> Array:
+    """Return the covariance of a weighted least-squares fit whose neighbours share errors.
+
+    Parameters
+    ----------
+    design : ndarray, shape (n, values)
+    residual : ndarray, shape (n,)
+    part : Part
+        Line, column and sigma of each residual.
+    """
+    weight = 1.0 / part.sigma**2
     own = np.linalg.inv(design.T @ (design * weight[:, None]))
     score = design * (weight * residual)[:, None]
-    lines, columns = (
-        _strips(part.line[kept], _STRIP_LINES),
-        _strips(part.column[kept], _STRIP_COLUMNS),
-    )
+    lines = _strips(part.line, _STRIP_LINES)
+    columns = _strips(part.column, _STRIP_COLUMNS)
     both = lines * (int(columns.max()) + 1) + columns
     spread = _spread(score, lines) + _spread(score, columns) - _spread(score, both)
     root = np.linalg.cholesky(own)

@@ -1,0 +1,119 @@
+"""`eschorty register`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from eschorty_ros.cli.console import show, table
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from eschorty_ros.surfaces.register import Pose
+
+
+@click.command("register")
+@click.argument(
+    "clouds", nargs=-1, required=True, type=click.Path(exists=True, dir_okay=False, path_type=Path)
+)
+@click.option(
+    "--start",
+    "starts",
+    multiple=True,
+    nargs=6,
+    type=float,
+    metavar="X Y Z RX RY RZ",
+    help="First guess for the next cloud: shift in mm, rotation vector in degrees.  [default: 0]",
+)
+@click.option(
+    "--reach-mm",
+    type=click.FloatRange(0.0, min_open=True),
+    default=10.0,
+    show_default=True,
+    help="Farthest partner of a point in the first round; halved three times.",
+)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    default=Path("registered.pcd"),
+    show_default=True,
+    help="Joined cloud, .pcd or .ply; beside it a picture, .png.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def command(
+    clouds: tuple[Path, ...],
+    starts: tuple[tuple[float, ...], ...],
+    reach_mm: float,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Bring CLOUDS (.pcd or .ply of this package) into the frame of the first; needs open3d.
+
+    Each is registered against those before it by generalised ICP with the points' own sigmas as
+    weights. Printed are its rotation, its shift at the middle of the overlap, both with sigma, and
+    with --json the transform in m and the covariance.
+
+    \b
+    Examples:
+      eschorty register forth.pcd back.pcd
+      eschorty register front.pcd side.pcd --start 0 30 0 0 0 15 --out both.ply
+    """  # noqa: D301
+    from eschorty_ros.core.base.files import check_writable
+    from eschorty_ros.core.storage import read_cloud, write_cloud
+    from eschorty_ros.report import figures
+    from eschorty_ros.report.surface_figures import joined_figure
+    from eschorty_ros.surfaces.register import join, pose_matrix, register
+
+    if len(clouds) < 2 or len(starts) > len(clouds) - 1:
+        raise click.UsageError("give two clouds or more, and at most one --start for each further")
+    check_writable(out)
+    parts = [read_cloud(path) for path in clouds]
+    joined, poses, sizes = parts[0], [], [len(parts[0])]
+    for number, part in enumerate(parts[1:]):
+        start = pose_matrix(starts[number]) if number < len(starts) else None
+        pose = register(joined, part, start, reach_mm)
+        joined = join(joined, part, pose)
+        poses.append(pose)
+        sizes.append(len(part))
+    write_cloud(out, joined)
+    figures.save(joined_figure(joined, sizes, str(out)), out.with_suffix(".png"))
+    if as_json:
+        facts = [_facts(path, pose) for path, pose in zip(clouds[1:], poses, strict=True)]
+        click.echo(json.dumps({"cloud": str(out), "points": len(joined), "poses": facts}))
+    else:
+        _print(clouds[1:], poses, joined, out)
+
+
+def _facts(path: Path, pose: Pose) -> dict[str, Any]:
+    return {
+        "cloud": str(path),
+        "transform_m": pose.transform.tolist(),
+        "rotation_deg": pose.rotation_deg.tolist(),
+        "shift_mm": pose.shift_mm.tolist(),
+        "sigma_deg_mm": pose.sigmas.tolist(),
+        "covariance_rad_mm": pose.covariance.tolist(),
+        "centre_mm": pose.centre_mm.tolist(),
+        "pairs": pose.pairs,
+        "overlap": pose.overlap,
+        "rms_sigmas": pose.rms_sigmas,
+    }
+
+
+def _print(
+    clouds: tuple[Path, ...], poses: list[Pose], joined: NDArray[np.void], out: Path
+) -> None:
+    rows = table(f"{out}: {len(joined):,} points", "cloud", "", "x", "y", "z", "pairs", "overlap")
+    for path, pose in zip(clouds, poses, strict=True):
+        sigmas = pose.sigmas
+        texts = [
+            [f"{value:.3f} ± {sigma:.3f}" for value, sigma in zip(values, spread, strict=True)]
+            for values, spread in ((pose.rotation_deg, sigmas[:3]), (pose.shift_mm, sigmas[3:]))
+        ]
+        rows.add_row(path.name, "turn °", *texts[0], f"{pose.pairs:,}", f"{pose.overlap:.1%}")
+        rows.add_row("", "shift mm", *texts[1], "", "")
+    show(rows)

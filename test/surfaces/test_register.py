@@ -1,0 +1,99 @@
+"""Clouds in one frame: known poses within the reported covariance."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from grid_clouds import cloud
+from scipy.spatial.transform import Rotation
+
+from eschorty_ros.cli import main
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.storage import read_cloud, write_cloud
+from eschorty_ros.surfaces.grid import organise
+from eschorty_ros.surfaces.register import join, pose_matrix, register
+
+
+def relief(y, z):
+    waves = 6.0 * np.sin(y / 5.0 + 0.3 * np.sin(z / 9.0)) * np.cos(z / 7.0)
+    return 1300.0 + waves + 3.0 * np.sin(z / 3.1)
+
+
+def moved(points, transform):
+    """The cloud as an instrument at the pose ``transform`` measures it."""
+    back = np.linalg.inv(transform)
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1) @ back[:3, :3].T + back[:3, 3]
+    seen = points.copy()
+    for k, axis in enumerate("xyz"):
+        seen[axis] = xyz[:, k]
+    return seen
+
+
+def known_pose(seed):
+    """Some 0.4 degrees about the middle of the cloud, and 1 mm."""
+    rng = np.random.default_rng(seed)
+    pose = pose_matrix([0.0, 0.0, 0.0, *rng.normal(0.0, 0.4, 3)])
+    middle = np.array([1.3, 0.02, 0.0])
+    pose[:3, 3] = middle - pose[:3, :3] @ middle + rng.normal(0.0, 1e-3, 3)
+    return pose
+
+
+def test_known_poses_are_within_the_reported_covariance():
+    ratios = []
+    for seed in range(6):
+        true = known_pose(seed)
+        first, other = cloud(relief, seed=2 * seed), cloud(relief, seed=2 * seed + 1)
+        pose = register(first, moved(other, true))
+        off = pose.transform @ np.linalg.inv(true)
+        turn = Rotation.from_matrix(off[:3, :3]).as_rotvec()
+        centre = pose.centre_mm * 1e-3
+        shift_mm = (off[:3, :3] @ centre + off[:3, 3] - centre) * 1e3
+        error = np.concatenate([turn, shift_mm])
+        ratios.append(error / np.sqrt(np.diag(pose.covariance)))
+        assert np.linalg.eigvalsh(pose.covariance)[0] > 0.0
+        assert np.all(pose.sigmas < [0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+        assert pose.overlap > 0.9
+    assert np.mean(np.abs(ratios) < 2.0) > 0.93
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+@pytest.mark.parametrize(
+    ("surface", "words"),
+    [
+        (lambda y, z: 1300.0 + 0.1 * y + 0.0 * z, "slides along"),
+        (lambda y, z: 1300.0 + 4.0 * np.sin(y / 5.0) + 0.0 * z, "slides along z"),
+    ],
+)
+def test_surfaces_that_slide_are_refused(surface, words):
+    with pytest.raises(ArgumentError, match=words):
+        register(cloud(surface), cloud(surface, seed=2))
+
+
+def test_clouds_apart_are_refused_and_a_start_brings_them_together():
+    first, other = cloud(relief), cloud(relief, seed=2)
+    away = known_pose(1) @ pose_matrix([200.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ArgumentError, match="give clouds that overlap"):
+        register(first, moved(other, away))
+    pose = register(first, moved(other, away), pose_matrix([200.0, 0, 0, 0, 0, 0]))
+    assert np.abs(pose.transform - away).max() < 2e-3
+    joined = join(first, moved(other, away), pose)
+    # One long sweep: 60 periods of each.
+    lines = np.flatnonzero(organise(joined).known.any(axis=1))
+    assert len(lines) == 120
+
+
+def test_the_command_joins_clouds(tmp_path):
+    true = known_pose(3)
+    write_cloud(tmp_path / "a.pcd", cloud(relief, seed=7))
+    write_cloud(tmp_path / "b.ply", moved(cloud(relief, seed=8), true))
+    arguments = ["register", *(str(tmp_path / name) for name in ("a.pcd", "b.ply"))]
+    out = tmp_path / "both.ply"
+    done = CliRunner().invoke(main, [*arguments, "--out", str(out), "--json"])
+    assert done.exit_code == 0, done.output
+    facts = json.loads(done.stdout)
+    assert np.abs(np.array(facts["poses"][0]["transform_m"]) - true).max() < 2e-3
+    assert len(read_cloud(out)) == facts["points"] == 48_000
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert CliRunner().invoke(main, arguments[:2]).exit_code == 2
+    assert "shift mm" in CliRunner().invoke(main, [*arguments, "--out", str(out)]).stdout
