@@ -37,6 +37,7 @@ setup(
         # Apache-2.0: rosbag2 files without ROS, for `eschorty convert` and `reconstruct BAG`.
         "bags": ["rosbags>=0.11"],
         "mesh": ["open3d>=0.19", "libusb-package"],
+        "viewer": ["viser>=1.1"],
         # LGPL: several transfers in flight; without it the camera is read one transfer at a time.
         "usb-async": ["libusb1>=3.1"],
         "usb-library": ["libusb-package"],

@@ -18,7 +18,7 @@ COMMANDS = {
     "reconstruct": "Turn a recording into a point cloud; needs no ROS.",
     "convert": "Make a rosbag2 of a recording, or a recording of a rosbag2; needs no ROS.",
     "calibrate": "Fit a build to targets at known ranges; a calibration and a page about it.",
-    "view": "Draw a cloud, or open it in a window.",
+    "view": "Draw a cloud, or show it or the instrument in the browser.",
     "measure": "Measure planes in a cloud: flatness, distance, step, gap and flush.",
     "mesh": "Make a triangle mesh of a cloud, decimated to the points' errors.",
     "register": "Join clouds of several passes or poses in one frame.",

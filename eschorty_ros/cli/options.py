@@ -84,3 +84,16 @@ def check_sweep(start_mm: float, stop_mm: float) -> None:
     """Refuse a sweep without length as wrong usage."""
     if start_mm == stop_mm:
         raise click.UsageError(f"--start and --stop are both {start_mm:g} mm; give a distance")
+
+
+def page_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the address of a page in the browser to a command."""
+    port = click.option(
+        "--port", type=click.IntRange(1, 65535), default=8080, show_default=True,
+        help="Port of the page.",
+    )  # fmt: skip
+    host = click.option(
+        "--host", default="127.0.0.1", show_default=True,
+        help="Address of the page; another one opens it to the network.",
+    )  # fmt: skip
+    return host(port(command))

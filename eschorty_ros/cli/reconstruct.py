@@ -88,11 +88,11 @@ def command(
     \b
     --json prints events, dropped_events, profiles, periods_per_profile, points, seconds,
     events_per_second, sigma_median_m (null when there is no point), warnings,
-    points_without_stage and counters (those that are not zero); for a recording with truth.csv also score: periods, points,
-    completeness, error_median_mm, error_p95_mm, bias_mm, within_1_sigma, within_2_sigma and
-    off_target (points where nothing is), flagged, and good_median_mm, good_p95_mm,
-    good_within_1_sigma and good_within_2_sigma of the points without a flag; without those that no
-    point gives.
+    points_without_stage and counters (those that are not zero); for a recording with truth.csv
+    also score: periods, points, completeness, error_median_mm, error_p95_mm, bias_mm,
+    within_1_sigma, within_2_sigma and off_target (points where nothing is), flagged, and good_median_mm, good_p95_mm,
+    good_within_1_sigma and good_within_2_sigma of the points without a flag; without those that
+    no point gives.
 
     \b
     Examples:
@@ -117,16 +117,21 @@ def command(
     check_writable(target)
     given = _given(settings)
     if not bag:
-        _reconstruct(load_recording(recording), recording, target, as_json, given)
+        _reconstruct(load_recording(recording), recording, target, jobs, as_json, given)
         return
     with temporary_folder() as made:
         recording_of(recording, made / recording.stem, frequency, calibration, given)
         loaded = load_recording(made / recording.stem)
-        _reconstruct(loaded, recording, target, as_json, given)
+        _reconstruct(loaded, recording, target, jobs, as_json, given)
 
 
 def _reconstruct(
-    loaded: Recording, recording: Path, target: Path, as_json: bool, given: dict[str, Any]
+    loaded: Recording,
+    recording: Path,
+    target: Path,
+    jobs: int | None,
+    as_json: bool,
+    given: dict[str, Any],
 ) -> None:
     """Write the cloud of ``loaded``, which the user calls ``recording``; print its figures."""
     from eschorty_ros.core.reconstruction import (

@@ -9,7 +9,7 @@ import click
 
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
-from eschorty_ros.cli.options import check_sweep, sweep_options
+from eschorty_ros.cli.options import check_sweep, page_options, sweep_options
 from eschorty_ros.core.base.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -51,6 +51,10 @@ if TYPE_CHECKING:
     type=click.Path(file_okay=False, path_type=Path),
     help="New folder for a recording, which `eschorty reconstruct` turns into the same points.",
 )
+@click.option(
+    "--live", is_flag=True, help="Show the scan on a page in the browser, until Ctrl-C (viser)."
+)
+@page_options
 def command(
     scene: str,
     frequency: float,
@@ -65,6 +69,9 @@ def command(
     out: Path,
     passes: int,
     record: Path | None,
+    live: bool,
+    host: str,
+    port: int,
 ) -> None:
     """Scan a scene with camera, laser, stage, reconstruction and scanner nodes.
 
@@ -78,12 +85,15 @@ def command(
     Examples:
       eschorty scan
       eschorty scan --scene sphere --speed 20 --out sphere
+      eschorty scan --scene face --live
       eschorty scan --scene part.ply --frequency 140 --calibration nominal
       eschorty scan --record rec && eschorty reconstruct rec
       eschorty scan --hardware lab.yaml --calibration my.yaml
     """  # noqa: D301
+    from eschorty_ros.cli.view import serve_cloud
     from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.storage.recording_writer import make_recording_folder
+    from eschorty_ros.viewer.page import load_viser
 
     check_sweep(start, stop)
     one_scan = nodes_module("one_process.scan", make="scan")
@@ -92,8 +102,12 @@ def command(
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     job = one_scan.ScanJob(
-        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record, passes
-    )
+        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record,
+        passes, (host, port) if live else None,
+    )  # fmt: skip
+    if live:
+        load_viser()
+        click.echo(f"page at http://{host}:{port}", err=True)
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")
     if record is not None:
@@ -101,6 +115,9 @@ def command(
     with ended_by_signals(), progress_bar("scanning") as feedback:
         result = one_scan.scan_once(job, feedback)
     finish(job, result, out)
+    if live:
+        # The browser comes back to the same address by itself.
+        serve_cloud(result.points, host, port)
 
 
 def _check(scene: str, calibration: str) -> None:

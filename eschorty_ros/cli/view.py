@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from eschorty_ros.core.base.errors import FormatError, OtherFormatError
+from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
+from eschorty_ros.cli.options import page_options
+from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
 
 if TYPE_CHECKING:
     from eschorty_ros.core.storage import Points
 
 _BOUNDS = {"x": 1e6, "y": 1e6, "z": 1e6, "t": 1e9}
 """Metres and seconds that a picture can hold."""
+_SHOW_S = 0.3
 
 
 @click.command("view")
-@click.argument("cloud", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument(
+    "cloud", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path)
+)
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
@@ -25,11 +31,33 @@ _BOUNDS = {"x": 1e6, "y": 1e6, "z": 1e6, "t": 1e9}
     "[default: CLOUD with .png]",
 )
 @click.option("--window", is_flag=True, help="Open an Open3D window instead (needs open3d).")
-def command(cloud: Path, out: Path | None, window: bool) -> None:
+@click.option("--browser", is_flag=True, help="Serve a page with CLOUD instead (needs viser).")
+@click.option(
+    "--live",
+    is_flag=True,
+    help="Serve a page with the instrument of this ROS domain instead of CLOUD (needs viser).",
+)
+@click.option(
+    "--allow-scan",
+    is_flag=True,
+    help="With --live: the page may start scans: light.",
+)
+@page_options
+def command(
+    cloud: Path | None,
+    out: Path | None,
+    window: bool,
+    browser: bool,
+    live: bool,
+    allow_scan: bool,
+    host: str,
+    port: int,
+) -> None:
     """Draw CLOUD (.pcd or .ply): depth map along the line and the stage, and a 3-D view.
 
     A cloud of another program needs x, y and z, in metres, and open3d to read it; drawn are a
-    view along x and a 3-D view. All proportions are true.
+    view along x and a 3-D view. All proportions are true. A page in the browser is served until
+    Ctrl-C, on this computer only unless --host says otherwise.
 
     \b
     Examples:
@@ -37,7 +65,31 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
       eschorty view scan/scan.pcd --out depth.pdf
       eschorty view scan/scan.pcd --out growing.gif
       eschorty view scan/scan.pcd --window
+      eschorty view scan/scan.pcd --browser
+      eschorty view --live --allow-scan
     """  # noqa: D301
+    if (cloud is None) != live or window + browser + live > 1 or (allow_scan and not live):
+        raise click.UsageError(
+            "give CLOUD, with --window or --browser, or --live, with --allow-scan, without it"
+        )
+    if cloud is None:
+        _serve_instrument(allow_scan, host, port)
+    else:
+        _show(cloud, out, window, (host, port) if browser else None)
+
+
+def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
+    from eschorty_ros.viewer.page import load_viser
+
+    node = nodes_module("viewer.node", make="setup")
+    load_viser()
+    values = {"allow_scan": str(allow_scan).lower(), "host": host, "port": str(port)}
+    given = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
+    if node.main(["--ros-args", "-r", "__ns:=/eschorty", *given]):
+        raise DeviceError("the viewer ended with an error; see the message above")
+
+
+def _show(cloud: Path, out: Path | None, window: bool, page: tuple[str, int] | None) -> None:
     from eschorty_ros.core.storage import read_cloud
 
     try:
@@ -48,6 +100,9 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
     if window:
         _open_window(points, cloud.name)
         return
+    if page is not None:
+        serve_cloud(points, *page)
+        return
     from eschorty_ros.report import figures
 
     target = out or cloud.with_suffix(".png")
@@ -57,6 +112,27 @@ def command(cloud: Path, out: Path | None, window: bool) -> None:
         draw = figures.scan_figure if own else figures.cloud_figure
         figures.save(draw(points, title=f"{cloud.name}: {len(points):,} points"), target)
     click.echo(str(target))
+
+
+def serve_cloud(points: Points, host: str, port: int) -> None:
+    """Serve a page with the points until Ctrl-C."""
+    from eschorty_ros.viewer.growing_cloud import GrowingCloud
+    from eschorty_ros.viewer.page import Page
+    from eschorty_ros.viewer.status import points_text
+
+    shown = GrowingCloud()
+    page = Page(shown, host=host, port=port)
+    shown.add(points)
+    with ended_by_signals():
+        click.echo(f"page at {page.url}; Ctrl-C ends it")
+        try:
+            while True:
+                page.show(points_text)
+                time.sleep(_SHOW_S)
+        except KeyboardInterrupt:
+            return
+        finally:
+            page.stop()
 
 
 def _draw_growing(points: Points, own: bool, target: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.spin import make_safe, signals_ignored
 from eschorty_ros.nodes.scanner.node import ScannerNode
 from eschorty_ros.nodes.stage.node import StageNode
+from eschorty_ros.nodes.viewer.node import ViewerNode
 
 NAMESPACE = "/eschorty"
 DEVICES = ("camera", "laser", "stage")
@@ -161,6 +162,7 @@ def composition(
     """Run all nodes with these parameters inside the context; the laser is off on every exit.
 
     ``action`` is the type and the name of the action that is to be called.
+    A table ``viewer`` adds the page in the browser.
     With ``bench``, options of ``eschorty-bench``, another process emulates the devices. Unless
     ``ROS_DOMAIN_ID`` is set, the nodes get a domain of their own, apart from other instruments.
     """
@@ -174,11 +176,14 @@ def composition(
             ending.enter_context(bench_process(folder / "bench", bench))
         file = folder / "parameters.yaml"
         file.write_text(_parameter_file(tables))
-        yield ending.enter_context(_running(file, *action))
+        factories = [*NODES.values(), *([ViewerNode] if "viewer" in tables else [])]
+        yield ending.enter_context(_running(file, factories, *action))
 
 
 @contextlib.contextmanager
-def _running(parameter_file: Path, kind: Any, action: str) -> Iterator[Composition]:
+def _running(
+    parameter_file: Path, factories: Iterable[Callable[[], Node]], kind: Any, action: str
+) -> Iterator[Composition]:
     nodes: list[Node] = []
     rclpy.init(
         args=[
@@ -192,7 +197,7 @@ def _running(parameter_file: Path, kind: Any, action: str) -> Iterator[Compositi
     )
     spinning = Spinning(THREADS)
     try:
-        for factory in NODES.values():
+        for factory in factories:
             nodes.append(factory())
         nodes.append(client := Node("eschorty_client"))
         # Before the nodes spin: an executor must not use a client that is being made.

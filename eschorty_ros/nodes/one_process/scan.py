@@ -30,7 +30,8 @@ class ScanJob:
     """A scan; mm and mm/s.
 
     ``hardware`` holds the parameters of the nodes of real devices, as ``read_hardware`` returns
-    them; without it the devices are emulated. ``record`` is a folder for the recording.
+    them; without it the devices are emulated. ``record`` is a folder for the recording, ``page``
+    host and port of a page in the browser.
     """
 
     scene: str
@@ -45,6 +46,7 @@ class ScanJob:
     hardware: Tables | None = None
     record: Path | None = None
     passes: int = 1
+    page: tuple[str, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
     if job.record is not None:
         parent, name = str(job.record.resolve().parent), job.record.resolve().name
         tables["reconstruction"] |= {"record": parent, "record_name": name}
+    if job.page is not None:
+        tables["viewer"] = dict(zip(("host", "port"), job.page, strict=True))
     bench = None
     if job.hardware is None:
         bench = bench_options(job.scene, job.calibration, job.seed, job.pixels)

@@ -1,0 +1,201 @@
+"""Node ``viewer``: the instrument's topics on a page in the browser."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rclpy.action import ActionClient
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import Image, PointCloud2
+
+from eschorty_ros.action import Scan
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.msg import LaserState, ReconstructionState
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.border import check_text
+from eschorty_ros.nodes.ros.cloud_messages import points_from_message
+from eschorty_ros.nodes.ros.conversions import m_from_mm
+from eschorty_ros.nodes.ros.parameters import Param, Parameters
+from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+from eschorty_ros.viewer.growing_cloud import GrowingCloud
+from eschorty_ros.viewer.page import HOST, PORT, Page
+from eschorty_ros.viewer.scan_control import Conditions, ScanControl, ScanValues
+from eschorty_ros.viewer.status import Status, laser_text
+
+TABLE = (
+    Param("host", HOST, "address that the page is served on; another than 127.0.0.1 opens it to "
+          "the network"),
+    Param("port", PORT, "port of the page", "", 1, 65535),
+    Param("allow_scan", False, "the page may start scans, with the code that the log shows"),
+)  # fmt: skip
+
+_SHOW_S = 0.4
+_LASER_SILENT_S = 2.0
+_COUNTS = (
+    "profiles", "points", "packets_lost", "events_dropped", "sensor_drop_words",
+    "points_without_stage",
+)  # fmt: skip
+
+
+class ViewerNode(Node):
+    """Shows points, profile, events and states; starts and cancels scans like any other client."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("viewer", **kwargs)
+        self.parameters = Parameters(self, TABLE)
+        self._cloud = GrowingCloud()
+        self._control = ScanControl(self.parameters["allow_scan"])
+        self.page = Page(
+            self._cloud, self._control, self.parameters["host"], self.parameters["port"]
+        )
+        self._status = Status()
+        self._laser_s = float("-inf")
+        self._interlock_open = True
+        self._scan_id = ""
+        self._handle: Any = None
+        self._lock = threading.Lock()
+        self._frame: Any = None
+        self._profile: Any = None
+        group = MutuallyExclusiveCallbackGroup()
+        for kind, topic, callback, profile in (
+            (PointCloud2, "points", self._on_points, qos.stream(50)),
+            (PointCloud2, "scan/points", self._on_scan, qos.latched()),
+            (PointCloud2, "profile", self._on_profile, qos.stream(2)),
+            (Image, "event_frame", self._on_frame, qos.stream(2)),
+            (LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)),
+            (ReconstructionState, "reconstruction/state", self._on_state, 10),
+        ):
+            self.create_subscription(kind, topic, callback, profile, callback_group=group)
+        self._scan = ActionClient(self, Scan, "scan", callback_group=group)
+        self.create_timer(
+            _SHOW_S, self._show, MutuallyExclusiveCallbackGroup(),
+            Clock(clock_type=ClockType.STEADY_TIME),
+        )  # fmt: skip
+        code = f", code {self._control.code} to start scans" if self._control.allowed else ""
+        self.notice = f"page at {self.page.url}{code}"
+        self.get_logger().info(self.notice)
+
+    def safe_state(self) -> None:
+        """Cancel a scan of the page; the scanner switches the laser off also without it."""
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            with unless_shut_down(self):
+                handle.cancel_goal_async()
+        self.page.stop()
+
+    def _on_points(self, message: PointCloud2) -> None:
+        self._cloud.add(_points(message))
+
+    def _on_scan(self, message: PointCloud2) -> None:
+        points = _points(message)
+        self._cloud.clear()
+        self._cloud.add(points)
+
+    def _on_profile(self, message: PointCloud2) -> None:
+        points = _points(message)
+        known = np.isfinite(points["x"]) & np.isfinite(points["z"])
+        self._profile = points["z"][known] * 1e3, points["x"][known] * 1e3
+
+    def _on_frame(self, message: Image) -> None:
+        if message.encoding != "mono8" or len(message.data) != message.height * message.width:
+            raise ArgumentError("event_frame is not mono8 of height times width; send that")
+        self._frame = np.frombuffer(message.data, np.uint8).reshape(message.height, message.width)
+
+    def _on_laser(self, message: LaserState) -> None:
+        self._laser_s = time.monotonic()
+        self._interlock_open = bool(message.interlock_open)
+        self._status.laser = laser_text(message.output, message.armed)
+        self._status.reason = check_text("reason", message.reason)
+
+    def _on_state(self, message: ReconstructionState) -> None:
+        self._status.events_per_second = float(message.events_per_second)
+        self._status.counts = {name: int(getattr(message, name)) for name in _COUNTS}
+        scan_id = check_text("scan_id", message.scan_id)
+        if scan_id and scan_id != self._scan_id:
+            self._cloud.clear()
+        self._scan_id = scan_id
+
+    def _conditions(self) -> Conditions:
+        return Conditions(
+            scanner=self._scan.server_is_ready(),
+            scanning=bool(self._scan_id) or self._handle is not None,
+            laser=time.monotonic() - self._laser_s < _LASER_SILENT_S,
+            interlock_open=self._interlock_open,
+        )
+
+    def _show(self) -> None:
+        asked, cancel = self.page.requests()
+        if asked is not None:
+            try:
+                self._begin(self._control.start(*asked, self._conditions()))
+            except ArgumentError as error:
+                self._status.message = f"not started: {error}"
+        if self._handle is not None and (cancel or self._control.abandoned(self.page.pages)):
+            self._handle.cancel_goal_async()
+        if time.monotonic() - self._laser_s >= _LASER_SILENT_S:
+            self._status.laser, self._status.reason = "no report", ""
+        self.page.show(self._status.markdown)
+        profile, self._profile = self._profile, None
+        if profile is not None and len(profile[0]):
+            self.page.profile(*(values.astype(np.float64) for values in profile))
+        frame, self._frame = self._frame, None
+        if frame is not None:
+            self.page.event_frame(frame)
+
+    def _begin(self, values: ScanValues) -> None:
+        self._status.message = ""
+        goal = Scan.Goal(
+            start=m_from_mm(values.start_mm),
+            stop=m_from_mm(values.stop_mm),
+            speed=m_from_mm(values.speed_mm_s),
+            frequency=values.frequency_hz,
+        )
+        self._scan.send_goal_async(goal, feedback_callback=self._on_feedback).add_done_callback(
+            self._on_answer
+        )
+
+    def _on_answer(self, future: Any) -> None:
+        handle = future.result()
+        if not handle.accepted:
+            self._control.ended()
+            self._status.message = "not started: the scanner refused the goal"
+            return
+        self._handle = handle
+        handle.get_result_async().add_done_callback(self._on_result)
+
+    def _on_feedback(self, message: Any) -> None:
+        state = message.feedback
+        self._status.phase = check_text("phase", state.waits_for or state.phase)
+        self._status.progress = float(state.progress)
+
+    def _on_result(self, future: Any) -> None:
+        result = future.result().result
+        self._handle = None
+        self._control.ended()
+        self._status.phase = ""
+        text = f"{result.verdict}, {result.points:,} points; {result.message}"
+        self._status.message = text.rstrip("; ")
+
+
+def _points(message: PointCloud2) -> Any:
+    try:
+        return points_from_message(message)
+    except (KeyError, ValueError, TypeError) as error:
+        raise ArgumentError(f"a cloud is malformed ({error}); send x y z and sigma") from error
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node; ``args`` are those of the process when omitted."""
+    return run(ViewerNode, threads=3, args=args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""The page: viser serves it, draws the points in the browser and reconnects by itself.
+
+viser was chosen over rerun: both draw points well, but rerun's page has no controls of one's own,
+so a scan could not be started from it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.errors import ArgumentError, EschortyError
+from eschorty_ros.viewer.growing_cloud import COLOURS, GrowingCloud, colours
+from eschorty_ros.viewer.scan_control import ScanControl, ScanValues
+
+HOST, PORT = "127.0.0.1", 8080
+_FRAME_STEP = 2
+_NAMES = {
+    "start_mm": "start (mm)", "stop_mm": "stop (mm)", "speed_mm_s": "speed (mm/s)",
+    "frequency_hz": "frequency (Hz)",
+}  # fmt: skip
+_AHEAD = 1.3
+
+
+def load_viser() -> ModuleType:
+    """Import ``viser``; EschortyError with one line of advice when it is not installed."""
+    try:
+        import viser
+    except ImportError as error:
+        raise EschortyError(
+            f"the page in the browser needs viser ({error}); run: pip install viser"
+        ) from error
+    module: ModuleType = viser
+    return module
+
+
+class Page:
+    """A page that shows a cloud, and an instrument if there is one.
+
+    Parameters
+    ----------
+    host, port : str, int
+    cloud : GrowingCloud
+    control : ScanControl, optional
+        Without one the page shows a saved cloud only.
+
+    Raises
+    ------
+    ArgumentError
+        When the port is taken.
+    EschortyError
+        Without viser.
+    """
+
+    def __init__(
+        self,
+        cloud: GrowingCloud,
+        control: ScanControl | None = None,
+        host: str = HOST,
+        port: int = PORT,
+    ) -> None:
+        viser = load_viser()
+        _check_free(host, port)
+        self._cloud = cloud
+        self._control = control
+        self._drawn: tuple[int, str, float] | None = None
+        self._centre: NDArray[np.float64] | None = None
+        self._lock = threading.Lock()
+        self._start: tuple[ScanValues, str] | None = None
+        self._cancel = False
+        # viser prints lines of its own.
+        with contextlib.redirect_stdout(None):
+            self.server = viser.ViserServer(host=host, port=port, label="eschorty", verbose=False)
+        self.url = f"http://{host}:{self.server.get_port()}"
+        self.server.scene.set_up_direction("+z")
+        self._build()
+        self.server.on_client_connect(self._aim)
+
+    def _build(self) -> None:
+        gui = self.server.gui
+        # It would open the page to the internet.
+        gui.configure_theme(show_share_button=False, show_logo=False)
+        self._colour = gui.add_dropdown("colour", COLOURS)
+        self._size = gui.add_slider("point size (mm)", 0.1, 5.0, 0.1, 0.8)
+        self._text = gui.add_markdown("")
+        if self._control is None:
+            return
+        with gui.add_folder("profile"):
+            self._profile_name = gui.add_markdown("range over z, mm")
+            self._profile: Any = None
+        with gui.add_folder("events"):
+            self._frame = gui.add_image(np.zeros((36, 64, 3), np.uint8), format="jpeg")
+        with gui.add_folder("scan"):
+            allowed = self._control.allowed
+            self._fields = {
+                name: gui.add_number(_NAMES[name], value, disabled=not allowed)
+                for name, value in ScanValues()._asdict().items()
+            }
+            self._code = gui.add_text("code", "", disabled=not allowed)
+            start = gui.add_button("Start scan", disabled=not allowed, color="red")
+            cancel = gui.add_button("Cancel scan")
+            start.on_click(lambda _: self._request())
+            cancel.on_click(lambda _: self._request_cancel())
+
+    def _request(self) -> None:
+        values = ScanValues(**{name: float(field.value) for name, field in self._fields.items()})
+        with self._lock:
+            self._start = values, str(self._code.value)
+
+    def _request_cancel(self) -> None:
+        with self._lock:
+            self._cancel = True
+
+    def requests(self) -> tuple[tuple[ScanValues, str] | None, bool]:
+        """Return the scan that was requested, with the code, and whether to cancel; once each."""
+        with self._lock:
+            asked, self._start, self._cancel = (self._start, self._cancel), None, False
+        return asked
+
+    @property
+    def pages(self) -> int:
+        """Return how many pages are open."""
+        return len(self.server.get_clients())
+
+    def show(self, text: Callable[[int, int], str]) -> None:
+        """Draw what has changed; ``text`` gets received points and stride."""
+        state = self._cloud.changes, str(self._colour.value), float(self._size.value)
+        if state != self._drawn:
+            self._drawn = state
+            shown = self._cloud.shown()
+            self._limits = self._draw(shown.xyz, shown.values[state[1]], state[2])
+            self._counts = shown.received, shown.stride
+        low, high = self._limits
+        scale = f"\n\n{self._colour.value}: {low:.4g} to {high:.4g}"
+        self._text.content = text(*self._counts) + scale
+
+    def _draw(
+        self, xyz: NDArray[np.float32], values: NDArray[np.float32], size_mm: float
+    ) -> tuple[float, float]:
+        rgb, limits = colours(values)
+        if len(xyz) and self._centre is None:
+            self._centre = np.asarray(np.median(xyz, axis=0), np.float64)
+            self._spread = max(float(np.ptp(xyz, axis=0).max()), 0.02)
+            for client in self.server.get_clients().values():
+                self._aim(client)
+        if not len(xyz):
+            self._centre = None
+        self.server.scene.add_point_cloud(
+            "/cloud", xyz, rgb, point_size=size_mm * 1e-3, precision="float32",
+            point_shading="flat", point_shape="circle",
+        )  # fmt: skip
+        return limits
+
+    def _aim(self, client: Any) -> None:
+        """Look at the cloud from the instrument's side."""
+        if self._centre is None:
+            return
+        back = _AHEAD * self._spread
+        client.camera.position = self._centre + np.array([-back, -0.4 * back, 0.3 * back])
+        client.camera.look_at = self._centre
+
+    def profile(self, z_mm: NDArray[np.float64], range_mm: NDArray[np.float64]) -> None:
+        """Show one period."""
+        from viser import uplot
+
+        order = np.argsort(z_mm)
+        data = z_mm[order], range_mm[order]
+        if self._profile is None:
+            self._profile = self.server.gui.add_uplot(
+                data, (uplot.Series(label="z"), uplot.Series(label="range", stroke="red")),
+                scales={"x": uplot.Scale(time=False)}, aspect=1.6,
+            )  # fmt: skip
+        else:
+            self._profile.data = data
+
+    def event_frame(self, image: NDArray[np.uint8]) -> None:
+        """Show an image of the recent events, grey."""
+        small = image[::_FRAME_STEP, ::_FRAME_STEP]
+        self._frame.image = np.repeat(small[:, :, None], 3, axis=2)
+
+    def stop(self) -> None:
+        """End the server."""
+        with contextlib.redirect_stdout(None):
+            self.server.stop()
+
+
+def _check_free(host: str, port: int) -> None:
+    """Refuse a port that is taken; viser would take another one without a word."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise ArgumentError(
+                f"{host}:{port} cannot be served ({error.strerror}); choose another --port"
+            ) from error

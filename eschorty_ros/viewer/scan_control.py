@@ -1,0 +1,106 @@
+"""When a page may start a scan, and when the scan that it started is cancelled."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.numbers import number
+
+ABANDONED_S = 5.0
+_CODE_BYTES = 4
+_TRIES = 5
+
+
+class ScanValues(NamedTuple):
+    """A scan as the page requests it: mm, mm/s, Hz."""
+
+    start_mm: float = 10.0
+    stop_mm: float = 60.0
+    speed_mm_s: float = 50.0
+    frequency_hz: float = 70.0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What is known of the instrument; the defaults are those before anything has been received."""
+
+    scanner: bool = False
+    scanning: bool = False
+    laser: bool = False
+    interlock_open: bool = True
+
+    def refusal(self) -> str:
+        """Return why no scan may begin, ``""`` when it may."""
+        reasons = {
+            "scanner": "no scanner is there",
+            "laser": "the laser node does not report",
+        }
+        for field in fields(self):
+            if field.name in reasons and not getattr(self, field.name):
+                return reasons[field.name]
+        if self.interlock_open:
+            return "the laser's interlock is open"
+        return "a scan is running; wait for its end or cancel it" if self.scanning else ""
+
+
+class ScanControl:
+    """Decides over requests of a page; light needs the switch and the code of the terminal.
+
+    A page of another site can reach a server on this computer, too: it does not know the code.
+
+    Parameters
+    ----------
+    allowed : bool
+        Whether scans may be started at all.
+    clock : callable
+        Returns monotonic seconds.
+    """
+
+    def __init__(self, allowed: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        self.allowed = allowed
+        self.code = secrets.token_hex(_CODE_BYTES) if allowed else ""
+        self._clock = clock
+        self._tries = _TRIES
+        self._ours = False
+        self._seen_s = clock()
+
+    def start(self, values: ScanValues, code: str, conditions: Conditions) -> ScanValues:
+        """Return the values of a scan that may begin.
+
+        Raises
+        ------
+        ArgumentError
+            When it may not, with the reason.
+        """
+        if not self.allowed:
+            raise ArgumentError("this page may not start scans; start it with --allow-scan")
+        if not self._tries:
+            raise ArgumentError("the code was wrong too often; start the viewer again")
+        if not hmac.compare_digest(code.strip().encode(), self.code.encode()):
+            self._tries -= 1
+            raise ArgumentError("the code is not the one on the viewer's terminal; enter that one")
+        self._tries = _TRIES
+        if refusal := conditions.refusal():
+            raise ArgumentError(refusal)
+        for name, value in values._asdict().items():
+            number(name, value)
+        if values.start_mm == values.stop_mm:
+            raise ArgumentError("start and stop are the same position; give a distance")
+        self._ours, self._seen_s = True, self._clock()
+        return values
+
+    def ended(self) -> None:
+        """Take note that the scan has ended."""
+        self._ours = False
+
+    def abandoned(self, pages: int) -> bool:
+        """Return whether a scan of this page is under way and no page has been there for 5 s."""
+        if pages:
+            self._seen_s = self._clock()
+        return self._ours and self._clock() - self._seen_s > ABANDONED_S

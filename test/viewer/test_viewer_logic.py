@@ -1,0 +1,116 @@
+"""The page's server without a browser: decimation, text, and when a scan may begin."""
+
+import numpy as np
+import pytest
+
+from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.storage import POINT_DTYPE
+from eschorty_ros.viewer.growing_cloud import GrowingCloud, colours
+from eschorty_ros.viewer.scan_control import ABANDONED_S, Conditions, ScanControl, ScanValues
+from eschorty_ros.viewer.status import Status, laser_text
+
+READY = Conditions(scanner=True, laser=True, interlock_open=False)
+
+
+def numbered(first, count):
+    points = np.zeros(count, POINT_DTYPE)
+    points["x"] = np.arange(first, first + count)
+    return points
+
+
+@pytest.mark.parametrize("batch", [1, 7, 64, 1000])
+def test_every_nth_point_is_kept_whatever_the_batches(batch):
+    cloud = GrowingCloud(limit=64)
+    for first in range(0, 1000, batch):
+        cloud.add(numbered(first, min(batch, 1000 - first)))
+        shown = cloud.shown()
+        assert len(shown.xyz) < 64 or shown.stride == 1
+        expected = np.arange(0, shown.received, shown.stride)
+        np.testing.assert_array_equal(shown.xyz[:, 0], expected)
+    assert (shown.received, shown.stride) == (1000, 16)
+    cloud.clear()
+    assert len(cloud.shown().xyz) == 0
+
+
+def test_it_follows_1_28_million_points_per_second():
+    """A second of points, in 20 batches, in a small part of a second."""
+    import time
+
+    cloud = GrowingCloud()
+    batches = [numbered(k * 64_000, 64_000) for k in range(20)]
+    cloud.add(batches[0])
+    begun_s = time.process_time()
+    for batch in batches:
+        cloud.add(batch)
+    cloud.shown()
+    assert time.process_time() - begun_s < 0.3
+    assert len(cloud.shown().xyz) <= 120_000
+
+
+def test_colours_ignore_what_is_not_known():
+    rgb, limits = colours(np.array([np.nan, 1.0, 2.0, 3.0, np.inf], np.float32))
+    assert rgb.shape == (5, 3)
+    assert limits == pytest.approx((1.02, 2.98))
+    assert len({tuple(colour) for colour in rgb[1:4]}) == 3
+    assert colours(np.empty(0, np.float32))[0].shape == (0, 3)
+    with pytest.raises(ArgumentError, match="send x y z and sigma"):
+        GrowingCloud().add(np.zeros(1, [("x", "f4")]))
+
+
+@pytest.mark.parametrize(
+    ("conditions", "words"),
+    [
+        (Conditions(), "no scanner"),
+        (Conditions(scanner=True), "does not report"),
+        (Conditions(scanner=True, laser=True), "interlock is open"),
+        (Conditions(scanner=True, laser=True, interlock_open=False, scanning=True), "is running"),
+    ],
+)
+def test_light_needs_every_condition(conditions, words):
+    control = ScanControl(allowed=True)
+    with pytest.raises(ArgumentError, match=words):
+        control.start(ScanValues(), control.code, conditions)
+    assert control.start(ScanValues(), f" {control.code} ", READY) == ScanValues()
+
+
+def test_light_needs_the_switch_the_code_and_a_sweep():
+    with pytest.raises(ArgumentError, match="--allow-scan"):
+        ScanControl(allowed=False).start(ScanValues(), "", READY)
+    control = ScanControl(allowed=True)
+    with pytest.raises(ArgumentError, match="give a distance"):
+        control.start(ScanValues(stop_mm=10.0), control.code, READY)
+    with pytest.raises(ArgumentError, match="speed_mm_s is nan"):
+        control.start(ScanValues(speed_mm_s=float("nan")), control.code, READY)
+    for _ in range(5):
+        with pytest.raises(ArgumentError, match="code is not"):
+            control.start(ScanValues(), "00000000", READY)
+    with pytest.raises(ArgumentError, match="too often"):
+        control.start(ScanValues(), control.code, READY)
+    assert ScanControl(allowed=True).code != control.code
+
+
+def test_a_scan_that_no_page_follows_is_cancelled():
+    now_s = [0.0]
+    control = ScanControl(allowed=True, clock=lambda: now_s[0])
+    now_s[0] = 100.0
+    assert not control.abandoned(pages=0)
+    control.start(ScanValues(), control.code, READY)
+    now_s[0] += ABANDONED_S - 0.1
+    assert not control.abandoned(pages=0)
+    assert not control.abandoned(pages=1)
+    now_s[0] += ABANDONED_S + 0.1
+    assert control.abandoned(pages=0)
+    control.ended()
+    assert not control.abandoned(pages=0)
+
+
+def test_the_text_names_laser_and_losses_and_carries_no_markup():
+    status = Status(laser=laser_text(1, True), reason="a|b <img src=x>", phase="sweeping",
+                    progress=0.5, counts={"packets_lost": 1234})  # fmt: skip
+    text = status.markdown(10_000, 4)
+    for words in ("**ON**", "sweeping 50%", "packets lost | 1,234", "10,000, every 4th drawn"):
+        assert words in text
+    assert "<img" not in text
+    assert [laser_text(*state) for state in ((0, True), (2, False), (77, True))] == [
+        "off, armed", "unknown", "unknown",
+    ]  # fmt: skip
