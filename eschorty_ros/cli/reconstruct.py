@@ -90,9 +90,9 @@ def command(
     events_per_second, sigma_median_m (null when there is no point), warnings,
     points_without_stage and counters (those that are not zero); for a recording with truth.csv
     also score: periods, points, completeness, error_median_mm, error_p95_mm, bias_mm,
-    within_1_sigma, within_2_sigma and off_target (points where nothing is), flagged, and good_median_mm, good_p95_mm,
-    good_within_1_sigma and good_within_2_sigma of the points without a flag; without those that
-    no point gives.
+    within_1_sigma, within_2_sigma, off_target (points where nothing is), flagged, and
+    good_median_mm, good_p95_mm, good_within_1_sigma and good_within_2_sigma of the points without a
+    flag; without those that no point gives.
 
     \b
     Examples:

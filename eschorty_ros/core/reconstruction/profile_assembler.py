@@ -44,7 +44,7 @@ WINDOW_EVENTS = 1 << 21
 """Events after which, with the next profile, the estimate of the line starts again.
 
 A window of the stream so depends on no event before it, and windows can be reconstructed at the
-same time. A footprint that is learned goes on.
+same time. Only a footprint that is learned goes on.
 """
 _OUTPUT_PROFILES = 64
 _HALF_MIN = 3 * FRACTION
@@ -163,6 +163,20 @@ class ProfileAssembler:
         _begin_window(self._memory, self._state)
 
     @property
+    def has_learned(self) -> bool:
+        """Return whether a line's footprint was learned since the last ``forget``."""
+        return bool(self._memory.footprint.state.any())
+
+    @property
+    def learns(self) -> bool:
+        """Return whether the next profile is learned from."""
+        return bool(self._memory.footprint.state[3])
+
+    def forget(self) -> None:
+        """Drop the line's footprint."""
+        _forget(self._memory.footprint)
+
+    @property
     def counters(self) -> dict[str, int]:
         """Counts by name."""
         return dict(zip(_COUNTERS.names or (), self._counters.item(), strict=True))
@@ -269,7 +283,7 @@ def _factor_max(settings: Settings) -> float:
 
 @kernel
 def _begin_window(memory, state):
-    """Drop the last rows, and what was learned of the line, but for the footprint of `learned`."""
+    """Drop the last rows, the line's width, the scatter and the usual widths."""
     state.window = 0
     state.half = memory.estimator.half_max
     memory.columns.seeds[:] = -1
@@ -277,8 +291,6 @@ def _begin_window(memory, state):
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0
     _restart_widths(memory.smoothing.widths)
-    if memory.estimator.method != _LEARNED:
-        _forget(memory.footprint)
 
 
 @kernel

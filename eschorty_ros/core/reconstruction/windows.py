@@ -23,10 +23,25 @@ _NO_EDGES = Edges(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 class _Window(NamedTuple):
-    """The events of a window, and the edges from its first to the one that ends it."""
+    """The events of a window, and the edges from its first to the one that ends it.
+
+    ``every`` is the number of periods in a profile; ``last`` closes the open period.
+    """
 
     events: HeldEvents
     edges: list[Edges]
+    modulation: Modulation
+    every: int
+    last: bool = False
+
+
+class _Assembled(NamedTuple):
+    """A window with its rows and counts, and whether a footprint was learned in it."""
+
+    window: _Window
+    rows: LineRows
+    counts: Counter[str]
+    learned: bool
 
 
 class WindowAssembler:
@@ -34,6 +49,8 @@ class WindowAssembler:
 
     Kernels release the interpreter's lock. The rows and counts are those of one assembler, in the
     same order; as many windows as threads and one more are in memory. ``close`` ends the stream.
+    A window with lines that the sensor's edge cuts needs the footprint learned before it: it is
+    assembled again, after the windows before it.
 
     Parameters
     ----------
@@ -47,26 +64,23 @@ class WindowAssembler:
     def __init__(self, settings: Settings, model: RangeModel, jobs: int) -> None:
         self._jobs = jobs
         self._pool = ThreadPoolExecutor(jobs, "window")
-        self._assemblers = [ProfileAssembler(settings, model) for _ in range(jobs)]
-        self._idle = deque(self._assemblers)
+        self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs))
+        self._serial = ProfileAssembler(settings, model)
         self._buffers = deque(HeldEvents() for _ in range(jobs + 2))
-        self._running: deque[Future[LineRows]] = deque()
+        self._running: deque[Future[_Assembled]] = deque()
         self._done: list[LineRows] = []
+        self._counts = Counter(self._serial.counters)
 
     def restart(self, modulation: Modulation, every: int) -> None:
         """Drop the open window; further events belong to profiles of ``every`` periods."""
-        self._modulation, self._every = modulation, every
-        self._window = _Window(self._buffers.popleft(), [])
+        self._window = _Window(self._buffers.popleft(), [], modulation, every)
         # Events of the open window before its first edge.
         self._outside = 0
 
     @property
     def counters(self) -> dict[str, int]:
         """Counts by name, complete after ``close``."""
-        counts = Counter[str]()
-        for assembler in self._assemblers:
-            counts.update(assembler.counters)
-        return dict(counts)
+        return dict(self._counts)
 
     def merge(self, held: EventArrays, new: EventArrays, edges: Edges) -> None:
         """Add events and edges to the open window, and begin others where it is full.
@@ -102,13 +116,13 @@ class WindowAssembler:
         """Close the open period if it has events, and wait for all windows."""
         self._submit(last=True)
         while self._running:
-            self._done.append(self._running.popleft().result())
+            self._collect()
         self._pool.shutdown()
 
     def take(self) -> LineRows:
         """Return the rows of the windows done since the last call, in order."""
         while self._running and self._running[0].done():
-            self._done.append(self._running.popleft().result())
+            self._collect()
         done, self._done = self._done, []
         return LineRows.concatenate(done)
 
@@ -122,24 +136,41 @@ class WindowAssembler:
 
     def _submit(self, last: bool = False) -> None:
         while len(self._running) > self._jobs:
-            self._done.append(self._running.popleft().result())
-        self._running.append(self._pool.submit(self._assemble, self._window, last))
-        self._window = _Window(self._buffers.popleft(), [])
+            self._collect()
+        window = self._window._replace(last=last)
+        self._running.append(self._pool.submit(self._assemble_apart, window))
+        self._window = window._replace(events=self._buffers.popleft(), edges=[])
         self._outside = 0
 
-    def _assemble(self, window: _Window, last: bool) -> LineRows:
-        events, edges = window
-        assembler = self._idle.popleft()
-        assembler.restart(self._modulation, self._every)
-        t_us, period = (np.concatenate(values) for values in zip(_NO_EDGES, *edges, strict=True))
-        assembler.merge(_NO_EVENTS, events.arrays, Edges(t_us, period))
-        if last:
-            assembler.close()
-        rows = assembler.take()
+    def _collect(self) -> None:
+        """Wait for the first window that runs; keep its rows and counts."""
+        done = self._running.popleft().result()
+        if done.learned or self._serial.learns:
+            done = _assembled(self._serial, done.window)
+        self._done.append(done.rows)
+        self._counts.update(done.counts)
+        events = done.window.events
         events.drop(len(events))
-        self._idle.append(assembler)
         self._buffers.append(events)
-        return rows
+
+    def _assemble_apart(self, window: _Window) -> _Assembled:
+        assembler = self._idle.popleft()
+        assembler.forget()
+        done = _assembled(assembler, window)
+        self._idle.append(assembler)
+        return done
+
+
+def _assembled(assembler: ProfileAssembler, window: _Window) -> _Assembled:
+    before = Counter(assembler.counters)
+    assembler.restart(window.modulation, window.every)
+    t_us, period = (np.concatenate(values) for values in zip(_NO_EDGES, *window.edges, strict=True))
+    assembler.merge(_NO_EVENTS, window.events.arrays, Edges(t_us, period))
+    if window.last:
+        assembler.close()
+    counts = Counter(assembler.counters)
+    counts.subtract(before)
+    return _Assembled(window, assembler.take(), counts, assembler.has_learned)
 
 
 def _part(edges: Edges, begin: int, end: int) -> Edges:

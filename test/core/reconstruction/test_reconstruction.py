@@ -60,6 +60,14 @@ def test_background_alone_gives_practically_no_points():
 def _split_cases():
     rng = np.random.default_rng(SEED)
     events = line_events(rng, flat, frequency_hz=500.0, periods=12, columns=300, edge_us=5000)
+    cut = line_events(
+        rng,
+        lambda k, c: np.where(4 <= k < 9, 716.0, 300.0 + 0.0 * c),
+        frequency_hz=500.0,
+        periods=16,
+        columns=300,
+        edge_us=5000,
+    )
     edges = 5000 + np.arange(12) * 2000 + rng.integers(-20, 21, 12)
     data, known = encoded(events), Modulation(500.0, on_edge_us=1000)
     return {
@@ -69,6 +77,7 @@ def _split_cases():
         "filter": (data, known, Settings(noise_filter="activity")),
         "gate": (data, known, Settings(phase_gate_us=500)),
         "learned": (data, known, Settings(centroid="learned")),
+        "cut": (encoded(cut), known, Settings()),
     }
 
 
