@@ -62,9 +62,9 @@ def _split_cases():
     events = line_events(rng, flat, frequency_hz=500.0, periods=12, columns=300, edge_us=5000)
     cut = line_events(
         rng,
-        lambda k, c: np.where(4 <= k < 9, 716.0, 300.0 + 0.0 * c),
+        lambda k, c: np.where(4 <= k < 40, 716.0, 300.0 + 0.0 * c),
         frequency_hz=500.0,
-        periods=16,
+        periods=44,
         columns=300,
         edge_us=5000,
     )
