@@ -36,6 +36,8 @@ class Cloud:
     counters : dict of str to int
         What became of the events.
     recording : Recording
+    organized : ndarray of POINT_DTYPE, shape (profiles, columns), or None
+        The points as a height map, with the setting ``organized``.
     """
 
     points: NDArray[np.void]
@@ -43,12 +45,13 @@ class Cloud:
     warnings: tuple[str, ...]
     counters: dict[str, int]
     recording: Recording
+    organized: NDArray[np.void] | None = None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the points as ``.pcd`` or ``.ply``; without points an ArgumentError."""
         if not len(self.points):
             raise ArgumentError(f"the cloud has 0 points; {path} is not written, see its warnings")
-        write_cloud(path, self.points)
+        write_cloud(path, self.points if self.organized is None else self.organized)
 
     def score(self) -> Accuracy | None:
         """Return the errors against ``truth.csv``, ``None`` where the recording has none."""
@@ -87,4 +90,11 @@ def reconstruct(
     loaded = recording if isinstance(recording, Recording) else load_recording(recording)
     chosen = replace(recorded_settings(loaded), **settings)
     found = reconstruct_recording(loaded, chosen, progress)
-    return Cloud(found.points, found.profiles, found.warnings, found.counters, loaded)
+    return Cloud(
+        found.points,
+        found.profiles,
+        found.warnings,
+        found.counters,
+        loaded,
+        found.organized,
+    )

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from eschorty_ros.core.modulation import Modulation
     from eschorty_ros.core.optics import Calibration
+    from eschorty_ros.core.storage import ScanLog
 
 PEAK_WINDOW_US = 10_000
 _SHOWN = (
@@ -45,17 +46,35 @@ def command(path: Path) -> None:
         read_stage_csv,
         read_truth_csv,
     )
+    from eschorty_ros.core.storage.recording import (
+        MARKS_FILE,
+        SCAN_FILE,
+        SETTINGS_FILE,
+        read_marks_csv,
+        read_scan_yaml,
+        read_settings_yaml,
+    )
 
     if path.is_dir():
         recording = load_recording(path)
         rows = {"calibration": _in_short(recording.calibration)}
         rows |= _laser(recording.modulation) | _stage(recording.stage_samples)
+        if recording.scan is not None:
+            rows |= _scan(recording.scan)
         pairs(str(path), rows | _truth(recording.truth))
         _raw(recording.events_path)
     elif path.suffix in (".pcd", ".ply"):
         _cloud(path)
     elif path.name == LASER_FILE:
         pairs(str(path), _laser(read_laser_yaml(path)))
+    elif path.name == SCAN_FILE:
+        pairs(str(path), _scan(read_scan_yaml(path)))
+    elif path.name == SETTINGS_FILE:
+        pairs(str(path), {name: str(value) for name, value in read_settings_yaml(path).items()})
+    elif path.name == MARKS_FILE:
+        marks = read_marks_csv(path)
+        pairs(str(path), {"packets lost": f"{marks['packets_lost'].sum():,}",
+                          "laser switched on": f"{marks['laser_on'].sum():,} times"})  # fmt: skip
     elif path.suffix in (".yaml", ".yml"):
         pairs(str(path), _calibration(load_calibration(path)))
     elif path.name == TRUTH_FILE:
@@ -99,6 +118,13 @@ def _stage(samples: NDArray[np.void]) -> dict[str, str]:
     }
 
 
+def _scan(scan: ScanLog) -> dict[str, str]:
+    return {
+        "scan": f"{scan.scan_id}, {scan.start_mm:g} to {scan.stop_mm:g} mm",
+        "recording": "; ".join(scan.faults) or "complete",
+    }
+
+
 def _truth(truth: NDArray[np.void] | None) -> dict[str, str]:
     if truth is None or len(truth) == 0:
         return {"truth": "none" if truth is None else "0 ranges"}
@@ -109,10 +135,13 @@ def _truth(truth: NDArray[np.void] | None) -> dict[str, str]:
 def _cloud(path: Path) -> None:
     import numpy as np
 
-    from eschorty_ros.core.storage import read_cloud
+    from eschorty_ros.core.storage import finite_points, read_cloud
 
-    points = read_cloud(path)
+    cloud = read_cloud(path, organized=True)
+    points = finite_points(cloud)
     rows = {"points": f"{len(points):,}"}
+    if cloud.ndim > 1:
+        rows["height map"] = f"{cloud.shape[0]:,} profiles x {cloud.shape[1]:,} columns"
     if len(points):
         for name, unit, scale in (
             ("x", "mm", 1e3),

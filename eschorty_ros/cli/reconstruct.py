@@ -152,7 +152,7 @@ def _reconstruct(
         report(1.0, "scoring and writing")
         measured = measure_recorded(result.points, result.profiles, loaded)
         if len(result.points):
-            write_cloud(target, result.points)
+            write_cloud(target, result.points if result.organized is None else result.organized)
     for warning in result.warnings:
         click.echo(f"eschorty: warning: {warning}", err=True)
     facts = summary(result)

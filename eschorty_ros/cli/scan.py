@@ -47,6 +47,11 @@ if TYPE_CHECKING:
     help="Sweeps, every second one back; their points are joined.",
 )
 @click.option(
+    "--organized",
+    is_flag=True,
+    help="Write scan.pcd as a height map of profiles and columns, NaN where nothing is.",
+)
+@click.option(
     "--record",
     type=click.Path(file_okay=False, path_type=Path),
     help="New folder for a recording, which `eschorty reconstruct` turns into the same points.",
@@ -68,6 +73,7 @@ def command(
     hardware: Path | None,
     out: Path,
     passes: int,
+    organized: bool,
     record: Path | None,
     live: bool,
     host: str,
@@ -103,7 +109,7 @@ def command(
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     job = one_scan.ScanJob(
         scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record,
-        passes, (host, port) if live else None,
+        passes, (host, port) if live else None, organized,
     )  # fmt: skip
     if live:
         load_viser()
@@ -137,7 +143,8 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     from eschorty_ros.simulation.scenes import names as scenes
 
     if result.success or len(result.points):
-        write_cloud(out / "scan.pcd", result.points)
+        cloud = result.points if result.organized is None else result.organized
+        write_cloud(out / "scan.pcd", cloud)
     if not result.success or not len(result.points):
         kept = f" ({len(result.points):,} points kept in {out / 'scan.pcd'})"
         raise DeviceError(result.message + (kept if len(result.points) else ""))

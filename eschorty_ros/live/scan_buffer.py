@@ -47,9 +47,13 @@ class PlacedPoints:
 
 @dataclass(frozen=True, slots=True)
 class AssembledScan:
-    """Points sorted by period, then column; ``t`` in seconds since ``stamp_ns``."""
+    """Points sorted by period, then column; ``t`` in seconds since ``stamp_ns``.
+
+    ``edge_ns`` is the rising edge of each point's period.
+    """
 
     points: NDArray[Any]
+    edge_ns: NDArray[np.int64]
     stamp_ns: int
     profiles: int
     sigma_median_m: float
@@ -126,7 +130,9 @@ class ScanBuffer:
             self._parts = [self._inside(placed_again(part)) for part in self._parts]
         self._parts = [part for part in self._parts if len(part)]
         if not self._parts:
-            return AssembledScan(np.empty(0, POINT_DTYPE), 0, 0, float("nan"))
+            return AssembledScan(
+                np.empty(0, POINT_DTYPE), np.empty(0, np.int64), 0, 0, float("nan")
+            )
         points = join_points([part.points for part in self._parts])
         t_ns = np.concatenate([part.t_ns for part in self._parts])
         edge_ns = np.concatenate([part.edge_ns for part in self._parts])
@@ -135,6 +141,7 @@ class ScanBuffer:
         order = np.lexsort((points["column"], edge_ns))
         return AssembledScan(
             points[order],
+            edge_ns[order],
             stamp_ns,
             len(np.unique(edge_ns)),
             float(np.median(points["sigma"])),

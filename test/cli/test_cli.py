@@ -127,7 +127,7 @@ def test_a_stated_failure_is_one_line_on_stderr_and_exit_code_1(tmp_path):
      NotADirectoryError(errno.ENOTDIR, "Not a directory", "file/x")],
 )  # fmt: skip
 def test_any_refusal_of_the_system_is_one_line(monkeypatch, cloud, error):
-    def refuse(_path):
+    def refuse(_path, **_):
         raise error
 
     monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", refuse)
@@ -153,7 +153,7 @@ def test_a_terminal_without_a_degree_sign_still_gets_its_table():
 
 
 def test_ctrl_c_is_exit_code_130(monkeypatch, cloud):
-    def interrupt(_path):
+    def interrupt(_path, **_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("eschorty_ros.core.storage.read_cloud", interrupt)

@@ -21,13 +21,17 @@ from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
 
 def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     rec = tmp_path / "rec"
-    options = ("--stop", 30, "--passes", 2, "--out", tmp_path / "scan", "--record", rec)
+    options = ("--stop", 30, "--passes", 2, "--organized", "--out", tmp_path / "scan",
+               "--record", rec)  # fmt: skip
     with LoggedCommand(tmp_path, "scan", *options) as command:
         code, stdout, stderr = command.end()
         assert code == 0, stderr
         assert "on" in command.outputs()
         assert command.outputs()[-1] == "off"
     points = read_cloud(tmp_path / "scan" / "scan.pcd")
+    made = read_cloud(tmp_path / "scan" / "scan.pcd", organized=True)
+    assert made.shape[1] == 1280
+    assert 50 <= made.shape[0] <= 60
     measured = assert_accurate(points, Sweep(10.0, 30.0, 50.0, 70.0, passes=2))
     assert f"{measured.error_median_mm:.3f} mm" in stdout
     assert f"{measured.error_p95_mm:.3f} mm" in stdout
@@ -36,6 +40,7 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     assert done.exit_code == 0, done.output
     assert "warning" not in done.stderr
     again = read_cloud(rec / "cloud.pcd")
+    assert read_cloud(rec / "cloud.pcd", organized=True).shape == made.shape
     for name in ("x", "z", "intensity", "sigma", "column"):
         np.testing.assert_array_equal(again[name], points[name], err_msg=name)
     # The stage's times are rounded to 1 us.

@@ -50,6 +50,7 @@ def prepare(folder):
     result = SimpleNamespace(
         success=True, message="", points=points, profiles=9, events=9, events_dropped=0,
         packets_lost=0, verdict="complete", completeness=1.0, recording="",
+        organized=None,
     )  # fmt: skip
     module = SimpleNamespace(
         ScanJob=lambda *values: SimpleNamespace(

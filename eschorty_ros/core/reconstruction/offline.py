@@ -17,7 +17,7 @@ from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings
 from eschorty_ros.core.reconstruction.settings import Settings
-from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage import Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.core.storage.recording import SETTINGS_FILE
 
@@ -43,6 +43,8 @@ class Result:
         Wall time of reconstruction and placing, reading of the file included.
     warnings : tuple of str
         One line each.
+    organized : ndarray of POINT_DTYPE, shape (profiles, columns), or None
+        ``points`` as a height map, with the setting ``organized``.
     """
 
     points: NDArray[np.void]
@@ -53,6 +55,7 @@ class Result:
     events: int
     seconds: float
     warnings: tuple[str, ...]
+    organized: NDArray[np.void] | None = None
 
     @property
     def events_per_second(self) -> float:
@@ -119,6 +122,9 @@ def reconstruct_recording(
         recording.calibration.stage_direction,
         origin_us,
     )
+    organized = None
+    if settings.organized == "on":
+        organized = height_map(points, profiles.edge_us, reconstructor.model.columns)
     newest_us = reconstructor.newest_t_us
     span_us = None if newest_us is None else (origin_us, newest_us)
     seconds = time.perf_counter() - began
@@ -135,6 +141,7 @@ def reconstruct_recording(
         counters["events"],
         seconds,
         (*warnings, *recording_warnings(recording, used, counters, points, span_us)),
+        organized,
     )
 
 

@@ -146,6 +146,10 @@ class Settings:
         "stage speed towards +y, from which the compensation follows a step through the "
         "line, 0 for a resting one; a recording's own speed is used instead",
     )
+    organized: str = _choice(
+        "off", SWITCH, "the cloud of a scan as a height map of profiles and columns, NaN where "
+        "nothing is",
+    )  # fmt: skip
     sigma_factor: float = _number(
         SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"
     )
@@ -171,6 +175,11 @@ class Settings:
             raise ArgumentError(
                 f"range_max is {self.range_max:g} m and range_min {self.range_min:g} m; choose a "
                 "larger range_max"
+            )
+        if self.returns == "all" and self.organized == "on":
+            raise ArgumentError(
+                "returns is 'all' and organized 'on', which has one point per column and profile; "
+                "choose strongest, first or last"
             )
         if self.returns == "all" and self.reflectance_compensation == "on":
             raise ArgumentError(

@@ -1,7 +1,8 @@
-"""The point type and its two file forms: binary PCD 0.7 and binary little-endian PLY."""
+"""The point type, its height map, and two file forms: binary PCD 0.7 and little-endian PLY."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import file_path, short
+from eschorty_ros.core.base.arrays import file_path, integer, short
 from eschorty_ros.core.base.errors import ArgumentError, FormatError, OtherFormatError
 from eschorty_ros.core.base.files import atomic_write, open_regular_file
 
@@ -50,6 +51,8 @@ _UNFLAGGED = {
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u2": "ushort"}
 _HEADER_LIMIT = 4096
+# A PCD of one row is a cloud without order.
+_HEIGHT_MIN = 2
 
 
 def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
@@ -59,7 +62,8 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
     ----------
     path : path
         Ends in ``.pcd`` or ``.ply``.
-    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
+    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,) or (profiles, columns)
+        A height map, as `height_map` returns it, is one of the PCD, too; PLY has none.
 
     Raises
     ------
@@ -79,22 +83,26 @@ def write_cloud(path: str | os.PathLike[str], points: Points) -> None:
     header = _header_writer(file_path("path", path))
     if not isinstance(points, np.ndarray):
         raise ArgumentError(f"points is {short(points)}; give an array of POINT_DTYPE")
-    if points.dtype not in _DTYPES or points.ndim != 1:
+    if points.dtype not in _DTYPES or points.ndim not in (1, 2):
         raise ArgumentError(
             f"points has dtype {points.dtype} and shape {points.shape}; give a one-dimensional "
-            "array of POINT_DTYPE or REFLECTANCE_DTYPE"
+            "array of POINT_DTYPE or REFLECTANCE_DTYPE, or a height map of these"
         )
+    if header is _ply_header or len(points) < _HEIGHT_MIN:
+        points = finite_points(points)
     with atomic_write(path) as stream:
-        stream.write(header(points.dtype, len(points)))
+        stream.write(header(points.dtype, points.shape))
         stream.write(np.ascontiguousarray(points).data)
 
 
-def read_cloud(path: str | os.PathLike[str]) -> Points:
+def read_cloud(path: str | os.PathLike[str], *, organized: bool = False) -> Points:
     """Read a cloud that :func:`write_cloud` wrote; without flags in the file they are 0.
 
     Returns
     -------
     ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
+        Of a height map the points that are there; with ``organized`` all of it, shape
+        (profiles, columns).
 
     Raises
     ------
@@ -107,15 +115,17 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
     header = _header_writer(source)
     with open_regular_file(source, FormatError) as stream:
         head = stream.read(_HEADER_LIMIT)
-        count, start = _parse_header(source, head)
+        shape, start = _parse_header(source, head)
+        count = math.prod(shape)
         kinds = (*_DTYPES, *_UNFLAGGED)
-        dtype = next((kind for kind in kinds if header(kind, count) == head[:start]), None)
+        dtype = next((kind for kind in kinds if header(kind, shape) == head[:start]), None)
         expected = 0 if dtype is None else count * dtype.itemsize
         found = os.fstat(stream.fileno()).st_size - start
         if dtype is not None and found == expected:
             stream.seek(start)
-            points = np.frombuffer(bytearray(stream.read(expected)), dtype, count)
-            return _widened(points, _UNFLAGGED.get(dtype, dtype))
+            points = np.frombuffer(bytearray(stream.read(expected)), dtype, count).reshape(shape)
+            points = _widened(points, _UNFLAGGED.get(dtype, dtype))
+            return points if organized else finite_points(points)
     if dtype is None:
         raise OtherFormatError(
             f"{source}: its header is not that of an eschorty_ros cloud; expected the fields "
@@ -125,6 +135,52 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
         f"{source}: {short(count)} points need {short(expected)} bytes and {found} follow the "
         "header; the file is damaged, write it again"
     )
+
+
+def height_map(points: Points, profile: NDArray[np.integer[Any]], columns: int) -> Points:
+    """Return the cloud as a map: one row for each profile, one column for each of the sensor.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
+        At most one point in each column of a profile.
+    profile : ndarray of integers, shape (n,)
+        What tells a point's profile from others, increasing with time.
+    columns : int
+        Columns of the sensor.
+
+    Returns
+    -------
+    ndarray of the dtype of ``points``, shape (profiles, columns)
+        Where nothing is, all numbers with a fraction are NaN and ``flags`` 0.
+
+    Examples
+    --------
+    >>> points = np.zeros(3, POINT_DTYPE)
+    >>> points["column"] = 0, 2, 1
+    >>> np.isnan(height_map(points, np.array([5, 5, 9]), 3)["x"]).tolist()
+    [[False, True, False], [True, False, True]]
+    """
+    numbers, row = np.unique(profile, return_inverse=True)
+    made = np.zeros((len(numbers), integer("columns", columns, 1, 1 << 16)), points.dtype)
+    for name in points.dtype.names or ():
+        if points.dtype[name].kind == "f":
+            made[name] = np.nan
+    made["column"] = np.arange(columns)
+    if len(points) and int(points["column"].max()) >= columns:
+        raise ArgumentError(
+            f"a point is in column {points['column'].max()} and columns is {columns}; give those "
+            "of the sensor"
+        )
+    made[row, points["column"]] = points
+    if np.count_nonzero(np.isfinite(made["x"])) != len(points):
+        raise ArgumentError("a column of a profile has two points; set returns to strongest")
+    return made
+
+
+def finite_points(points: Points) -> Points:
+    """Return the points of a height map that are there, shape (n,); other clouds as they are."""
+    return points if points.ndim == 1 else points[np.isfinite(points["x"])]
 
 
 def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -149,7 +205,7 @@ def _is_points(part: Any) -> bool:
 def _widened(points: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     if points.dtype == dtype:
         return points
-    wide = np.empty(len(points), dtype)
+    wide = np.empty(points.shape, dtype)
     known = points.dtype.names or ()
     for name in dtype.names or ():
         missing = 0 if name == "flags" else np.nan
@@ -170,7 +226,8 @@ def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
     return [(name, dtype[name]) for name in dtype.names or ()]
 
 
-def _pcd_header(dtype: np.dtype[Any], count: int) -> bytes:
+def _pcd_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    height, width = (1, *shape)[-2:]
     fields = _fields(dtype)
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
@@ -179,31 +236,37 @@ def _pcd_header(dtype: np.dtype[Any], count: int) -> bytes:
         "SIZE " + " ".join(str(kind.itemsize) for _, kind in fields),
         "TYPE " + " ".join(kind.kind.upper() for _, kind in fields),
         "COUNT " + " ".join("1" for _ in fields),
-        f"WIDTH {count}",
-        "HEIGHT 1",
+        f"WIDTH {width}",
+        f"HEIGHT {height}",
         "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {count}",
+        f"POINTS {height * width}",
         "DATA binary",
     ]
     return ("\n".join(lines) + "\n").encode()
 
 
-def _ply_header(dtype: np.dtype[Any], count: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+def _ply_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {shape[0]}"]
     lines += [f"property {_PLY_TYPES[kind.str[1:]]} {name}" for name, kind in _fields(dtype)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode()
 
 
-def _parse_header(source: Path, data: bytes) -> tuple[int, int]:
-    """Return the number of points and the offset of the first one."""
+def _parse_header(source: Path, data: bytes) -> tuple[tuple[int, ...], int]:
+    """Return the shape of the cloud and the offset of the first point."""
     pcd = source.suffix.lower() == ".pcd"
-    end, key = (b"DATA binary\n", b"POINTS ") if pcd else (b"end_header\n", b"element vertex ")
+    end, key = (b"DATA binary\n", b"WIDTH ") if pcd else (b"end_header\n", b"element vertex ")
     stop = data.find(end, 0, _HEADER_LIMIT)
-    begin = data.find(key, 0, max(stop, 0))
-    digits = data[begin + len(key) : data.find(b"\n", begin)].strip()
-    if stop < 0 or begin < 0 or not digits.isdigit():
+    width = _number_after(key, data, stop)
+    height = _number_after(b"HEIGHT ", data, stop) if pcd else 1
+    if width is None or height is None:
         raise OtherFormatError(
             f"{source}: no binary {'PCD' if pcd else 'PLY'} header found; "
             "give a cloud that eschorty_ros wrote"
         )
-    return int(digits), stop + len(end)
+    return (width,) if height < _HEIGHT_MIN else (height, width), stop + len(end)
+
+
+def _number_after(key: bytes, data: bytes, stop: int) -> int | None:
+    begin = data.find(key, 0, max(stop, 0))
+    digits = data[begin + len(key) : data.find(b"\n", begin)].strip()
+    return int(digits) if begin >= 0 and digits.isdigit() else None

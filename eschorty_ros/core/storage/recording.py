@@ -169,8 +169,8 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
         modulation=read_laser_yaml(folder / LASER_FILE),
         calibration=load_calibration(folder / CALIBRATION_FILE),
         scan=scan,
-        settings=_read_settings(settings) if settings.exists() else {},
-        marks=_read_marks(marks) if marks.exists() else np.empty(0, MARK_DTYPE),
+        settings=read_settings_yaml(settings) if settings.exists() else {},
+        marks=read_marks_csv(marks) if marks.exists() else np.empty(0, MARK_DTYPE),
     )
 
 
@@ -185,14 +185,17 @@ def read_scan_yaml(path: str | os.PathLike[str]) -> ScanLog:
     return validate(ScanLog, read_yaml(path, FormatError), FormatError)
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
+def read_settings_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read ``settings.yaml``: names and values; a FormatError names the file and the fault."""
     data = read_yaml(path, FormatError).data
     if not isinstance(data, dict):
         raise FormatError(f"{path}: it has {short(data)} instead of settings; remove it")
     return data
 
 
-def _read_marks(path: Path) -> NDArray[np.void]:
+def read_marks_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
+    """Read ``marks.csv``: MARK_DTYPE, shape (n,); a FormatError names the file and the line."""
+    path = file_path("path", path)
     marks = _read_csv(path, MARK_DTYPE)
     back = np.flatnonzero(np.diff(marks["byte"], prepend=0) < 0)
     if back.size:

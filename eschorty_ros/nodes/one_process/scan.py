@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.action import Scan
-from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, finite_points
 from eschorty_ros.nodes.one_process.composition import (
     START_S,
     Feedback,
@@ -47,13 +47,15 @@ class ScanJob:
     record: Path | None = None
     passes: int = 1
     page: tuple[str, int] | None = None
+    organized: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class ScanResult:
     """The action's result and the cloud (POINT_DTYPE, REFLECTANCE_DTYPE) of `scan/points`.
 
-    ``verdict`` is ``complete``, ``partial`` or ``failed``.
+    ``organized`` is the height map of a job that asks for one; ``verdict`` is ``complete``,
+    ``partial`` or ``failed``.
     """
 
     success: bool
@@ -66,6 +68,7 @@ class ScanResult:
     verdict: str
     completeness: float
     recording: str = ""
+    organized: NDArray[np.void] | None = None
 
 
 def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
@@ -84,6 +87,8 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         tables["reconstruction"] |= {"record": parent, "record_name": name}
     if job.page is not None:
         tables["viewer"] = dict(zip(("host", "port"), job.page, strict=True))
+    if job.organized:
+        tables["reconstruction"]["organized"] = "on"
     bench = None
     if job.hardware is None:
         bench = bench_options(job.scene, job.calibration, job.seed, job.pixels)
@@ -106,14 +111,15 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         ended = running.result(goal, on_feedback)
         if ended.points:
             wait(
-                lambda: clouds and clouds[-1].width == ended.points,
+                lambda: clouds and len(points_from_message(clouds[-1])) == ended.points,
                 START_S,
                 "no cloud of this scan came on scan/points",
             )
+    cloud = _cloud_points(clouds[-1]) if ended.points else np.empty(0, POINT_DTYPE)
     return ScanResult(
         bool(ended.success),
         str(ended.message),
-        _cloud_points(clouds[-1]) if ended.points else np.empty(0, POINT_DTYPE),
+        finite_points(cloud),
         int(ended.profiles),
         int(ended.events),
         int(ended.packets_lost),
@@ -121,13 +127,14 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         str(ended.verdict),
         float(ended.completeness),
         str(ended.recording),
+        cloud if cloud.ndim == 2 else None,
     )
 
 
 def _cloud_points(cloud: PointCloud2) -> NDArray[np.void]:
-    received = points_from_message(cloud)
+    received = points_from_message(cloud, organized=True)
     names = received.dtype.names or ()
-    points = np.empty(len(received), REFLECTANCE_DTYPE if "reflectance" in names else POINT_DTYPE)
+    points = np.empty(received.shape, REFLECTANCE_DTYPE if "reflectance" in names else POINT_DTYPE)
     for name in points.dtype.names or ():
         points[name] = received[name]
     return points

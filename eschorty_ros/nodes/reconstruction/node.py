@@ -27,6 +27,7 @@ from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline
+from eschorty_ros.live.scan_buffer import AssembledScan
 from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.msg import LaserState, PositionTrigger
 from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
@@ -146,7 +147,7 @@ class ReconstructionNode(Node):
             self._in_worker,
             self._running,
             self.parameters["stage_timeout"],
-            self._outputs.scan,
+            self._publish_scan,
             self._recorder,
         )
         if self.parameters["publish_tf"]:
@@ -223,6 +224,9 @@ class ReconstructionNode(Node):
         done, reason = self._in_worker(use)
         if not done:
             raise ArgumentError(f"calibration not exchanged: {reason}")
+
+    def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
+        self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")
 
     def _recorder(self, scan_id: str, start_mm: float, stop_mm: float) -> ScanRecorder | None:
         """Return a recorder of a scan, ``None`` unless the parameter ``record`` is set."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any
 
@@ -9,9 +10,10 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import place_link
-from eschorty_ros.core.storage import join_points
+from eschorty_ros.core.storage import height_map, join_points
 from eschorty_ros.live.event_frame import EventFrame
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles
@@ -114,7 +116,12 @@ class Outputs:
             live = live_points(points[inside], t_ns[inside], stamp_ns)
             self._points.publish(cloud_message(live, stamp_ns, BASE))
 
-    def scan(self, scan: AssembledScan, fallback_stamp_ns: int) -> None:
-        """Publish an assembled scan, also an empty one."""
+    def scan(self, scan: AssembledScan, fallback_stamp_ns: int, organized: bool) -> None:
+        """Publish an assembled scan, also an empty one; ``organized``: as a height map."""
         stamp_ns = scan.stamp_ns if len(scan.points) else fallback_stamp_ns
-        self._scan.publish(cloud_message(scan.points, stamp_ns, BASE))
+        points = scan.points
+        if organized:
+            # A scan during which returns was changed may have no map.
+            with contextlib.suppress(ArgumentError):
+                points = height_map(points, scan.edge_ns, self._model.columns)
+        self._scan.publish(cloud_message(points, stamp_ns, BASE))

@@ -46,12 +46,14 @@ def _bytes_field(values: NDArray[Any]) -> array[int]:
 
 
 def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
-    """Return the unorganised ``PointCloud2`` of a structured array, field by field."""
+    """Return the ``PointCloud2`` of a structured array, field by field.
+
+    A height map, shape (profiles, columns), is organised and not dense.
+    """
     message = PointCloud2()
     message.header.stamp = stamp_from_ns(stamp_ns)
     message.header.frame_id = frame_id
-    message.height = 1
-    message.width = len(points)
+    message.height, message.width = (1, *points.shape)[-2:]
     dtype = points.dtype
     assert dtype.names is not None
     assert dtype.fields is not None
@@ -66,15 +68,18 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
     ]
     message.is_bigendian = False
     message.point_step = dtype.itemsize
-    message.row_step = dtype.itemsize * len(points)
-    message.is_dense = True
-    if len(points):
+    message.row_step = dtype.itemsize * message.width
+    message.is_dense = points.ndim == 1
+    if points.size:
         message.data = _bytes_field(points)
     return message
 
 
-def points_from_message(message: PointCloud2) -> NDArray[Any]:
-    """Return an unorganised cloud as a structured array with the message's fields."""
+def points_from_message(message: PointCloud2, *, organized: bool = False) -> NDArray[Any]:
+    """Return a cloud as a structured array with the message's fields.
+
+    Of an organised one the points that are there; with ``organized`` all of it, as it is.
+    """
     codes = {datatype: "<" + code for code, datatype in _POINT_FIELD_TYPES.items()}
     dtype = np.dtype(
         {
@@ -84,7 +89,10 @@ def points_from_message(message: PointCloud2) -> NDArray[Any]:
             "itemsize": message.point_step,
         }
     )
-    return np.frombuffer(message.data, dtype=dtype, count=message.width * message.height)
+    points = np.frombuffer(message.data, dtype=dtype, count=message.width * message.height)
+    if organized and message.height > 1:
+        return points.reshape(message.height, message.width)
+    return points if message.is_dense else points[np.isfinite(points["x"])]
 
 
 def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:

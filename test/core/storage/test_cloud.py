@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
-from eschorty_ros.core.storage import POINT_DTYPE, Points, read_cloud, write_cloud
+from eschorty_ros.core.storage import POINT_DTYPE, Points, height_map, read_cloud, write_cloud
 from eschorty_ros.simulation.scenes import load_open3d
 
 EXTENSIONS = [".pcd", ".ply"]
@@ -86,6 +86,36 @@ def test_nan_and_strided_points_survive(tmp_path, extension):
     points["sigma"][4] = np.inf
     write_cloud(tmp_path / f"c{extension}", points[::2])
     assert read_cloud(tmp_path / f"c{extension}").tobytes() == points[::2].tobytes()
+
+
+def test_a_height_map_is_organised_in_pcd_and_its_points_read_everywhere(tmp_path, open3d):
+    """As PCL has it: HEIGHT profiles, WIDTH columns, NaN where nothing is."""
+    rng = np.random.default_rng(3)
+    profile, column = np.nonzero(rng.random((9, 40)) < 0.7)
+    points = cloud(len(profile))
+    points["column"] = column
+    order = rng.permutation(len(points))
+    made = height_map(points[order], 100 + 5 * profile[order], 40)
+    assert made.shape == (9, 40)
+    assert np.isnan(made[["x", "sigma", "t"]].tolist()).all(axis=-1).sum() == 360 - len(points)
+    np.testing.assert_array_equal(made[profile, column], points)
+    for name in ("map.pcd", "map.ply"):
+        write_cloud(tmp_path / name, made)
+        np.testing.assert_array_equal(read_cloud(tmp_path / name), points)
+    head = (tmp_path / "map.pcd").read_bytes()[:400].decode("ascii", "replace")
+    assert "WIDTH 40\nHEIGHT 9\n" in head
+    assert "POINTS 360\n" in head
+    assert read_cloud(tmp_path / "map.pcd", organized=True).tobytes() == made.tobytes()
+    seen = np.asarray(open3d.io.read_point_cloud(str(tmp_path / "map.pcd")).points)
+    np.testing.assert_array_equal(seen[np.isfinite(seen[:, 0])], coordinates(points))
+
+
+def test_two_points_of_a_cell_and_columns_beyond_the_sensor_are_refused():
+    for columns, words in ((40, "two points"), (1, "column 1 and columns is 1")):
+        points = cloud(2)
+        points["column"] = columns > 1, 1
+        with pytest.raises(ArgumentError, match=words):
+            height_map(points, np.zeros(2, int), columns)
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
