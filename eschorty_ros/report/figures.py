@@ -271,7 +271,7 @@ def draw_map(
     artist = axes.pcolorfast(
         grid.along_mm,
         edges_mm,
-        image if grid.stage_mm[-1] >= grid.stage_mm[0] else image[::-1],
+        image[np.argsort(grid.stage_mm, kind="stable")],
         cmap=colours,
         vmin=limits[0],
         vmax=limits[1],

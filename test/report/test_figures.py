@@ -92,6 +92,19 @@ def test_the_depth_map_holds_each_point_once():
     )
 
 
+def test_a_pass_back_is_drawn_where_it_was():
+    forth, _ = step_cloud()
+    back = forth.copy()
+    back["t"] = 2.0 - back["t"]
+    back["y"] += 0.2e-3
+    figure = figures.scan_figure(np.concatenate([forth, back]))
+    depth = next(axes for axes in figure.axes if axes.get_title() == "Depth map")
+    image = depth.images[0].get_array()
+    nearer = (image[:, 0] < 1320.0)[~np.isnan(np.asarray(image)[:, 0])]
+    assert len(nearer) == 48
+    assert np.count_nonzero(np.diff(nearer)) == 1
+
+
 @pytest.mark.parametrize(("lines", "known"), [(1, True), (3, False)])
 def test_one_profile_and_an_error_that_is_nowhere_known_are_drawn(tmp_path, lines, known):
     points, error = step_cloud(lines)
