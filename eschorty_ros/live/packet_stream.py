@@ -322,7 +322,8 @@ class PacketStream:
         if self._recorder is not None:
             assert self._epoch is not None
             run = self._reconstructor, self._epoch
-            self._recorder.packet(packet, missing, run, self._wraps)
+            for part in packets:
+                self._recorder.packet(part, missing if part is packet else 0, run, self._wraps)
         reconstructor, before_us = self._reconstructor, self._reconstructor.settled_us
         # One call for all packets that wait: each call costs as much as the events of one packet.
         profiles = reconstructor.push(

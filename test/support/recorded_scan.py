@@ -63,11 +63,16 @@ class LiveScan:
         self.samples = recording.stage_samples.tolist()
 
     def run(self, until_us=1 << 60):
-        """Feed what comes before ``until_us``; return the scan's report, or None before its end."""
+        """Feed what comes before ``until_us``; return the scan's report, or None before its end.
+
+        As in the node, up to three packets wait for each other, and what happens between two
+        packets takes effect there.
+        """
         pipeline, begun, lit, row, now_s = self.pipeline, False, False, 0, 0.0
         pipeline.stream.set_laser(self.modulation, None)
-        for t_us, packet in self.packets:
+        for index, (t_us, packet) in enumerate(self.packets):
             if t_us > until_us:
+                pipeline.process(now_s)
                 return None
             now_s = t_us * 1e-6
             while row < len(self.samples) and self.samples[row][0] <= t_us:
@@ -75,13 +80,17 @@ class LiveScan:
                 row += 1
             if not begun and t_us > BEGIN_US:
                 begun = True
+                pipeline.process(now_s)
                 pipeline.begin_scan("s", *LIMITS_MM, self.recorder)
             if not lit and t_us > LASER_US:
                 lit = True
+                pipeline.process(now_s)
                 on_ns = ZERO_NS + LASER_US * 1000
                 pipeline.stream.set_laser(self.modulation, None, on_ns)
             pipeline.add_packet(packet, now_s)
-            pipeline.step(now_s)
+            if index % 3 == 2:
+                pipeline.step(now_s)
+        pipeline.step(now_s)
         for t_us, position_mm in self.samples[row:]:
             pipeline.add_stage(ZERO_NS + t_us * 1000, position_mm)
         pipeline.close_period("s", now_s)
