@@ -49,11 +49,13 @@ from eschorty_ros.core.line.window import (
     TOO_FEW,
     UNMODULATED,
     Returns,
+    _densest,
     _densest_window,
     _exceeds_background,
     _full_column,
     _mean_shift,
     _padded,
+    _resolve_tie,
     _rows_nearer,
     _second_return,
 )
@@ -69,6 +71,9 @@ _MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID, _LEARNED = range(6)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 # Windows of a column that are tested for the laser's modulation.
 _WINDOWS_MAX = 4
+# Share of the evidence of the last period and of the column before that counts in a column: at most
+# ten times its own is remembered.
+_VOTE = 0.45
 # A full column wider than this many times the line's variance holds background.
 _BACKGROUND_FREE = 1.5
 # Half the width of a line in standard deviations: 1.7 for a flat one, about 3 for a Gaussian.
@@ -427,6 +432,70 @@ def _all_returns(packed, column, half, estimator, found):
 
 
 @kernel
+def _rival(packed, column, half, found):
+    """Return the strongest window beside the one found, or that one where none is half as strong.
+
+    Boxes of dense events are full in the middle of every line; complete windows tell them apart.
+    """
+    a = found.window
+    if found.status == AMBIGUOUS:
+        return found.other
+    if 2 * (column.events - a.sums.events) < a.sums.events:
+        return a
+    gap = half * 20 // 13
+    densest = _densest(packed, column, half, a.centre, gap)
+    if densest.events == 0:
+        return a
+    b = _resolve_tie(packed, column, half, densest, a.centre).window
+    near = abs(a.centre - b.centre) < gap
+    return a if near or 2 * b.sums.events < a.sums.events else b
+
+
+@kernel
+def _vote(columns, c, a, b, half):
+    """Return by how many events neighbours have window ``a`` stronger than its rival ``b``.
+
+    They are the same column in the last period and the column before, where the windows continue
+    their two lines.
+    """
+    evidence = 0.0
+    for other in (c, c - 1):
+        if other < 0 or columns.rivals[other] < 0:
+            continue
+        first, second = columns.seeds[other], columns.rivals[other]
+        if max(abs(a.centre - first), abs(b.centre - second)) <= half:
+            evidence += _VOTE * columns.evidence[other]
+        elif max(abs(a.centre - second), abs(b.centre - first)) <= half:
+            evidence -= _VOTE * columns.evidence[other]
+    return evidence
+
+
+@kernel
+def _stronger(packed, column, c, half, columns, seeded, blink, found):
+    """Return the stronger one of a column's windows; when ``seeded`` its neighbours vote."""
+    a = found.window
+    b = _rival(packed, column, half, found)
+    alone = b.centre == a.centre
+    if not alone and blink.step > 0:
+        # A second window is a second chance for background.
+        alone = not _follows(packed, column, b.first, b.last, blink)[1]
+    if alone:
+        columns.rivals[c] = -1
+        return Returns(FOUND, False, a, a)
+    evidence = float(a.sums.events - b.sums.events)
+    if seeded:
+        evidence += _vote(columns, c, a, b, half)
+    columns.rivals[c] = -1
+    if evidence == 0.0:
+        return Returns(AMBIGUOUS, True, a, b)
+    if evidence < 0.0:
+        a, b = b, a
+    columns.rivals[c] = b.centre
+    columns.evidence[c] = abs(evidence)
+    return Returns(FOUND, False, a, a)
+
+
+@kernel
 def _row_in_window(packed, column, window, other, half, estimator, scratch):
     """Return the row of the return in ``window`` by a method that reads its events again.
 
@@ -513,6 +582,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             if found.status == UNMODULATED:
                 unmodulated += 1
                 continue
+        if windowed and estimator.returns == _STRONGEST and found.status != TOO_FEW:
+            found = _stronger(packed, column, c, half, columns, estimator.seeded, blink, found)
         if estimator.returns != _STRONGEST:
             found = _all_returns(packed, column, half, estimator, found)
             if testing and found.second:

@@ -19,14 +19,18 @@ class Columns(NamedTuple):
     """Packed events by column: ``counts`` of them from ``starts`` on, with room for padding.
 
     The room for events grows up to ``limit``. ``seeds`` are the rows of the lines in the last
-    period, fixed point; -1 for none. In a region of interest column ``c`` takes ``row_first[c]``
-    and the ``row_span[c]`` rows behind it; without one both are empty.
+    period, fixed point; -1 for none. ``rivals`` are those of second lines that are nearly as
+    strong, and ``evidence`` the events by which the first ones have been stronger. In a region of
+    interest column ``c`` takes ``row_first[c]`` and the ``row_span[c]`` rows behind it; without one
+    both are empty.
     """
 
     packed: NDArray[np.uint32]
     starts: NDArray[np.int64]
     counts: NDArray[np.uint32]
     seeds: NDArray[np.int64]
+    rivals: NDArray[np.int64]
+    evidence: NDArray[np.float64]
     limit: int
     row_first: NDArray[np.uint32]
     row_span: NDArray[np.uint32]
@@ -54,6 +58,8 @@ def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
         starts=np.arange(columns) * stride,
         counts=np.zeros(columns, np.uint32),
         seeds=np.full(columns, -1, np.int64),
+        rivals=np.full(columns, -1, np.int64),
+        evidence=np.zeros(columns),
         limit=limit,
         row_first=_ALL_ROWS,
         row_span=_ALL_ROWS,
@@ -76,8 +82,9 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
     starts = np.cumsum(sizes) - sizes
     packed = np.empty(int(sizes.sum()), np.uint32)
     packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
-    seeds = np.full(counts.size, -1, np.int64)
-    return Columns(packed, starts, counts.astype(np.uint32), seeds, 0, _ALL_ROWS, _ALL_ROWS)
+    return empty_columns(counts.size, 0, 0)._replace(
+        packed=packed, starts=starts, counts=counts.astype(np.uint32)
+    )
 
 
 @kernel

@@ -287,6 +287,7 @@ def _begin_window(memory, state):
     state.window = 0
     state.half = memory.estimator.half_max
     memory.columns.seeds[:] = -1
+    memory.columns.rivals[:] = -1
     memory.scatter.squares[:] = 0.0
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0

@@ -1,14 +1,18 @@
 """Streams that a second, independent pixel model makes hard: background, defects, full columns."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from independent_pixels import FIRST_EDGE_US, Camera, Events, stream, wavy
 from reconstructing import CALIBRATION, reconstruct
 
+from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.simulation.scenes import Plane
+from eschorty_ros.simulation.world import World
 
 MODEL = CALIBRATION.model()
 
@@ -59,6 +63,37 @@ def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows):
     assert np.mean(good[~crossing]) > 0.99, f"seed {camera.seed}"
     assert np.quantile(np.abs(error[crossing & good]), 0.95) < 2.2
     assert np.mean(np.abs(error)[~good] < 2.0 * found.sigma_mm[~good]) > 0.8
+
+
+@dataclass(frozen=True)
+class Dim(Plane):
+    reflects: float = 1.0
+
+    def reflectance(self, stage_mm, columns, model):
+        return np.full((np.size(stage_mm), np.size(columns)), self.reflects)
+
+
+def _simulated_line(row: float, reflects: float, seed: int) -> Events:
+    """Return the events of a plane, whose line is at ``row``, on the simulation's pixels."""
+    plane = Dim(float(MODEL.range_mm(row)), reflects=reflects)
+    world = World(plane, CALIBRATION, seed=seed, background_hz=0.0)
+    world.set_laser(FIRST_EDGE_US, True, Modulation(70.0, on_edge_us=FIRST_EDGE_US))
+    events = Decoder(MODEL.columns, MODEL.rows).decode(world.advance(150_000))
+    return events.t, events.x, events.y, events.p
+
+
+@pytest.mark.parametrize("rows", [-60.0, 60.0])
+@pytest.mark.parametrize("pixels", ["simulated", "independent"])
+def test_a_weaker_line_beside_the_line_is_never_taken_for_it(pixels, rows):
+    camera = Camera(contrast=40.0, threshold=1.4, mismatch=0.25, periods=10)
+    if pixels == "simulated":
+        lines = _simulated_line(350.0, 1.0, 1), _simulated_line(350.0 + rows, 0.4, 2)
+    else:
+        ghost = camera.line(lambda k, c: 350.0 + rows + 0.0 * c, power=0.4)
+        lines = camera.line(lambda k, c: 350.0 + 0.0 * c), ghost
+    found, _ = points(camera, *lines)
+    assert len(found) > 0.999 * found.profile_count * 1280
+    assert np.abs(found.row - 350.0).max() < 5.0, f"seed {camera.seed}"
 
 
 NO_LINE: dict[str, tuple[int, Callable[[Camera], Events], float]] = {
