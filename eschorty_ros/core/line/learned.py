@@ -217,7 +217,11 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
         footprint.state[2] += 1
     footprint.state[0] += 1
     doublings = min(max(footprint.state[1] - _ROUNDS, 0), _DOUBLINGS)
-    if footprint.state[2] >= _COLUMNS_MIN << (doublings if whole else 0):
+    columns = _COLUMNS_MIN << doublings
+    if not whole:
+        # More rounds: footprint and rows converge together.
+        columns = (_COLUMNS_MIN // 2) << min(footprint.state[4] // 12, _DOUBLINGS)
+    if footprint.state[2] >= columns:
         _compute(footprint)
         footprint.state[4] = 0 if whole else footprint.state[4] + 1
         pixels[:] = 0.0
