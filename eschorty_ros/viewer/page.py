@@ -81,7 +81,7 @@ class Page:
         self.url = f"http://{host}:{self.server.get_port()}"
         self.server.scene.set_up_direction("+z")
         self._build()
-        self.server.on_client_connect(self._aim)
+        self.server.on_client_connect(self._connected)
 
     def _build(self) -> None:
         gui = self.server.gui
@@ -92,31 +92,37 @@ class Page:
         self._text = gui.add_markdown("")
         if self._control is None:
             return
-        with gui.add_folder("profile"):
-            self._profile_name = gui.add_markdown("range over z, mm")
-            self._profile: Any = None
+        self._profile: Any = None
+        self._profile_folder = gui.add_folder("profile: range over z, mm")
         with gui.add_folder("events"):
             self._frame = gui.add_image(np.zeros((36, 64, 3), np.uint8), format="jpeg")
-        with gui.add_folder("scan"):
-            allowed = self._control.allowed
-            self._fields = {
-                name: gui.add_number(_NAMES[name], value, disabled=not allowed)
+
+    def _connected(self, client: Any) -> None:
+        """Aim the camera and give the page its controls: no other page sees its code."""
+        self._aim(client)
+        if self._control is None:
+            return
+        allowed = self._control.allowed
+        with client.gui.add_folder("scan"):
+            fields = {
+                name: client.gui.add_number(_NAMES[name], value, disabled=not allowed)
                 for name, value in ScanValues()._asdict().items()
             }
-            self._code = gui.add_text("code", "", disabled=not allowed)
-            start = gui.add_button("Start scan", disabled=not allowed, color="red")
-            cancel = gui.add_button("Cancel scan")
-            start.on_click(lambda _: self._request())
-            cancel.on_click(lambda _: self._request_cancel())
+            code = client.gui.add_text("code", "", disabled=not allowed)
+            start = client.gui.add_button("Start scan", disabled=not allowed, color="red")
+            cancel = client.gui.add_button("Cancel scan")
 
-    def _request(self) -> None:
-        values = ScanValues(**{name: float(field.value) for name, field in self._fields.items()})
-        with self._lock:
-            self._start = values, str(self._code.value)
+        def request(_: Any) -> None:
+            values = ScanValues(**{name: float(field.value) for name, field in fields.items()})
+            with self._lock:
+                self._start = values, str(code.value)
 
-    def _request_cancel(self) -> None:
-        with self._lock:
-            self._cancel = True
+        def request_cancel(_: Any) -> None:
+            with self._lock:
+                self._cancel = True
+
+        start.on_click(request)
+        cancel.on_click(request_cancel)
 
     def requests(self) -> tuple[tuple[ScanValues, str] | None, bool]:
         """Return the scan that was requested, with the code, and whether to cancel; once each."""
@@ -138,7 +144,8 @@ class Page:
             self._limits = self._draw(shown.xyz, shown.values[state[1]], state[2])
             self._counts = shown.received, shown.stride
         low, high = self._limits
-        scale = f"\n\n{self._colour.value}: {low:.4g} to {high:.4g}"
+        unit = "" if self._colour.value == "reflectance" else " m"
+        scale = f"\n\n{self._colour.value}: {low:.4g} to {high:.4g}{unit}" if high > low else ""
         self._text.content = text(*self._counts) + scale
 
     def _draw(
@@ -173,10 +180,11 @@ class Page:
         order = np.argsort(z_mm)
         data = z_mm[order], range_mm[order]
         if self._profile is None:
-            self._profile = self.server.gui.add_uplot(
-                data, (uplot.Series(label="z"), uplot.Series(label="range", stroke="red")),
-                scales={"x": uplot.Scale(time=False)}, aspect=1.6,
-            )  # fmt: skip
+            with self._profile_folder:
+                self._profile = self.server.gui.add_uplot(
+                    data, (uplot.Series(label="z"), uplot.Series(label="range", stroke="red")),
+                    scales={"x": uplot.Scale(time=False)}, aspect=1.6,
+                )  # fmt: skip
         else:
             self._profile.data = data
 

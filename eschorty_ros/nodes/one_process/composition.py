@@ -84,7 +84,7 @@ class Composition:
 
     def __init__(self, client: Node, nodes: list[Node], action: Any, spinning: Spinning) -> None:
         self.client = client
-        self._nodes = nodes
+        self.nodes = nodes
         self._spinning = spinning
         self._action = action
 
@@ -139,7 +139,7 @@ class Composition:
     def _waiting(self) -> list[str]:
         return [
             f"{node.get_name()}: {reason}"
-            for node in self._nodes
+            for node in self.nodes
             if (reason := getattr(node, "waiting", ""))
         ]
 
@@ -147,12 +147,12 @@ class Composition:
         self._spinning.raise_error()
         failed = [
             f"{node.get_name()}: {reason.splitlines()[-1]}"
-            for node in self._nodes
+            for node in self.nodes
             if (reason := getattr(node, "failure", ""))
         ]
         if failed:
             raise DeviceError("; ".join(failed))
-        return all(getattr(node, "active", True) for node in self._nodes)
+        return all(getattr(node, "active", True) for node in self.nodes)
 
 
 @contextlib.contextmanager
