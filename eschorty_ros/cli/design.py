@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from eschorty_ros.core.optics import Design
+
+# Light of one period at 70 Hz and duty 0.5.
+_LIGHT_S = 0.5 / 70.0
 
 
 @click.command("design")
@@ -34,9 +37,22 @@ if TYPE_CHECKING:
     "--ranges", type=click.IntRange(2, 100), default=8, show_default=True, help="Table rows."
 )
 @click.option(
+    "--pixel-um", type=float, default=4.86, show_default=True, help="Pixel pitch of the sensor."
+)
+@click.option("--columns", type=int, default=1280, show_default=True, help="Columns of the sensor.")
+@click.option("--rows", type=int, default=720, show_default=True, help="Rows of the sensor.")
+@click.option(
+    "--power-mw", type=float, help="Peak power of the line: adds photons and an estimated class."
+)
+@click.option(
+    "--wavelength-nm", type=float, default=450.0, show_default=True, help="With --power-mw."
+)
+@click.option(
     "--out",
+    "outs",
+    multiple=True,
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Also write the plots here, .png, .pdf or .svg.",
+    help="Also write the plots here, .png, .pdf or .svg, or the build, .yaml.",
 )
 def command(
     focal_mm: float,
@@ -47,12 +63,18 @@ def command(
     far_mm: float | None,
     b_mm: float,
     ranges: int,
-    out: Path | None,
+    pixel_um: float,
+    columns: int,
+    rows: int,
+    power_mw: float | None,
+    wavelength_nm: float,
+    outs: tuple[Path, ...],
 ) -> None:
     """Tabulate range, sampling and depth of field of an optical build.
 
     Give the sensor tilt (--theta-prime-deg) or the far range (--far-mm); without either, the tilt
     is -7.77 degrees, the nominal design. Depth of field is a focus tolerance, not a range error.
+    The laser's class is an estimate after IEC 60825-1, not a safety statement.
 
     \b
     Examples:
@@ -60,13 +82,15 @@ def command(
       eschorty design --near-mm 500 --far-mm 1500
       eschorty design --focal-mm 24 --f-number 2 --theta-deg 85.87 --theta-prime-deg -7.62 \\
                       --near-mm 784.6 --out design.png
+      eschorty design --near-mm 500 --far-mm 1500 --power-mw 40 --out my.yaml
     """  # noqa: D301
     import numpy as np
 
-    from eschorty_ros.core.optics import design, design_for_ranges
+    from eschorty_ros.core.optics import design, design_for_ranges, save_calibration
 
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
+    sensor: dict[str, Any] = {"pixel_um": pixel_um, "columns": columns, "rows": rows}
     if far_mm is not None:
         build = design_for_ranges(
             focal_length_mm=focal_mm,
@@ -75,6 +99,7 @@ def command(
             near_mm=near_mm,
             far_mm=far_mm,
             b_mm=b_mm,
+            **sensor,
         )
     else:
         build = design(
@@ -84,14 +109,41 @@ def command(
             theta_prime_deg=-7.77 if theta_prime_deg is None else theta_prime_deg,
             near_mm=near_mm,
             b_mm=b_mm,
+            **sensor,
         )
     near, far = build.range_limits_mm
     # A pole on the sensor puts the last row at infinity.
     last = far if np.isfinite(far) else 20.0 * near
     _print(build, np.linspace(near, last, ranges))
-    if out is not None:
-        _draw(build, np.linspace(near, last, 400), out)
+    if power_mw is not None:
+        _print_light(build, near, min(far, last), power_mw, wavelength_nm)
+    for out in outs:
+        if out.suffix in (".yaml", ".yml"):
+            save_calibration(build.calibration(out.stem), out)
+        else:
+            _draw(build, np.linspace(near, last, 400), out)
         click.echo(str(out))
+
+
+def _print_light(
+    build: Design, near_mm: float, far_mm: float, power_mw: float, wavelength_nm: float
+) -> None:
+    from eschorty_ros.core.optics import laser_class, photons_per_column
+
+    photons = [
+        photons_per_column(build, range_mm, power_mw, wavelength_nm, _LIGHT_S)
+        for range_mm in (near_mm, far_mm)
+    ]
+    click.echo(
+        f"{power_mw:g} mW at {wavelength_nm:g} nm: {photons[0]:.2g} to {photons[1]:.2g} photons "
+        f"per column in {_LIGHT_S * 1e3:.1f} ms from white, nearest to farthest"
+    )
+    found = laser_class(power_mw, wavelength_nm, build.field_deg)
+    limits = ", ".join(f"{name}: {limit:.3g}" for name, limit in found.limits_mw.items())
+    click.echo(
+        f"class {found.name} by estimate, not a safety statement: {found.accessible_mw:.3g} mW "
+        f"through 7 mm at 100 mm (limits in mW {limits}; IEC 60825-1)"
+    )
 
 
 def _print(build: Design, range_mm: NDArray[np.float64]) -> None:

@@ -156,7 +156,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         figures.save(figure, out / "scan.png")
         pairs(_headline(result, out), _counted(result))
         return
-    truth = scenes.named(job.scene)
+    truth = scenes.named(job.scene, calibration.model())
     model, direction = calibration.model(), calibration.stage_direction
     error_mm = accuracy.range_error_mm(result.points, truth, model, direction)
     sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, job.passes)

@@ -60,11 +60,12 @@ def command(
     from eschorty_ros.simulation.scenes import named
     from eschorty_ros.simulation.world import simulate_recording
 
+    build = load_calibration(calibration)
     with ended_by_signals(), progress_bar("simulating") as report:
         recording = simulate_recording(
             out,
-            named(scene),
-            load_calibration(calibration),
+            named(scene, build.model()),
+            build,
             modulation=Modulation(frequency, duty),
             start_mm=start,
             stop_mm=stop,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import Array, positive
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.storage.cloud import MIXED, SENSOR_EDGE
 from eschorty_ros.surfaces.profiles import period_s, profile_index
 
 CELLS_MAX = 50_000_000
@@ -53,7 +54,10 @@ class Links(NamedTuple):
 
 
 def organise(points: NDArray[np.void]) -> CloudGrid:
-    """Return a cloud as a grid; points without finite place, time or positive sigma are left out.
+    """Return a cloud as a grid.
+
+    Left out are points without finite place, time or positive sigma, and those whose flags say that
+    they are on two surfaces or cut by the sensor's edge.
 
     Parameters
     ----------
@@ -69,6 +73,7 @@ def organise(points: NDArray[np.void]) -> CloudGrid:
         & (np.abs(points["t"]) < 1e9)
         & (points["sigma"] > 0.0)
         & (points["sigma"] < 1e6)
+        & _on_one_surface(points)
     )
     chosen = points[kept]
     period = period_s(chosen) if len(chosen) else float("nan")
@@ -94,6 +99,13 @@ def organise(points: NDArray[np.void]) -> CloudGrid:
         xyz[known, k] = points[axis][index[known]].astype(np.float64) * 1e3
     sigma[known] = points["sigma"][index[known]].astype(np.float64) * 1e3
     return CloudGrid(index, first, xyz, sigma)
+
+
+def _on_one_surface(points: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return which points have neither of these flags; those without flags all pass."""
+    if "flags" not in (points.dtype.names or ()):
+        return np.ones(len(points), bool)
+    return np.asarray(points["flags"] & (MIXED | SENSOR_EDGE) == 0)
 
 
 def links(grid: CloudGrid, sigmas: float, steepness: float = 0.0) -> Links:

@@ -12,6 +12,7 @@ from eschorty_ros.core.optics.calibration_file import (
     save_named_calibration,
 )
 from eschorty_ros.core.optics.design import Design, DesignTable, design, design_for_ranges
+from eschorty_ros.core.optics.light import LaserClass, laser_class, photons_per_column
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXELS_MAX,
@@ -29,13 +30,16 @@ __all__ = [
     "Calibration",
     "Design",
     "DesignTable",
+    "LaserClass",
     "RangeModel",
     "config_file",
     "depth_of_field_mm",
     "design",
     "design_for_ranges",
+    "laser_class",
     "load_calibration",
     "load_named_calibration",
+    "photons_per_column",
     "refuse_other_instrument",
     "save_calibration",
     "save_named_calibration",

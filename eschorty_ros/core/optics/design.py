@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import Array, integer, number, positive, reals
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics.calibration_file import Calibration
 from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXEL_UM,
@@ -122,6 +123,24 @@ class Design:
     def axis_row(self) -> float:
         """Row that looks along the optical axis, px; usually just off the sensor."""
         return float(self.model.row(self.axis_range_mm))
+
+    def calibration(self, name: str) -> Calibration:
+        """Return the build as a calibration of a bare name, which is not fitted to anything."""
+        model = self.model
+        return Calibration(
+            name=name,
+            focal_length_mm=self.focal_length_mm,
+            f_number=self.f_number,
+            pixel_um=model.pixel_um,
+            theta_deg=self.theta_deg,
+            theta_prime_deg=self.theta_prime_deg,
+            k_prime_px=model.k_prime_px,
+            b_mm=model.b_mm,
+            b_prime_px=model.b_prime_px,
+            columns=model.columns,
+            rows=model.rows,
+            principal_column=model.principal_column,
+        )
 
     def at(self, range_mm: ArrayLike) -> DesignTable:
         """Return the build's properties at ranges (mm, any shape)."""

@@ -68,8 +68,9 @@ class Bench:
     def __init__(
         self, settings: BenchSettings, clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        self._scene = named(settings.scene)
         calibration = load_calibration(settings.calibration)
+        self._model = calibration.model()
+        self._scene = named(settings.scene, self._model)
         pixels = preset(settings.pixels)
         warm_up(calibration)
 
@@ -94,7 +95,7 @@ class Bench:
 
     def set_scene(self, scene: str) -> None:
         """Set the scene from the next start of the stream on."""
-        self._scene = named(scene)
+        self._scene = named(scene, self._model)
 
     def usb_devices(self) -> list[EmulatedUsbDevice]:
         """Return the devices on the USB bus."""

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.simulation.scenes.face import Face
 from eschorty_ros.simulation.scenes.leaves import Leaves
 from eschorty_ros.simulation.scenes.mesh import Mesh
 from eschorty_ros.simulation.scenes.posts import Posts
 from eschorty_ros.simulation.scenes.scene import Scene
 from eschorty_ros.simulation.scenes.surfaces import Plane, Sphere, Steps
+from eschorty_ros.simulation.scenes.within_range import within_range
 
 __all__ = ["NAMES", "RECEDING_MM", "Plane", "Scene", "Sphere", "Steps", "named"]
 
@@ -32,10 +34,11 @@ _BUILDERS: dict[str, Callable[[], Scene]] = {
 NAMES = tuple(_BUILDERS)
 
 
-def named(name_or_mesh_path: str | Path) -> Scene:
+def named(name_or_mesh_path: str | Path, model: RangeModel | None = None) -> Scene:
     """Return the scene of a name (one of ``NAMES``) or from a mesh file.
 
-    A mesh is in metres in ``eschorty_base`` (x = range); any format Open3D reads.
+    With ``model``, a named scene that this build does not see whole is moved into its range. A mesh
+    is in metres in ``eschorty_base`` (x = range); any format Open3D reads.
 
     Raises
     ------
@@ -48,7 +51,7 @@ def named(name_or_mesh_path: str | Path) -> Scene:
     """
     builder = _BUILDERS.get(str(name_or_mesh_path))
     if builder is not None:
-        return builder()
+        return builder() if model is None else within_range(builder(), model)
     path = Path(name_or_mesh_path)
     if not path.is_file():
         raise ArgumentError(

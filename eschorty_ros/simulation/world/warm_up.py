@@ -16,7 +16,7 @@ def warm_up(calibration: Calibration) -> None:
     The first run on a machine compiles for some seconds; later runs load numba's cache. Without it
     a simulated camera stops for seconds at its first light.
     """
-    world = World(named("plane"), calibration)
+    world = World(named("plane", calibration.model()), calibration)
     world.set_laser(0, True, Modulation(1000.0, on_edge_us=0))
     world.set_sensor(500, SensorControl(Biases(diff_on=1)))
     world.advance(1000)
