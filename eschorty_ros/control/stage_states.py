@@ -6,11 +6,15 @@ from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 
 # A stall of up to this many periods is filled.
 FILL_MAX = 200
+REST_NS = 100_000_000
+"""Distance of the states of a stage at rest."""
 # A newest time further back than this is that of a clock that was set back.
 _CLOCK_BACK_NS = 100_000_000
 
 
-def states_since(stage: LinearStage, last_ns: int, period_ns: int) -> list[StageState]:
+def states_since(
+    stage: LinearStage, last_ns: int, period_ns: int, rested: bool = False
+) -> list[StageState]:
     """Return the states since ``last_ns`` in time order; a stall leaves no gap.
 
     Parameters
@@ -21,6 +25,8 @@ def states_since(stage: LinearStage, last_ns: int, period_ns: int) -> list[Stage
         returned.
     period_ns : int
         Distance of the states that fill a stall.
+    rested : bool
+        Whether the last published state was at rest.
 
     Raises
     ------
@@ -28,8 +34,11 @@ def states_since(stage: LinearStage, last_ns: int, period_ns: int) -> list[Stage
         When the stage has failed.
     """
     newest = stage.state()
-    if last_ns - _CLOCK_BACK_NS <= newest.t_ns <= last_ns:
+    rests = rested and not newest.moving
+    if -_CLOCK_BACK_NS <= newest.t_ns - last_ns <= (REST_NS if rests else 0):
         return []
+    if rests:
+        return [newest]
     missed = range(last_ns + period_ns, newest.t_ns - period_ns // 2, period_ns)
     fill = missed if len(missed) <= FILL_MAX else ()
     filled = [(t_ns, stage.state(t_ns)) for t_ns in fill]

@@ -36,7 +36,7 @@ _ODOM_DEPTH = 2000
 TABLE = (
     *drivers.DRIVER,
     *DRIVER_TABLE,
-    Param("odom_rate", 100.0, "rate of stage/odom", "Hz", 1.0, 500.0),
+    Param("odom_rate", 100.0, "rate of stage/odom in motion; 10 Hz at rest", "Hz", 1.0, 500.0),
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
     Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
     Param("home_timeout", 60.0, "longest time for homing", "s", 1.0, 600.0),
@@ -62,7 +62,7 @@ class StageNode(DeviceNode):
         self._stage: LinearStage | None = None
         super().__init__("stage", TABLE, **kwargs)
         self.moves = 0
-        self._published_ns = 0
+        self._published_ns, self._rested = 0, False
         self._odom = self.create_publisher(Odometry, "stage/odom", qos.stream(_ODOM_DEPTH))
         self._trigger = self.create_publisher(PositionTrigger, "stage/trigger", qos.latched())
         self._move = ActionServer(
@@ -233,12 +233,12 @@ class StageNode(DeviceNode):
             return
         try:
             period_ns = round(1e9 / self.parameters["odom_rate"])
-            states = states_since(stage, self._published_ns, period_ns)
+            states = states_since(stage, self._published_ns, period_ns, self._rested)
         except EschortyError as error:
             self.fault(f"stage lost: {error}")
             return
         for state in states:
-            self._published_ns = state.t_ns
+            self._published_ns, self._rested = state.t_ns, not state.moving
             self._odom.publish(self._odometry(state))
 
     def _trigger_message(self, pulses: PulseTrain | None) -> PositionTrigger:
