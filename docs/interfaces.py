@@ -28,6 +28,7 @@ from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.lifecycle import AUTO_START
 from eschorty_ros.nodes.ros.parameters import Param
+from eschorty_ros.nodes.viewer import node as viewer
 
 PAGE = Path(__file__).with_suffix(".md")
 NAMESPACE = "/eschorty"
@@ -108,6 +109,8 @@ def every_node() -> Iterator[list[Node]]:
             mock.patch.object(replay.ReplayNode, "_run"),
         ):
             nodes.append(replay.ReplayNode(parameter_overrides=playing))
+        with mock.patch.object(viewer, "Page"):
+            nodes.append(viewer.ViewerNode())
         yield nodes
     finally:
         for node in nodes:

@@ -73,6 +73,9 @@ class Page:
         self._drawn: tuple[int, str, float] | None = None
         self._centre: NDArray[np.float64] | None = None
         self._lock = threading.Lock()
+        # A stopped server takes no more.
+        self._serving = threading.Lock()
+        self._stopped = False
         self._start: tuple[ScanValues, str] | None = None
         self._cancel = False
         # viser prints lines of its own.
@@ -135,8 +138,34 @@ class Page:
         """Return how many pages are open."""
         return len(self.server.get_clients())
 
-    def show(self, text: Callable[[int, int], str]) -> None:
-        """Draw what has changed; ``text`` gets received points and stride."""
+    def show(
+        self,
+        text: Callable[[int, int], str],
+        profile: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+        frame: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Draw what has changed.
+
+        Parameters
+        ----------
+        text : callable
+            Returns the text, of received points and stride.
+        profile : tuple of ndarray, optional
+            z and range of one period, mm.
+        frame : ndarray of uint8, shape (rows, columns), optional
+            Image of the recent events.
+        """
+        with self._serving:
+            if self._stopped:
+                return
+            self._show(text)
+            if profile is not None and len(profile[0]):
+                self._show_profile(*profile)
+            if frame is not None:
+                small = frame[::_FRAME_STEP, ::_FRAME_STEP]
+                self._frame.image = np.repeat(small[:, :, None], 3, axis=2)
+
+    def _show(self, text: Callable[[int, int], str]) -> None:
         state = self._cloud.changes, str(self._colour.value), float(self._size.value)
         if state != self._drawn:
             self._drawn = state
@@ -173,8 +202,7 @@ class Page:
         client.camera.position = self._centre + np.array([-back, -0.4 * back, 0.3 * back])
         client.camera.look_at = self._centre
 
-    def profile(self, z_mm: NDArray[np.float64], range_mm: NDArray[np.float64]) -> None:
-        """Show one period."""
+    def _show_profile(self, z_mm: NDArray[np.float64], range_mm: NDArray[np.float64]) -> None:
         from viser import uplot
 
         order = np.argsort(z_mm)
@@ -188,14 +216,10 @@ class Page:
         else:
             self._profile.data = data
 
-    def event_frame(self, image: NDArray[np.uint8]) -> None:
-        """Show an image of the recent events, grey."""
-        small = image[::_FRAME_STEP, ::_FRAME_STEP]
-        self._frame.image = np.repeat(small[:, :, None], 3, axis=2)
-
     def stop(self) -> None:
         """End the server."""
-        with contextlib.redirect_stdout(None):
+        with self._serving, contextlib.redirect_stdout(None):
+            self._stopped = True
             self.server.stop()
 
 

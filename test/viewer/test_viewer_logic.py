@@ -1,14 +1,20 @@
 """The page's server without a browser: decimation, text, and when a scan may begin."""
 
+import socket
+import sys
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.storage import POINT_DTYPE
+from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
 from eschorty_ros.viewer.growing_cloud import GrowingCloud, colours
 from eschorty_ros.viewer.scan_control import ABANDONED_S, Conditions, ScanControl, ScanValues
 from eschorty_ros.viewer.status import Status, laser_text
 
+CLOUD = "c.pcd"
 READY = Conditions(scanner=True, laser=True, interlock_open=False)
 
 
@@ -114,3 +120,28 @@ def test_the_text_names_laser_and_losses_and_carries_no_markup():
     assert [laser_text(*state) for state in ((0, True), (2, False), (77, True))] == [
         "off, armed", "unknown", "unknown",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("--allow-scan", CLOUD), ("--live", CLOUD), ("--browser", "--window", CLOUD)]
+)
+def test_view_refuses_what_does_not_go_together(tmp_path, arguments):
+    write_cloud(tmp_path / CLOUD, numbered(0, 10))
+    given = [str(tmp_path / CLOUD) if text == CLOUD else text for text in arguments]
+    assert CliRunner().invoke(main, ["view", *given]).exit_code == 2
+
+
+def test_a_page_without_viser_or_on_a_taken_port_is_one_line(tmp_path, monkeypatch):
+    write_cloud(tmp_path / CLOUD, numbered(0, 10))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        view = ["view", str(tmp_path / CLOUD), "--browser", "--port", port]
+        done = CliRunner().invoke(main, view)
+        assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+        assert "choose another --port" in done.stderr
+    monkeypatch.setitem(sys.modules, "viser", None)
+    done = CliRunner().invoke(main, view)
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+    assert "pip install viser" in done.stderr

@@ -20,6 +20,7 @@ from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.parameters import check_name, from_settings, of_ros
 from eschorty_ros.nodes.scanner import node as scanner
 from eschorty_ros.nodes.stage import node as stage
+from eschorty_ros.nodes.viewer import node as viewer
 
 _NAMESPACE = "/eschorty/"
 _KEY = "ros__parameters"
@@ -30,6 +31,7 @@ TABLES = {
     "reconstruction": (*reconstruction_parameters.TABLE, *from_settings(Settings, dynamic=True)),
     "scanner": scanner.TABLE,
     "replay": replay.TABLE,
+    "viewer": viewer.TABLE,
 }
 
 

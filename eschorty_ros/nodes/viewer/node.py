@@ -102,7 +102,8 @@ class ViewerNode(Node):
     def _on_profile(self, message: PointCloud2) -> None:
         points = _points(message)
         known = np.isfinite(points["x"]) & np.isfinite(points["z"])
-        self._profile = points["z"][known] * 1e3, points["x"][known] * 1e3
+        z, x = (points[axis][known].astype(np.float64) * 1e3 for axis in "zx")
+        self._profile = z, x
 
     def _on_frame(self, message: Image) -> None:
         if message.encoding != "mono8" or len(message.data) != message.height * message.width:
@@ -142,13 +143,9 @@ class ViewerNode(Node):
             self._handle.cancel_goal_async()
         if time.monotonic() - self._laser_s >= _LASER_SILENT_S:
             self._status.laser, self._status.reason = "no report", ""
-        self.page.show(self._status.markdown)
         profile, self._profile = self._profile, None
-        if profile is not None and len(profile[0]):
-            self.page.profile(*(values.astype(np.float64) for values in profile))
         frame, self._frame = self._frame, None
-        if frame is not None:
-            self.page.event_frame(frame)
+        self.page.show(self._status.markdown, profile, frame)
 
     def _begin(self, values: ScanValues) -> None:
         self._status.message = ""
