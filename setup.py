@@ -38,6 +38,7 @@ setup(
         "bags": ["rosbags>=0.11"],
         "mesh": ["open3d>=0.19", "libusb-package"],
         "viewer": ["viser>=1.1"],
+        "cluster": ["distributed"],
         # LGPL: several transfers in flight; without it the camera is read one transfer at a time.
         "usb-async": ["libusb1>=3.1"],
         "usb-library": ["libusb-package"],

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from eschorty_ros.cli.cluster import on_cluster
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.options import bag_options
@@ -17,6 +21,7 @@ from eschorty_ros.core.base.errors import EschortyError
 if TYPE_CHECKING:
     from eschorty_ros.core.reconstruction import Result
     from eschorty_ros.core.storage import Recording
+    from eschorty_ros.report.accuracy import Accuracy
 
 
 class SettingsCommand(click.Command):
@@ -56,25 +61,37 @@ def setting_options() -> list[click.Parameter]:
 
 
 @click.command("reconstruct", cls=SettingsCommand)
-@click.argument("recording", type=click.Path(exists=True, path_type=Path))
+@click.argument(
+    "recordings",
+    metavar="RECORDING...",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, path_type=Path),
+)
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Cloud to write, .pcd or .ply.  [default: RECORDING/cloud.pcd]",
+    help="Cloud to write, .pcd or .ply, of one recording.  [default: RECORDING/cloud.pcd]",
 )
 @click.option("--jobs", type=click.IntRange(1, 256), help="Threads.  [default: one per core]")
+@click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Reconstruct on the cluster of this dask scheduler, one task a recording.",
+)
 @bag_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def command(
-    recording: Path,
+    recordings: tuple[Path, ...],
     out: Path | None,
     jobs: int | None,
+    dask: str | None,
     as_json: bool,
     frequency: float | None,
     calibration: str | None,
     **settings: Any,
 ) -> None:
-    """Turn RECORDING, a folder or a rosbag2, into a point cloud.
+    """Turn each RECORDING, a folder or a rosbag2, into a point cloud.
 
     The cloud is in eschorty_base, in metres: x y z, intensity (events used), sigma (one sigma of
     the range), t (seconds since the first event), column, flags (1: on two surfaces, 2: cut by the
@@ -83,7 +100,8 @@ def command(
 
     The settings are those of the recorded scan, or the defaults, where no option is given.
 
-    A cloud without points is not written: exit code 1, with the reason.
+    A cloud without points is not written: exit code 1, with the reason. Of several recordings one
+    that fails does not end the others.
 
     \b
     --json prints events, dropped_events, profiles, periods_per_profile, points, seconds,
@@ -92,7 +110,8 @@ def command(
     also score: periods, points, completeness, error_median_mm, error_p95_mm, bias_mm,
     within_1_sigma, within_2_sigma, off_target (points where nothing is), flagged, and
     good_median_mm, good_p95_mm, good_within_1_sigma and good_within_2_sigma of the points without a
-    flag; without those that no point gives.
+    flag; without those that no point gives. Of several recordings it prints one object a line, with
+    recording first, and error alone where it failed.
 
     \b
     Examples:
@@ -100,40 +119,102 @@ def command(
       eschorty reconstruct rec --out rec.ply --centroid median
       eschorty reconstruct rec --json --smoothing-half-width 0
       eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
+      eschorty reconstruct monday/* --dask tcp://host:8786
     """  # noqa: D301
+    from eschorty_ros.live.bag_files import is_bag
+
+    several = len(recordings) > 1
+    if several and out is not None:
+        raise click.BadParameter(f"one file for {len(recordings)} recordings", param_hint="--out")
+    for recording in recordings:
+        bag = is_bag(recording)
+        if recording.is_file() and not bag:
+            raise click.BadParameter(f"{recording} is a file; give a recording's folder or a bag")
+        if not bag and (frequency is not None or calibration is not None):
+            raise click.UsageError(
+                f"--frequency and --calibration are for a bag; {recording} is none"
+            )
+    targets = [out or _target(recording) for recording in recordings]
+    if targets[0].suffix not in (".pcd", ".ply"):
+        raise click.BadParameter(f"{out} ends in neither .pcd nor .ply", param_hint="--out")
+    task = partial(
+        reconstruct_to,
+        jobs=jobs,
+        given=_given(settings),
+        frequency=frequency,
+        calibration=calibration,
+        show=dask is None,
+    )
+    calls = list(zip(recordings, targets, strict=True))
+    failed: dict[Path, Exception] = {}
+    for index, done in _here(task, calls) if dask is None else on_cluster(dask, task, calls):
+        recording, target = calls[index]
+        error = done if isinstance(done, Exception) else None
+        if error is None:
+            facts, measured = done
+            _print(facts, measured, target, recording if several else None, as_json)
+            if not facts["points"]:
+                error = EschortyError(f"{recording} gives no points; {target} is not written")
+        elif as_json and several:
+            click.echo(json.dumps({"recording": str(recording), "error": str(error)}))
+        if error is not None:
+            failed[recording] = error
+            if several:
+                click.echo(f"eschorty: {recording}: {error or type(error).__name__}", err=True)
+    if failed and not several:
+        raise failed[recordings[0]]
+    if failed:
+        raise EschortyError(f"{len(failed)} of {len(recordings)} recordings failed, as said above")
+
+
+def _target(recording: Path) -> Path:
+    """Return where the cloud of a recording, a folder or a bag, is written."""
+    if recording.is_dir():
+        return recording / "cloud.pcd"
+    return recording.with_suffix(".pcd")
+
+
+def _here(
+    task: Callable[[Path, Path], Any], calls: list[tuple[Path, Path]]
+) -> Iterator[tuple[int, Any]]:
+    """Yield the index and the result of each call of ``task``, or its error."""
+    for index, call in enumerate(calls):
+        try:
+            yield index, task(*call)
+        except (EschortyError, OSError) as error:
+            yield index, error
+
+
+def reconstruct_to(
+    recording: Path,
+    target: Path,
+    *,
+    jobs: int | None,
+    given: dict[str, Any],
+    frequency: float | None,
+    calibration: str | None,
+    show: bool,
+) -> tuple[dict[str, Any], Accuracy | None]:
+    """Write the cloud of a recording, if it has points; return its summary and its errors.
+
+    With ``show`` the progress is printed.
+    """
     from eschorty_ros.core.base.files import check_writable, temporary_folder
     from eschorty_ros.core.storage import load_recording
     from eschorty_ros.live.bag_files import is_bag
 
-    bag = is_bag(recording)
-    if recording.is_file() and not bag:
-        raise click.BadParameter(f"{recording} is a file; give a recording's folder or a bag")
-    if not bag and (frequency is not None or calibration is not None):
-        raise click.UsageError("--frequency and --calibration are for a bag; RECORDING is none")
-    folder = recording if recording.is_dir() else recording.parent
-    target = out or folder / ("cloud.pcd" if recording.is_dir() else f"{recording.stem}.pcd")
-    if target.suffix not in (".pcd", ".ply"):
-        raise click.BadParameter(f"{target} ends in neither .pcd nor .ply", param_hint="--out")
     check_writable(target)
-    given = _given(settings)
-    if not bag:
-        _reconstruct(load_recording(recording), recording, target, jobs, as_json, given)
-        return
+    if not is_bag(recording):
+        return _reconstruct(load_recording(recording), target, jobs, given, show)
     with temporary_folder() as made:
         recording_of(recording, made / recording.stem, frequency, calibration, given)
-        loaded = load_recording(made / recording.stem)
-        _reconstruct(loaded, recording, target, jobs, as_json, given)
+        return _reconstruct(load_recording(made / recording.stem), target, jobs, given, show)
 
 
 def _reconstruct(
-    loaded: Recording,
-    recording: Path,
-    target: Path,
-    jobs: int | None,
-    as_json: bool,
-    given: dict[str, Any],
-) -> None:
-    """Write the cloud of ``loaded``, which the user calls ``recording``; print its figures."""
+    loaded: Recording, target: Path, jobs: int | None, given: dict[str, Any], show: bool
+) -> tuple[dict[str, Any], Accuracy | None]:
+    """Write the cloud of ``loaded``; return as `reconstruct_to`."""
     from eschorty_ros.core.reconstruction import (
         reconstruct_recording,
         recorded_settings,
@@ -143,7 +224,7 @@ def _reconstruct(
     from eschorty_ros.report.accuracy import measure_recorded
 
     chosen = replace(recorded_settings(loaded), **given)
-    with progress_bar("reconstructing") as report:
+    with progress_bar("reconstructing") if show else nullcontext(lambda done, note: None) as report:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)
         result = reconstruct_recording(
@@ -153,17 +234,27 @@ def _reconstruct(
         measured = measure_recorded(result.points, result.profiles, loaded)
         if len(result.points):
             write_cloud(target, result.points if result.organized is None else result.organized)
-    for warning in result.warnings:
-        click.echo(f"eschorty: warning: {warning}", err=True)
-    facts = summary(result)
-    if measured is not None:
-        known = {name: value for name, value in asdict(measured).items() if value == value}
-        facts["score"] = known
+    return summary(result), measured
+
+
+def _print(
+    facts: dict[str, Any],
+    measured: Accuracy | None,
+    target: Path,
+    recording: Path | None,
+    as_json: bool,
+) -> None:
+    """Print what is known of a cloud; the recording is named where there are several."""
+    name = "" if recording is None else f"{recording}: "
+    for warning in facts["warnings"]:
+        click.echo(f"eschorty: warning: {name}{warning}", err=True)
     if as_json:
-        click.echo(json.dumps(facts))
-    if not len(result.points):
-        raise EschortyError(f"{recording} gives no points; {target} is not written")
-    if as_json:
+        first = {} if recording is None else {"recording": str(recording)}
+        if measured is not None:
+            known = {name: value for name, value in asdict(measured).items() if value == value}
+            facts = {**facts, "score": known}
+        click.echo(json.dumps({**first, **facts}))
+    if as_json or not facts["points"]:
         return
     sigma = facts["sigma_median_m"]
     pairs(

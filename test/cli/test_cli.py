@@ -1,8 +1,10 @@
 """The commands as a user types them: output, files, exit codes."""
 
+import contextlib
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -366,3 +368,31 @@ def test_design_prints_the_nominal_build_and_plots_it(tmp_path):
 def test_design_finds_the_tilt_for_two_ranges():
     assert "sensor -7.6" in good("design", "--near-mm", 784.6, "--far-mm", 2115.9)
     assert run("design", "--near-mm", 900, "--far-mm", 800).exit_code == 1
+
+
+@pytest.mark.parametrize("where", ["here", "cluster"])
+def test_a_bad_recording_does_not_end_the_others(recording, tmp_path, where):
+    """Two good ones around one with a broken file; the clouds of a cluster are those made here."""
+    good("reconstruct", recording)
+    expected = (recording / "cloud.pcd").read_bytes()
+    folders = [tmp_path / name for name in ("a", "bad", "b")]
+    for folder in folders:
+        shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("cloud.pcd"))
+    (folders[1] / "events.raw").write_bytes(b"% evt 2.0\n% end\n\0\0")
+    options = ["--json"]
+    with contextlib.ExitStack() as stack:
+        if where == "cluster":
+            distributed = pytest.importorskip("distributed")
+            local = distributed.LocalCluster(
+                n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+            )
+            options += ["--dask", stack.enter_context(local).scheduler_address]
+        done = run("reconstruct", *folders, *options)
+    assert done.exit_code == 1
+    facts = {Path(line["recording"]): line for line in map(json.loads, done.stdout.splitlines())}
+    assert set(facts) == set(folders)
+    assert "not EVT3" in facts[folders[1]]["error"]
+    assert "1 of 3 recordings failed" in done.stderr
+    for folder in (folders[0], folders[2]):
+        assert facts[folder]["points"] > 0
+        assert (folder / "cloud.pcd").read_bytes() == expected

@@ -1,0 +1,46 @@
+"""Tasks on a cluster of dask.distributed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
+
+_CONNECT_S = 30
+
+
+def on_cluster(
+    address: str, task: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
+) -> Iterator[tuple[int, Any]]:
+    """Yield the index and the result of each call of ``task``, or its exception, as they end.
+
+    The workers have this package and see the same files.
+
+    Raises
+    ------
+    EschortyError
+        When dask.distributed is not installed.
+    DeviceError
+        When no scheduler answers at ``address``.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise EschortyError(
+            "--dask needs dask.distributed; install it by `pip install 'eschorty_ros[cluster]'`"
+        ) from error
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise DeviceError(
+            f"no dask scheduler answers at {address}; start one by `dask scheduler`"
+        ) from error
+    with client:
+        # Two calls with the same arguments are two tasks; none is retried: it would write again.
+        index = {
+            client.submit(task, *call, pure=False, retries=0): k for k, call in enumerate(calls)
+        }
+        for done in as_completed(index, loop=client.loop):
+            failure = done.exception()
+            yield index[done], done.result() if failure is None else failure
