@@ -16,6 +16,8 @@ from eschorty_ros.core.reconstruction.settings import Settings
 
 PERIODS_MAX = 1000
 _HELD_EVENTS_MAX = 1 << 22
+# Events of a window that are looked at, evenly spread.
+_SAMPLE = 4096
 # Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
 _CELL_BITS = 4
 _LINE_CELLS_MAX = 8.0
@@ -60,10 +62,8 @@ class ProfileLength:
             if window is None and not last:
                 return 0
             end = t.size if window is None else begin + window.size
-            found = False
-            if begin < end:
-                found = estimate_phase(t[begin:end], p[begin:end], self._modulation).found
-                found = found or _is_line(x[begin:end], y[begin:end])
+            sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
+            found = begin < end and self._is_lit(t[sample], x[sample], y[sample], p[sample])
             if not found and (window is None or end > _HELD_EVENTS_MAX):
                 return 1
             if found:
@@ -82,6 +82,16 @@ class ProfileLength:
             begin = end
         wanted = math.ceil(2.0 * Settings().events_min / max(events, 1e-9))
         return min(wanted, periods_max(self._modulation))
+
+    def _is_lit(
+        self,
+        t_us: NDArray[np.int64],
+        columns: NDArray[np.uint16],
+        rows: NDArray[np.uint16],
+        polarity: NDArray[np.uint8],
+    ) -> bool:
+        """Return true when events follow the laser or are on a line."""
+        return estimate_phase(t_us, polarity, self._modulation).found or _is_line(columns, rows)
 
     def _events(self, t_us: NDArray[np.int64], columns: NDArray[np.uint16]) -> float:
         """Return the events of a lit column in a period."""
