@@ -66,7 +66,9 @@ class WindowAssembler:
         self._pool = ThreadPoolExecutor(jobs, "window")
         self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs))
         self._serial = ProfileAssembler(settings, model)
-        self._buffers = deque(HeldEvents() for _ in range(jobs + 2))
+        # Room for the profile in which the window becomes full, too.
+        capacity = profile_assembler.WINDOW_EVENTS * 5 // 4
+        self._buffers = deque(HeldEvents(capacity) for _ in range(jobs + 2))
         self._running: deque[Future[_Assembled]] = deque()
         self._done: list[LineRows] = []
         self._counts = Counter(self._serial.counters)
