@@ -62,14 +62,15 @@ class Camera:
         self,
         row: Callable[[int, NDArray[Any]], NDArray[Any]],
         power: float = 1.0,
-        part: Callable[[int], tuple[float, float]] = lambda _: (-REACH, REACH),
+        part: Callable[[int], tuple[float, float]] = lambda _: (-ROWS, ROWS),
     ) -> Events:
         """Return the events of a line at ``row(period, columns)``; NaN is dark.
 
         Only the ``part`` of its thickness, rows from its centre, falls on this surface.
         """
         column = np.arange(COLUMNS)
-        offset = np.arange(-REACH, REACH + 1)
+        reach = max(REACH, round(2.4 * self.half_width_px))
+        offset = np.arange(-reach, reach + 1)
         parts: list[Events] = []
         for k in range(self.periods):
             true_row = np.broadcast_to(np.asarray(row(k, column), float), column.shape)

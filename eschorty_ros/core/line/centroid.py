@@ -168,10 +168,14 @@ class Scratch(NamedTuple):
 
 
 class PeriodSums(NamedTuple):
-    """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns."""
+    """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns.
+
+    ``events`` are those of the columns with a row, used or not.
+    """
 
     squares: float
     freedom: np.int64
+    events: np.int64
     too_few_events: np.int64
     ambiguous: np.int64
     two_returns: np.int64
@@ -543,7 +547,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     out.row[:] = np.nan
     out.shift[:] = np.nan
     squares = 0.0
-    freedom, few, ambiguous, two = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    freedom, events, few = np.int64(0), np.int64(0), np.int64(0)
+    ambiguous, two = np.int64(0), np.int64(0)
     unmodulated, events_unmodulated = np.int64(0), np.int64(0)
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
@@ -551,7 +556,9 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     learning = estimator.method == _LEARNED or footprint.state[3] > 0
     near_edge = False
     packed, model = columns.packed, estimator.error_model
-    line_variance = min((half / HALF_PER_SIGMA) ** 2, estimator.line_variance)
+    line_variance = (half / HALF_PER_SIGMA) ** 2
+    if half <= estimator.half_max:
+        line_variance = min(line_variance, estimator.line_variance)
     if estimator.method == _GAUSS_ML:
         scratch = Scratch(scratch.row_counts, _fill_likelihood(scratch.likelihood, half))
     for c in range(columns.counts.size):
@@ -634,8 +641,11 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             out.truncated[k, c] = estimate.truncated
             narrow = variance <= _BACKGROUND_FREE * estimator.line_variance
             if not estimate.truncated and (windowed or narrow):
+                events += n if k == 0 else 0
                 squares += variance * (used - 1)
                 freedom += used - 1
             window, other = other, window
     footprint.state[3] = near_edge
-    return PeriodSums(squares, freedom, few, ambiguous, two, unmodulated, events_unmodulated)
+    return PeriodSums(
+        squares, freedom, events, few, ambiguous, two, unmodulated, events_unmodulated
+    )

@@ -49,6 +49,8 @@ same time. Only a footprint that is learned goes on.
 _OUTPUT_PROFILES = 64
 _HALF_MIN = 3 * FRACTION
 _WIDTH_MIN_DOF = 64
+# Times the limit that a line may be wide.
+_WIDER = 4
 _COUNTERS = np.dtype(
     [
         (name, np.int64)
@@ -61,6 +63,7 @@ _COUNTERS = np.dtype(
             "events_gated",
             "periods_closed",
             "periods_empty",
+            "profiles_too_wide",
             "columns_too_few_events",
             "columns_ambiguous",
             "columns_isolated",
@@ -267,7 +270,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             widths=empty_widths(*shape),
         ),
         rows=empty_rows(*shape),
-        scratch=make_scratch(estimator.half_max),
+        scratch=make_scratch(_WIDER * estimator.half_max),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
         window_events=WINDOW_EVENTS,
     )
@@ -296,11 +299,15 @@ def _begin_window(memory, state):
 
 @kernel
 def _adapted_half(half, sums, half_max):
-    """Return the half width for the next period: 1.3 x the width of this one's rows, averaged."""
+    """Return the half width for the next period: 1.3 x the width of this one's rows, averaged.
+
+    It exceeds the limit where most events of the columns are in the windows, hence the line's.
+    """
     if sums.freedom < _WIDTH_MIN_DOF:
         return half
     measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
-    return np.int64(min(max(np.rint(0.5 * (half + measured)), _HALF_MIN), half_max))
+    limit = half_max * (_WIDER if 3 * sums.freedom > 2 * sums.events else 1)
+    return np.int64(min(max(np.rint(0.5 * (half + measured)), _HALF_MIN), limit))
 
 
 @kernel
@@ -338,6 +345,7 @@ def _close(memory, state, counters):
     columns, estimator, blink, footprint, scatter, smoothing, rows, scratch, output, _ = memory
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
+    counters.profiles_too_wide += state.half > estimator.half_max
     counters.periods_closed += 1
     counters.columns_too_few_events += sums.too_few_events
     counters.columns_ambiguous += sums.ambiguous

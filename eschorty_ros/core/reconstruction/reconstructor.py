@@ -306,6 +306,12 @@ class Reconstructor:
                 f"{self.modulation.frequency_hz:g} Hz and gave no points; check the frequency and "
                 "that the laser is on"
             )
+        if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
+            found.append(
+                f"the line is wider than line_width_px = {self.settings.line_width_px:g} in "
+                f"{counts['profiles_too_wide']} of {counts['periods_closed']} profiles; raise it, "
+                "or focus the laser"
+            )
         per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
         few = counts["columns_too_few_events"]
         if few > 10 * counts["points"] and per_column < _EVENTS_WANTED:

@@ -148,6 +148,16 @@ def test_no_event_of_a_full_column_is_lost(camera, settings):
     assert np.abs(found.row - wavy(0, found.column.astype(float))).max() < 1.0
 
 
+def test_a_line_wider_than_the_limit_is_followed_with_a_warning():
+    camera = Camera(periods=12, half_width_px=29.0)
+    found, reconstructor = points(camera, camera.line(wavy), camera.scattered(1e6))
+    error = error_px(found)[found.period >= 5]
+    assert abs(error.mean()) < 0.05, f"seed {camera.seed}"
+    assert 0.63 < np.mean(np.abs(error) < found.sigma_row[found.period >= 5]) < 0.8
+    (warning,) = reconstructor.warnings
+    assert "wider than line_width_px = 20" in warning
+
+
 def _kept(camera: Camera, share: float) -> Events:
     t, x, y, p = camera.line(wavy)
     kept = camera.rng.random(t.size) < share
