@@ -444,8 +444,6 @@ def _rival(packed, column, half, found):
     a = found.window
     if found.status == AMBIGUOUS:
         return found.other
-    if 2 * (column.events - a.sums.events) < a.sums.events:
-        return a
     gap = half * 20 // 13
     densest = _densest(packed, column, half, a.centre, gap)
     if densest.events == 0:
@@ -589,8 +587,14 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             if found.status == UNMODULATED:
                 unmodulated += 1
                 continue
-        if windowed and estimator.returns == _STRONGEST and found.status != TOO_FEW:
-            found = _stronger(packed, column, c, half, columns, estimator.seeded, blink, found)
+        if windowed and estimator.returns == _STRONGEST:
+            used = found.window.sums.events
+            if found.status == AMBIGUOUS or (
+                found.status == FOUND and 2 * (column.events - used) >= used
+            ):
+                found = _stronger(packed, column, c, half, columns, estimator.seeded, blink, found)
+            else:
+                columns.rivals[c] = -1
         if estimator.returns != _STRONGEST:
             found = _all_returns(packed, column, half, estimator, found)
             if testing and found.second:
