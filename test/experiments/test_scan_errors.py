@@ -61,7 +61,7 @@ def test_the_leaf_levels_of_the_truth_are_2_2_mm_apart():
     points = np.zeros(line.size, POINT_DTYPE)
     points["x"] = (truth[line, column] + noise_mm) * 1e-3
     points["y"], points["t"], points["column"] = stage[line] * 1e-3, line / 150.0, column
-    result = Result(points, Profiles.empty(), {}, stage.size, 0, 0.0, ())
+    result = Result(points, Profiles.empty(), {}, stage.size, 1, 0, 0.0, ())
     steps = level_steps(level_residuals(leaves, result, MODEL, pitch_mm))
     assert [(step.near, step.far) for step in steps] == [(0, 1), (1, 2)]
     for step in steps:

@@ -189,6 +189,12 @@ CALLS: dict[str, Call] = {
         near_mm=(None, Kind([3.0, "abc"])),
         **LENS,
     ),
+    "optics.laser_class": call(
+        optics.laser_class,
+        power_mw=(40.0, number(0.0)),
+        wavelength_nm=(450.0, number(399.0, 1051.0)),
+        fan_deg=(15.0, number(-1.0, 180.0)),
+    ),
     "optics.design_for_ranges": call(
         optics.design_for_ranges,
         near_mm=(800.0, number(0.0, 2100.0)),
@@ -333,7 +339,7 @@ CALLS: dict[str, Call] = {
     "storage.write_cloud": call(
         storage.write_cloud,
         path=("c.pcd", path()),
-        points=(POINTS, Kind([None, 3, "abc", np.zeros(3), POINTS.reshape(2, 2)])),
+        points=(POINTS, Kind([None, 3, "abc", np.zeros(3), POINTS.reshape(2, 2, 1)])),
     ),
     "storage.read_cloud": call(
         lambda path: (storage.write_cloud("c.pcd", POINTS), storage.read_cloud(path)),
@@ -480,12 +486,13 @@ NOT_FOR_USERS = {
     # Plain records that the package makes.
     "calibration.CalibrationFit", "calibration.Post", "evt3.Counters", "evt3.EventArrays",
     "evt3.Events", "evt3.Triggers", "line.Centroids", "optics.DesignTable",
-    "reconstruction.Result", "storage.Recording",
+    "optics.LaserClass", "reconstruction.Result", "storage.Recording", "storage.ScanLog",
     # Their arguments are objects of the package, or go to functions of the table.
     "calibration.AggregateFrame", "calibration.find_posts", "calibration.match_posts",
     "calibration.moving_target", "calibration.recorded_moving_target",
-    "calibration.recorded_posts", "optics.refuse_other_instrument",
+    "calibration.recorded_posts", "optics.photons_per_column", "optics.refuse_other_instrument",
     "reconstruction.add_stage", "reconstruction.reconstruct_recording",
+    "reconstruction.recorded_settings", "storage.finite_points", "storage.height_map",
     "reconstruction.stage_offset_m", "reconstruction.stage_speed_mm_s", "reconstruction.warm_up",
     # Parts of the streaming pipeline.
     "clocks.ClockLine", "clocks.EdgeClock", "clocks.LowerEnvelope", "clocks.MotionPlan",

@@ -49,13 +49,11 @@ from eschorty_ros.core.line.window import (
     TOO_FEW,
     UNMODULATED,
     Returns,
-    _densest,
     _densest_window,
     _exceeds_background,
     _full_column,
     _mean_shift,
     _padded,
-    _resolve_tie,
     _rows_nearer,
     _second_return,
 )
@@ -436,24 +434,6 @@ def _all_returns(packed, column, half, estimator, found):
 
 
 @kernel
-def _rival(packed, column, half, found):
-    """Return the strongest window beside the one found, or that one where none is half as strong.
-
-    Boxes of dense events are full in the middle of every line; complete windows tell them apart.
-    """
-    a = found.window
-    if found.status == AMBIGUOUS:
-        return found.other
-    gap = half * 20 // 13
-    densest = _densest(packed, column, half, a.centre, gap)
-    if densest.events == 0:
-        return a
-    b = _resolve_tie(packed, column, half, densest, a.centre).window
-    near = abs(a.centre - b.centre) < gap
-    return a if near or 2 * b.sums.events < a.sums.events else b
-
-
-@kernel
 def _vote(columns, c, a, b, half):
     """Return by how many events neighbours have window ``a`` stronger than its rival ``b``.
 
@@ -473,11 +453,14 @@ def _vote(columns, c, a, b, half):
 
 
 @kernel
-def _stronger(packed, column, c, half, columns, seeded, blink, found):
-    """Return the stronger one of a column's windows; when ``seeded`` its neighbours vote."""
-    a = found.window
-    b = _rival(packed, column, half, found)
-    alone = b.centre == a.centre
+def _stronger(packed, column, c, half, columns, estimator, blink, found):
+    """Return the stronger one of a column's two returns; in a stream its neighbours vote.
+
+    Boxes of dense events are full in the middle of every line; complete windows tell them apart.
+    """
+    both = _all_returns(packed, column, half, estimator, found)
+    a, b = both.window, both.other
+    alone = not both.second
     if not alone and blink.step > 0:
         # A second window is a second chance for background.
         alone = not _follows(packed, column, b.first, b.last, blink)[1]
@@ -485,10 +468,11 @@ def _stronger(packed, column, c, half, columns, seeded, blink, found):
         columns.rivals[c] = -1
         return Returns(FOUND, False, a, a)
     evidence = float(a.sums.events - b.sums.events)
-    if seeded:
+    if estimator.seeded:
         evidence += _vote(columns, c, a, b, half)
     columns.rivals[c] = -1
-    if evidence == 0.0:
+    # Of two complete windows with as many events the one with the denser middle is the line.
+    if evidence == 0.0 and found.status == AMBIGUOUS:
         return Returns(AMBIGUOUS, True, a, b)
     if evidence < 0.0:
         a, b = b, a
@@ -592,7 +576,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             if found.status == AMBIGUOUS or (
                 found.status == FOUND and 2 * (column.events - used) >= used
             ):
-                found = _stronger(packed, column, c, half, columns, estimator.seeded, blink, found)
+                found = _stronger(packed, column, c, half, columns, estimator, blink, found)
             else:
                 columns.rivals[c] = -1
         if estimator.returns != _STRONGEST:

@@ -55,8 +55,8 @@ class ErrorModel(NamedTuple):
 
 METHOD_ERRORS = {
     "mode_mean": ErrorModel(0.2, 0.89, 0.4, 0.20),
-    "mean": ErrorModel(0.4, 0.672, 1.0, 0.18),
-    "median": ErrorModel(0.2, 0.935, 1.48, 0.11, median=True),
+    "mean": ErrorModel(0.4, 0.715, 1.0, 0.18),
+    "median": ErrorModel(0.2, 1.0, 1.48, 0.11, median=True),
     "gauss_ml": ErrorModel(0.2, 0.91, 0.4, 0.20),
     "edge_mid": ErrorModel(0.243, 0.885, 0.42, 0.18),
     # Before a footprint is learned.

@@ -9,7 +9,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Settings
 
 SEED = 5
-SINGLE = Settings(events_min=1, isolation_events=0, smoothing_half_width=0)
+SINGLE = Settings(events_min=1, isolation_events=0, smoothing_half_width=0, periods_per_profile=1)
 EDGE_US = 1000
 
 
