@@ -78,7 +78,7 @@ test: $(SETUP) $(BUILD)/test.stamp
 else
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
-	@$(ENTER) pytest --numprocesses $(JOBS) --dist loadfile $(PROCESSES) || { (($$? == 1)) && echo "Once more:" && pytest $(PROCESSES) --last-failed --last-failed-no-failures none; }
+	@$(ENTER) pytest $(PROCESSES) || { (($$? == 1)) && echo "Once more:" && pytest $(PROCESSES) --last-failed --last-failed-no-failures none; }
 endif
 
 quick: $(SETUP) $(BUILD)/test.stamp

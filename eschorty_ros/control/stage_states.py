@@ -34,10 +34,12 @@ def states_since(
         When the stage has failed.
     """
     newest = stage.state()
+    since_ns = newest.t_ns - last_ns
     rests = rested and not newest.moving
-    if -_CLOCK_BACK_NS <= newest.t_ns - last_ns <= (REST_NS if rests else 0):
+    if -_CLOCK_BACK_NS <= since_ns <= (REST_NS if rests else 0):
         return []
-    if rests:
+    # In a longer stall the stage may have moved.
+    if rests and since_ns <= 2 * REST_NS:
         return [newest]
     missed = range(last_ns + period_ns, newest.t_ns - period_ns // 2, period_ns)
     fill = missed if len(missed) <= FILL_MAX else ()

@@ -46,6 +46,8 @@ def test_a_stage_at_rest_has_ten_states_per_second_and_none_is_missing_when_it_m
     assert states_since(bench.stage, last.t_ns, PERIOD_NS, rested=True) == []
     bench.advance(0.1)
     (rest,) = states_since(bench.stage, last.t_ns, PERIOD_NS, rested=True)
+    bench.advance(0.3)
+    assert len(states_since(bench.stage, rest.t_ns, PERIOD_NS, rested=True)) > 20
     bench.stage.move_to(10.0, 50.0)
     bench.advance(0.2)
     moved = states_since(bench.stage, rest.t_ns, PERIOD_NS, rested=True)
