@@ -70,8 +70,8 @@ reference: $(SETUP)
 
 # Pure parts share the cores, the longest first; what starts processes and devices runs alone. The
 # emulated bench runs in real time, and a computer that stalls fails a scan: what failed runs once more.
-PURE := $(addprefix test/,experiments core live control simulation stability surfaces report)
-ALONE := test $(addprefix --ignore=,$(PURE))
+PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
+PROCESSES := test $(addprefix --ignore=,$(PURE))
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
