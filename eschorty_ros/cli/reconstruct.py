@@ -164,7 +164,9 @@ def command(
     if failed and not several:
         raise failed[recordings[0]]
     if failed:
-        raise EschortyError(f"{len(failed)} of {len(recordings)} recordings failed, as said above")
+        raise EschortyError(
+            f"{len(failed)} of {len(recordings)} recordings failed; see the lines above"
+        )
 
 
 def _target(recording: Path) -> Path:

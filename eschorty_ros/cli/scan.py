@@ -108,9 +108,21 @@ def command(
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
     job = one_scan.ScanJob(
-        scene, calibration, start, stop, speed, frequency, seed, pixels, keep, tables, record,
-        passes, (host, port) if live else None, organized,
-    )  # fmt: skip
+        scene=scene,
+        calibration=calibration,
+        start_mm=start,
+        stop_mm=stop,
+        speed_mm_s=speed,
+        frequency_hz=frequency,
+        seed=seed,
+        pixels=pixels,
+        keep=keep,
+        hardware=tables,
+        record=record,
+        passes=passes,
+        page=(host, port) if live else None,
+        organized=organized,
+    )
     if live:
         load_viser()
         click.echo(f"page at http://{host}:{port}", err=True)

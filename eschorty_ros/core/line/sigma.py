@@ -12,10 +12,9 @@ share the other part::
 
     common^2 + motion^2 * shift of the line since the last profile + (jump * that shift)^2
 
-The constants are fitted to the simulated
-scenes of the report's sigma experiment, at 70, 300 and 1000 Hz. In a stream the columns' own part
-is scaled by the scatter of near columns (`scatter`), so that only its course over the columns and
-the first profile depend on the constants.
+The constants are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
+1000 Hz. In a stream the columns' own part is scaled by the scatter of near columns (`scatter`), so
+that only its course over the columns and the first profile depend on the constants.
 """
 
 from __future__ import annotations

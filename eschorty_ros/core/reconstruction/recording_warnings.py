@@ -44,22 +44,12 @@ def recording_warnings(
     span_us : tuple of int or None
         Sensor times of the first and the last event, ``None`` without events.
     """
-    faults = recording.scan.faults if recording.scan is not None else []
-    return faults + _contradictions(recording, settings, counters, points, span_us)
-
-
-def _contradictions(
-    recording: Recording,
-    settings: Settings,
-    counters: Mapping[str, int],
-    points: Points,
-    span_us: tuple[int, int] | None,
-) -> list[str]:
+    found = recording.scan.faults if recording.scan is not None else []
     if span_us is None:
-        return ["no points: no events came; look at the camera, its lens cap and the laser"]
+        return [*found, "no points: no events came; look at the camera, its lens cap and the laser"]
     reader = RawReader(recording.events_path)
     stated_hz, shown_hz = recording.modulation.frequency_hz, _frequency_hz(recording, reader)
-    found = _geometry(recording, reader)
+    found += _geometry(recording, reader)
     if shown_hz not in (None, stated_hz):
         found.append(
             f"frequency_hz is {stated_hz:g} in laser.yaml and the events show {shown_hz:.4g} Hz; "
