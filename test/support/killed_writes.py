@@ -53,8 +53,8 @@ def prepare(folder):
         organized=None,
     )  # fmt: skip
     module = SimpleNamespace(
-        ScanJob=lambda *values: SimpleNamespace(
-            scene=values[0], calibration=values[1], start_mm=10.0, stop_mm=13.0, speed_mm_s=200.0,
+        ScanJob=lambda scene, calibration, **_: SimpleNamespace(
+            scene=scene, calibration=calibration, start_mm=10.0, stop_mm=13.0, speed_mm_s=200.0,
             frequency_hz=70.0, sweep_s=0.015, hardware=None, passes=1,
         ),
         scan_once=lambda *_: result,
