@@ -52,7 +52,7 @@ class StillBench:
 
         def complete() -> bool:
             counts = self.bench.physics.statistics()
-            return counts["behind_s"] < 1.1e-3 and arrived() == counts["events"]
+            return counts["behind_s"] < 4e-3 and arrived() == counts["events"]
 
         wait_until(complete, "every event", poll_s=1e-3)
 

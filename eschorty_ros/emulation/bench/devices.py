@@ -91,7 +91,11 @@ class Bench:
         self.laser.mutex = self.physics.lock
         self.camera = Evk4Model(self.physics)
         self.camera.lateness_ns = lambda: self.physics.late_ns
-        self.camera.configure = lambda settings: self.physics.set_sensor(sensor_control(settings))
+        self.camera.configure = self._configure
+
+    def _configure(self, settings: SensorSettings) -> None:
+        self.physics.packet_us = settings.packet_period_us
+        self.physics.set_sensor(sensor_control(settings))
 
     def set_scene(self, scene: str) -> None:
         """Set the scene from the next start of the stream on."""

@@ -27,11 +27,11 @@ TRIGGERS = ("none", "laser", "stage")
 Pulses = Callable[[int, int], list[tuple[int, bool]]]
 """Edges of the stage's trigger output from one bench time (ns) to before another: time, rising."""
 
-PACKET_US = 1_008
-"""Period of the sensor's output in its own time."""
-
-_PACKETS_AT_ONCE = 16
-_PACKET_S = PACKET_US * 1e-6
+_PACKET_US = 4_000
+# Shorter packets leave together.
+_PACKET_MIN_US = 1_000
+_AT_ONCE_US = 16_000
+_SLEEP_MIN_S = 1e-4
 _PULSE_MAX_NS = 1_000_000_000
 _PPB = 1_000_000_000
 
@@ -119,6 +119,8 @@ class Physics:
     Attributes
     ----------
     lock : threading.RLock
+    packet_us : int
+        Sensor time after which a packet of bytes leaves, at least a millisecond.
     late_ns : int
         Bench time between the end of the bytes simulated last and their simulation.
     late_changes : int
@@ -144,6 +146,7 @@ class Physics:
             raise ArgumentError(f"trigger is {trigger!r}; choose one of {', '.join(TRIGGERS)}")
         self.lock = threading.RLock()
         self.clock_ns = clock_ns
+        self.packet_us = _PACKET_US
         self.late_ns = 0
         self.late_changes = 0
         self.edges = 0
@@ -193,7 +196,7 @@ class Physics:
             now_ns = self.clock_ns()
             if now_ns <= self._collected_ns:
                 return
-            # This runs a thousand times a second: skip a carriage at rest, which gives no pulses.
+            # This runs with every packet: skip a carriage at rest, which gives no pulses.
             if self._collected_ns <= self._plan.end_ns + _PULSE_MAX_NS:
                 self._stage_edges.extend(self._pulses(self._collected_ns, now_ns))
             self._collected_ns = now_ns
@@ -224,7 +227,7 @@ class Physics:
         self._running.clear()
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        """Return the bytes sent by now, ``b""`` when none come in ``timeout_s``."""
+        """Return the packets sent by now, ``b""`` when none come in ``timeout_s``."""
         deadline_s = time.monotonic() + timeout_s
         while True:
             with self._simulating:
@@ -236,7 +239,7 @@ class Physics:
             left_s = deadline_s - time.monotonic()
             if data or left_s <= 0.0 or not self._running.is_set():
                 return data
-            time.sleep(min(_PACKET_S, left_s))
+            time.sleep(min(self._next_packet_s(), left_s))
 
     def statistics(self) -> dict[str, float]:
         """Return counts of events, dropped events, late changes and trigger edges, and the lag."""
@@ -252,6 +255,20 @@ class Physics:
             "trigger_edges": float(self.edges),
             "trigger_edges_missed": float(self.edges_missed),
         }
+
+    def _next_packet_s(self) -> float:
+        """Return the time until the next packet leaves or arrives."""
+        world = self._world
+        if world is None or not self._running.is_set():
+            return _PACKET_MIN_US * 1e-6
+        due_ns = self._zero_ns + self._bench_ns(world.now_us + self._step_us)
+        if self._in_transit:
+            due_ns = min(due_ns, self._in_transit[0][0])
+        return max(due_ns - self.clock_ns(), 0) * 1e-9 + _SLEEP_MIN_S
+
+    @property
+    def _step_us(self) -> int:
+        return max(self.packet_us, _PACKET_MIN_US)
 
     def _simulate(self) -> bool:
         """Advance the world by some packets at most; returns whether it advanced."""
@@ -269,10 +286,11 @@ class Physics:
                 world.set_sensor(self._from_us(world, change.since_ns), change.control)
             else:
                 self._apply_plan(world, change)
-        packets = (self._sensor_us(horizon_ns) - world.now_us) // PACKET_US
+        step_us = self._step_us
+        packets = (self._sensor_us(horizon_ns) - world.now_us) // step_us
         if packets < 1:
             return False
-        data = world.advance(world.now_us + min(packets, _PACKETS_AT_ONCE) * PACKET_US)
+        data = world.advance(world.now_us + min(packets, max(_AT_ONCE_US // step_us, 1)) * step_us)
         self.late_ns = horizon_ns - self._zero_ns - self._bench_ns(world.now_us)
         if data:
             late_ns = round(self._usb_chance.uniform(0.0, self._imperfections.usb_jitter_ms) * 1e6)

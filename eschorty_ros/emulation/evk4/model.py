@@ -25,7 +25,6 @@ from eschorty_ros.emulation.evk4.registers import SENSOR_RESET, Registers
 from eschorty_ros.emulation.evk4.sequences import Phase, SequenceWatch
 from eschorty_ros.emulation.evk4.settings import SETTING_ADDRESSES, SensorSettings, read_settings
 from eschorty_ros.emulation.evk4.stream import (
-    Packetiser,
     PixelMask,
     SensorSource,
     dropped,
@@ -35,7 +34,7 @@ from eschorty_ros.emulation.evk4.treuzell import BoardIdentity, TreuzellBoard
 
 CONTROL_OUT, CONTROL_IN, DATA_IN = 0x02, 0x82, 0x81
 PACKET_BYTES = 1024
-_PULL_BYTES = 1 << 20
+_PULL_BYTES = 96 << 10
 
 
 class Evk4Model(EmulatedUsbDevice):
@@ -105,7 +104,6 @@ class Evk4Model(EmulatedUsbDevice):
         self.lateness_ns: Callable[[], int] | None = None
         self._source = source
         self.board = TreuzellBoard(board, self)
-        self._packets = Packetiser()
         self._mask = PixelMask((), (), ())
         # Held by the reading thread and by the one that starts and stops.
         self._stream_lock = threading.Lock()
@@ -164,11 +162,8 @@ class Evk4Model(EmulatedUsbDevice):
         if was is Phase.STREAMING:
             with self._stream_lock:
                 self._run += 1
-                self._send(self._packets.flush())
             self._source.stop()
         elif self.watch.phase is Phase.STREAMING:
-            with self._stream_lock:
-                self._packets = Packetiser()
             self._source.start()
 
     def _configure(self) -> None:
@@ -180,7 +175,7 @@ class Evk4Model(EmulatedUsbDevice):
                 self.configure(settings)
 
     def _pull(self, timeout_s: float) -> None:
-        """Move words from the source to the endpoint until a packet is complete or time is up."""
+        """Move words from the source to the endpoint until some have come or time is up."""
         run, until_s = self._run, time.monotonic() + timeout_s
         if self.buffer_bytes is not None:
             self._overflow(run)
@@ -188,7 +183,7 @@ class Evk4Model(EmulatedUsbDevice):
             data = self._source.read(_PULL_BYTES, max(0.0, until_s - time.monotonic()))
             if self.lateness_ns is not None:
                 self.late_ns = self.lateness_ns()
-            if not self._packetise(data, run):
+            if not self._send_words(data, run):
                 return
 
     def _overflow(self, run: int) -> None:
@@ -197,26 +192,21 @@ class Evk4Model(EmulatedUsbDevice):
             kept = data[: space - space % 2]
             space -= len(kept)
             lost += (len(data) - len(kept)) // 2
-            if kept and not self._packetise(kept, run):
+            if kept and not self._send_words(kept, run):
                 return
         if lost:
-            self._packetise(dropped(lost), run)
+            self._send_words(dropped(lost), run)
 
-    def _packetise(self, data: bytes, run: int) -> bool:
-        """Queue the packets of ``data``; False without data or after the end of its stream."""
+    def _send_words(self, data: bytes, run: int) -> bool:
+        """Queue words; False without any or after the end of their stream."""
         with self._stream_lock:
-            if run != self._run:
-                return False
-            if not data:
-                # The sensor sends a packet every period, however small.
-                self._send(self._packets.flush())
+            if run != self._run or not data:
                 return False
             if not self._settings.trigger_in:
                 data = without_triggers(data)
             if self._mask:
                 data = self._mask.apply(data)
-            for packet in self._packets.push(data, self._settings.packet_period_us):
-                self._send(packet)
+            self._send(data)
         return True
 
     def _send(self, packet: bytes) -> None:

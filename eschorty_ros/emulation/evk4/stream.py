@@ -1,10 +1,8 @@
-"""The data stream of the EVK4: the sensor's words without masked pixels, in packets."""
+"""The data stream of the EVK4: the sensor's words without masked pixels."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import groupby
-from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
@@ -15,8 +13,6 @@ from eschorty_ros.core.evt3 import words as w3
 Words = NDArray[np.uint16]
 
 _VECTOR_BITS = 12
-_WAITING_PACKETS = 4
-_JOINED_BYTES = 96 << 10
 
 
 class SensorSource(Protocol):
@@ -29,7 +25,7 @@ class SensorSource(Protocol):
         """Start; sensor time is 0."""
 
     def read(self, max_bytes: int, timeout_s: float) -> bytes:
-        """Return new EVT3 words, ``b""`` when none came in ``timeout_s``."""
+        """Return the words of the packets sent by now, ``b""`` when none come in ``timeout_s``."""
 
     def stop(self) -> None:
         """Stop."""
@@ -111,73 +107,6 @@ class PixelMask:
         if len(bases):
             self._base = int(bases[-1] + steps[-1])
         return bases
-
-
-class Packetiser:
-    """Cuts a word stream where sensor time passes a multiple of the packet period.
-
-    Packets that wait for a host which reads late are joined, so that it catches up.
-    """
-
-    def __init__(self) -> None:
-        self._pending: list[Words] = []
-        self._high = 0
-        self._period_index = -1
-
-    def push(self, data: bytes, period_us: int) -> list[bytes]:
-        """Add words; returns the packets that they complete."""
-        words = np.frombuffer(data, np.dtype("<u2"))
-        cuts = self._cuts(words, period_us)
-        packets, begin = [], 0
-        for cut in cuts:
-            packets.append(self._finish(words[begin:cut]))
-            begin = cut
-        if begin < len(words):
-            self._pending.append(words[begin:])
-        return _joined([packet for packet in packets if packet])
-
-    def flush(self) -> bytes:
-        """Return the incomplete packet."""
-        return self._finish(np.zeros(0, np.uint16))
-
-    def _finish(self, last: Words) -> bytes:
-        parts, self._pending = [*self._pending, last], []
-        return b"".join(part.tobytes() for part in parts)
-
-    def _cuts(self, words: Words, period_us: int) -> list[int]:
-        kinds = words >> 12
-        at = np.flatnonzero((kinds == w3.TIME_LOW) | (kinds == w3.TIME_HIGH))
-        if not len(at):
-            return []
-        payload = (words[at] & 0xFFF).astype(np.int64)
-        is_high = kinds[at] == w3.TIME_HIGH
-        last_high = np.maximum.accumulate(np.where(is_high, np.arange(len(at)), -1))
-        high = np.where(last_high >= 0, payload[last_high], self._high)
-        self._high = int(high[-1])
-        # A TIME_HIGH alone gives no time: it is repeated within its 4096 us.
-        periods = ((high << 12) | payload)[~is_high] // period_us
-        if not len(periods):
-            return []
-        changed = np.flatnonzero(np.diff(periods, prepend=self._period_index))
-        self._period_index = int(periods[-1])
-        return [int(cut) for cut in self._before_high(kinds, at[~is_high][changed])]
-
-    @staticmethod
-    def _before_high(kinds: NDArray[np.integer], cuts: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Keep a TIME_HIGH with the TIME_LOW that follows it."""
-        follows = (cuts > 0) & (kinds[cuts - 1] == w3.TIME_HIGH)
-        return cuts - follows
-
-
-def _joined(packets: list[bytes]) -> list[bytes]:
-    """Join the packets that wait, up to the size of a transfer."""
-    if len(packets) < _WAITING_PACKETS:
-        return packets
-    ends = np.cumsum([len(packet) for packet in packets])
-    return [
-        b"".join(packet for _, packet in group)
-        for _, group in groupby(zip(ends // _JOINED_BYTES, packets, strict=True), itemgetter(0))
-    ]
 
 
 def without_triggers(data: bytes) -> bytes:

@@ -6,7 +6,7 @@ from eschorty_ros.hardware.camera.event_rate import ERC_RATE_MAX
 from eschorty_ros.hardware.camera.event_trail import TRAIL_THRESHOLD_US, TRAIL_TYPES
 from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
-from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_DEFAULT_US, PACKET_PERIOD_US
+from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_US
 from eschorty_ros.hardware.camera.pixel_selection import windows_of
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
 
@@ -16,7 +16,6 @@ __all__ = [
     "ERC_RATE_MAX",
     "HEIGHT",
     "LEAVE",
-    "PACKET_PERIOD_DEFAULT_US",
     "PACKET_PERIOD_US",
     "TRAIL_THRESHOLD_US",
     "TRAIL_TYPES",

@@ -17,7 +17,6 @@ from eschorty_ros.hardware.camera.registers import (
 )
 
 PACKET_PERIOD_US = (16, 65_520)
-PACKET_PERIOD_DEFAULT_US = 1008
 
 _PACKET_PERIOD = 0xB028
 _PERIOD_MASK = 0xFFF0

@@ -10,7 +10,6 @@ from eschorty_ros.hardware.camera.biases import BiasBank, check_offset
 from eschorty_ros.hardware.camera.event_rate import ERC_RATE_DEFAULT, set_event_rate
 from eschorty_ros.hardware.camera.event_trail import clear_event_trail, set_event_trail
 from eschorty_ros.hardware.camera.monitors import (
-    PACKET_PERIOD_DEFAULT_US,
     set_packet_period,
     set_trigger_input,
 )
@@ -47,7 +46,7 @@ class CameraSettings:
 
     biases: Mapping[str, int] = field(default_factory=dict)
     wide_biases: bool = False
-    packet_period_us: int = PACKET_PERIOD_DEFAULT_US
+    packet_period_us: int = LEAVE
     erc_rate: int | None = None
     anti_flicker: AntiFlicker | None = None
     trail_filter: str = ""

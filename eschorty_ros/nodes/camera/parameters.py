@@ -15,7 +15,6 @@ from eschorty_ros.hardware.camera import (
     ERC_RATE_MAX,
     HEIGHT,
     LEAVE,
-    PACKET_PERIOD_DEFAULT_US,
     PACKET_PERIOD_US,
     TRAIL_THRESHOLD_US,
     TRAIL_TYPES,
@@ -60,7 +59,7 @@ EVK4_TABLE = (
     *_BIAS_TABLE,
     Param(
         "mipi_frame_period",
-        PACKET_PERIOD_DEFAULT_US,
+        LEAVE,
         "period of the sensor's packets (latency), in steps of 16; -1 leaves 4000",
         "us",
         LEAVE,

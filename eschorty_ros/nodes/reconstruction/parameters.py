@@ -19,8 +19,8 @@ TABLE = (
           choices=WAVEFORMS, dynamic=True),
     Param("clock_timeout", 2.0, "longest wait for camera/clock if it has a publisher; then the "
           "packets' stamps are used", "s", 0.0, 60.0),
-    Param("packet_period", 1008e-6, "time over which the camera collects events before it sends "
-          "them; metavision_driver's default is 0.004", "s", 0.0, 0.1),
+    Param("packet_period", 0.004, "time over which the camera collects events before it sends "
+          "them: its mipi_frame_period, which drivers leave at 4 ms", "s", 0.0, 0.1),
     Param("stage_gap", 0.5, "longest time between two stage samples that is bridged; 0 bridges any",
           "s", 0.0, 1e6, dynamic=True),
     # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.

@@ -128,7 +128,7 @@ def test_default_settings_leave_the_pixels_alone() -> None:
         assert (seen.event_rate, seen.flicker_band_hz, seen.noise_filter) == (None,) * 3
         assert not seen.trigger_in
         assert seen.columns_off | seen.rows_off | seen.pixels_off == frozenset()
-        assert seen.packet_period_us == 1008
+        assert seen.packet_period_us == 4000
 
 
 def test_bias_is_set_and_read_back_while_streaming(bench: CameraBench) -> None:
