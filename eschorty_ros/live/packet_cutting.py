@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from eschorty_ros.core.base.errors import ArgumentError
 
 SIZE_MAX_BYTES = 256_000
+# Every packet costs each subscriber as much as some thousand events: those of a dark scene wait.
+_QUIET_BYTES = 8192
+_QUIET_AGES = 5
 
 
 class Packetizer:
@@ -15,7 +18,7 @@ class Packetizer:
     Parameters
     ----------
     time_threshold_ns : int
-        Age of a packet's first byte at which it is complete.
+        Age of a packet's first byte at which it is complete; five times that for under 8 kB.
     size_threshold : int
         Bytes of a complete packet, rounded down to 16-bit words.
 
@@ -44,7 +47,8 @@ class Packetizer:
             yield self._first_ns, bytes(self._pending[: self._size])
             del self._pending[: self._size]
             self._first_ns = arrival_ns
-        if self._pending and arrival_ns - self._first_ns >= self._age_ns:
+        ages = _QUIET_AGES if len(self._pending) < _QUIET_BYTES else 1
+        if self._pending and arrival_ns - self._first_ns >= ages * self._age_ns:
             yield from self.flush()
 
     def flush(self) -> Iterator[tuple[int, bytes]]:

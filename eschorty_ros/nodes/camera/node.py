@@ -36,7 +36,14 @@ TABLE = (
     *drivers.DRIVER,
     *EVK4_TABLE,
     Param("frame_id", "eschorty_optical", "frame of the packets' headers"),
-    Param("event_message_time_threshold", 0.004, "age at which a packet leaves", "s", 0.0, 1.0),
+    Param(
+        "event_message_time_threshold",
+        0.004,
+        "age at which a packet leaves, one of under 8 kB at five times that",
+        "s",
+        0.0,
+        1.0,
+    ),
     Param(
         "event_message_size_threshold",
         128_000,

@@ -22,6 +22,7 @@ from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
+from eschorty_ros.nodes.ros.executor import QueueingGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param
@@ -74,12 +75,11 @@ class StageNode(DeviceNode):
             goal_callback=lambda _: GoalResponse.ACCEPT,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
-        ticking = MutuallyExclusiveCallbackGroup()
         period_s = 1.0 / self.parameters["odom_rate"]
         self.create_timer(
-            period_s, self._publish_odom, callback_group=ticking, clock=self.steady_clock
+            period_s, self._publish_odom, callback_group=QueueingGroup(), clock=self.steady_clock
         )
-        diagnostics.Diagnostics(self, self._report, ticking)
+        diagnostics.Diagnostics(self, self._report, MutuallyExclusiveCallbackGroup())
         Heartbeat(self, "stage/heartbeat", self._healthy)
 
     def open_device(self) -> None:
