@@ -79,6 +79,8 @@ class WindowAssembler:
         # Events of the open window before its first edge.
         self._outside = 0
 
+    has_begun = False
+
     @property
     def counters(self) -> dict[str, int]:
         """Counts by name, complete after ``close``."""
