@@ -270,6 +270,20 @@ class Decoder:
         trigger_t, channel, edge = self._memory.triggers
         return Events(t[:n], x[:n], y[:n], p[:n], Triggers(trigger_t[:m], channel[:m], edge[:m]))
 
+    def go_on_from(self, other: Decoder) -> None:
+        """Take over the state of ``other``, without its counts."""
+        self._numbers[: len(_STATE)] = other._numbers[: len(_STATE)]
+
+    def add_counts(self, other: Decoder) -> None:
+        """Add the counts of ``other`` and set them to 0 there."""
+        self._numbers[len(_STATE) :] += other._numbers[len(_STATE) :]
+        other._numbers[len(_STATE) :] = 0
+
+    def is_at(self, other: Decoder) -> bool:
+        """Return whether the state is that of ``other``, as far as it matters for what follows."""
+        size = len(_STATE) if self._state.others_parts else _STATE.index("others_type")
+        return bool(np.array_equal(self._numbers[:size], other._numbers[:size]))
+
     @property
     def memory(self) -> DecoderMemory:
         """State and counters, for a kernel that `decode_into` returns."""
@@ -283,7 +297,11 @@ class Decoder:
         even = stream.size & ~1
         self._odd = stream[even:].tobytes()
         words = stream[:even].view("<u2")
-        return words if words.flags.aligned else words.copy()
+        if not words.flags.aligned:
+            words = words.copy()
+        # One type of array for kernels, whatever the bytes are in.
+        words.flags.writeable = False
+        return words
 
 
 def _trigger_arrays(size: int) -> _TriggerArrays:

@@ -151,6 +151,11 @@ class PhaseLock:
         self._count += size
 
     @property
+    def tracks(self) -> bool:
+        """Return whether edges are moved by the events of each block."""
+        return self._block_end_us is not None
+
+    @property
     def observes(self) -> bool:
         """Return whether more of the block's events have to be observed."""
         return self._block_end_us is not None and self._count < _EVENTS_MAX

@@ -15,7 +15,9 @@ from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAss
 from eschorty_ros.core.reconstruction.profile_length import ProfileLength
 from eschorty_ros.core.reconstruction.windows import WindowAssembler
 
-# Edges are computed so far ahead of the words that are decoded.
+PASS_WORDS = 1 << 19
+"""Words that one thread decodes in a pass."""
+# Edges are computed so far ahead of them.
 _AHEAD_US = 100_000
 
 
@@ -90,8 +92,9 @@ class PeriodCutter:
         """
         assembler, lock, schedule = self._assembler, self.lock, self.lock.schedule
         now_us, read, stopped = floor_us, 0, True
-        while stopped and isinstance(assembler, ProfileAssembler) and self._knows_ahead():
-            edges_us, indices, end_us = schedule.ahead(lock.limit(now_us + _AHEAD_US))
+        while stopped and self._knows_ahead():
+            ahead_us = _AHEAD_US if words.size <= PASS_WORDS else END_OF_STREAM_US // 2
+            edges_us, indices, end_us = schedule.ahead(lock.limit(now_us + ahead_us))
             span, edges = Span(floor_us, end_us), Edges(edges_us, indices)
             held, used = self._held.arrays, 0
             if len(self._held):

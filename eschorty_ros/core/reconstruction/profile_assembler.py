@@ -87,9 +87,12 @@ _COUNTERS = np.dtype(
 )
 # ``status`` is one of the three below, ``half`` the half width of a window for the open period in
 # fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs more room,
-# ``window`` the number of events since the estimate started.
+# ``window`` the number of events since the estimate started, ``over`` 1 where a pass ended with it.
 _STATE = np.dtype(
-    [(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows", "full", "window")]
+    [
+        (name, np.int64)
+        for name in ("period", "edge_us", "status", "half", "rows", "full", "window", "over")
+    ]
 )
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
@@ -132,10 +135,14 @@ class _Memory(NamedTuple):
 
 
 class Span(NamedTuple):
-    """Times of the events to assign; earlier ones count as at ``floor_us``."""
+    """Times of the events to assign; earlier ones count as at ``floor_us``.
+
+    With ``one_window`` the pass ends with the window of the estimate.
+    """
 
     floor_us: int
     end_us: int
+    one_window: bool = False
 
 
 class _Progress(NamedTuple):
@@ -183,6 +190,38 @@ class ProfileAssembler:
         self._memory.columns.counts[:] = 0
         _begin_window(self._memory, self._state)
 
+    def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
+        """Begin a window, and its first period at an edge, with the settings of ``before``.
+
+        Nothing is counted, and no footprint learned.
+        """
+        self._gate = before._gate
+        self._memory = self._memory._replace(blink=before._memory.blink)
+        self._memory.columns.counts[:] = 0
+        self._counters = np.zeros(1, _COUNTERS)[0]
+        self._state["rows"] = 0
+        self._done = []
+        _forget(self._memory.footprint)
+        _begin_window(self._memory, self._state)
+        self._state["status"] = _EMPTY
+        self._state["edge_us"], self._state["period"] = edges.t_us[edge], edges.period[edge]
+
+    def exchange_footprints(self, other: ProfileAssembler) -> None:
+        """Go on with the footprint of ``other``, which gets that of this one."""
+        mine, others = self._memory.footprint, other._memory.footprint
+        self._memory = self._memory._replace(footprint=others)
+        other._memory = other._memory._replace(footprint=mine)
+
+    @property
+    def window_is_over(self) -> bool:
+        """Return whether the last pass over words ended with the window."""
+        return bool(self._state["over"])
+
+    @property
+    def events_left(self) -> int:
+        """Events after which the window ends, with the profile."""
+        return int(self._memory.window_events - self._state["window"])
+
     @property
     def has_learned(self) -> bool:
         """Return whether a line's footprint was learned since the last ``forget``."""
@@ -192,10 +231,6 @@ class ProfileAssembler:
     def learns(self) -> bool:
         """Return whether the next profile is learned from."""
         return bool(self._memory.footprint.state[3])
-
-    def forget(self) -> None:
-        """Drop the line's footprint."""
-        _forget(self._memory.footprint)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -259,7 +294,7 @@ class ProfileAssembler:
             full, crowded = self._widen(), self._state["rows"] > rows_max
             if crowded:
                 self._collect()
-            elif not full:
+            if self.window_is_over or not (full or crowded):
                 return progress
 
     def _widen(self) -> bool:
@@ -517,6 +552,7 @@ def _merge_words(words, progress, decoder, span, edges, gate, memory, state, cou
     columns = memory.columns
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge
+    state.over = 0
     while True:
         limit_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
         counts, numbers = columns.counts.copy(), decoder.numbers.copy()
@@ -540,6 +576,10 @@ def _merge_words(words, progress, decoder, span, edges, gate, memory, state, cou
             break
         if state.status == _FILLED and state.rows > rows_max:
             break
+        filled = state.status == _FILLED
         _begin_period(edges, edge, memory, state, counters)
         edge += 1
+        if span.one_window and filled and state.window == 0:
+            state.over = 1
+            break
     return _Progress(np.int64(i), edge)

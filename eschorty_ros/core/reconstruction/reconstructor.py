@@ -16,7 +16,7 @@ from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction.periods import PeriodCutter
+from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
 from eschorty_ros.core.reconstruction.profile_length import periods_max
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
@@ -26,7 +26,6 @@ from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 
 _PIECE_WORDS = 1 << 16
-_PASS_WORDS = 1 << 19
 # Few words more than a block of the phase lock needs events.
 _BLOCK_WORDS = 1 << 13
 _EVENTS_WANTED = 16
@@ -102,10 +101,11 @@ class Reconstructor:
             self._filter = ActivityFilter(model.columns, model.rows)
         self._assembler: ProfileAssembler | WindowAssembler
         # A learned footprint follows the whole stream.
-        if integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned":
-            self._assembler = ProfileAssembler(settings, model)
-        else:
-            self._assembler = WindowAssembler(settings, model, jobs)
+        alone = integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned"
+        self._jobs = 1 if alone else jobs
+        self._assembler = (
+            ProfileAssembler(settings, model) if alone else WindowAssembler(settings, model, jobs)
+        )
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
@@ -131,7 +131,8 @@ class Reconstructor:
         while begin < words.size:
             size = _PIECE_WORDS
             if self._filter is None:
-                read = self._add_words(words[begin : begin + _PASS_WORDS])
+                alone = self._jobs == 1 or self._periods.lock.tracks
+                read = self._add_words(words[begin:][: PASS_WORDS if alone else None])
                 begin += read
                 if read:
                     continue
