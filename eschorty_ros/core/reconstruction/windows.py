@@ -118,6 +118,8 @@ class WindowAssembler:
         if self._decoder is not decoder:
             decoder.add_counts(self._decoder)
             decoder.go_on_from(self._decoder)
+        # The words may be those of a file that is to be closed.
+        self._words = words[:0].copy()
         return self._at
 
     def _start(
