@@ -11,11 +11,12 @@ import hashlib
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 
 def kernel(*arguments: Any, **options: Any) -> Any:
@@ -70,13 +71,25 @@ def _names(code: CodeType) -> Iterator[str]:
             yield from _names(constant)
 
 
+def with_names(function: Any, suffix: str, **names: Any) -> Any:
+    """Return the kernel of ``function`` with other global ``names``, such as kernels it calls.
+
+    ``suffix`` tells it from others of the same function.
+    """
+    clone = FunctionType(function.__code__, {**function.__globals__, **names})
+    clone.__module__, clone.__qualname__ = function.__module__, f"{function.__qualname__}_{suffix}"
+    return kernel(clone)
+
+
 @cache
 def _file_digest(path: str) -> str:
     return hashlib.blake2b(Path(path).read_bytes(), digest_size=16).hexdigest()
 
 
-def record(*names: str, value: int = 0) -> Any:
+def record(*names: str, value: int = 0, numbers: NDArray[np.int64] | None = None) -> Any:
     """Return a record of int64 fields, all ``value``, that Python and kernels change by name.
+
+    It is a view of ``numbers`` where they are given.
 
     >>> state = record("row", "column")
     >>> state.row += 3
@@ -84,4 +97,6 @@ def record(*names: str, value: int = 0) -> Any:
     (3, 0)
     """
     dtype = np.dtype([(name, np.int64) for name in names])
-    return np.full(len(names), value, np.int64).view(dtype).view(np.recarray)[0]
+    if numbers is None:
+        numbers = np.full(len(names), value, np.int64)
+    return numbers.view(dtype).view(np.recarray)[0]

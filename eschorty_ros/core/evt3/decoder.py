@@ -1,20 +1,22 @@
 """Streaming EVT3 decoder: one compiled state machine over the 16-bit words.
 
 The frequent words (ADDR_Y, ADDR_X, complete vector triples, TIME_LOW) are handled in the loop of
-``_decode``, all others in small functions.
+``_decode``, all others in small functions. Each event goes to a sink: ``emit(sink, n, t_us, column,
+row, polarity)``, a kernel that takes event number ``n`` and returns ``n + 1``. `decode_into`
+compiles the state machine for a kernel ``emit``; that of `Decoder` stores the events in arrays.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import int64, typeof, types, uint8, uint16, uint64
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import byte_view, integer
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import kernel, record, with_names
 from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.evt3._bits import ctz64, popcount64
 from eschorty_ros.core.evt3.events import EVENT_ARRAYS, Events, Triggers, event_arrays
@@ -58,13 +60,27 @@ _STATE = (
     "others_parts",  # words of the current OTHERS F F 7 that have come
     "others_type",
     "others_payload",
+    "late",  # _IN_TIME; _LATE while the time is past the last to decode, _STOPPED at an event
 )
+_IN_TIME, _LATE, _STOPPED = range(3)
+_FOREVER_US = 1 << 62
 
 
 class _TriggerArrays(NamedTuple):
     t: NDArray[np.int64]
     channel: NDArray[np.uint8]
     edge: NDArray[np.uint8]
+
+
+class DecoderMemory(NamedTuple):
+    """What a decoder is made of for kernels; ``numbers`` are all of ``state`` and ``counts``."""
+
+    width: int
+    height: int
+    state: Any
+    counts: Any
+    numbers: NDArray[np.int64]
+    triggers: _TriggerArrays
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,13 +177,17 @@ class Decoder:
         self.width = int(width)
         self.height = int(height)
         self._events = event_arrays(0)
-        self._triggers = _trigger_arrays(0)
+        self._numbers = np.zeros(len(_STATE) + len(_COUNTS), np.int64)
+        self._state = record(*_STATE, numbers=self._numbers[: len(_STATE)])
+        self._counts = record(*_COUNTS, numbers=self._numbers[len(_STATE) :])
+        self._memory = DecoderMemory(
+            self.width, self.height, self._state, self._counts, self._numbers, _trigger_arrays(0)
+        )
         self.reset()
 
     def reset(self) -> None:
         """Drop state and counters."""
-        self._state = record(*_STATE)
-        self._counts = record(*_COUNTS)
+        self._numbers[:] = 0
         self._odd = b""
         self._drop_context()
 
@@ -206,6 +226,11 @@ class Decoder:
         return int(self._state.t_us)
 
     @property
+    def newest_us(self) -> int:
+        """Time of the newest event or trigger."""
+        return int(self._state.floor_us)
+
+    @property
     def settled_us(self) -> int | None:
         """Time before which no event can come any more; ``None`` before the first TIME_HIGH.
 
@@ -228,23 +253,43 @@ class Decoder:
         Events
             Views of reused buffers, valid until the next call.
         """
-        words = self._words(data)
+        return self.decode_words(self.words(data))
+
+    def decode_words(self, words: NDArray[np.uint16]) -> Events:
+        """Return events and triggers of the next ``words``, as `decode` does of bytes."""
         if words.size <= _WORST_CASE_WORDS:
             events, triggers = _EVENTS_PER_WORD_MAX * words.size, words.size
         else:
             events, triggers = (int(bound) for bound in _bounds(words))
         if len(self._events.t) < events:
             self._events = event_arrays(events)
-        if len(self._triggers.t) < triggers:
-            self._triggers = _trigger_arrays(triggers)
-        n, m = _decode(
-            words, self.width, self.height, self._state, self._counts, self._events, self._triggers
-        )
+        if len(self._memory.triggers.t) < triggers:
+            self._memory = self._memory._replace(triggers=_trigger_arrays(triggers))
+        n, m = _decode_events(words, self._memory, self._events)
         t, x, y, p = self._events
-        trigger_t, channel, edge = self._triggers
+        trigger_t, channel, edge = self._memory.triggers
         return Events(t[:n], x[:n], y[:n], p[:n], Triggers(trigger_t[:m], channel[:m], edge[:m]))
 
-    def _words(self, data: Bytes) -> NDArray[np.uint16]:
+    def go_on_from(self, other: Decoder) -> None:
+        """Take over the state of ``other``, without its counts."""
+        self._numbers[: len(_STATE)] = other._numbers[: len(_STATE)]
+
+    def add_counts(self, other: Decoder) -> None:
+        """Add the counts of ``other`` and set them to 0 there."""
+        self._numbers[len(_STATE) :] += other._numbers[len(_STATE) :]
+        other._numbers[len(_STATE) :] = 0
+
+    def is_at(self, other: Decoder) -> bool:
+        """Return whether the state is that of ``other``, as far as it matters for what follows."""
+        size = len(_STATE) if self._state.others_parts else _STATE.index("others_type")
+        return bool(np.array_equal(self._numbers[:size], other._numbers[:size]))
+
+    @property
+    def memory(self) -> DecoderMemory:
+        """State and counters, for a kernel that `decode_into` returns."""
+        return self._memory
+
+    def words(self, data: Bytes) -> NDArray[np.uint16]:
         """Return the words of the carried byte and ``data``; an odd last byte is carried on."""
         stream = np.frombuffer(byte_view("data", data), dtype=np.uint8)
         if self._odd:
@@ -252,7 +297,11 @@ class Decoder:
         even = stream.size & ~1
         self._odd = stream[even:].tobytes()
         words = stream[:even].view("<u2")
-        return words if words.flags.aligned else words.copy()
+        if not words.flags.aligned:
+            words = words.copy()
+        # One type of array for kernels, whatever the bytes are in.
+        words.flags.writeable = False
+        return words
 
 
 def _trigger_arrays(size: int) -> _TriggerArrays:
@@ -265,6 +314,10 @@ def _trigger_arrays(size: int) -> _TriggerArrays:
 
 _WORDS = types.Array(uint16, 1, "C", readonly=True)
 _TRIGGERS = types.NamedTuple((int64[::1], uint8[::1], uint8[::1]), _TriggerArrays)
+_MEMORY = types.NamedTuple(
+    (int64, int64, typeof(record(*_STATE)), typeof(record(*_COUNTS)), int64[::1], _TRIGGERS),
+    DecoderMemory,
+)
 
 
 @kernel
@@ -293,9 +346,8 @@ def _bounds(words):
 
 
 @kernel
-def _skip_to_time(words, c):
-    """Return the index of the first TIME_HIGH; count the words and events before it."""
-    i = np.uint64(0)
+def _skip_to_time(words, i, c):
+    """Return the index of the first TIME_HIGH from ``i`` on; count what is before it."""
     while i < np.uint64(words.size) and words[i] >> 12 != w3.TIME_HIGH:
         lost = np.int64(_event_count(words[i]))
         c.events_before_time += lost
@@ -412,7 +464,25 @@ def _continue_others(words, i, s, c):
 
 
 @kernel
-def _vector(mask, bits, s, c, out, n):
+def emit(sink, n, t_us, column, row, polarity):
+    """Store an event."""
+    sink.t[n] = t_us
+    sink.x[n] = np.uint16(column)
+    sink.y[n] = np.uint16(row)
+    sink.p[n] = np.uint8(polarity)
+    return n + np.uint64(1)
+
+
+@kernel
+def _is_late(mask, bits, s):
+    """Return true when a vector's first event on the sensor is too late to decode."""
+    if s.late == _IN_TIME or s.base >= s.limit:
+        return False
+    shown = min(s.limit - s.base, np.int64(bits))
+    return mask & ((np.uint64(1) << np.uint64(shown)) - np.uint64(1)) != np.uint64(0)
+
+
+def _vector(mask, bits, s, c, sink, n):
     """Emit a vector of ``bits`` pixels at the base with every check; return the event count."""
     base = s.base
     dropped = np.int64(0)
@@ -420,11 +490,7 @@ def _vector(mask, bits, s, c, out, n):
         if mask >> np.uint64(k) & np.uint64(1):
             column = base + np.int64(k)
             if column < s.limit:
-                out.t[n] = s.t_us
-                out.x[n] = np.uint16(column)
-                out.y[n] = np.uint16(s.row)
-                out.p[n] = np.uint8(s.polarity)
-                n += np.uint64(1)
+                n = emit(sink, n, s.t_us, column, s.row, s.polarity)
             else:
                 dropped += 1
     if base >= _NO_BASE:
@@ -443,9 +509,8 @@ def _vector(mask, bits, s, c, out, n):
     return n
 
 
-@kernel
-def _triple_by_words(words, i, s, c, out, n):
-    """Emit vector words one at a time until their triple is complete, broken or cut.
+def _triple_by_words(words, i, s, c, sink, n):
+    """Emit vector words one at a time until their triple is complete, broken, cut or late.
 
     Returns the next word's index and the event count.
     """
@@ -453,11 +518,17 @@ def _triple_by_words(words, i, s, c, out, n):
         word = np.uint64(words[i])
         kind = word >> np.uint64(12)
         if kind == w3.VECT_12 and s.triple < 2:
-            n = _vector(word & np.uint64(0xFFF), np.uint64(12), s, c, out, n)
+            if _is_late(word & np.uint64(0xFFF), 12, s):
+                s.late = _STOPPED
+                break
+            n = _vector(word & np.uint64(0xFFF), np.uint64(12), s, c, sink, n)
             s.triple += 1
             i += np.uint64(1)
         elif kind == w3.VECT_8 and s.triple == 2:
-            n = _vector(word & np.uint64(0xFF), np.uint64(8), s, c, out, n)
+            if _is_late(word & np.uint64(0xFF), 8, s):
+                s.late = _STOPPED
+                break
+            n = _vector(word & np.uint64(0xFF), np.uint64(8), s, c, sink, n)
             s.triple = 0
             i += np.uint64(1)
             break
@@ -480,50 +551,43 @@ def _drop_x(c, row, limit):
     c.events_without_y += 1
 
 
-@kernel(
-    types.UniTuple(uint64, 2)(
-        _WORDS,
-        int64,
-        int64,
-        typeof(record(*_STATE)),
-        typeof(record(*_COUNTS)),
-        EVENT_ARRAYS,
-        _TRIGGERS,
-    )
-)
-def _decode(words, width, height, s, c, out, triggers):
-    """Decode all ``words``; return the numbers of events and triggers written.
+def _decode(words, i, until_us, through, memory, sink):
+    """Decode ``words`` from ``i`` on; return the next index, the numbers of events and triggers.
 
-    ``out`` and ``triggers`` hold at least ``_bounds(words)`` entries.
+    The pass stops before the first event at ``until_us`` or later, and without ``through`` before
+    the first trigger.
     """
-    t_out, x_out, y_out, p_out = out
+    width, height, s, c, _, triggers = memory
     end = np.uint64(words.size)
     one = np.uint64(1)
-    i = np.uint64(0)
     n = np.uint64(0)
     m = np.uint64(0)
     if s.run != _RUNNING:
-        i = _skip_to_time(words, c)
+        i = _skip_to_time(words, i, c)
     t = s.t_us
     floor = s.floor_us
     mark = np.uint64(0)
     row = s.row
-    limit = s.limit
+    s.late = _LATE if t >= until_us else _IN_TIME
     if i < end and s.triple > 0:
-        i, n = _triple_by_words(words, i, s, c, out, n)
+        i, n = _triple_by_words(words, i, s, c, sink, n)
+        if s.late == _STOPPED:
+            end = i
     if i < end and s.others_parts > 0:
         i = _continue_others(words, i, s, c)
     base = s.base
     polarity = np.uint8(s.polarity)
+    # Late events take the way of those outside the sensor, so that others need no comparison.
+    shown = 0 if s.late else width
+    limit = shown if np.uint64(row) < np.uint64(height) else 0
     while i < end:
         word = np.uint32(words[i])
         kind = word >> np.uint32(12)
         i += one
         if kind == w3.ADDR_Y:
             row = np.int64(word & np.uint32(0x7FF))
-            limit = width if row < height else 0
-            if limit == 0:
-                c.y_past_height += 1
+            limit = shown if row < height else 0
+            c.y_past_height += row >= height
             if i >= end:
                 break
             # The usual successor, without another turn of the loop.
@@ -535,13 +599,13 @@ def _decode(words, width, height, s, c, out, triggers):
         if kind == w3.ADDR_X:
             x = np.int64(word & np.uint32(0x7FF))
             if x < limit:
-                t_out[n] = t
-                x_out[n] = np.uint16(x)
-                y_out[n] = np.uint16(row)
-                p_out[n] = np.uint8((word >> np.uint32(11)) & np.uint32(1))
-                n += one
+                n = emit(sink, n, t, x, row, (word >> np.uint32(11)) & np.uint32(1))
             else:
-                _drop_x(c, row, limit)
+                limit_x = width if np.uint64(row) < np.uint64(height) else 0
+                if x < limit_x:
+                    i -= one
+                    break
+                _drop_x(c, row, limit_x)
         elif kind == w3.VECT_12:
             if (
                 i + one < end
@@ -558,17 +622,15 @@ def _decode(words, width, height, s, c, out, triggers):
                 first = base
                 base += 32
                 while mask != np.uint64(0):
-                    t_out[n] = t
-                    x_out[n] = np.uint16(first + np.int64(ctz64(mask)))
-                    y_out[n] = np.uint16(row)
-                    p_out[n] = polarity
-                    n += one
+                    n = emit(sink, n, t, first + np.int64(ctz64(mask)), row, polarity)
                     mask &= mask - one
             else:
-                s.t_us, s.row, s.limit = t, row, limit
-                s.base, s.polarity = base, polarity
-                i, n = _triple_by_words(words, i - one, s, c, out, n)
+                s.t_us, s.row, s.base, s.polarity = t, row, base, polarity
+                s.limit = width if np.uint64(row) < np.uint64(height) else 0
+                i, n = _triple_by_words(words, i - one, s, c, sink, n)
                 base = s.base
+                if s.late == _STOPPED:
+                    break
         elif kind == w3.VECT_BASE_X:
             base = np.int64(word & np.uint32(0x7FF))
             polarity = np.uint8((word >> np.uint32(11)) & np.uint32(1))
@@ -583,22 +645,35 @@ def _decode(words, width, height, s, c, out, triggers):
             if t < floor:
                 c.time_low_back += 1
                 t = floor
+            s.late = _LATE if t >= until_us else _IN_TIME
+            shown = 0 if s.late else width
+            limit = shown if np.uint64(row) < np.uint64(height) else 0
         elif kind == w3.TIME_HIGH:
             if n + m != mark:
                 mark = n + m
                 floor = t
             t = _time_high(s, c, np.int64(word & np.uint32(0xFFF)), floor)
+            s.late = _LATE if t >= until_us else _IN_TIME
+            shown = 0 if s.late else width
+            limit = shown if np.uint64(row) < np.uint64(height) else 0
         elif kind == w3.EXT_TRIGGER:
+            if not through:
+                i -= one
+                break
             triggers.t[m] = t
             triggers.channel[m] = np.uint8((word >> np.uint32(8)) & np.uint32(0xF))
             triggers.edge[m] = np.uint8(word & np.uint32(1))
             m += one
         elif kind == w3.VECT_8:
             # It belongs to a triple whose first words are missing.
+            s.t_us, s.row, s.base, s.polarity = t, row, base, polarity
+            s.limit = width if np.uint64(row) < np.uint64(height) else 0
+            mask = np.uint64(word) & np.uint64(0xFF)
+            if _is_late(mask, 8, s):
+                i -= one
+                break
             c.broken_triples += 1
-            s.t_us, s.row, s.limit = t, row, limit
-            s.base, s.polarity = base, polarity
-            n = _vector(np.uint64(word) & np.uint64(0xFF), np.uint64(8), s, c, out, n)
+            n = _vector(mask, np.uint64(8), s, c, sink, n)
             base = s.base
         elif kind == w3.OTHERS:
             _begin_others(s, c, np.int64(word & np.uint32(0xFFF)))
@@ -614,9 +689,30 @@ def _decode(words, width, height, s, c, out, triggers):
     s.t_us = t
     s.floor_us = t if n + m != mark else floor
     s.row = row
-    s.limit = limit
+    s.limit = width if np.uint64(row) < np.uint64(height) else 0
     s.base = base
     s.polarity = polarity
+    s.late = _IN_TIME
     c.events += n
     c.triggers += m
+    return i, n, m
+
+
+def decode_into(emit: Any, name: str) -> Any:
+    """Return ``_decode`` compiled for a kernel ``emit``; ``name`` tells it from others."""
+    vector = with_names(_vector, name, emit=emit)
+    triple = with_names(_triple_by_words, name, _vector=vector)
+    return with_names(_decode, name, emit=emit, _vector=vector, _triple_by_words=triple)
+
+
+_decode_stored = decode_into(emit, "stored")
+
+
+@kernel(types.UniTuple(uint64, 2)(_WORDS, _MEMORY, EVENT_ARRAYS))
+def _decode_events(words, memory, out):
+    """Decode all ``words``; return the numbers of events and triggers written.
+
+    ``out`` and the triggers hold at least ``_bounds(words)`` entries.
+    """
+    _, n, m = _decode_stored(words, np.uint64(0), _FOREVER_US, True, memory, out)
     return n, m

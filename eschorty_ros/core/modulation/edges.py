@@ -186,6 +186,14 @@ class EdgeSchedule:
         self._triggers_us = self._triggers_us[used:]
         return self._edges_us[:n], self._indices[:n]
 
+    def ahead(self, until_us: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+        """Return copies of what `advance` would return, and its ``safe_us``; nothing advances."""
+        before = self._state, self._counts, self._triggers_us, self.safe_us
+        edges_us, indices = (values.copy() for values in self.advance(until_us))
+        safe_us = self.safe_us
+        self._state, self._counts, self._triggers_us, self.safe_us = before
+        return edges_us, indices, safe_us
+
     def _edge_us(self, step: int) -> int:
         return self._state.anchor_us + round(step * self._period)
 

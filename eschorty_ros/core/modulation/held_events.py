@@ -17,19 +17,14 @@ EventArrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 class HeldEvents:
     """A growing queue of events in time order.
 
-    Parameters
-    ----------
-    capacity : int
-        Events for which there is room from the start.
-
     Attributes
     ----------
     refused : int
         Leading events in which no phase was found.
     """
 
-    def __init__(self, capacity: int = _CAPACITY) -> None:
-        self._buffers = tuple(np.empty(capacity, dtype) for dtype in _DTYPES)
+    def __init__(self) -> None:
+        self._buffers = tuple(np.empty(_CAPACITY, dtype) for dtype in _DTYPES)
         self._first = 0
         self._end = 0
         self.refused = 0

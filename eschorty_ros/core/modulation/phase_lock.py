@@ -150,6 +150,16 @@ class PhaseLock:
         self._t[new], self._p[new] = t_us[:size], polarity[:size]
         self._count += size
 
+    @property
+    def tracks(self) -> bool:
+        """Return whether edges are moved by the events of each block."""
+        return self._block_end_us is not None
+
+    @property
+    def observes(self) -> bool:
+        """Return whether more of the block's events have to be observed."""
+        return self._block_end_us is not None and self._count < _EVENTS_MAX
+
     def close_block(self, watermark_us: int) -> bool:
         """Close the block that ends before ``watermark_us``; return whether there was one.
 

@@ -21,6 +21,9 @@ from eschorty_ros.core.storage import Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.core.storage.recording import SETTINGS_FILE
 
+# Bytes of the file that are mapped at a time, in one thread and in several.
+_PASS_BYTES = 1 << 20
+_WINDOWS_BYTES = 1 << 26
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
 
@@ -98,29 +101,19 @@ def reconstruct_recording(
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
     reader = RawReader(recording.events_path)
-    parts: list[Profiles] = []
+    placed = _Placed(recording)
     done = 0
-    for chunk in reader.chunks(1 << 20):
-        parts.extend(_pushed(reconstructor, memoryview(chunk), done, recording.marks))
+    for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
+        for found in _pushed(reconstructor, chunk, done, recording.marks):
+            placed.add(found)
         done += len(chunk)
         if progress is not None:
             progress(done, total)
-    parts.append(reconstructor.flush())
-    profiles = Profiles.concatenate(parts)
-    position = recording.stage.position_mm(profiles.t_us)
-    known = np.isfinite(position)
-    without_stage = int(known.size - known.sum())
-    if recording.scan is not None:
-        known &= recording.scan.between(position)
-    if not known.all():
-        profiles = profiles.select(known)
+    placed.add(reconstructor.flush())
+    profiles, position = placed.joined()
     origin_us = reconstructor.first_t_us or 0
     points = place(
-        profiles,
-        reconstructor.model,
-        position[known],
-        recording.calibration.stage_direction,
-        origin_us,
+        profiles, reconstructor.model, position, recording.calibration.stage_direction, origin_us
     )
     organized = None
     if settings.organized == "on":
@@ -129,7 +122,7 @@ def reconstruct_recording(
     span_us = None if newest_us is None else (origin_us, newest_us)
     seconds = time.perf_counter() - began
     counters = reconstructor.counters
-    counters["points_without_stage"] = without_stage
+    counters["points_without_stage"] = placed.without_stage
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
     warnings = [str(line) for line in reader.warnings] + reconstructor.warnings
     return Result(
@@ -143,6 +136,46 @@ def reconstruct_recording(
         (*warnings, *recording_warnings(recording, used, counters, points, span_us)),
         organized,
     )
+
+
+class _Placed:
+    """Profiles with the stage's position at each point, those outside the scan left out."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._parts: list[tuple[Profiles, NDArray[np.float64]]] = []
+        self.without_stage = 0
+
+    def add(self, profiles: Profiles) -> None:
+        """Append profiles."""
+        position = self._recording.stage.position_mm(profiles.t_us)
+        known = np.isfinite(position)
+        self.without_stage += int(known.size - known.sum())
+        if self._recording.scan is not None:
+            known &= self._recording.scan.between(position)
+        if not known.all():
+            profiles, position = profiles.select(known), position[known]
+        if len(profiles):
+            self._parts.append((profiles, position))
+
+    def joined(self) -> tuple[Profiles, NDArray[np.float64]]:
+        """Return all profiles and positions, and free the parts of an array when it is copied."""
+        parts, self._parts = self._parts, []
+        if not parts:
+            return Profiles.empty(), np.empty(0)
+        position = np.concatenate([position for _, position in parts])
+        arrays: dict[str, Any] = {
+            item.name: [getattr(profiles, item.name) for profiles, _ in parts]
+            for item in fields(Profiles)
+        }
+        parts.clear()
+        return Profiles(**{name: _joined(arrays.pop(name)) for name in list(arrays)}), position
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Return the parts of an array as one; they are ``None`` where it is not estimated."""
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if known else None
 
 
 def recorded_settings(recording: Recording) -> Settings:

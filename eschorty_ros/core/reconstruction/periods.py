@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from eschorty_ros.core.evt3 import Events
+from eschorty_ros.core.evt3 import Decoder, Events
+from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.edges import EDGES_MAX
 from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
-from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler
+from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
 from eschorty_ros.core.reconstruction.profile_length import ProfileLength
 from eschorty_ros.core.reconstruction.windows import WindowAssembler
+
+PASS_WORDS = 1 << 19
+"""Words that one thread decodes in a pass."""
+# Edges are computed so far ahead of them.
+_AHEAD_US = 100_000
 
 
 class PeriodCutter:
@@ -61,6 +68,55 @@ class PeriodCutter:
         self._held.append(arrays)
         if self._begin(watermark_us):
             self._assign_held(watermark_us)
+
+    def _knows_ahead(self) -> bool:
+        """Return whether the next edges are known before their events, and a period is open.
+
+        They are not where triggers set them, and where the phase is tracked the first events of a
+        block have to be seen.
+        """
+        schedule = self.lock.schedule
+        return (
+            schedule.anchored
+            and not schedule.triggered
+            and schedule.first_trigger_us is None
+            and not self.lock.observes
+            and self._assembler.has_begun
+        )
+
+    def add_words(self, words: NDArray[np.uint16], decoder: Decoder, floor_us: int) -> int:
+        """Decode ``words`` and assign their events without storing them; return the words read.
+
+        Fewer than all are read before a trigger and where the next edges are not known. Events
+        before ``floor_us`` count as at that time.
+        """
+        assembler, lock, schedule = self._assembler, self.lock, self.lock.schedule
+        now_us, read, stopped = floor_us, 0, True
+        while stopped and self._knows_ahead():
+            ahead_us = _AHEAD_US if words.size <= PASS_WORDS else END_OF_STREAM_US // 2
+            edges_us, indices, end_us = schedule.ahead(lock.limit(now_us + ahead_us))
+            span, edges = Span(floor_us, end_us), Edges(edges_us, indices)
+            held, used = self._held.arrays, 0
+            if len(self._held):
+                if held[0][-1] >= end_us:
+                    break
+                used = int(np.searchsorted(edges_us, held[0][-1], "right"))
+                assembler.merge(held, _part(held, 0, 0), Edges(edges_us[:used], indices[:used]))
+                edges = Edges(edges_us[used:], indices[used:])
+                self._held.drop(len(self._held))
+            count, more = assembler.merge_words(words[read:], decoder, span, edges)
+            read, used = read + int(count), used + more
+            stopped = read < words.size and int(words[read]) >> 12 != EXT_TRIGGER
+            now_us = max(decoder.settled_us or 0, decoder.newest_us + 1)
+            if stopped:
+                now_us = max(now_us, (decoder.time_us or 0) + 1)
+            edges_us, indices = schedule.advance(lock.limit(now_us))
+            if len(edges_us) > used:
+                nothing = _part(held, 0, 0)
+                assembler.merge(nothing, nothing, Edges(edges_us[used:], indices[used:]))
+            if not lock.close_block(now_us) and stopped:
+                lock.skip_to(now_us - 1)
+        return read
 
     def finish(self, newest_us: int | None) -> None:
         """Assign the events held back, up to ``newest_us``, and close the open period."""

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.evt3 import EventArrays
+from eschorty_ros.core.evt3 import Decoder, EventArrays
+from eschorty_ros.core.evt3.decoder import decode_into
+from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.line.blinking import Blink, blink
 from eschorty_ros.core.line.centroid import (
     _LEARNED,
@@ -23,7 +25,16 @@ from eschorty_ros.core.line.centroid import (
     half_width_fixed,
     make_scratch,
 )
-from eschorty_ros.core.line.columns import Columns, _append, empty_columns, wider_columns
+from eschorty_ros.core.line.columns import (
+    Bins,
+    Columns,
+    _append,
+    _bin,
+    _forget_refused,
+    _needs_room,
+    empty_columns,
+    wider_columns,
+)
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import Footprint, _forget, _learn, make_footprint
 from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
@@ -76,9 +87,12 @@ _COUNTERS = np.dtype(
 )
 # ``status`` is one of the three below, ``half`` the half width of a window for the open period in
 # fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs more room,
-# ``window`` the number of events since the estimate started.
+# ``window`` the number of events since the estimate started, ``over`` 1 where a pass ended with it.
 _STATE = np.dtype(
-    [(name, np.int64) for name in ("period", "edge_us", "status", "half", "rows", "full", "window")]
+    [
+        (name, np.int64)
+        for name in ("period", "edge_us", "status", "half", "rows", "full", "window", "over")
+    ]
 )
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
@@ -120,10 +134,21 @@ class _Memory(NamedTuple):
     window_events: int
 
 
-class _Progress(NamedTuple):
-    """First event and first edge not processed yet."""
+class Span(NamedTuple):
+    """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    event: int
+    With ``one_window`` the pass ends with the window of the estimate.
+    """
+
+    floor_us: int
+    end_us: int
+    one_window: bool = False
+
+
+class _Progress(NamedTuple):
+    """First event, or word, and first edge not processed yet."""
+
+    event: np.int64 | int
     edge: int
 
 
@@ -165,6 +190,38 @@ class ProfileAssembler:
         self._memory.columns.counts[:] = 0
         _begin_window(self._memory, self._state)
 
+    def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
+        """Begin a window, and its first period at an edge, with the settings of ``before``.
+
+        Nothing is counted, and no footprint learned.
+        """
+        self._gate = before._gate
+        self._memory = self._memory._replace(blink=before._memory.blink)
+        self._memory.columns.counts[:] = 0
+        self._counters = np.zeros(1, _COUNTERS)[0]
+        self._state["rows"] = 0
+        self._done = []
+        _forget(self._memory.footprint)
+        _begin_window(self._memory, self._state)
+        self._state["status"] = _EMPTY
+        self._state["edge_us"], self._state["period"] = edges.t_us[edge], edges.period[edge]
+
+    def exchange_footprints(self, other: ProfileAssembler) -> None:
+        """Go on with the footprint of ``other``, which gets that of this one."""
+        mine, others = self._memory.footprint, other._memory.footprint
+        self._memory = self._memory._replace(footprint=others)
+        other._memory = other._memory._replace(footprint=mine)
+
+    @property
+    def window_is_over(self) -> bool:
+        """Return whether the last pass over words ended with the window."""
+        return bool(self._state["over"])
+
+    @property
+    def events_left(self) -> int:
+        """Events after which the window ends, with the profile."""
+        return int(self._memory.window_events - self._state["window"])
+
     @property
     def has_learned(self) -> bool:
         """Return whether a line's footprint was learned since the last ``forget``."""
@@ -174,10 +231,6 @@ class ProfileAssembler:
     def learns(self) -> bool:
         """Return whether the next profile is learned from."""
         return bool(self._memory.footprint.state[3])
-
-    def forget(self) -> None:
-        """Drop the line's footprint."""
-        _forget(self._memory.footprint)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -201,13 +254,56 @@ class ProfileAssembler:
             progress = _merge(
                 *parts, edges, progress, self._gate, self._memory, self._state, self._counters
             )
-            if self._state["full"]:
-                columns = wider_columns(self._memory.columns)
-                self._memory = self._memory._replace(columns=columns)
-                self._state["full"] = 0
+            self._widen()
             if progress.event == size and progress.edge == edges.t_us.size:
                 return
             self._collect()
+
+    @property
+    def has_begun(self) -> bool:
+        """Return whether a period is open."""
+        return bool(self._state["status"] != _CLOSED)
+
+    def merge_words(
+        self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
+    ) -> tuple[np.int64 | int, int]:
+        """Decode words straight into the columns of the open period and of those that follow.
+
+        Parameters
+        ----------
+        words : ndarray of uint16
+        decoder : Decoder
+            Its state is advanced.
+        span : Span
+            The pass stops before the first event at its end or later, and before a trigger.
+        edges : Edges
+            Beginnings of periods before the span's end.
+
+        Returns
+        -------
+        int, int
+            Words read and edges used.
+        """
+        progress = _Progress(0, 0)
+        rows_max = self._memory.output.row.size - self._memory.rows.row.size
+        while True:
+            progress = _merge_words(
+                words, progress, decoder.memory, span, edges, self._gate, self._memory,
+                self._state, self._counters,
+            )  # fmt: skip
+            full, crowded = self._widen(), self._state["rows"] > rows_max
+            if crowded:
+                self._collect()
+            if self.window_is_over or not (full or crowded):
+                return progress
+
+    def _widen(self) -> bool:
+        """Give the columns more room where one is full; return whether it was so."""
+        full = bool(self._state["full"])
+        if full:
+            self._memory = self._memory._replace(columns=wider_columns(self._memory.columns))
+            self._state["full"] = 0
+        return full
 
     def close(self) -> None:
         """Close the open period if it has events; it stays open for further ones."""
@@ -365,6 +461,18 @@ def _close(memory, state, counters):
 
 
 @kernel
+def _count(events, outside, refused, state, counters):
+    """Count the events read of the open period."""
+    state.window += events
+    refusals = outside + refused.over_limit + refused.outside_region + refused.gated
+    counters.events_binned += events - refusals
+    counters.events_outside_sensor += outside
+    counters.events_over_column_limit += refused.over_limit
+    counters.events_outside_roi += refused.outside_region
+    counters.events_gated += refused.gated
+
+
+@kernel
 def _fill(events, first, limit_us, columns, rows, gate, state, counters):
     """Sort the events before ``limit_us`` into the open period; return the index of the next."""
     if state.status == _CLOSED:
@@ -375,15 +483,22 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
         return i
     state.status = _FILLED
     appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
-    state.window += appended.next - first
-    refused = appended.over_limit + appended.outside + appended.outside_region + appended.gated
-    counters.events_binned += appended.next - first - refused
     state.full = appended.full
-    counters.events_over_column_limit += appended.over_limit
-    counters.events_outside_sensor += appended.outside
-    counters.events_outside_roi += appended.outside_region
-    counters.events_gated += appended.gated
+    if not appended.full:
+        _count(appended.next - first, appended.outside, columns.refused, state, counters)
     return appended.next
+
+
+@kernel
+def _begin_period(edges, edge, memory, state, counters):
+    """Close the open period and begin the next at an edge."""
+    if state.status == _FILLED:
+        _close(memory, state, counters)
+    elif state.status == _EMPTY:
+        counters.periods_empty += 1
+    state.status = _EMPTY
+    state.edge_us = edges.t_us[edge]
+    state.period = edges.period[edge]
 
 
 @kernel
@@ -401,15 +516,9 @@ def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
                 return i, edge
         if edge == edges.t_us.size or (i == t.size and not drain):
             return i, edge
-        if state.status == _FILLED:
-            if state.rows > rows_max:
-                return i, edge
-            _close(memory, state, counters)
-        elif state.status == _EMPTY:
-            counters.periods_empty += 1
-        state.status = _EMPTY
-        state.edge_us = edges.t_us[edge]
-        state.period = edges.period[edge]
+        if state.status == _FILLED and state.rows > rows_max:
+            return i, edge
+        _begin_period(edges, edge, memory, state, counters)
         edge += 1
 
 
@@ -428,3 +537,49 @@ def _merge(held, new, edges, progress, gate, memory, state, counters):
             return _Progress(i, edge)
     i, edge = _merge_part(new, edges, i - size, edge, True, gate, memory, state, counters)
     return _Progress(size + i, edge)
+
+
+_decode_into_bins = decode_into(_bin, "bins")
+
+
+@kernel
+def _merge_words(words, progress, decoder, span, edges, gate, memory, state, counters):
+    """Decode words into the open period and those that begin at the edges.
+
+    It ends before the first event at the end of ``span`` or later, and before a trigger. Words
+    and edges remain when a column or the output has no room.
+    """
+    columns = memory.columns
+    rows_max = memory.output.row.size - memory.rows.row.size
+    i, edge = np.uint64(progress.event), progress.edge
+    state.over = 0
+    while True:
+        limit_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
+        counts, numbers = columns.counts.copy(), decoder.numbers.copy()
+        _forget_refused(columns.refused)
+        bins = Bins(
+            columns.packed, columns.counts, np.uint32(columns.room), columns.row_first,
+            columns.row_span, columns.refused, gate, state.edge_us,
+            max(state.edge_us, span.floor_us),
+        )  # fmt: skip
+        end, events, _ = _decode_into_bins(words, i, limit_us, False, decoder, bins)
+        if _needs_room(columns):
+            columns.counts[:], decoder.numbers[:] = counts, numbers
+            state.full = 1
+            break
+        i = end
+        if events > 0:
+            state.status = _FILLED
+            _count(np.int64(events), 0, columns.refused, state, counters)
+        late = i < np.uint64(words.size) and words[i] >> 12 != EXT_TRIGGER
+        if not late or edge == edges.t_us.size:
+            break
+        if state.status == _FILLED and state.rows > rows_max:
+            break
+        filled = state.status == _FILLED
+        _begin_period(edges, edge, memory, state, counters)
+        edge += 1
+        if span.one_window and filled and state.window == 0:
+            state.over = 1
+            break
+    return _Progress(np.int64(i), edge)

@@ -16,7 +16,7 @@ from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction.periods import PeriodCutter
+from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
 from eschorty_ros.core.reconstruction.profile_length import periods_max
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
@@ -25,7 +25,9 @@ from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 
-_PIECE_BYTES = 1 << 17
+_PIECE_WORDS = 1 << 16
+# Few words more than a block of the phase lock needs events.
+_BLOCK_WORDS = 1 << 13
 _EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
 _STAGE_EDGES_MAX = 1024
@@ -99,10 +101,11 @@ class Reconstructor:
             self._filter = ActivityFilter(model.columns, model.rows)
         self._assembler: ProfileAssembler | WindowAssembler
         # A learned footprint follows the whole stream.
-        if integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned":
-            self._assembler = ProfileAssembler(settings, model)
-        else:
-            self._assembler = WindowAssembler(settings, model, jobs)
+        alone = integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned"
+        self._jobs = 1 if alone else jobs
+        self._assembler = (
+            ProfileAssembler(settings, model) if alone else WindowAssembler(settings, model, jobs)
+        )
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
@@ -124,9 +127,18 @@ class Reconstructor:
         data : bytes-like
             EVT3, cut anywhere.
         """
-        view = byte_view("data", data)
-        for begin in range(0, len(view), _PIECE_BYTES):
-            events = self._decoded(view[begin : begin + _PIECE_BYTES])
+        words, begin = self._decoder.words(byte_view("data", data)), 0
+        while begin < words.size:
+            size = _PIECE_WORDS
+            if self._filter is None:
+                alone = self._jobs == 1 or self._periods.lock.tracks
+                read = self._add_words(words[begin:][: PASS_WORDS if alone else None])
+                begin += read
+                if read:
+                    continue
+                size = _BLOCK_WORDS if self._periods.lock.observes else _PIECE_WORDS
+            events = self._decoded(words[begin : begin + size])
+            begin += size
             if events is not None:
                 self._periods.add(self._filtered(events), self._watermark_us)
         rows = self._with_reflectance(self._assembler.take())
@@ -144,9 +156,20 @@ class Reconstructor:
         rows = self._compensated(rows, last=True)
         return self._with_ranges(rows)
 
-    def _decoded(self, piece: memoryview) -> Events | None:
+    def _add_words(self, words: NDArray[np.uint16]) -> int:
+        """Decode words into periods without storing the events; return the number read."""
+        before = self._decoder.counters.events
+        read = self._periods.add_words(words, self._decoder, self._watermark_us)
+        events = self._decoder.counters.events - before
+        if events:
+            self.newest_t_us = max(self._decoder.newest_us, self._watermark_us)
+            self._counts["events"] += events
+        self._watermark_us = max(self._watermark_us, self._decoder.settled_us or 0)
+        return read
+
+    def _decoded(self, piece: NDArray[np.uint16]) -> Events | None:
         """Return the events of ``piece``, or ``None`` before the stream's first time."""
-        events = self._decoder.decode(piece)
+        events = self._decoder.decode_words(piece)
         settled_us = self._decoder.settled_us
         if settled_us is None:
             return None

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from eschorty_ros.core.evt3 import Encoder
+from eschorty_ros.core.evt3 import Decoder, Encoder
+from eschorty_ros.core.evt3.cuts import Cut, next_cut
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
@@ -36,6 +39,11 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
         row.ravel().astype(np.uint16),
         np.ones(t.size, np.uint8),
     )
+    settings = replace(settings or Settings(), periods_per_profile=1)
     reconstructor = Reconstructor(calibration, modulation, settings)
-    reconstructor.push(data)
+    # With the first piece the phase is known, and the second is decoded straight into columns.
+    for piece in (data[: len(data) // 2], data[len(data) // 2 :]):
+        reconstructor.push(piece)
     reconstructor.flush()
+    decoder = Decoder(calibration.columns, calibration.rows)
+    next_cut(decoder.words(data), Cut(0, 0), np.zeros(1, np.int64), 1, decoder)

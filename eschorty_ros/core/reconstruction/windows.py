@@ -1,4 +1,4 @@
-"""Windows of a stream assembled at the same time, each by a thread of its own."""
+"""Windows of a stream reconstructed at the same time, each by a thread of its own."""
 
 from __future__ import annotations
 
@@ -7,50 +7,42 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.evt3.cuts import Cut, next_cut
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
+from eschorty_ros.core.modulation.held_events import EventArrays
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import profile_assembler
-from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler
+from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
 
 JOBS_MAX = 256
 
-_NO_EVENTS = np.empty(0, "i8"), np.empty(0, "u2"), np.empty(0, "u2"), np.empty(0, "u1")
-_NO_EDGES = Edges(np.empty(0, np.int64), np.empty(0, np.int64))
-
 
 class _Window(NamedTuple):
-    """The events of a window, and the edges from its first to the one that ends it.
+    """A window that a thread assembles: where it begins, and the cut at its end.
 
-    ``every`` is the number of periods in a profile; ``last`` closes the open period.
+    ``first`` holds the decoder's state at the beginning.
     """
 
-    events: HeldEvents
-    edges: list[Edges]
-    modulation: Modulation
-    every: int
-    last: bool = False
-
-
-class _Assembled(NamedTuple):
-    """A window with its rows and counts, and whether a footprint was learned in it."""
-
-    window: _Window
-    rows: LineRows
-    counts: Counter[str]
-    learned: bool
+    begin: Cut
+    first: Decoder
+    decoder: Decoder
+    assembler: ProfileAssembler
+    end: Future[Cut]
 
 
 class WindowAssembler:
-    """A `ProfileAssembler` that gives each window of `WINDOW_EVENTS` events to another thread.
+    """A `ProfileAssembler` that turns windows of `WINDOW_EVENTS` events into rows on all cores.
 
-    Kernels release the interpreter's lock. The rows and counts are those of one assembler, in the
-    same order; as many windows as threads and one more are in memory. ``close`` ends the stream.
-    A window with lines that the sensor's edge cuts needs the footprint learned before it: it is
-    assembled again, after the windows before it.
+    A window begins without knowledge of the events before it, so that any thread can decode it from
+    the words' place on: a pass that only counts events finds where, and with which decoder's state.
+    That is compared with the state in which the window before ends. Where they differ, in a stream
+    with faults, and where a footprint was learned, the window is assembled again, behind the one
+    before it. So rows and counts are those of one assembler, in the same order.
 
     Parameters
     ----------
@@ -64,117 +56,120 @@ class WindowAssembler:
     def __init__(self, settings: Settings, model: RangeModel, jobs: int) -> None:
         self._jobs = jobs
         self._pool = ThreadPoolExecutor(jobs, "window")
-        self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs))
-        self._serial = ProfileAssembler(settings, model)
-        # Room for the profile in which the window becomes full, too.
-        capacity = profile_assembler.WINDOW_EVENTS * 5 // 4
-        self._buffers = deque(HeldEvents(capacity) for _ in range(jobs + 2))
-        self._running: deque[Future[_Assembled]] = deque()
+        self._open = ProfileAssembler(settings, model)
+        self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs + 1))
         self._done: list[LineRows] = []
-        self._counts = Counter(self._serial.counters)
+        self._counts: Counter[str] = Counter()
+        self._at = Cut(0, 0)
 
     def restart(self, modulation: Modulation, every: int) -> None:
-        """Drop the open window; further events belong to profiles of ``every`` periods."""
-        self._window = _Window(self._buffers.popleft(), [], modulation, every)
-        # Events of the open window before its first edge.
-        self._outside = 0
+        """Drop the open period; further events belong to profiles of ``every`` periods."""
+        self._open.restart(modulation, every)
+
+    @property
+    def has_begun(self) -> bool:
+        """Return whether a period is open."""
+        return self._open.has_begun
 
     @property
     def counters(self) -> dict[str, int]:
-        """Counts by name, complete after ``close``."""
-        return dict(self._counts)
+        """Counts by name."""
+        counts = Counter(self._open.counters)
+        counts.update(self._counts)
+        return dict(counts)
 
     def merge(self, held: EventArrays, new: EventArrays, edges: Edges) -> None:
-        """Add events and edges to the open window, and begin others where it is full.
-
-        Parameters
-        ----------
-        held, new : tuple of ndarray
-            Times in us, columns, rows and polarities in time order, first those of ``held``.
-        edges : Edges
-            No more events come before the last one.
-        """
-        size = held[0].size + new[0].size
-        before = np.searchsorted(held[0], edges.t_us) + np.searchsorted(new[0], edges.t_us)
-        event = edge = 0
-        while edge < before.size:
-            ahead = len(self._window.events) - event + before[edge:]
-            if not self._window.edges:
-                self._outside = int(ahead[0])
-            full = ahead - self._outside >= profile_assembler.WINDOW_EVENTS
-            if not full.any():
-                break
-            last = edge + int(np.argmax(full))
-            self._append(held, new, event, int(before[last]))
-            self._window.edges.append(_part(edges, edge, last + 1))
-            self._submit()
-            self._window.edges.append(_part(edges, last, last + 1))
-            event, edge = int(before[last]), last + 1
-        self._append(held, new, event, size)
-        if edge < before.size:
-            self._window.edges.append(_part(edges, edge, before.size))
+        """Assign events to periods, in this thread; see `ProfileAssembler.merge`."""
+        self._open.merge(held, new, edges)
 
     def close(self) -> None:
-        """Close the open period if it has events, and wait for all windows."""
-        self._submit(last=True)
-        while self._running:
-            self._collect()
-        self._pool.shutdown()
+        """Close the open period if it has events; it stays open for further ones."""
+        self._open.close()
 
     def take(self) -> LineRows:
-        """Return the rows of the windows done since the last call, in order."""
-        while self._running and self._running[0].done():
-            self._collect()
-        done, self._done = self._done, []
+        """Return the rows of the periods closed since the last call."""
+        done, self._done = [*self._done, self._open.take()], []
         return LineRows.concatenate(done)
 
-    def _append(self, held: EventArrays, new: EventArrays, begin: int, end: int) -> None:
-        first = held[0].size
-        for events, offset in ((held, 0), (new, first)):
-            a, b = max(begin - offset, 0), max(end - offset, 0)
-            if a < min(b, events[0].size):
-                t, x, y, p = events
-                self._window.events.append((t[a:b], x[a:b], y[a:b], p[a:b]))
+    def merge_words(
+        self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
+    ) -> Cut:
+        """Decode words into periods, as `ProfileAssembler.merge_words` does."""
+        if words.size < self._open.events_left // 2:
+            return Cut(*self._open.merge_words(words, decoder, span, edges))
+        self._words, self._span, self._edges = words, span._replace(one_window=True), edges
+        self._decoder, self._first_decoder = decoder, decoder
+        probe, cut, left, going = _copy(decoder), Cut(0, 0), self._open.events_left, True
+        running = deque([self._start(cut, decoder, decoder, self._open)])
+        while going:
+            found = next_cut(words, cut, edges.t_us, left, probe)
+            if found is None:
+                break
+            cut, left = found, profile_assembler.WINDOW_EVENTS
+            if len(running) > self._jobs:
+                going = self._accept(running.popleft(), going)
+            assembler = self._idle.popleft()
+            assembler.begin_window(edges, cut.edge - 1, self._open)
+            running.append(self._start(cut, _copy(probe), _copy(probe), assembler))
+        while running:
+            going = self._accept(running.popleft(), going)
+        while going:
+            going = self._go_on()
+        if self._decoder is not decoder:
+            decoder.add_counts(self._decoder)
+            decoder.go_on_from(self._decoder)
+        # The words may be those of a file that is to be closed.
+        self._words = words[:0].copy()
+        return self._at
 
-    def _submit(self, last: bool = False) -> None:
-        while len(self._running) > self._jobs:
-            self._collect()
-        window = self._window._replace(last=last)
-        self._running.append(self._pool.submit(self._assemble_apart, window))
-        self._window = window._replace(events=self._buffers.popleft(), edges=[])
-        self._outside = 0
+    def _start(
+        self, begin: Cut, first: Decoder, decoder: Decoder, assembler: ProfileAssembler
+    ) -> _Window:
+        end = self._pool.submit(self._assemble, begin, decoder, assembler)
+        return _Window(begin, first, decoder, assembler, end)
 
-    def _collect(self) -> None:
-        """Wait for the first window that runs; keep its rows and counts."""
-        done = self._running.popleft().result()
-        if done.learned or self._serial.learns:
-            done = _assembled(self._serial, done.window)
-        self._done.append(done.rows)
-        self._counts.update(done.counts)
-        events = done.window.events
-        events.drop(len(events))
-        self._buffers.append(events)
+    def _assemble(self, begin: Cut, decoder: Decoder, assembler: ProfileAssembler) -> Cut:
+        """Assemble a window from ``begin`` on; return where it ends."""
+        words, edges = self._words[begin.word :], self._edges
+        later = Edges(edges.t_us[begin.edge :], edges.period[begin.edge :])
+        read, used = assembler.merge_words(words, decoder, self._span, later)
+        return Cut(int(begin.word + read), begin.edge + used)
 
-    def _assemble_apart(self, window: _Window) -> _Assembled:
-        assembler = self._idle.popleft()
-        assembler.forget()
-        done = _assembled(assembler, window)
-        self._idle.append(assembler)
-        return done
+    def _go_on(self) -> bool:
+        """Assemble the window behind the last one in this thread; return whether it is over."""
+        self._at = self._assemble(self._at, self._decoder, self._open)
+        return self._open.window_is_over
+
+    def _accept(self, window: _Window, going: bool) -> bool:
+        """Wait for a window and append it to those before it; return whether it is over.
+
+        Without ``going`` it is dropped.
+        """
+        end, assembler = window.end.result(), window.assembler
+        if assembler is self._open:
+            self._at = end
+            return assembler.window_is_over
+        learned = assembler.has_learned or self._open.learns
+        if (
+            not going
+            or learned
+            or window.begin != self._at
+            or not self._decoder.is_at(window.first)
+        ):
+            self._idle.append(assembler)
+            return going and self._go_on()
+        assembler.exchange_footprints(self._open)
+        self._done.append(self._open.take())
+        self._counts.update(self._open.counters)
+        if self._decoder is not self._first_decoder:
+            self._first_decoder.add_counts(self._decoder)
+        self._idle.append(self._open)
+        self._open, self._decoder, self._at = assembler, window.decoder, end
+        return assembler.window_is_over
 
 
-def _assembled(assembler: ProfileAssembler, window: _Window) -> _Assembled:
-    before = Counter(assembler.counters)
-    assembler.restart(window.modulation, window.every)
-    t_us, period = (np.concatenate(values) for values in zip(_NO_EDGES, *window.edges, strict=True))
-    assembler.merge(_NO_EVENTS, window.events.arrays, Edges(t_us, period))
-    if window.last:
-        assembler.close()
-    counts = Counter(assembler.counters)
-    counts.subtract(before)
-    return _Assembled(window, assembler.take(), counts, assembler.has_learned)
-
-
-def _part(edges: Edges, begin: int, end: int) -> Edges:
-    """Return a copy of some edges."""
-    return Edges(edges.t_us[begin:end].copy(), edges.period[begin:end].copy())
+def _copy(decoder: Decoder) -> Decoder:
+    """Return a decoder in the same state, with nothing counted."""
+    copy = Decoder(decoder.width, decoder.height)
+    copy.go_on_from(decoder)
+    return copy

@@ -7,6 +7,7 @@ header stops at the first two bytes that are not ``% ``.
 from __future__ import annotations
 
 import datetime
+import mmap
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -97,6 +98,28 @@ class RawReader:
     def __iter__(self) -> Iterator[bytes]:
         return self.chunks()
 
+    def mapped(self, size: int) -> Iterator[memoryview]:
+        """Iterate over the words' bytes as `chunks` does, without copies: views of a memory map.
+
+        The pages of a view are given back to the system when the next one is asked for.
+        """
+        integer("size", size, mmap.PAGESIZE, 1 << 40)
+        first = self.header.size_bytes
+        with open_regular_file(self.path, FormatError) as file:
+            end = os.fstat(file.fileno()).st_size
+            if end <= first:
+                return
+            pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        for begin in range(first, end, size):
+            yield memoryview(pages)[begin : begin + size]
+            page = begin - begin % mmap.PAGESIZE
+            pages.madvise(mmap.MADV_DONTNEED, page, min(begin + size, end) - page)
+        self._check_end(end - first)
+
+    def _check_end(self, total: int) -> None:
+        if total % 2:
+            self._warn("ends in the middle of a word; its last byte is not decoded")
+
     def _chunks(self, size: int, begin: int) -> Iterator[bytes]:
         total = begin
         with open_regular_file(self.path, FormatError) as file:
@@ -104,8 +127,7 @@ class RawReader:
             while piece := file.read(size):
                 total += len(piece)
                 yield piece
-        if total % 2:
-            self._warn("ends in the middle of a word; its last byte is not decoded")
+        self._check_end(total)
 
     def _warn(self, what: str) -> None:
         line = f"{self.path} {what}"

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from streams import RECORDING_SHARES, recording_like_words, words_of
 
 from eschorty_ros.core import evt3
+from eschorty_ros.core.evt3.decoder import _decode_stored, _trigger_arrays
+from eschorty_ros.core.evt3.events import event_arrays
 from eschorty_ros.core.storage.raw_file import RawReader
 
 RECORDING = Path(__file__).parents[4] / "shared/data/evt3_gen41_sample.raw"
@@ -202,14 +204,36 @@ def test_any_split_gives_the_same(words: list[int], cuts: list[int]) -> None:
     assert (events, triggers, decoder.counters) == decoded(data)
 
 
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(any_words(), st.lists(st.integers(0, 2000), max_size=6))
+def test_passes_that_stop_before_late_events_give_the_same(
+    words: list[int], stops: list[int]
+) -> None:
+    """As the reconstruction decodes: up to the end of a period, then on from there."""
+    data = np.array(words, dtype="<u2")
+    expected, triggers, counters = decoded(data.tobytes())
+    t_us = sorted(expected[k % len(expected)][0] + k % 2 for k in stops if expected)
+    decoder, i, events, found = evt3.Decoder(), 0, [], []
+    memory = decoder.memory._replace(triggers=_trigger_arrays(data.size))
+    for until_us in (*t_us, 1 << 62):
+        out = event_arrays(12 * data.size)
+        i, n, m = _decode_stored(data, np.uint64(i), until_us, True, memory, out)
+        events += list(zip(*(values[:n].tolist() for values in out), strict=True))
+        found += list(zip(*(values[:m].tolist() for values in memory.triggers), strict=True))
+        assert all(event[0] < until_us for event in events)
+    assert (int(i), events, found) == (data.size, expected, triggers)
+    assert decoder.counters == counters
+
+
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.binary(max_size=400))
 def test_random_bytes_stay_inside_the_buffers(data: bytes) -> None:
     decoder, words, guard = evt3.Decoder(), len(data) // 2, 64
-    buffers = decoder._events, decoder._triggers = tuple(
+    buffers = tuple(
         type(arrays)(*(np.full(size + guard, 77, array.dtype) for array in arrays))
-        for arrays, size in ((decoder._events, 12 * words), (decoder._triggers, words))
+        for arrays, size in ((decoder._events, 12 * words), (decoder.memory.triggers, words))
     )
+    decoder._events, decoder._memory = buffers[0], decoder.memory._replace(triggers=buffers[1])
     events = decoder.decode(data)
     for arrays, written in zip(buffers, (len(events), len(events.triggers)), strict=True):
         assert all((array[written:] == 77).all() for array in arrays)

@@ -18,6 +18,7 @@ from eschorty_ros.core.reconstruction import (
     place,
     place_link,
     profile_assembler,
+    windows,
 )
 
 SEED = 77
@@ -99,17 +100,35 @@ def test_any_split_gives_the_same_points_and_counts(case):
 
 @pytest.mark.parametrize("case", [*SPLIT_CASES, "returns", "compensation"])
 def test_threads_give_the_same_points_and_counts(case, monkeypatch):
-    """With windows of a few periods each, so that there are many."""
+    """With windows of a few periods each, so that there are many, in a stream with faults too."""
     monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 20_000)
+    rng = np.random.default_rng(SEED)
     more = {"returns": {"returns": "all"}, "compensation": {"reflectance_compensation": "on"}}
     stream, modulation, settings = SPLIT_CASES.get(case, SPLIT_CASES["edge"])
     settings = replace(settings, **more.get(case, {}))
-    serial, a = reconstruct(stream, modulation, settings, range(0, len(stream), 9973))
-    for jobs in (2, 5):
-        parallel = Reconstructor(CALIBRATION, modulation, settings, jobs)
-        parts = [parallel.push(stream[k : k + 7001]) for k in range(0, len(stream), 7001)]
-        assert_same(serial, Profiles.concatenate([*parts, parallel.flush()]))
-        assert a.counters == parallel.counters
+    faulty = np.frombuffer(stream, "<u2").copy()
+    faulty[rng.integers(0, faulty.size, 40)] = rng.integers(0, 1 << 16, 40)
+    for data in (stream, faulty.tobytes()):
+        half = len(data) // 2 + 1
+        serial, a = reconstruct(data, modulation, settings, [half])
+        for jobs in (2, 5):
+            parallel = Reconstructor(CALIBRATION, modulation, settings, jobs)
+            parts = [parallel.push(data[k : k + half]) for k in range(0, len(data), half)]
+            assert_same(serial, Profiles.concatenate([*parts, parallel.flush()]))
+            assert a.counters == parallel.counters
+
+
+def test_windows_are_found_without_decoding_what_is_before_them(monkeypatch):
+    """None is assembled by itself, behind the one before it."""
+    monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 30_000)
+    monkeypatch.delattr(windows.WindowAssembler, "_go_on")
+    stream, modulation, settings = SPLIT_CASES["edge"]
+    parallel = Reconstructor(CALIBRATION, modulation, settings, 2)
+    found = Profiles.concatenate(
+        [parallel.push(stream[:2000]), parallel.push(stream[2000:]), parallel.flush()]
+    )
+    assert_same(found, reconstruct(stream, modulation, settings)[0])
+    assert parallel.counters["events"] > 2 * 30_000
 
 
 def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():

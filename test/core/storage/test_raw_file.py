@@ -46,6 +46,15 @@ def test_chunks_have_the_size_asked_for(tmp_path: Path) -> None:
     assert [len(piece) for piece in reader.chunks(32)] == [32, 32, 16]
 
 
+def test_a_mapped_file_gives_the_same_bytes(tmp_path: Path) -> None:
+    reader = reader_of(tmp_path, NEW + WORDS * 5000 + b"?")
+    pieces = list(reader.mapped(4096))
+    assert {len(piece) for piece in pieces[:-1]} == {4096}
+    assert b"".join(pieces) == WORDS * 5000 + b"?"
+    assert "middle of a word" in reader.warnings[0]
+    assert list(reader_of(tmp_path, NEW).mapped(4096)) == []
+
+
 def test_odd_byte_is_a_warning(tmp_path: Path) -> None:
     reader = reader_of(tmp_path, NEW + WORDS[:-1])
     assert b"".join(reader) == WORDS[:-1]
