@@ -239,7 +239,7 @@ def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | 
 
 
 class SweepProgress:
-    """The share of a scan's way between start and stop that the stage has gone, of all passes."""
+    """The share of a scan's way between start and stop, of all passes, that is reconstructed."""
 
     def __init__(self, request: ScanRequest) -> None:
         self._ends_mm = sorted((request.start_mm, request.stop_mm))
@@ -248,10 +248,8 @@ class SweepProgress:
         self._last_mm: float | None = None
 
     def share(self, phase: str, position_mm: float) -> float:
-        """Return the share, 0 to 1, when the stage is at a position in ``phase``."""
-        if phase == "finishing":
-            return 1.0
-        if phase != "sweeping" or math.isnan(position_mm):
+        """Return the share, 0 to 1, when the newest point is of a stage position in ``phase``."""
+        if phase not in ("sweeping", "finishing") or math.isnan(position_mm):
             return 0.0
         position_mm = min(max(position_mm, self._ends_mm[0]), self._ends_mm[1])
         if self._last_mm is not None:
