@@ -1,5 +1,6 @@
 """`eschorty scan` over real DDS: cloud, picture, figures; the laser is off however it ends."""
 
+import json
 import signal
 
 import numpy as np
@@ -36,9 +37,14 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     assert f"{measured.error_median_mm:.3f} mm" in stdout
     assert f"{measured.error_p95_mm:.3f} mm" in stdout
     assert (tmp_path / "scan" / "scan.png").read_bytes().startswith(b"\x89PNG")
-    done = CliRunner().invoke(main, ["reconstruct", str(rec)])
+    done = CliRunner().invoke(main, ["reconstruct", str(rec), "--json"])
     assert done.exit_code == 0, done.output
     assert "warning" not in done.stderr
+    score = json.loads(done.stdout)["score"]
+    assert score["error_median_mm"] == pytest.approx(measured.error_median_mm, rel=0.03)
+    assert (score["periods"], score["completeness"]) == pytest.approx(
+        (measured.periods, measured.completeness), rel=0.01
+    )
     cloud = read_cloud(rec / "cloud.pcd")
     assert read_cloud(rec / "cloud.pcd", organized=True).shape == made.shape
     names = ["x", "z", "intensity", "sigma", "column", "flags"]
