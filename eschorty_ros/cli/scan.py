@@ -123,6 +123,7 @@ def command(
         page=(host, port) if live else None,
         organized=organized,
     )
+    one_scan.check_job(job)
     if live:
         load_viser()
         click.echo(f"page at http://{host}:{port}", err=True)

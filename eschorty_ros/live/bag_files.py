@@ -109,6 +109,10 @@ class BagReader:
         """Return whether the bag has messages of a type."""
         return any(item.msgcount for item in self._chosen.get(kind, ()))
 
+    def counts(self) -> dict[str, int]:
+        """Return the number of messages of each topic."""
+        return {item.topic: item.msgcount for item in self._reader.connections}
+
     @property
     def custom(self) -> dict[str, str]:
         """Custom data of the bag's metadata."""
