@@ -7,6 +7,8 @@ html_theme = "furo"
 html_title = "eschorty_ros"
 html_show_copyright = False
 html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 # Headings get the names that GitHub gives them, so that links work in both.
 myst_heading_anchors = 4
 # The pages' indented blocks are commands.
