@@ -1,8 +1,9 @@
 # make setup  everything the others need; then `. .build/setup.sh` for a shell with it
 # make scan   a simulated scan: cloud, picture, error against the truth
 # make report the paper's experiments again: report/index.html
-# make tradeoff speed against error again, and the README's table from it
+# make tradeoff speed against error again, and the table of docs/tradeoff.md from it
 # make faults the fault table of docs/faults.md again, from its tests
+# make docs   the documentation as a site: .build/site/index.html
 # make reference docs/interfaces.md and config/sros2 again, from the nodes
 # make test   every test
 # make test-floor the pure tests with the oldest versions, those of Ubuntu 24.04, in a venv of their own
@@ -45,7 +46,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report tradeoff faults reference picture moving-picture test test-floor quick check lint format types contracts clean
+.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -60,7 +61,22 @@ report: $(SETUP)
 
 tradeoff: $(SETUP)
 	@$(ENTER) eschorty report --out report --only tradeoff
-	@$(ENTER) python -m eschorty_experiments.readme_table report/tradeoff-changes.csv README.md
+	@$(ENTER) python -m eschorty_experiments.tradeoff_page report/tradeoff-changes.csv docs/tradeoff.md
+
+DOCS := $(BUILD)/docs
+
+docs: $(SETUP) $(DOCS)/stamp
+	@$(ENTER) $(DOCS)/bin/python -m sphinx --quiet --fail-on-warning --keep-going docs $(BUILD)/site
+	@echo "$(BUILD)/site/index.html"
+
+# An environment of its own, since Sphinx needs another docutils than ROS; the package's own comes after it.
+$(DOCS)/stamp: requirements/docs.txt $(BUILD)/run.stamp
+	@echo "Installing Sphinx into $(DOCS)"
+	@$(PYTHON) -m venv --clear $(DOCS)
+	@$(DOCS)/bin/pip --disable-pip-version-check install --quiet -r $<
+	@$(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))' \
+	  > "$$($(DOCS)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/run.pth"
+	@touch $@
 
 faults: $(SETUP)
 	@$(ENTER) python docs/faults.py

@@ -13,6 +13,7 @@ import click
 from eschorty_ros.cli.console import pairs, progress_bar, show, table
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.core.base.errors import FitError
+from eschorty_ros.core.optics import SHIPPED
 
 if TYPE_CHECKING:
     from eschorty_ros.core.calibration import CalibrationReport, KnownTarget, Method, Targets
@@ -33,7 +34,7 @@ _BLOCKS = 8
     "--nominal",
     default="config_3",
     show_default=True,
-    help="The build as designed: nominal, config_1, config_2, config_3, or a calibration.yaml.",
+    help=f"The build as designed: {', '.join(SHIPPED)}, or a calibration.yaml.",
 )
 @click.option(
     "--out",

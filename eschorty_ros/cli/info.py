@@ -28,7 +28,7 @@ _SHOWN = (
 @click.command("info")
 @click.argument("path", type=click.Path(exists=True, path_type=Path))
 def command(path: Path) -> None:
-    """Show the content of PATH: a recording folder, any file of it, or a .pcd or .ply cloud.
+    """Show the content of PATH: a recording, any file of it, a rosbag2, or a .pcd or .ply cloud.
 
     \b
     Examples:
@@ -54,8 +54,12 @@ def command(path: Path) -> None:
         read_scan_yaml,
         read_settings_yaml,
     )
+    from eschorty_ros.live.bag_files import BagReader, is_bag
 
-    if path.is_dir():
+    if is_bag(path):
+        with BagReader(path) as bag:
+            pairs(f"{path}: a bag", {topic: f"{n:,}" for topic, n in bag.counts().items()})
+    elif path.is_dir():
         recording = load_recording(path)
         rows = {"calibration": _in_short(recording.calibration)}
         rows |= _laser(recording.modulation) | _stage(recording.stage_samples)

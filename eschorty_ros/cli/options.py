@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from eschorty_ros.core.optics import SHIPPED
 from eschorty_ros.simulation.pixels import PRESETS
 
 _SWEEP = (
@@ -41,7 +42,7 @@ _SWEEP = (
         "--calibration",
         default="config_3",
         show_default=True,
-        help="nominal, config_1, config_2, config_3, or the path of a calibration.yaml.",
+        help=f"{', '.join(SHIPPED)}, or the path of a calibration.yaml.",
     ),
     click.option(
         "--pixels",

@@ -123,6 +123,7 @@ def command(
         page=(host, port) if live else None,
         organized=organized,
     )
+    one_scan.check_job(job)
     if live:
         load_viser()
         click.echo(f"page at http://{host}:{port}", err=True)
@@ -150,7 +151,7 @@ def _check(scene: str, calibration: str) -> None:
 def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     """Write cloud and picture, print the table; DeviceError for a failed or empty scan."""
     from eschorty_ros.core.optics import load_calibration
-    from eschorty_ros.core.storage import write_cloud
+    from eschorty_ros.core.storage import TRUTH_FILE, load_recording, write_cloud, write_truth_csv
     from eschorty_ros.report import accuracy, figures
     from eschorty_ros.simulation.scenes import names as scenes
 
@@ -178,6 +179,11 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         f"{job.calibration}; median |error| {measured.error_median_mm:.2f} mm"
     )
     figures.save(figures.scan_figure(result.points, error_mm, title, direction), out / "scan.png")
+    if result.recording:
+        recording = load_recording(result.recording)
+        known = accuracy.recorded_truth(result.points, truth, recording, sweep)
+        columns = (known[name] for name in ("t_us", "column", "range_mm"))
+        write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
     _print(result, measured, sweep.seconds, out)
 
 

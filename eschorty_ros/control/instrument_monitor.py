@@ -107,6 +107,11 @@ class InstrumentMonitor:
         self.at_rest = abs(velocity_mm_s) < _REST_MM_S
         self.samples.append((t_ns, position_mm))
 
+    def reconstructed_mm(self) -> float:
+        """Return where the stage was at the newest event reconstructed, NaN when not known."""
+        samples = reversed(list(self.samples))
+        return next((mm for t_ns, mm in samples if t_ns <= self.until_ns), math.nan)
+
     def update_heartbeat(self, text: str) -> None:
         """Store a heartbeat of the reconstruction."""
         self._sender, stopped = read_heartbeat(text)

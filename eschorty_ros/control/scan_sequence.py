@@ -176,24 +176,28 @@ class ScanInstrument(Instrument, Protocol):
         """Publish the points collected."""
 
 
-def check_request(request: ScanRequest, limits: ScanLimits) -> None:
-    """Raise ``ArgumentError`` with name, value and remedy unless the scan can be done."""
-    low, high = limits.travel_mm
+def check_request(request: ScanRequest, limits: ScanLimits, unit: str = "m") -> None:
+    """Raise ``ArgumentError`` with name, value and remedy unless the scan can be done.
+
+    Lengths in messages are in ``unit``, ``m`` or ``mm``.
+    """
+    scale = 1.0 if unit == "mm" else 1e-3
+    low, high = (f"{end * scale:g}" for end in limits.travel_mm)
     for name in ("start_mm", "stop_mm"):
         value = getattr(request, name)
-        if not low <= value <= high:
+        if not limits.travel_mm[0] <= value <= limits.travel_mm[1]:
             raise ArgumentError(
-                f"{name[:-3]} is {value * 1e-3:g} m; choose {low * 1e-3:g} to {high * 1e-3:g} m, "
+                f"{name[:-3]} is {value * scale:g} {unit}; choose {low} to {high} {unit}, "
                 "the stage's travel"
             )
     if request.start_mm == request.stop_mm:
         raise ArgumentError(
-            f"start and stop are both {request.start_mm * 1e-3:g} m; choose different ones"
+            f"start and stop are both {request.start_mm * scale:g} {unit}; choose different ones"
         )
     if not SPEED_MIN_MM_S <= request.speed_mm_s <= limits.speed_max_mm_s:
         raise ArgumentError(
-            f"speed is {request.speed_mm_s * 1e-3:g} m/s; choose {SPEED_MIN_MM_S * 1e-3:g} to "
-            f"{limits.speed_max_mm_s * 1e-3:g} m/s"
+            f"speed is {request.speed_mm_s * scale:g} {unit}/s; choose "
+            f"{SPEED_MIN_MM_S * scale:g} to {limits.speed_max_mm_s * scale:g} {unit}/s"
         )
     if not 1 <= request.passes <= PASSES_MAX:
         raise ArgumentError(f"passes is {request.passes}; choose 1 to {PASSES_MAX}")
@@ -239,7 +243,7 @@ def crossing_ns(samples: Sequence[tuple[int, float]], level_mm: float) -> int | 
 
 
 class SweepProgress:
-    """The share of a scan's way between start and stop that the stage has gone, of all passes."""
+    """The share of a scan's way between start and stop, of all passes, that is reconstructed."""
 
     def __init__(self, request: ScanRequest) -> None:
         self._ends_mm = sorted((request.start_mm, request.stop_mm))
@@ -248,10 +252,8 @@ class SweepProgress:
         self._last_mm: float | None = None
 
     def share(self, phase: str, position_mm: float) -> float:
-        """Return the share, 0 to 1, when the stage is at a position in ``phase``."""
-        if phase == "finishing":
-            return 1.0
-        if phase != "sweeping" or math.isnan(position_mm):
+        """Return the share, 0 to 1, when the newest point is of a stage position in ``phase``."""
+        if phase not in ("sweeping", "finishing") or math.isnan(position_mm):
             return 0.0
         position_mm = min(max(position_mm, self._ends_mm[0]), self._ends_mm[1])
         if self._last_mm is not None:

@@ -74,14 +74,17 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._any = _rosbags("highlevel").AnyReader([path], default_typestore=_store())
+        # The definitions in a bag are not used: the library cannot parse every one of ROS's own.
+        self._store = _store()
+        with self._named():
+            self._reader = _rosbags("rosbag2").Reader(path)
         self._chosen: dict[str, Any] = {}
 
     def __enter__(self) -> BagReader:
         with self._named():
-            self._any.open()
+            self._reader.open()
             for kind, topic in TOPICS.items():
-                found = [item for item in self._any.connections if item.msgtype == kind]
+                found = [item for item in self._reader.connections if item.msgtype == kind]
                 ours = [item for item in found if item.topic.endswith(topic.split("/", 2)[2])]
                 found = ours or ([] if kind == CLOCK else found)
                 topics = sorted({item.topic for item in found})
@@ -89,22 +92,31 @@ class BagReader:
                     raise FormatError(
                         f"{self.path} has {kind} on {', '.join(topics)}; leave one of them in it"
                     )
+                if found and found[0].digest not in ("", self._store.hash_rihs01(kind)):
+                    raise FormatError(
+                        f"{self.path} has another {kind} than this version; convert it with the "
+                        "version that recorded it"
+                    )
                 if found:
                     self._chosen[kind] = found
         return self
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Exception):
-            self._any.close()
+            self._reader.close()
 
     def __contains__(self, kind: str) -> bool:
         """Return whether the bag has messages of a type."""
         return any(item.msgcount for item in self._chosen.get(kind, ()))
 
+    def counts(self) -> dict[str, int]:
+        """Return the number of messages of each topic."""
+        return {item.topic: item.msgcount for item in self._reader.connections}
+
     @property
     def custom(self) -> dict[str, str]:
         """Custom data of the bag's metadata."""
-        return dict(self._any.readers[0].storage.metadata.custom or {})
+        return dict(self._reader.storage.metadata.custom or {})
 
     def messages(self, *kinds: str) -> Iterator[BagMessage]:
         """Yield the messages of these types in the order of their arrival."""
@@ -112,8 +124,8 @@ class BagReader:
         if not connections:
             return
         with self._named():
-            for connection, t_ns, data in self._any.messages(connections):
-                fields = self._any.deserialize(data, connection.msgtype)
+            for connection, t_ns, data in self._reader.messages(connections):
+                fields = self._store.deserialize_cdr(data, connection.msgtype)
                 yield BagMessage(connection.msgtype, t_ns, fields)
 
     @contextlib.contextmanager

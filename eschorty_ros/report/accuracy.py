@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import Profiles
-from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage import TRUTH_DTYPE, Recording
 from eschorty_ros.surfaces.profiles import profile_index
 
 # Range per stage travel between two periods of one surface.
@@ -246,16 +246,69 @@ def measure(
         error_mm = range_error_mm(points, scene, model, stage_direction)
     lit: list[NDArray[np.bool_]] = []
     number = np.full(len(points), -1, dtype=np.int64)
+    for mine, positions, within in _passes(points, sweep, stage_direction):
+        before = sum(len(mask) for mask in lit)
+        number[mine] = np.where(within >= 0, within + before, -1)
+        lit.append(lit_columns(scene, model, positions))
+    return _accuracy(points, error_mm, np.concatenate(lit), number)
+
+
+def _passes(
+    points: NDArray[np.void], sweep: Sweep, stage_direction: tuple[float, float, float]
+) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.int64]]]:
+    """Yield which points are of each pass, and its periods as `complete_periods`."""
     turned = replace(sweep, start_mm=sweep.stop_mm, stop_mm=sweep.start_mm)
     of_pass = pass_index(points, sweep, stage_direction)
     for index in range(sweep.passes):
         mine = of_pass == index
         one = turned if index % 2 else sweep
-        positions, within = complete_periods(points[mine], one, stage_direction)
-        before = sum(len(mask) for mask in lit)
-        number[mine] = np.where(within >= 0, within + before, -1)
-        lit.append(lit_columns(scene, model, positions))
-    return _accuracy(points, error_mm, np.concatenate(lit), number)
+        yield mine, *complete_periods(points[mine], one, stage_direction)
+
+
+def recorded_truth(
+    points: NDArray[np.void],
+    scene: KnownScene,
+    recording: Recording,
+    sweep: Sweep,
+) -> NDArray[np.void]:
+    """Return the scene's ranges at the periods of a recorded scan, by its stage's log.
+
+    Parameters
+    ----------
+    points : ndarray of POINT_DTYPE, shape (n,)
+        The scan's cloud: it shows where the periods are.
+    scene : KnownScene
+    recording : Recording
+        Of the scan, as the nodes recorded it.
+    sweep : Sweep
+
+    Returns
+    -------
+    ndarray of TRUTH_DTYPE
+        One row per whole period and column whose line is on the sensor.
+    """
+    samples, calibration = recording.stage_samples, recording.calibration
+    model, every = calibration.model(), np.arange(calibration.columns, dtype=np.int64)
+    at_mm, t_us = samples["position_mm"], samples["t_us"]
+    parts = [np.empty(0, TRUTH_DTYPE)]
+    passes = _passes(points, sweep, calibration.stage_direction)
+    for number, (_, positions, _) in enumerate(passes):
+        for position in positions:
+            below = at_mm < position
+            crossed = np.flatnonzero(below[1:] != below[:-1])[number : number + 1]
+            if not crossed.size:
+                continue
+            ends = slice(crossed[0], crossed[0] + 2)
+            share = (position - at_mm[ends][0]) / np.diff(at_mm[ends])[0]
+            range_mm = scene.range_mm(np.array([position]), every, model)[0]
+            row = model.row(range_mm, every)
+            with np.errstate(invalid="ignore"):
+                lit = np.flatnonzero((row >= 0.0) & (row <= model.rows - 1.0))
+            part = np.empty(lit.size, TRUTH_DTYPE)
+            part["t_us"] = t_us[ends][0] + round(share * np.diff(t_us[ends])[0])
+            part["column"], part["range_mm"] = lit, range_mm[lit]
+            parts.append(part)
+    return np.concatenate(parts)
 
 
 def pass_index(

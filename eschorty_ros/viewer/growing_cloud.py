@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import integer
 from eschorty_ros.core.base.errors import ArgumentError
 
-COLOURS = ("range", "sigma", "reflectance")
+COLOURS = ("range", "sigma", "reflectance", "pass")
 POINTS_MAX = 120_000
 _ABSENT = 0.5
+# Least correlation of position and time in a profile of a moving stage, squared.
+_MOVING = 0.5
 
 
 class Shown(NamedTuple):
@@ -45,21 +47,24 @@ class GrowingCloud:
         with self._lock:
             self._count = self._received = 0
             self._stride = 1
+            self._pass, self._way = 1, 0.0
             self.changes = 0
 
     def add(self, points: NDArray[np.void]) -> None:
-        """Add points in m with ``x y z sigma`` and, where known, ``reflectance``."""
+        """Add points in m with ``x y z sigma``, and ``t column reflectance`` where known."""
         names = points.dtype.names or ()
         if not {"x", "y", "z", "sigma"} <= set(names):
             raise ArgumentError(f"points have the fields {' '.join(names)}; send x y z and sigma")
         with self._lock:
             self.changes += 1
+            number = self._passes(points, names)
             begin = -self._received % self._stride
             self._received += len(points)
             while len(points):
                 part = points[begin :: self._stride][: self._limit - self._count]
-                self._store(part, names)
-                points = points[begin + len(part) * self._stride :]
+                self._store(part, number[begin :: self._stride][: len(part)], names)
+                begin += len(part) * self._stride
+                points, number = points[begin:], number[begin:]
                 begin = 0
                 if self._count == self._limit:
                     # Index i of the kept points is received point i times stride.
@@ -69,11 +74,36 @@ class GrowingCloud:
                     self._stride *= 2
                     begin = missing
 
-    def _store(self, part: NDArray[np.void], names: tuple[str, ...]) -> None:
+    def _store(
+        self, part: NDArray[np.void], number: NDArray[np.float32], names: tuple[str, ...]
+    ) -> None:
         rows = self._kept[self._count : self._count + len(part)]
         for k, name in enumerate(("x", "y", "z", "x", "sigma", "reflectance")):
             rows[:, k] = part[name] if name in names else np.nan
+        rows[:, -1] = number
         self._count += len(part)
+
+    def _passes(self, points: NDArray[np.void], names: tuple[str, ...]) -> NDArray[np.float32]:
+        """Return each point's pass: the stage goes the other way in the next one."""
+        if not {"t", "column"} <= set(names) or not len(points):
+            return np.full(len(points), np.nan, np.float32)
+        column = points["column"].astype(np.int32)
+        begins = np.flatnonzero(np.diff(column, prepend=np.iinfo(np.int32).max) < 0)
+        profile = np.repeat(np.arange(len(begins)), np.diff([*begins, len(points)]))
+        t, y = (
+            points[name].astype(np.float64) - points[name][begins][profile] for name in ("t", "y")
+        )
+        count, mean_t, mean_y = (np.bincount(profile, weights) for weights in (None, t, y))
+        t -= (mean_t / count)[profile]
+        y -= (mean_y / count)[profile]
+        both = np.bincount(profile, t * y)
+        spread = np.bincount(profile, t * t) * np.bincount(profile, y * y)
+        number = np.empty(len(begins), np.float32)
+        for k, way in enumerate(np.where(both**2 > _MOVING * spread, np.sign(both), 0.0)):
+            self._pass += int(way * self._way < 0.0)
+            self._way = way or self._way
+            number[k] = self._pass
+        return number[profile]
 
     def shown(self) -> Shown:
         """Return what to draw now; points that are not finite are left out."""

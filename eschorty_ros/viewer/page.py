@@ -24,7 +24,8 @@ HOST, PORT = "127.0.0.1", 8080
 _FRAME_STEP = 2
 _NAMES = {
     "start_mm": "start (mm)", "stop_mm": "stop (mm)", "speed_mm_s": "speed (mm/s)",
-    "frequency_hz": "frequency (Hz)",
+    "frequency_hz": "frequency (Hz)", "duty": "duty, 0: as it is", "passes": "passes",
+    "record": "record into",
 }  # fmt: skip
 _AHEAD = 1.3
 
@@ -107,16 +108,16 @@ class Page:
             return
         allowed = self._control.allowed
         with client.gui.add_folder("scan"):
-            fields = {
-                name: client.gui.add_number(_NAMES[name], value, disabled=not allowed)
-                for name, value in ScanValues()._asdict().items()
-            }
+            fields = {}
+            for name, value in ScanValues()._asdict().items():
+                add = client.gui.add_text if isinstance(value, str) else client.gui.add_number
+                fields[name] = add(_NAMES[name], value, disabled=not allowed)
             code = client.gui.add_text("code", "", disabled=not allowed)
             start = client.gui.add_button("Start scan", disabled=not allowed, color="red")
             cancel = client.gui.add_button("Cancel scan")
 
         def request(_: Any) -> None:
-            values = ScanValues(**{name: float(field.value) for name, field in fields.items()})
+            values = ScanValues(**{name: field.value for name, field in fields.items()})
             with self._lock:
                 self._start = values, str(code.value)
 
@@ -173,7 +174,7 @@ class Page:
             self._limits = self._draw(shown.xyz, shown.values[state[1]], state[2])
             self._counts = shown.received, shown.stride
         low, high = self._limits
-        unit = "" if self._colour.value == "reflectance" else " m"
+        unit = " m" if self._colour.value in ("range", "sigma") else ""
         scale = f"\n\n{self._colour.value}: {low:.4g} to {high:.4g}{unit}" if high > low else ""
         self._text.content = text(*self._counts) + scale
 

@@ -10,20 +10,28 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import number
+from eschorty_ros.core.base.numbers import integer, number
 
 ABANDONED_S = 5.0
 _CODE_BYTES = 4
 _TRIES = 5
+PASSES_MAX = 255
+"""As the action's goal can state them."""
 
 
 class ScanValues(NamedTuple):
-    """A scan as the page requests it: mm, mm/s, Hz."""
+    """A scan as the page requests it: mm, mm/s, Hz; duty 0 keeps the laser's.
+
+    ``record`` is a folder of the reconstruction's computer; without one, its own parameter holds.
+    """
 
     start_mm: float = 10.0
     stop_mm: float = 60.0
     speed_mm_s: float = 50.0
     frequency_hz: float = 70.0
+    duty: float = 0.0
+    passes: int = 1
+    record: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,11 +97,18 @@ class ScanControl:
         if refusal := conditions.refusal():
             raise ArgumentError(refusal)
         for name, value in values._asdict().items():
-            number(name, value)
+            if not isinstance(value, str):
+                number(name, value)
+        integer("passes", values.passes, 1, PASSES_MAX)
         if values.start_mm == values.stop_mm:
             raise ArgumentError("start and stop are the same position; give a distance")
         self._ours, self._seen_s = True, self._clock()
         return values
+
+    @property
+    def under_way(self) -> bool:
+        """Return whether a scan of this page has begun and not ended."""
+        return self._ours
 
     def ended(self) -> None:
         """Take note that the scan has ended."""

@@ -63,7 +63,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def changes_table(summaries: Sequence[Summary]) -> DataTable:
-    """Return baseline, default, and the default with one setting changed, the README's table."""
+    """Return baseline, default, and the default with one setting changed: docs/tradeoff.md."""
     percent = [f"{100 * share:g}" for share in BACKGROUND_SHARES]
     columns = [
         "setting",

@@ -156,6 +156,7 @@ def test_a_failed_calibration_leaves_the_old_file(targets_csv, tmp_path):
     bad = tmp_path / "bad.csv"
     for text, message in (
         ("row,range_mm\n100,900\n101,900\n", "range_mm holds 1 different ranges"),
+        ("row,range_mm\n300,1000\n300,1000.2\n300.1,999.9\n", "ranges differ by 0.3 mm"),
         ("row,range_mm\n100,900\n900,1000\n", "row of target line 3 is 900"),
         ("row,range_mm\n100,900\n,1000\n", "line 3: row is empty"),
         ("row,range_mm\n100,900\n100,900\n", "are the same"),

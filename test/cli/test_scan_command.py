@@ -1,5 +1,6 @@
 """`eschorty scan` over real DDS: cloud, picture, figures; the laser is off however it ends."""
 
+import json
 import signal
 
 import numpy as np
@@ -36,9 +37,14 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     assert f"{measured.error_median_mm:.3f} mm" in stdout
     assert f"{measured.error_p95_mm:.3f} mm" in stdout
     assert (tmp_path / "scan" / "scan.png").read_bytes().startswith(b"\x89PNG")
-    done = CliRunner().invoke(main, ["reconstruct", str(rec)])
+    done = CliRunner().invoke(main, ["reconstruct", str(rec), "--json"])
     assert done.exit_code == 0, done.output
     assert "warning" not in done.stderr
+    score = json.loads(done.stdout)["score"]
+    assert score["error_median_mm"] == pytest.approx(measured.error_median_mm, rel=0.03)
+    assert (score["periods"], score["completeness"]) == pytest.approx(
+        (measured.periods, measured.completeness), rel=0.01
+    )
     cloud = read_cloud(rec / "cloud.pcd")
     assert read_cloud(rec / "cloud.pcd", organized=True).shape == made.shape
     names = ["x", "z", "intensity", "sigma", "column", "flags"]
@@ -52,11 +58,27 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     np.testing.assert_array_equal(parts[0][names], parts[1][names])
     np.testing.assert_allclose(parts[0]["y"], parts[1]["y"], atol=1e-7, rtol=0)
     for command in (["convert", str(rec), str(tmp_path / "bag")],
-                    ["reconstruct", str(tmp_path / "bag")]):  # fmt: skip
+                    ["reconstruct", str(tmp_path / "bag")],
+                    ["info", str(tmp_path / "bag")]):  # fmt: skip
         done = CliRunner().invoke(main, command)
         assert done.exit_code == 0, done.output
         assert done.stderr == "" or "warning" not in done.stderr
+    assert "/eschorty/camera/events" in done.stdout
     np.testing.assert_array_equal(read_cloud(tmp_path / "bag" / "cloud.pcd"), cloud)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--stop", "500"), "stop is 500 mm; choose 0 to 220 mm, the stage's travel"),
+        (("--speed", "900"), "speed is 900 mm/s; choose 0.001 to 250 mm/s"),
+    ],
+)
+def test_limits_are_checked_in_the_options_unit_before_anything_starts(tmp_path, option, words):
+    options = ["scan", "--out", str(tmp_path / "scan"), "--record", str(tmp_path / "rec")]
+    done = CliRunner().invoke(main, [*options, *option])
+    assert (done.exit_code, done.stderr) == (1, f"eschorty: {words}\n")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_scan_records_into_a_new_folder_only(tmp_path):

@@ -3,6 +3,7 @@
 import subprocess
 import time
 
+import numpy as np
 import pytest
 
 from eschorty_ros.control.heartbeat import place
@@ -61,3 +62,13 @@ def test_a_drain_ends_although_there_is_progress():
     with pytest.raises(ScanFailure, match="behind the end of the sweep"):
         waiting.drain(10.0, 0.1)
     assert time.monotonic() - begun_s < 5.0
+
+
+def test_the_progress_is_where_the_stage_was_at_the_newest_event():
+    subject = monitor()
+    subject.samples.clear()
+    assert np.isnan(subject.reconstructed_mm())
+    for t_ns, at_mm in ((100, 1.0), (200, 2.0), (300, 3.0)):
+        subject.update_stage(t_ns, at_mm, 10.0, 0.0)
+    subject.update_reconstruction(ReconstructionStatus(250, 0.0, 0, 0, ""), 0.0)
+    assert subject.reconstructed_mm() == 2.0

@@ -44,6 +44,10 @@ def test_passes_go_forth_and_back_under_one_light():
     progress = SweepProgress(replace(request, passes=2))
     shares = [progress.share("sweeping", at_mm) for at_mm in (18.0, 30.0, 41.0, 30.0, 18.0)]
     assert shares == [0.0, 0.25, 0.5, 0.75, 1.0]
+    progress = SweepProgress(REQUEST)
+    lagging = [("to_start", 20.0), ("sweeping", 20.0), ("sweeping", 25.0), ("finishing", 25.0)]
+    assert [progress.share(*at) for at in lagging] == [0.0, 0.0, 0.25, 0.25]
+    assert progress.share("finishing", 40.0) == 1.0
 
 
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("move", 1),

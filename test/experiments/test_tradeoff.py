@@ -1,11 +1,11 @@
-"""Speed against error: what is compared, the front, and the README's table of it."""
+"""Speed against error: what is compared, the front, and the page's table of it."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from eschorty_experiments import readme_table
+from eschorty_experiments import tradeoff_page
 from eschorty_experiments._tradeoff_runs import (
     BASELINE,
     SMOOTHING,
@@ -61,12 +61,12 @@ def test_peak_memory_is_the_most_held_at_once():
 
 
 def table_lines():
-    text = (ROOT / "README.md").read_text()
-    table = text.partition(readme_table.BEGIN)[2].partition(readme_table.END)[0]
+    text = (ROOT / "docs" / "tradeoff.md").read_text()
+    table = text.partition(tradeoff_page.BEGIN)[2].partition(tradeoff_page.END)[0]
     return [line for line in table.splitlines() if line.startswith("|")]
 
 
-def test_the_readme_shows_the_settings_of_this_code():
+def test_the_page_shows_the_settings_of_this_code():
     shown = [line.split("|")[1].strip() for line in table_lines()[2:]]
     expected = [variant.label for variant in one_change()]
     assert shown == expected, "run `make tradeoff`"
@@ -74,25 +74,25 @@ def test_the_readme_shows_the_settings_of_this_code():
 
 
 def test_the_table_replaces_what_is_between_the_markers():
-    heads = ["setting", *readme_table._COLUMNS]
+    heads = ["setting", *tradeoff_page._COLUMNS]
     data = ",".join(heads) + "\n" + ",".join(["one thing", *["0.123456"] * (len(heads) - 1)]) + "\n"
-    table = readme_table.markdown(data)
+    table = tradeoff_page.markdown(data)
     assert re.search(r"^\| one thing \| 0\.1 \| 0 \| 0\.1 \|", table, re.MULTILINE)
-    before = f"head\n{readme_table.BEGIN}\nold\n{readme_table.END}\ntail\n"
-    after = readme_table.replaced(before, table)
+    before = f"head\n{tradeoff_page.BEGIN}\nold\n{tradeoff_page.END}\ntail\n"
+    after = tradeoff_page.replaced(before, table)
     assert "old" not in after
     assert after.startswith("head\n")
     assert after.endswith("tail\n")
-    assert readme_table.replaced(after, table) == after
+    assert tradeoff_page.replaced(after, table) == after
 
 
-@pytest.mark.parametrize("text", ["", readme_table.BEGIN, readme_table.END + readme_table.BEGIN])
+@pytest.mark.parametrize("text", ["", tradeoff_page.BEGIN, tradeoff_page.END + tradeoff_page.BEGIN])
 def test_a_document_without_markers_is_refused(text):
     with pytest.raises(ArgumentError, match="needs the lines"):
-        readme_table.replaced(text, "| |\n")
+        tradeoff_page.replaced(text, "| |\n")
 
 
 @pytest.mark.parametrize("text", ["", "setting,ns_per_event\na,1\n"])
 def test_other_data_are_refused(text):
     with pytest.raises(ArgumentError, match=r"tradeoff-changes\.csv"):
-        readme_table.markdown(text)
+        tradeoff_page.markdown(text)

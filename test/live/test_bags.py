@@ -1,5 +1,8 @@
 """Bags of both storages: to a recording and back, the points stay the same."""
 
+import contextlib
+import re
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,3 +95,23 @@ def test_the_definitions_are_those_of_the_message_files():
         folder = ROOT if package == "eschorty_ros" else ROOT / "external_msgs" / package
         file = (folder / "msg" / f"{name}.msg").read_text()
         assert get_types_from_msg(text, kind) == get_types_from_msg(file, kind)
+
+
+def test_a_bag_is_read_without_its_definitions_and_refused_with_other_messages(tmp_path, source):
+    """ROS writes definitions as IDL that the library cannot parse, such as EventPacket's."""
+    recording_to_bag(source, tmp_path / "bag", "sqlite3")
+    [file] = (tmp_path / "bag").glob("*.db3")
+
+    def change(table, column, value):
+        with contextlib.closing(sqlite3.connect(file)) as base, base:
+            assert base.execute(f"UPDATE {table} SET {column} = ?", (value,)).rowcount
+
+    change("message_definitions", "encoded_message_definition", '@verbatim #include "x.idl"')
+    bag_to_recording(tmp_path / "bag", tmp_path / "again")
+    np.testing.assert_array_equal(points(load_recording(tmp_path / "again")), points(source))
+    other = "RIHS01_" + 64 * "0"
+    change("topics", "type_description_hash", other)
+    listed = tmp_path / "bag" / "metadata.yaml"
+    listed.write_text(re.sub("RIHS01_[0-9a-f]{64}", other, listed.read_text()))
+    with pytest.raises(EschortyError, match="than this version"):
+        bag_to_recording(tmp_path / "bag", tmp_path / "no")

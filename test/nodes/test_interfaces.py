@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +13,6 @@ import policies
 from rclpy.node import Node
 
 from eschorty_ros.nodes.ros.instrument_client import InstrumentClient
-
-README = Path(__file__).resolve().parents[2] / "README.md"
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +79,3 @@ def test_only_scanner_and_reconstruction_may_light_the_laser_under_sros2(nodes):
         lights |= {"/eschorty/laser/arm"} & rights["services", "request"]
         assert bool(lights) == (node.get_name() in ("scanner", "reconstruction")), node.get_name()
     assert "heartbeat" not in policies.file_of(policies.OPERATOR).read_text().split("subscribe")[0]
-
-
-def test_the_readme_names_every_topic_of_the_instrument(nodes):
-    text = README.read_text(encoding="utf-8")
-    elsewhere = {"camera/clock"}
-    assert [name for name in set(tables.topics(nodes)) - elsewhere if name not in text] == []

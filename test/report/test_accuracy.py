@@ -206,3 +206,26 @@ def test_a_recorded_truth_scores_as_its_scene_does(tmp_path, scene):
     (tmp_path / "truth.csv").unlink()
     bare = load_recording(tmp_path)
     assert accuracy.measure_recorded(found.points, found.profiles, bare) is None
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_the_truth_of_a_recorded_scan_is_the_scene_at_its_periods(tmp_path, back):
+    """The simulation's own truth has the middle of the lit phase; events are some ms around it."""
+    ends = np.array([21.0, 11.0] if back else [11.0, 21.0])
+    scene = named("steps")
+    recording = simulate_recording(
+        tmp_path, scene, load_calibration("config_3"), start_mm=ends[0], stop_mm=ends[1], seed=2
+    )
+    points = reconstruct_recording(recording).points
+    # Without the ramps.
+    sweep = accuracy.Sweep(*np.clip(ends, 12.0, 20.0), 50.0, 70.0)
+    truth = accuracy.recorded_truth(points, scene, recording, sweep)
+    times = np.unique(truth["t_us"])
+    assert len(times) == accuracy.measure(points, scene, MODEL, sweep).periods >= 10
+    assert np.abs(np.diff(times) * 1e-6 - PERIOD_S).max() < 1e-4
+    known = np.unique(recording.truth["t_us"])
+    apart = np.abs(times[:, None] - known).min(axis=1)
+    assert apart.max() < 3000
+    stage_mm = recording.stage.position_mm(times)
+    expected = scene.range_mm(stage_mm, np.arange(1280), MODEL)
+    np.testing.assert_allclose(truth["range_mm"], expected[np.isfinite(expected)], atol=0.01)

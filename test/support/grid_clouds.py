@@ -22,3 +22,13 @@ def cloud(range_mm, sigma_mm=0.3, smooth=5, seed=1):
     points["t"], points["column"] = line[known] / 70.0, column[known]
     points["sigma"], points["intensity"] = sigma_mm * 1e-3, 20
     return points
+
+
+def moved(points, transform):
+    """The cloud as an instrument at the pose ``transform`` measures it."""
+    back = np.linalg.inv(transform)
+    xyz = np.stack([points[axis] for axis in "xyz"], axis=1) @ back[:3, :3].T + back[:3, 3]
+    seen = points.copy()
+    for k, axis in enumerate("xyz"):
+        seen[axis] = xyz[:, k]
+    return seen

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from grid_clouds import cloud
+from grid_clouds import cloud, moved
 from scipy.spatial.transform import Rotation
 
 from eschorty_ros.cli import main
@@ -18,16 +18,6 @@ from eschorty_ros.surfaces.register import join, pose_matrix, register
 def relief(y, z):
     waves = 6.0 * np.sin(y / 5.0 + 0.3 * np.sin(z / 9.0)) * np.cos(z / 7.0)
     return 1300.0 + waves + 3.0 * np.sin(z / 3.1)
-
-
-def moved(points, transform):
-    """The cloud as an instrument at the pose ``transform`` measures it."""
-    back = np.linalg.inv(transform)
-    xyz = np.stack([points[axis] for axis in "xyz"], axis=1) @ back[:3, :3].T + back[:3, 3]
-    seen = points.copy()
-    for k, axis in enumerate("xyz"):
-        seen[axis] = xyz[:, k]
-    return seen
 
 
 def known_pose(seed):

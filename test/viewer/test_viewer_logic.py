@@ -38,6 +38,25 @@ def test_every_nth_point_is_kept_whatever_the_batches(batch):
     assert len(cloud.shown().xyz) == 0
 
 
+def test_the_pass_follows_from_the_stage_s_direction_whatever_the_batches():
+    """Forth, back and forth at 50 mm/s and 70 Hz; events of a profile within 6 ms."""
+    t_s = (np.arange(90)[:, None] / 70.0 + np.arange(40) % 7 * 1e-3).ravel()
+    points = numbered(0, len(t_s))
+    points["column"], points["t"] = np.tile(np.arange(40), 90), t_s
+    way_s = t_s % (60 / 70.0)
+    points["y"] = 0.01 + 0.05 * np.minimum(way_s, 60 / 70.0 - way_s)
+    expected = 1 + np.arange(90).repeat(40) // 30
+    for batch in (len(points), 130, 17):
+        cloud = GrowingCloud()
+        for first in range(0, len(points), batch):
+            cloud.add(points[first : first + batch])
+        number = cloud.shown().values["pass"]
+        assert np.mean(number == expected) > (0.99 if batch > 40 else 0.95)
+    cloud.add(points[:0])
+    cloud.add(numbered(0, 1)[["x", "y", "z", "sigma"]])
+    assert np.isnan(cloud.shown().values["pass"][-1])
+
+
 def test_it_follows_1_28_million_points_per_second():
     """A second of points, in 20 batches, in a small part of a second."""
     import time
@@ -85,6 +104,8 @@ def test_light_needs_the_switch_the_code_and_a_sweep():
     control = ScanControl(allowed=True)
     with pytest.raises(ArgumentError, match="give a distance"):
         control.start(ScanValues(stop_mm=10.0), control.code, READY)
+    with pytest.raises(ArgumentError, match="passes is 0"):
+        control.start(ScanValues(passes=0), control.code, READY)
     with pytest.raises(ArgumentError, match="speed_mm_s is nan"):
         control.start(ScanValues(speed_mm_s=float("nan")), control.code, READY)
     for _ in range(5):

@@ -45,6 +45,8 @@ _ROBUST_TARGETS_MIN = 5
 _CONTRADICTION_SIGMA = 6.0
 # Standard deviation of k' over k'.
 _SLOPE_SIGMA_MAX = 1 / 3
+# Ranges that differ by less are one range within their errors.
+_SPAN_SIGMAS = 3.0
 _CHANNELS = ("row", "width", "spacing")
 
 
@@ -276,6 +278,12 @@ def _refuse_undetermined(targets: Targets, names: tuple[str, ...]) -> None:
         raise FitError(
             f"range_mm holds {distinct} different ranges (condition number inf); give targets at "
             "2 different ranges or more"
+        )
+    span, sigma = float(np.ptp(targets.range_mm)), float(np.max(targets.sigma_range_mm))
+    if span < _SPAN_SIGMAS * sigma:
+        raise FitError(
+            f"the targets do not determine the build: their ranges differ by {span:g} mm and have "
+            f"a sigma of {sigma:g} mm; give targets that move in range"
         )
     if set(names) == {WIDTH_BIAS}:
         raise ArgumentError(

@@ -3,6 +3,7 @@
 from eschorty_ros.core.optics.calibration_file import (
     BUILDS,
     PARAMETERS,
+    SHIPPED,
     Calibration,
     config_file,
     load_calibration,
@@ -27,6 +28,7 @@ __all__ = [
     "PARAMETERS",
     "PIXELS_MAX",
     "POLE_MARGIN_PX",
+    "SHIPPED",
     "Calibration",
     "Design",
     "DesignTable",

@@ -29,6 +29,7 @@ from eschorty_ros.core.optics.range_model import (
 )
 
 BUILDS = ("nominal", "config_1", "config_2", "config_3")
+SHIPPED = (*BUILDS, "config_3_as_built")
 PARAMETERS = (
     "k_mm",
     "k_prime_px",
@@ -212,7 +213,7 @@ def load_named_calibration(folder: str | os.PathLike[str], name: str) -> Calibra
         return _read(shipped)
     raise CalibrationError(
         f"there is no calibration named {short(name)} in {folder}; save it there first, or "
-        f"choose one of {', '.join(BUILDS)}"
+        f"choose one of {', '.join(SHIPPED)}"
     )
 
 
@@ -329,7 +330,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
     if shipped := _shipped(text):
         return shipped
     raise CalibrationError(
-        f"there is no calibration named {text!r}; choose one of {', '.join(BUILDS)} "
+        f"there is no calibration named {text!r}; choose one of {', '.join(SHIPPED)} "
         "or give a path ending in .yaml"
     )
 

@@ -1,8 +1,8 @@
 """Light of a build: photons that return from a column of the line, and an estimate of the class.
 
-The class is estimated from the limits of IEC 60825-1:2014 for a small source and long viewing,
-tables 3, 6 and 7; it is no safety statement. The line is spread over its fan, of which an eye of
-7 mm at 100 mm receives a part.
+The class is estimated from the limits of IEC 60825-1:2014 (edition 3.0, tables 3, 5, 6, 8) for a
+small source and long viewing; it is no safety statement. The line is spread over its fan, of which
+an eye of 7 mm at 100 mm receives a part.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ def laser_class(power_mw: float, wavelength_nm: float, fan_deg: float) -> LaserC
         photochemical = 0.039 * 10.0 ** (0.02 * max(wavelength_nm - 450.0, 0.0))
         limits = {"1": min(_THERMAL_MW, photochemical), "2": 1.0, "3R": 5.0, "3B": 500.0}
     else:
-        # C4; C7 is 1 up to 1150 nm.
-        first = _THERMAL_MW * 10.0 ** (0.002 * (wavelength_nm - 700.0))
-        limits = {"1": first, "3R": 5.0 * first, "3B": 500.0}
+        # C7 is 1 up to 1150 nm.
+        c4 = 10.0 ** (0.002 * (wavelength_nm - 700.0))
+        limits = {"1": _THERMAL_MW * c4, "3R": 2.0 * c4, "3B": 500.0}
     name = next((name for name, limit in limits.items() if accessible <= limit), "4")
     return LaserClass(accessible, limits, name)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.action import Scan
+from eschorty_ros.control.scan_sequence import ScanRequest, check_request
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, finite_points
 from eschorty_ros.nodes.one_process.composition import (
     START_S,
@@ -23,6 +24,8 @@ from eschorty_ros.nodes.one_process.composition import (
 )
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
+from eschorty_ros.nodes.scanner.node import TABLE as SCANNER_TABLE
+from eschorty_ros.nodes.scanner.node import scan_limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,16 @@ class ScanResult:
     completeness: float
     recording: str = ""
     organized: NDArray[np.void] | None = None
+
+
+def check_job(job: ScanJob) -> None:
+    """Raise ``ArgumentError``, in mm, unless stage and scanner can do the scan."""
+    given = (job.hardware or {}).get("scanner", {})
+    limits = scan_limits({param.name: param.default for param in SCANNER_TABLE} | given)
+    request = ScanRequest(
+        "", job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, passes=job.passes
+    )
+    check_request(request, limits, "mm")
 
 
 def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:

@@ -205,9 +205,10 @@ class ScannerNode(Node):
             if phase == sent_phase and now_s - sent_s < _FEEDBACK_S:
                 return
             sent_s, sent_phase = now_s, phase
-            position_mm = self._client.monitor.position_mm
-            feedback = Scan.Feedback(phase=phase, progress=progress.share(phase, position_mm))
-            feedback.position = m_from_mm(position_mm)
+            monitor = self._client.monitor
+            share = progress.share(phase, monitor.reconstructed_mm())
+            feedback = Scan.Feedback(phase=phase, progress=share)
+            feedback.position = m_from_mm(monitor.position_mm)
             feedback.waits_for = self._client.waits_for
             state = self._client.monitor.reconstruction
             if state is not None and phase in ("preparing", "to_start"):

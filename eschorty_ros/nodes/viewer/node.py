@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
 
 from eschorty_ros.action import Scan
@@ -39,6 +40,8 @@ TABLE = (
 
 _SHOW_S = 0.4
 _LASER_SILENT_S = 2.0
+# The scanner sends feedback ten times a second.
+_SCANNER_SILENT_S = 10.0
 _COUNTS = (
     "profiles", "points", "packets_lost", "events_dropped", "sensor_drop_words",
     "points_without_stage",
@@ -61,7 +64,8 @@ class ViewerNode(Node):
         self._interlock_open = True
         self._scan_id = ""
         self._handle: Any = None
-        self._lock = threading.Lock()
+        self._scanner_s = float("-inf")
+        self._record_before: str | None = None
         self._frame: Any = None
         self._profile: Any = None
         group = MutuallyExclusiveCallbackGroup()
@@ -75,6 +79,10 @@ class ViewerNode(Node):
         ):
             self.create_subscription(kind, topic, callback, profile, callback_group=group)
         self._scan = ActionClient(self, Scan, "scan", callback_group=group)
+        self._get_parameters, self._set_parameters = (
+            self.create_client(kind, f"reconstruction/{name}", callback_group=group)
+            for kind, name in ((GetParameters, "get_parameters"), (SetParameters, "set_parameters"))
+        )
         self.create_timer(
             _SHOW_S, self._show, MutuallyExclusiveCallbackGroup(),
             Clock(clock_type=ClockType.STEADY_TIME),
@@ -127,7 +135,7 @@ class ViewerNode(Node):
     def _conditions(self) -> Conditions:
         return Conditions(
             scanner=self._scan.server_is_ready(),
-            scanning=bool(self._scan_id) or self._handle is not None,
+            scanning=bool(self._scan_id) or self._control.under_way,
             laser=time.monotonic() - self._laser_s < _LASER_SILENT_S,
             interlock_open=self._interlock_open,
         )
@@ -139,6 +147,7 @@ class ViewerNode(Node):
                 self._begin(self._control.start(*asked, self._conditions()))
             except ArgumentError as error:
                 self._status.message = f"not started: {error}"
+        self._check_scanner()
         if self._handle is not None and (cancel or self._control.abandoned(self.page.pages)):
             self._handle.cancel_goal_async()
         if time.monotonic() - self._laser_s >= _LASER_SILENT_S:
@@ -147,39 +156,86 @@ class ViewerNode(Node):
         frame, self._frame = self._frame, None
         self.page.show(self._status.markdown, profile, frame)
 
+    def _check_scanner(self) -> None:
+        """Give up a scan whose scanner is gone; another one may have come in its place."""
+        silent_s = time.monotonic() - self._scanner_s
+        if self._control.under_way and silent_s > _SCANNER_SILENT_S:
+            self._end("the scanner does not answer; start another scan when it is there again")
+
+    def _end(self, message: str) -> None:
+        """Take note of the end of the page's scan."""
+        self._handle = None
+        self._control.ended()
+        self._status.phase, self._status.message = "", message
+        if self._record_before is not None:
+            self._set_record(self._record_before)
+            self._record_before = None
+
     def _begin(self, values: ScanValues) -> None:
-        self._status.message = ""
+        self._status.message, self._scanner_s = "", time.monotonic()
         goal = Scan.Goal(
             start=m_from_mm(values.start_mm),
             stop=m_from_mm(values.stop_mm),
             speed=m_from_mm(values.speed_mm_s),
-            frequency=values.frequency_hz,
+            frequency=float(values.frequency_hz),
+            duty=float(values.duty),
+            passes=values.passes,
         )
+        if not values.record:
+            self._send(goal)
+            return
+
+        def on_value(future: Any) -> None:
+            self._record_before = future.result().values[0].string_value
+            self._set_record(values.record).add_done_callback(on_set)
+
+        def on_set(future: Any) -> None:
+            [answer] = future.result().results
+            if answer.successful:
+                self._send(goal)
+            else:
+                self._end(f"not started: {answer.reason}")
+
+        asked = self._get_parameters.call_async(GetParameters.Request(names=["record"]))
+        asked.add_done_callback(on_value)
+
+    def _set_record(self, folder: str) -> Any:
+        """Set the folder into which the reconstruction records."""
+        request = SetParameters.Request()
+        request.parameters = [Parameter("record", value=folder).to_parameter_msg()]
+        return self._set_parameters.call_async(request)
+
+    def _send(self, goal: Any) -> None:
+        if not self._control.under_way:
+            return
         self._scan.send_goal_async(goal, feedback_callback=self._on_feedback).add_done_callback(
             self._on_answer
         )
 
     def _on_answer(self, future: Any) -> None:
         handle = future.result()
+        if not self._control.under_way:
+            handle.cancel_goal_async()
+            return
         if not handle.accepted:
-            self._control.ended()
-            self._status.message = "not started: the scanner refused the goal"
+            self._end("not started: the scanner refused the goal")
             return
         self._handle = handle
-        handle.get_result_async().add_done_callback(self._on_result)
+        handle.get_result_async().add_done_callback(lambda ended: self._on_result(handle, ended))
 
     def _on_feedback(self, message: Any) -> None:
+        self._scanner_s = time.monotonic()
         state = message.feedback
         self._status.phase = check_text("phase", state.waits_for or state.phase)
         self._status.progress = float(state.progress)
 
-    def _on_result(self, future: Any) -> None:
+    def _on_result(self, handle: Any, future: Any) -> None:
+        if handle is not self._handle:
+            return
         result = future.result().result
-        self._handle = None
-        self._control.ended()
-        self._status.phase = ""
-        text = f"{result.verdict}, {result.points:,} points; {result.message}"
-        self._status.message = text.rstrip("; ")
+        recorded = f"recorded into {result.recording}" if result.recording else ""
+        counted = f"{result.verdict}, {result.points:,} points"
+        self._end("; ".join(text for text in (counted, result.message, recorded) if text))
 
 
 def _points(message: PointCloud2) -> Any:

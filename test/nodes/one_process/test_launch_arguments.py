@@ -99,8 +99,8 @@ def test_every_argument_is_described_and_read(file: str, tmp_path: Path) -> None
     assert all(len(argument.description) > 15 for argument in table)
 
 
-def test_the_readme_has_every_argument_with_its_default() -> None:
-    lines = (Path(__file__).parents[3] / "README.md").read_text().splitlines()
+def test_the_page_has_every_argument_with_its_default() -> None:
+    lines = (Path(__file__).parents[3] / "docs" / "ros.md").read_text().splitlines()
     for argument in SCAN:
         line = next(line for line in lines if re.match(rf"\| .*`{argument.name}`", line))
         assert f"`{argument.default}`" in line or "`config/" in line

@@ -57,15 +57,23 @@ def test_a_scan_is_started_from_the_page_and_its_points_appear(page, tmp_path):
         assert coloured_share(page) < 0.001
         page.get_by_role("button", name="Start scan").click()
         page.get_by_text("the code is not the one").wait_for(timeout=WAIT_MS)
-        page.get_by_label("stop (mm)").fill("30")
-        code = page.locator("input.mantine-TextInput-input:visible").last
+        page.get_by_label("stop (mm)").fill("24")
+        page.get_by_label("passes").fill("2")
+        record, code = page.locator("input.mantine-TextInput-input:visible").all()[-2:]
+        record.fill(str(tmp_path / "records"))
+        record.press("Tab")
         code.fill(viewer._control.code)
         code.press("Tab")
         page.get_by_role("button", name="Start scan").click()
         page.get_by_text("ON", exact=True).wait_for(timeout=WAIT_MS)
         page.get_by_text("complete, ").wait_for(timeout=WAIT_MS)
+        page.get_by_text("recorded into").wait_for(timeout=WAIT_MS)
         page.screenshot(path=tmp_path / "page.png")
         assert page.get_by_text("off", exact=True).count() == 1
         assert coloured_share(page) > 0.02
-        assert len(viewer._cloud.shown().xyz) > 10_000
+        shown = viewer._cloud.shown()
+        assert len(shown.xyz) > 10_000
+        assert set(shown.values["pass"]) == {1.0, 2.0}
+        [recording] = (tmp_path / "records").iterdir()
+        assert (recording / "events.raw").stat().st_size > 100_000
     print(tmp_path / "page.png")

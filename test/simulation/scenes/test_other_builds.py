@@ -79,7 +79,7 @@ def test_named_scenes_stay_as_they_are_where_a_build_sees_them_and_are_in_view_e
         (501.0, 633.0, 0.0, "4"),
         (0.040, 405.0, 0.0, "2"),
         (0.77, 850.0, 0.0, "1"),
-        (0.79, 850.0, 0.0, "3R"),
+        (3.95, 850.0, 0.0, "3R"),
         # A fan of 60 degrees is 115 mm wide at the eye: 1/16.5 of it enters.
         (16.0, 633.0, 60.0, "2"),
     ],

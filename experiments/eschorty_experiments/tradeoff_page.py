@@ -1,6 +1,6 @@
-"""The README's table of speed against error, made from the report's data.
+"""The table of docs/tradeoff.md, speed against error, made from the report's data.
 
-Usage: python -m eschorty_experiments.readme_table report/tradeoff-changes.csv README.md
+Usage: python -m eschorty_experiments.tradeoff_page report/tradeoff-changes.csv docs/tradeoff.md
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def markdown(table: str) -> str:
     rows = list(csv.DictReader(io.StringIO(table)))
     if not rows or not {"setting", *_COLUMNS} <= set(rows[0]):
         raise ArgumentError(
-            "the data of the README's table lack rows or columns; "
+            "the data of the page's table lack rows or columns; "
             "give the file tradeoff-changes.csv of a report"
         )
     heads = ["setting", *(heading for heading, _, _ in _COLUMNS.values())]
@@ -74,10 +74,10 @@ def replaced(document: str, table: str) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Replace the table in a README by that of a CSV file."""
-    data, readme = (Path(argument) for argument in arguments)
-    text = replaced(readme.read_text(), markdown(data.read_text()))
-    with atomic_write(readme) as stream:
+    """Replace the table in a page by that of a CSV file."""
+    data, page = (Path(argument) for argument in arguments)
+    text = replaced(page.read_text(), markdown(data.read_text()))
+    with atomic_write(page) as stream:
         stream.write(text.encode())
 
 

@@ -1,0 +1,148 @@
+"""The viewer's node against a scanner and a laser that come, go and come back; no browser."""
+
+import contextlib
+import socket
+import threading
+import time
+
+import pytest
+import rclpy
+from eschorty_ros.action import Scan
+from eschorty_ros.msg import LaserState
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.viewer import node as viewer_module
+from eschorty_ros.nodes.viewer.node import ViewerNode
+from eschorty_ros.viewer.scan_control import ScanValues
+
+VALUES = ScanValues(stop_mm=20.0, duty=0.3, passes=2)
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Instrument(Node):
+    """Answers as scanner, reconstruction and laser do."""
+
+    def __init__(self, interlock_open=False):
+        super().__init__("reconstruction", namespace="/eschorty")
+        self.declare_parameter("record", "/before")
+        self.goals, self.recorded = [], []
+        self.release, self.silent = threading.Event(), False
+        self._state = LaserState(interlock_open=interlock_open)
+        self._publisher = self.create_publisher(LaserState, "laser/state", qos.latched(100))
+        self.create_timer(0.1, lambda: self._publisher.publish(self._state))
+        self._server = ActionServer(
+            self, Scan, "scan", self._execute, cancel_callback=lambda _: CancelResponse.ACCEPT
+        )
+
+    def _execute(self, goal):
+        self.goals.append(goal.request)
+        self.recorded.append(self.get_parameter("record").value)
+        while not self.release.wait(0.05) and not goal.is_cancel_requested:
+            if not self.silent:
+                goal.publish_feedback(Scan.Feedback(phase="sweeping"))
+        if goal.is_cancel_requested:
+            goal.canceled()
+        else:
+            goal.succeed()
+        return Scan.Result(verdict="complete", points=7, recording=self.recorded[-1])
+
+
+@pytest.fixture
+def world(monkeypatch):
+    """A viewer that may start scans, and a way to add and remove an instrument."""
+    monkeypatch.setattr(viewer_module, "_SCANNER_SILENT_S", 1.0)
+    rclpy.init()
+    executor = MultiThreadedExecutor(6)
+    values = [Parameter("allow_scan", value=True), Parameter("port", value=free_port())]
+    viewer = ViewerNode(namespace="/eschorty", parameter_overrides=values)
+    executor.add_node(viewer)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+
+    @contextlib.contextmanager
+    def instrument(**kwargs):
+        node = Instrument(**kwargs)
+        executor.add_node(node)
+        try:
+            yield node
+        finally:
+            executor.remove_node(node)
+            node._server.destroy()
+            node.destroy_node()
+
+    yield viewer, instrument
+    viewer.safe_state()
+    executor.shutdown()
+    rclpy.try_shutdown()
+    thread.join(5.0)
+    viewer.destroy_node()
+
+
+def wait(condition, limit_s=30.0):
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end_s, "timed out"
+        time.sleep(0.05)
+
+
+def ask(viewer, values=VALUES):
+    """As a page does: the values and the code."""
+    with viewer.page._lock:
+        viewer.page._start = values, viewer._control.code
+
+
+def says(viewer, words):
+    return lambda: words in viewer._status.message
+
+
+def test_a_scan_of_the_page_has_all_its_values_and_outlives_no_scanner(world):
+    viewer, instrument = world
+    ask(viewer)
+    wait(says(viewer, "no scanner is there"))
+    with instrument(interlock_open=True):
+        wait(lambda: viewer._conditions().laser and viewer._conditions().scanner)
+        ask(viewer)
+        wait(says(viewer, "interlock is open"))
+    wait(lambda: not viewer._conditions().scanner)
+    with instrument() as first:
+        wait(lambda: not viewer._conditions().refusal())
+        ask(viewer, VALUES._replace(record="/data"))
+        wait(lambda: first.goals)
+        [goal] = first.goals
+        assert (goal.stop, goal.duty, goal.passes) == pytest.approx((0.02, 0.3, 2))
+        assert first.recorded == ["/data"]
+        ask(viewer)
+        wait(says(viewer, "a scan is running"))
+        first.release.set()
+        wait(says(viewer, "complete, 7 points; recorded into /data"))
+        wait(lambda: first.get_parameter("record").value == "/before")
+        first.release.clear()
+        ask(viewer)
+        wait(lambda: len(first.goals) == 2)
+        assert first.recorded[1] == "/before"
+        with viewer.page._lock:
+            viewer.page._cancel = True
+        wait(says(viewer, "complete, 7 points"))
+        first.silent = True
+        ask(viewer)
+        wait(lambda: len(first.goals) == 3)
+        wait(says(viewer, "the scanner does not answer"))
+        first.release.set()
+        time.sleep(0.5)
+        assert says(viewer, "the scanner does not answer")(), "a late result"
+    wait(lambda: not viewer._conditions().scanner)
+    with instrument() as second:
+        wait(lambda: not viewer._conditions().refusal())
+        ask(viewer)
+        wait(lambda: second.goals)
+        second.release.set()
+        wait(says(viewer, "complete"))
