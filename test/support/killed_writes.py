@@ -16,9 +16,10 @@ from types import SimpleNamespace
 
 from click.testing import CliRunner
 
-from eschorty_ros.cli import main, scan
+from eschorty_ros.cli import main
 from eschorty_ros.core.optics import load_calibration, save_calibration
 from eschorty_ros.core.storage import read_cloud
+from eschorty_ros.nodes.one_process import scan as one_scan
 from eschorty_ros.report import calibration_page, figures
 
 STEPS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree"}
@@ -52,14 +53,7 @@ def prepare(folder):
         packets_lost=0, verdict="complete", completeness=1.0, recording="",
         organized=None,
     )  # fmt: skip
-    module = SimpleNamespace(
-        ScanJob=lambda scene, calibration, **_: SimpleNamespace(
-            scene=scene, calibration=calibration, start_mm=10.0, stop_mm=13.0, speed_mm_s=200.0,
-            frequency_hz=70.0, sweep_s=0.015, hardware=None, passes=1,
-        ),
-        scan_once=lambda *_: result,
-    )  # fmt: skip
-    scan.nodes_module = lambda *_, **__: module
+    one_scan.scan_once = lambda *_: result
     # Drawing takes long and touches no file.
     figures.scan_figure = lambda *_, **__: figures.new_figure(1.0, 1.0)
     calibration_page.calibration_html = lambda *_: "<html></html>" * 1000
