@@ -38,7 +38,7 @@ BUT_ONE = 0.98 - 1.0 / PERIODS
 SLOW_HZ, SLOW_M_S, FAR_M = 20.0, 0.010, 0.200
 """Of sweeps that are interrupted: few events, and interrupted far from their end."""
 SLOW = {"stop": FAR_M, "speed": SLOW_M_S, "frequency": SLOW_HZ}
-SWEPT_POINTS = 90_000
+SWEPT_POINTS = 40_000
 # The feedback also counts points outside start to stop, as many as the stage's begin takes on a
 # busy computer.
 KEPT_POINTS = SWEPT_POINTS // 4
