@@ -46,7 +46,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-floor quick check lint format types contracts clean
+.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-scans test-single test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -84,17 +84,23 @@ faults: $(SETUP)
 reference: $(SETUP)
 	@$(ENTER) python docs/interfaces.py && python docs/policies.py
 
-# Pure parts share the cores, the longest first; what starts processes and devices runs alone. The
+# Pure parts share the cores, the longest first; then whole scans beside single nodes and devices. The
 # emulated bench runs in real time, and a computer that stalls fails a scan: what failed runs once more.
 PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
-PROCESSES := test $(addprefix --ignore=,$(PURE))
+SCANS := $(addprefix test/,cli launch nodes/scanner nodes/ros nodes/viewer nodes/test_hostile_messages.py)
+SINGLE := test $(addprefix --ignore=,$(PURE) $(SCANS))
+once_more = { (($$? == 1)) && echo "Once more:" && pytest $(1) --last-failed --last-failed-no-failures none -o cache_dir=$(BUILD)/$@; }
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
 else
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
-	@$(ENTER) pytest $(PROCESSES) || { (($$? == 1)) && echo "Once more:" && pytest $(PROCESSES) --last-failed --last-failed-no-failures none; }
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=line test-scans test-single
+
+test-scans test-single: tests = $(if $(filter %scans,$@),$(SCANS),$(SINGLE))
+test-scans test-single: $(SETUP) $(BUILD)/test.stamp
+	@$(ENTER) pytest $(tests) -o cache_dir=$(BUILD)/$@ || $(call once_more,$(tests))
 endif
 
 quick: $(SETUP) $(BUILD)/test.stamp
