@@ -10,7 +10,6 @@ import hashlib
 import json
 import os
 import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -65,15 +64,14 @@ THREADS_TEXT = """
 
 `reconstruct_recording` as `eschorty reconstruct --jobs N` runs it, in a process of its own: the
 recording is read from the disk's cache and cut into windows of two million events, and each of N
-threads decodes windows and turns them into points. *Wall* and *CPU* are from the file to placed
-points. *Most* is what the CPU times allow on as many free cores: that of one thread over the N-th
-part of all. The clouds are compared bit for bit. *Memory* is the most that the process held, less
-that of the interpreter with everything imported and compiled; *points* is the part of it that the
-result takes.
+threads decodes windows and turns them into rows. *Wall* is from the file to placed points, *CPU*
+has the check of the laser's frequency, too. The clouds are compared bit for bit. *Memory* is the
+most that the process held, *before* what it held with everything imported and compiled, *points*
+what the result takes.
 """
 THREADS = (
     "laser", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s", "times one thread",
-    "most", "same points", "memory, MB", "points, MB",
+    "same points", "memory, MB", "before, MB", "points, MB",
 )  # fmt: skip
 
 
@@ -89,6 +87,7 @@ class Run(NamedTuple):
     cpu_s: float
     events: int
     memory_mb: float
+    before_mb: float
     points_mb: float
     points: str
 
@@ -97,7 +96,7 @@ def write_recording(folder: Path, modulation: Modulation, data: bytes, repeats: 
     """Write a recording of a stage at rest: ``data`` that many times, each later than the last."""
     folder.mkdir()
     write_laser_yaml(folder / LASER_FILE, modulation)
-    save_calibration(folder / CALIBRATION_FILE, single.CALIBRATION)
+    save_calibration(single.CALIBRATION, folder / CALIBRATION_FILE)
     write_stage_csv(folder / STAGE_FILE, [0, 1 << 40], [0.0, 0.0])
     with RawWriter(folder / EVENTS_FILE) as file:
         words = np.frombuffer(data, "<u2").copy()
@@ -126,12 +125,14 @@ def measure(folder: Path, jobs: int) -> Run:
     arrays = (getattr(result.profiles, item.name) for item in fields(Profiles))
     size = result.points.nbytes + sum(array.nbytes for array in arrays if array is not None)
     spent = result.seconds, time.process_time() - cpu
-    return Run(*spent, result.events, most_memory_mb() - before_mb, size / 1e6, points.hexdigest())
+    memory_mb = most_memory_mb()
+    return Run(*spent, result.events, memory_mb, before_mb, size / 1e6, points.hexdigest())
 
 
 def most_memory_mb() -> float:
     """Return the most memory that this process held so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    (line,) = (x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
+    return int(line.split()[1]) / 1e3
 
 
 def cpu_s(task: Callable[[], object]) -> float:
@@ -166,7 +167,7 @@ def threads(recording: Path, frequency_hz: float, repeats: int) -> str:
     counts = sorted({1, 2, len(os.sched_getaffinity(0))})
     runs = [[measured(recording, jobs) for jobs in counts] for _ in range(repeats)]
     size_mb = (recording / EVENTS_FILE).stat().st_size / 1e6
-    alone_s, alone_cpu_s = np.min([row[0][:2] for row in runs], axis=0)
+    alone_s = min(row[0].wall_s for row in runs)
     rows = ""
     for jobs, same in zip(counts, zip(*runs, strict=True), strict=True):
         wall_s, cpu = np.min([one[:2] for one in same], axis=0)
@@ -175,8 +176,8 @@ def threads(recording: Path, frequency_hz: float, repeats: int) -> str:
         rows += (
             f"| {frequency_hz:g} Hz | {size_mb:.0f} | {events / 1e6:.1f} M | {jobs} | "
             f"{wall_s:.2f} | {cpu:.2f} | {events / wall_s / 1e6:.0f} | {alone_s / wall_s:.2f} | "
-            f"{alone_cpu_s / (cpu / jobs):.2f} | {'yes' if equal else 'NO'} | "
-            f"{memory_mb:.0f} | {same[0].points_mb:.0f} |\n"
+            f"{'yes' if equal else 'NO'} | {memory_mb:.0f} | {same[0].before_mb:.0f} | "
+            f"{same[0].points_mb:.0f} |\n"
         )
     return rows
 
