@@ -6,8 +6,13 @@ Usage: python benchmark/performance.py [--seconds S] [--repeats N] [--out FILE]
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
 import platform
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import fields
@@ -19,8 +24,20 @@ import numpy as np
 import reconstruct as single
 import scipy
 
+from eschorty_ros.core.evt3.words import TIME_HIGH
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.core.optics import save_calibration
+from eschorty_ros.core.reconstruction import Profiles, Settings, reconstruct_recording, warm_up
+from eschorty_ros.core.storage import (
+    CALIBRATION_FILE,
+    EVENTS_FILE,
+    LASER_FILE,
+    STAGE_FILE,
+    load_recording,
+    write_laser_yaml,
+    write_stage_csv,
+)
+from eschorty_ros.core.storage.raw_file import RawWriter
 
 HEAD = """# Speed of the reconstruction
 
@@ -37,6 +54,7 @@ CPU time from EVT3 bytes to ranges with the default settings. *Decoding* is from
 arrays alone, the *ratio* what the reconstruction reaches of it in the same run. The paper's method
 is in plain numpy.
 """
+LARGE_BYTES = 2 << 30
 ONE_THREAD = (
     "laser", "events", "per column and period", "decoding, Mev/s", "to ranges, Mev/s", "ratio",
     "paper, Mev/s", "times the paper",
@@ -44,14 +62,16 @@ ONE_THREAD = (
 THREADS_TEXT = """
 ## Threads
 
-`eschorty reconstruct --jobs N`: one thread more decodes and follows the phase, and the N turn
-windows of two million events into rows. The points are compared bit for bit. *Most* is what the
-CPU times allow on two free cores: that of one thread over the larger of half of all and that of
-the decoding thread.
+`reconstruct_recording` as `eschorty reconstruct --jobs N` runs it, in a process of its own: the
+recording is read from the disk's cache and cut into windows of two million events, and each of N
+threads decodes windows and turns them into rows. *Wall* is from the file to placed points, *CPU*
+has the check of the laser's frequency, too. The clouds are compared bit for bit. *Memory* is the
+most that the process held, *before* what it held with everything imported and compiled, *points*
+what the result takes.
 """
 THREADS = (
-    "laser", "events", "threads", "wall, s", "CPU, s", "decoding thread, s", "Mev/s",
-    "times one thread", "most", "same points",
+    "laser", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s", "times one thread",
+    "same points", "memory, MB", "before, MB", "points, MB",
 )  # fmt: skip
 
 
@@ -61,27 +81,58 @@ def header(names: tuple[str, ...]) -> str:
 
 
 class Run(NamedTuple):
-    """Times of one run and what it found."""
+    """Times of one run, its events, memory and points."""
 
     wall_s: float
     cpu_s: float
-    first_s: float
     events: int
-    found: Profiles
+    memory_mb: float
+    before_mb: float
+    points_mb: float
+    points: str
 
 
-def run(data: bytes, modulation: Modulation, jobs: int) -> Run:
-    """Reconstruct ``data`` with ``jobs`` threads."""
-    reconstructor = Reconstructor(single.CALIBRATION, modulation, Settings(), jobs)
-    view = memoryview(data)
-    wall, cpu, first = time.perf_counter(), time.process_time(), time.thread_time()
-    parts = [
-        reconstructor.push(view[k : k + single.CHUNK_BYTES])
-        for k in range(0, len(data), single.CHUNK_BYTES)
-    ]
-    found = Profiles.concatenate([*parts, reconstructor.flush()])
-    spent = time.perf_counter() - wall, time.process_time() - cpu, time.thread_time() - first
-    return Run(*spent, reconstructor.counters["events"], found)
+def write_recording(folder: Path, modulation: Modulation, data: bytes, repeats: int) -> Path:
+    """Write a recording of a stage at rest: ``data`` that many times, each later than the last."""
+    folder.mkdir()
+    write_laser_yaml(folder / LASER_FILE, modulation)
+    save_calibration(single.CALIBRATION, folder / CALIBRATION_FILE)
+    write_stage_csv(folder / STAGE_FILE, [0, 1 << 40], [0.0, 0.0])
+    with RawWriter(folder / EVENTS_FILE) as file:
+        words = np.frombuffer(data, "<u2").copy()
+        is_high = words >> 12 == TIME_HIGH
+        steps = int((words[is_high] & 0xFFF)[-1]) + 2
+        for _ in range(repeats):
+            file.write(words.tobytes())
+            words[is_high] = TIME_HIGH << 12 | ((words[is_high] + steps) & 0xFFF)
+    return folder
+
+
+def measured(folder: Path, jobs: int) -> Run:
+    """Reconstruct a recording in another process."""
+    command = [sys.executable, __file__, "--recording", str(folder), "--jobs", str(jobs)]
+    return Run(*json.loads(subprocess.check_output(command)))
+
+
+def measure(folder: Path, jobs: int) -> Run:
+    """Reconstruct a recording in this process."""
+    recording = load_recording(folder)
+    warm_up(recording.calibration)
+    before_mb = most_memory_mb()
+    cpu = time.process_time()
+    result = reconstruct_recording(recording, jobs=jobs)
+    points = hashlib.sha256(result.points.tobytes())
+    arrays = (getattr(result.profiles, item.name) for item in fields(Profiles))
+    size = result.points.nbytes + sum(array.nbytes for array in arrays if array is not None)
+    spent = result.seconds, time.process_time() - cpu
+    memory_mb = most_memory_mb()
+    return Run(*spent, result.events, memory_mb, before_mb, size / 1e6, points.hexdigest())
+
+
+def most_memory_mb() -> float:
+    """Return the most memory that this process held so far."""
+    (line,) = (x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
+    return int(line.split()[1]) / 1e3
 
 
 def cpu_s(task: Callable[[], object]) -> float:
@@ -111,27 +162,22 @@ def one_thread(frequency_hz: float, seconds: float, repeats: int) -> str:
     )
 
 
-def threads(frequency_hz: float, seconds: float, repeats: int) -> str:
-    """Return the rows of the second table."""
-    modulation = Modulation(frequency_hz, on_edge_us=0)
-    data, _ = single.simulated(modulation, seconds)
+def threads(recording: Path, frequency_hz: float, repeats: int) -> str:
+    """Return the rows of the second table for a recording."""
     counts = sorted({1, 2, len(os.sched_getaffinity(0))})
-    runs = [[run(data, modulation, jobs) for jobs in counts] for _ in range(repeats)]
-    serial = runs[0][0]
+    runs = [[measured(recording, jobs) for jobs in counts] for _ in range(repeats)]
+    size_mb = (recording / EVENTS_FILE).stat().st_size / 1e6
+    alone_s = min(row[0].wall_s for row in runs)
     rows = ""
     for jobs, same in zip(counts, zip(*runs, strict=True), strict=True):
-        equal = all(
-            np.array_equal(getattr(serial.found, item.name), getattr(one.found, item.name))
-            for one in same
-            for item in fields(Profiles)
-        )
-        best = Run(*np.min([one[:3] for one in same], axis=0), serial.events, serial.found)
-        alone_s, alone_cpu_s = np.min([[row[0].wall_s, row[0].cpu_s] for row in runs], axis=0)
-        most = alone_cpu_s / max(best.cpu_s / min(jobs, 2), best.first_s)
+        wall_s, cpu = np.min([one[:2] for one in same], axis=0)
+        equal = all(one.points == runs[0][0].points for one in same)
+        events, memory_mb = same[0].events, max(one.memory_mb for one in same)
         rows += (
-            f"| {frequency_hz:g} Hz | {best.events / 1e6:.1f} M | {jobs} | {best.wall_s:.2f} | "
-            f"{best.cpu_s:.2f} | {best.first_s:.2f} | {best.events / best.wall_s / 1e6:.0f} | "
-            f"{alone_s / best.wall_s:.2f} | {most:.2f} | {'yes' if equal else 'NO'} |\n"
+            f"| {frequency_hz:g} Hz | {size_mb:.0f} | {events / 1e6:.1f} M | {jobs} | "
+            f"{wall_s:.2f} | {cpu:.2f} | {events / wall_s / 1e6:.0f} | {alone_s / wall_s:.2f} | "
+            f"{'yes' if equal else 'NO'} | {memory_mb:.0f} | {same[0].before_mb:.0f} | "
+            f"{same[0].points_mb:.0f} |\n"
         )
     return rows
 
@@ -141,7 +187,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0, help="length of the 70 Hz stream")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("docs/performance.md"))
+    parser.add_argument("--recording", type=Path, help="reconstruct it and print the run")
+    parser.add_argument("--jobs", type=int, help="threads for --recording")
     arguments = parser.parse_args()
+    if arguments.recording is not None:
+        print(json.dumps(measure(arguments.recording, arguments.jobs)))
+        return
     cores = len(os.sched_getaffinity(0))
     text = HEAD.format(
         computer=f"{single.cpu_name()}, {cores} cores, {platform.system()} {platform.machine()}.",
@@ -158,8 +209,15 @@ def main() -> None:
     for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.1)):
         text += one_thread(frequency_hz, 1.5 * share, arguments.repeats)
     text += THREADS_TEXT + header(THREADS)
-    for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.15)):
-        text += threads(frequency_hz, arguments.seconds * share, arguments.repeats)
+    with tempfile.TemporaryDirectory() as made:
+        for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.15)):
+            modulation = Modulation(frequency_hz, on_edge_us=0)
+            data, _ = single.simulated(modulation, arguments.seconds * share)
+            for number, repeats in ((1, arguments.repeats), (LARGE_BYTES // len(data), 1)):
+                name = f"{frequency_hz:g}_{number}"
+                recording = write_recording(Path(made) / name, modulation, data, number)
+                text += threads(recording, frequency_hz, repeats)
+                (recording / EVENTS_FILE).unlink()
     arguments.out.write_text(text)
     print(text)
 

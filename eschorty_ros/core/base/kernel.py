@@ -24,6 +24,10 @@ def kernel(*arguments: Any, **options: Any) -> Any:
 
     ``@kernel`` compiles at the first call, ``@kernel(signature, ...)`` at import and for these
     signatures only. Keyword options are those of ``numba.njit``.
+
+    ``_nrt=False`` is for inner kernels that neither make nor return arrays. They count no
+    references to the arrays they use: each count is atomic and costs as much as a column's sums.
+    What they call inherits it, but for kernels with ``_nrt=True``.
     """
     if len(arguments) == 1 and callable(arguments[0]) and hasattr(arguments[0], "__code__"):
         return _compiled(arguments[0], (), options)
@@ -74,11 +78,11 @@ def _names(code: CodeType) -> Iterator[str]:
 def with_names(function: Any, suffix: str, **names: Any) -> Any:
     """Return the kernel of ``function`` with other global ``names``, such as kernels it calls.
 
-    ``suffix`` tells it from others of the same function.
+    It makes and returns no arrays. ``suffix`` tells it from others of the same function.
     """
     clone = FunctionType(function.__code__, {**function.__globals__, **names})
     clone.__module__, clone.__qualname__ = function.__module__, f"{function.__qualname__}_{suffix}"
-    return kernel(clone)
+    return kernel(_nrt=False)(clone)
 
 
 @cache

@@ -64,7 +64,7 @@ def _pass_over(sink, n, t_us, column, row, polarity):
 _decode_over = decode_into(_pass_over, "over")
 
 
-@kernel
+@kernel(_nrt=False)
 def _scan(words, begin, end):
     """Return the summary of the block of words begin..end - 1."""
     events, high, base = np.uint32(0), np.uint32(0), np.uint32(0)

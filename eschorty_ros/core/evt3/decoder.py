@@ -463,7 +463,7 @@ def _continue_others(words, i, s, c):
     return i
 
 
-@kernel
+@kernel(_nrt=False)
 def emit(sink, n, t_us, column, row, polarity):
     """Store an event."""
     sink.t[n] = t_us

@@ -85,7 +85,7 @@ def _sine(phase):
     return value if turn < np.uint32(0x8000) else np.uint32(np.uint32(0) - value)
 
 
-@kernel
+@kernel(_nrt=False)
 def _vector(packed, column, first, last, blink):
     """Return the sum of unit vectors over the events of rows first..last."""
     base = np.uint32(first)
@@ -114,7 +114,7 @@ def _vector(packed, column, first, last, blink):
     return Vector(events, x, y)
 
 
-@kernel
+@kernel(_nrt=False)
 def _is_concentrated(packed, column, first, last, blink):
     """Return true when 9 of 10 events of rows first..last are between their edge and the other one.
 
@@ -138,7 +138,7 @@ def _is_concentrated(packed, column, first, last, blink):
     return events >= 16 and 10 * np.int64(sums >> np.uint32(16)) <= events
 
 
-@kernel
+@kernel(_nrt=False)
 def _follows(packed, column, first, last, blink):
     """Return true when events of rows first..last follow the laser, and true when that is sure."""
     vector = _vector(packed, column, first, last, blink)
@@ -155,7 +155,7 @@ def _follows(packed, column, first, last, blink):
     return bursts, bursts
 
 
-@kernel
+@kernel(_nrt=True)
 def _has_bursts(packed, column, first, last, blink):
     """Return true when many ON events are close behind a rising edge and OFF ones a falling one.
 
@@ -176,7 +176,7 @@ def _has_bursts(packed, column, first, last, blink):
     return improbable.min() > _RAYLEIGH_MIN and improbable.sum() > _RAYLEIGH_SURE
 
 
-@kernel
+@kernel(_nrt=False)
 def _without(packed, column, first, last):
     """Remove the events of rows first..last from a column and return what is left."""
     n = np.int64(0)
@@ -188,7 +188,7 @@ def _without(packed, column, first, last):
     return _padded(packed, column.start, n)
 
 
-@kernel
+@kernel(_nrt=True)
 def _without_hot_pixels(packed, column, first, last, blink, counts):
     """Remove from a column the pixels of rows first..last that fire without the laser.
 

@@ -362,7 +362,7 @@ def _is_windowed(method):
     return method != _MEAN and method != _MEDIAN
 
 
-@kernel
+@kernel(_nrt=False)
 def _search(packed, column, half, estimator):
     """Search a column for the window of its line."""
     if not _is_windowed(estimator.method):
@@ -380,7 +380,7 @@ def _search(packed, column, half, estimator):
     return found
 
 
-@kernel
+@kernel(_nrt=False)
 def _find(packed, column, half, estimator, seed):
     """Find the window of a column's line, from the row ``seed`` on if it is 0 or more."""
     if seed >= 0:
@@ -392,7 +392,7 @@ def _find(packed, column, half, estimator, seed):
     return _search(packed, column, half, estimator)
 
 
-@kernel
+@kernel(_nrt=False)
 def _modulated(packed, column, found, half, estimator, blink, scratch):
     """Return the window of events that follow the laser, and the column without other windows.
 
@@ -420,7 +420,7 @@ def _modulated(packed, column, found, half, estimator, blink, scratch):
     return Returns(UNMODULATED, False, found.window, found.window), column, True
 
 
-@kernel
+@kernel(_nrt=False)
 def _all_returns(packed, column, half, estimator, found):
     """Search for a second return beside the one that was found.
 
@@ -433,7 +433,7 @@ def _all_returns(packed, column, half, estimator, found):
     return _second_return(packed, column, half, estimator.rows, estimator.events_min, found.window)
 
 
-@kernel
+@kernel(_nrt=False)
 def _vote(columns, c, a, b, half):
     """Return by how many events neighbours have window ``a`` stronger than its rival ``b``.
 
@@ -452,7 +452,7 @@ def _vote(columns, c, a, b, half):
     return evidence
 
 
-@kernel
+@kernel(_nrt=False)
 def _stronger(packed, column, c, half, columns, estimator, blink, found):
     """Return the stronger one of a column's two returns; in a stream its neighbours vote.
 
@@ -481,7 +481,7 @@ def _stronger(packed, column, c, half, columns, estimator, blink, found):
     return Returns(FOUND, False, a, a)
 
 
-@kernel
+@kernel(_nrt=False)
 def _row_in_window(packed, column, window, other, half, estimator, scratch):
     """Return the row of the return in ``window`` by a method that reads its events again.
 
@@ -520,7 +520,7 @@ def _reported(returns, found):
     return (far, near) if returns == _LAST else (near, far)
 
 
-@kernel
+@kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     """Estimate the rows of every column into ``out`` and empty the columns.
 
@@ -542,7 +542,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     if half <= estimator.half_max:
         line_variance = min(line_variance, estimator.line_variance)
     if estimator.method == _GAUSS_ML:
-        scratch = Scratch(scratch.row_counts, _fill_likelihood(scratch.likelihood, half))
+        size = _fill_likelihood(scratch.likelihood, half)
+        scratch = Scratch(scratch.row_counts, scratch.likelihood[:size])
     for c in range(columns.counts.size):
         n = np.int64(columns.counts[c])
         columns.counts[c] = 0

@@ -106,14 +106,14 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
     )
 
 
-@kernel
+@kernel(_nrt=False)
 def _forget_refused(refused):
     refused.over_limit = 0
     refused.outside_region = 0
     refused.gated = 0
 
 
-@kernel
+@kernel(_nrt=False)
 def _bin(bins, n, t_us, column, row, polarity):
     """Append an event to its column, or count why not: a decoder's ``emit``."""
     # An array that is bound to a name here is counted as used for every event.
@@ -137,7 +137,7 @@ def _bin(bins, n, t_us, column, row, polarity):
     return n + np.uint64(1)
 
 
-@kernel
+@kernel(_nrt=False)
 def _needs_room(columns):
     """Return true when events found no room in columns that may grow."""
     return columns.refused.over_limit > 0 and columns.room < columns.limit

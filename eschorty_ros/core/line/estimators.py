@@ -34,7 +34,7 @@ def _variance(sums):
     return (n * sums.d2 - sums.d * sums.d) / (float(n) * (n - 1))
 
 
-@kernel
+@kernel(_nrt=False)
 def _median(packed, column, counts):
     """Return the middle row, or the mean of the two middle rows; ``counts`` is zeroed scratch."""
     n = column.events
@@ -59,7 +59,7 @@ def _median(packed, column, counts):
     return (lower + upper) / 2.0
 
 
-@kernel
+@kernel(_nrt=False)
 def _quantile_edge(counts, low, high, step, total):
     """Return the row up to which, from ``low`` on, there are ``total / _EDGE_PART`` events.
 
@@ -82,7 +82,7 @@ def _quantile_edge(counts, low, high, step, total):
     return (row + other) / 2.0
 
 
-@kernel
+@kernel(_nrt=False)
 def _edge_midpoint(packed, column, low, high, counts):
     """Return the middle between the first and the last eighth of the events of rows low..high."""
     total = np.int64(0)
@@ -102,21 +102,21 @@ def likelihood_size(half: int) -> int:
     return int(np.ceil(_REACH * half)) + FRACTION
 
 
-@kernel
+@kernel(_nrt=False)
 def _fill_likelihood(table, half):
-    """Return ``exp(d^2 / 2 sigma^2)`` for distances of 0, 1, 2... fixed-point steps from the line.
+    """Fill ``exp(d^2 / 2 sigma^2)`` for distances of 0, 1, 2... fixed-point steps from the line.
 
-    ``sigma`` is that of a line whose window has the half width ``half``; the result is a view of
-    ``table``.
+    ``sigma`` is that of a line whose window has the half width ``half``. Returns the number of
+    entries.
     """
     size = np.int64(np.ceil(_REACH * half)) + FRACTION
     scale = 0.5 * (HALF_PER_SIGMA / (FRACTION * half)) ** 2
     for d in range(size):
         table[d] = np.exp(scale * (d * d))
-    return table[:size]
+    return size
 
 
-@kernel
+@kernel(_nrt=False)
 def _gauss_ml(packed, column, window, first, last, half, rows, table):
     """Return the row of greatest likelihood for a Gaussian of known width on uniform background.
 

@@ -90,14 +90,14 @@ def _forget(footprint):
     footprint.state[:] = 0
 
 
-@kernel
+@kernel(_nrt=False)
 def _bias_left(footprint):
     """Return the share of a cut line's bias that is left, 0 where whole lines are learned from."""
     rounds = footprint.state[4]
     return _BIAS_KEPT**rounds if rounds > 0 else 0.0
 
 
-@kernel
+@kernel(_nrt=False)
 def _count_rows(packed, column, low, high, counts):
     """Count the events of rows low..high into ``counts``."""
     for i in range(column.start, column.start + column.events):
@@ -106,7 +106,7 @@ def _count_rows(packed, column, low, high, counts):
             counts[row] += 1
 
 
-@kernel
+@kernel(_nrt=False)
 def _sample(packed, column, c, row, rows, footprint, counts):
     """Keep the events by row of column ``c`` to learn from, when its turn has come.
 
@@ -125,7 +125,7 @@ def _sample(packed, column, c, row, rows, footprint, counts):
     counts[first : last + 1] = 0
 
 
-@kernel
+@kernel(_nrt=False)
 def _log_likelihoods(footprint, place, low, high, counts, rows):
     """Fill the log-likelihoods of the places around ``place``; return the best one's offset."""
     likelihood, log, reach = footprint.likelihood, footprint.log, footprint.reach
@@ -156,7 +156,7 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
     return best
 
 
-@kernel
+@kernel(_nrt=False)
 def _learned_row(packed, column, row, rows, footprint, counts):
     """Return the row of a line near ``row`` and its variance; 0 and -1 before any is learned.
 

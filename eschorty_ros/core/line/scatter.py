@@ -48,7 +48,7 @@ def empty_scatter(columns: int, factor_max: float) -> Scatter:
     return Scatter(squares, expected, number, factor_max)
 
 
-@kernel
+@kernel(_nrt=False)
 def _add_differences(rows, scatter):
     """Add the second differences of a profile to the sums, but for lines that an edge cuts."""
     row, sigma2, cut = rows.row[0], rows.sigma2[0], rows.truncated[0]
@@ -70,7 +70,7 @@ def _add_differences(rows, scatter):
         scatter.number[block] = _KEPT * scatter.number[block] + number
 
 
-@kernel
+@kernel(_nrt=False)
 def _common_shift(shift, variance, first, last):
     """Return the mean way of the line in a block of columns, 0 where their scatter explains it."""
     total, number = 0.0, 0
@@ -83,7 +83,7 @@ def _common_shift(shift, variance, first, last):
     return total / number
 
 
-@kernel
+@kernel(_nrt=False)
 def _scale(rows, scatter, model):
     """Scale the variances of a profile by the scatter, and add that of the line's motion.
 

@@ -30,7 +30,7 @@ class Smoothing(NamedTuple):
     widths: Widths
 
 
-@kernel
+@kernel(_nrt=False)
 def _nearest(row, c, target):
     """Return the index of column ``c``'s return nearest to the row ``target``; 0 if it has none."""
     best = 0
@@ -40,7 +40,7 @@ def _nearest(row, c, target):
     return best
 
 
-@kernel
+@kernel(_nrt=False)
 def _partner(row, k, c, other):
     """Return the offset and index of the return in column ``other`` that continues ``k`` of ``c``.
 
@@ -53,7 +53,7 @@ def _partner(row, k, c, other):
     return row[index, other] - row[k, c], index
 
 
-@kernel
+@kernel(_nrt=False)
 def _smooth(rows, smoothing):
     """Average each point with symmetric pairs of neighbours; return the number of averaged points.
 
@@ -104,7 +104,7 @@ def _smooth(rows, smoothing):
     return smoothed
 
 
-@kernel
+@kernel(_nrt=False)
 def _is_isolated(row, k, c, gate):
     returns, columns = row.shape
     for other in range(max(c - _ISOLATION_REACH, 0), min(c + _ISOLATION_REACH + 1, columns)):
@@ -114,7 +114,7 @@ def _is_isolated(row, k, c, gate):
     return True
 
 
-@kernel
+@kernel(_nrt=False)
 def _reject_isolated(rows, smoothing):
     """Set weak and doubtful points without a neighbour near in rows to NaN; return their number."""
     row, isolated = rows.row, smoothing.isolated

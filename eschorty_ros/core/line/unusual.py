@@ -78,7 +78,7 @@ def _restart_widths(widths):
     widths.before[:] = np.nan
 
 
-@kernel
+@kernel(_nrt=False)
 def _is_usual(widths, width, reach):
     place = _bin(width)
     low, high = max(place - reach, 0), min(place + reach + 1, _BINS)
@@ -112,7 +112,7 @@ def _update(widths, columns):
     widths.state[0] = (median + 0.5) / _PER_ROW
 
 
-@kernel
+@kernel(_nrt=False)
 def _mark_unusual(rows, row, sigma2, widths):
     """Mark the mixed points of a profile's smoothed rows and widen their variance ``sigma2``."""
     returns, columns = row.shape

@@ -90,7 +90,7 @@ class _Densest(NamedTuple):
     highest: np.int64
 
 
-@kernel
+@kernel(_nrt=False)
 def _padded(packed, start, events):
     """Fill the last block behind the column's events and return its place."""
     blocks = (events + BLOCK - 1) // BLOCK
@@ -99,7 +99,7 @@ def _padded(packed, start, events):
     return Column(start, events, blocks)
 
 
-@kernel
+@kernel(_nrt=False)
 def _window_sums(packed, column, first, last):
     """Return the sums over rows first..last.
 
@@ -134,7 +134,7 @@ def _window_sums(packed, column, first, last):
     return Sums(events, sum_d, sum_d2, sum_time)
 
 
-@kernel
+@kernel(_nrt=False)
 def _window_events(packed, column, first, last):
     """Return the number of events in rows first..last."""
     base = np.uint32(first)
@@ -161,14 +161,14 @@ def _limits(centre, half, first, last):
     return max(low, first), min(high, last)
 
 
-@kernel
+@kernel(_nrt=False)
 def _full_column(packed, column):
     """Return the window over all rows; its centre is not computed and set to -1."""
     sums = _window_sums(packed, column, 0, ROW_LAST)
     return Window(np.int64(0), np.int64(ROW_LAST), sums, np.int64(-1))
 
 
-@kernel
+@kernel(_nrt=False)
 def _mean_shift(packed, column, centre, half, first, last):
     """Move a window to the mean of its events, ``_ITERATIONS_MAX`` times at most.
 
@@ -191,7 +191,7 @@ def _mean_shift(packed, column, centre, half, first, last):
     return Window(low, high, sums, centre)
 
 
-@kernel
+@kernel(_nrt=False)
 def _densest_pairwise(packed, column, radius, avoid, gap):
     best = np.int64(0)
     lowest = np.int64(ROW_LAST)
@@ -209,7 +209,7 @@ def _densest_pairwise(packed, column, radius, avoid, gap):
     return _Densest(best, lowest, highest)
 
 
-@kernel
+@kernel(_nrt=True)
 def _densest_histogram(packed, column, radius, avoid, gap):
     size = 1 << ROW_BITS
     below = np.zeros(size + 1, np.int64)
@@ -231,7 +231,7 @@ def _densest_histogram(packed, column, radius, avoid, gap):
     return _Densest(best, lowest, highest)
 
 
-@kernel
+@kernel(_nrt=False)
 def _densest(packed, column, half, avoid, gap):
     """Find the box of half the window's width, centred on an event, with most events.
 
@@ -252,14 +252,14 @@ def _rows_nearer(centre, other):
     return max((both >> (FRACTION_BITS + 1)) + 1, 0), ROW_LAST
 
 
-@kernel
+@kernel(_nrt=False)
 def _mean_shift_beside(packed, column, half, seed, avoid):
     """Run the mean shift from ``seed`` over the rows nearer to it than to ``avoid``."""
     first, last = _rows_nearer(seed, avoid)
     return _mean_shift(packed, column, seed, half, first, last)
 
 
-@kernel
+@kernel(_nrt=False)
 def _resolve_tie(packed, column, half, densest, avoid):
     """Run the mean shift from the equally dense rows and choose without preferring a direction.
 
@@ -285,7 +285,7 @@ def _resolve_tie(packed, column, half, densest, avoid):
     return Returns(AMBIGUOUS, True, a, b)
 
 
-@kernel
+@kernel(_nrt=False)
 def _densest_window(packed, column, half):
     """Find the densest window of a column."""
     return _resolve_tie(packed, column, half, _densest(packed, column, half, _NOWHERE, 0), _NOWHERE)
@@ -321,13 +321,13 @@ def _is_significant(events, others, half, rows):
     return improbable > np.log(_FALSE_SECOND * max(2.0 * rows / width, 1.0))
 
 
-@kernel
+@kernel(_nrt=False)
 def _box_events(packed, column, centre, half):
     low, high = _limits(centre, half >> 1, 0, ROW_LAST)
     return _window_events(packed, column, low, high)
 
 
-@kernel
+@kernel(_nrt=False)
 def _second_return(packed, column, half, rows, events_min, a):
     """Search for the return of another surface than that of window ``a``.
 

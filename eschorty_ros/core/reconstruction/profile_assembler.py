@@ -406,7 +406,7 @@ def _adapted_half(half, sums, half_max):
     return np.int64(min(max(np.rint(0.5 * (half + measured)), _HALF_MIN), limit))
 
 
-@kernel
+@kernel(_nrt=False)
 def _write(rows, smoothing, state, output):
     """Write the period's rows behind ``state.rows``, by column, nearest return first."""
     returns, columns = rows.row.shape

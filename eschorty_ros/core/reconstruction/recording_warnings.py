@@ -11,6 +11,8 @@ from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
 
 _PIECE_BYTES = 1 << 26
+# Counting has a cost for each chunk, too.
+_CHUNK_BYTES = 1 << 20
 _FEW = 10
 _LOSSES = {
     "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
@@ -88,7 +90,7 @@ def _frequency_hz(recording: Recording, reader: RawReader) -> float | None:
     decoder = Decoder(header.width, header.height)
     begin = max(reader.size_bytes - header.size_bytes - _PIECE_BYTES, 0) // 4 * 2
     done = 0
-    for chunk in reader.chunks(begin=begin):
+    for chunk in reader.chunks(_CHUNK_BYTES, begin):
         events = decoder.decode(chunk)
         estimate.add(events.t, events.p)
         done += len(chunk)
