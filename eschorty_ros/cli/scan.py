@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
+from eschorty_ros.cli.files import IN_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, page_options, sweep_options
 from eschorty_ros.core.base.errors import DeviceError
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 @click.option(
     "--hardware",
     metavar="CONFIG",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=IN_FILE,
     help="Scan with real devices: a YAML file of parameters by node; docs/hardware.md.",
 )
 @click.option(

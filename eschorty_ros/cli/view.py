@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import page_options
 from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
@@ -21,12 +22,10 @@ _SHOW_S = 0.3
 
 
 @click.command("view")
-@click.argument(
-    "cloud", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path)
-)
+@click.argument("cloud", required=False, type=IN_FILE)
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     help="Picture to write, .png, .pdf or .svg; .gif shows the scan growing.  "
     "[default: CLOUD with .png]",
 )
