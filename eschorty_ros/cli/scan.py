@@ -100,7 +100,7 @@ def command(
     from eschorty_ros.cli.view import serve_cloud
     from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.storage.recording_writer import make_recording_folder
-    from eschorty_ros.viewer.page import load_viser
+    from eschorty_ros.viewer.page import load_viser, open_when_served
 
     check_sweep(start, stop)
     one_scan = nodes_module("one_process.scan", make="scan")
@@ -127,6 +127,7 @@ def command(
     one_scan.check_job(job)
     if live:
         load_viser()
+        open_when_served(host, port)
         click.echo(f"page at http://{host}:{port}", err=True)
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")

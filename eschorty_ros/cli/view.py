@@ -78,10 +78,11 @@ def command(
 
 
 def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
-    from eschorty_ros.viewer.page import load_viser
+    from eschorty_ros.viewer.page import load_viser, open_when_served
 
     node = nodes_module("viewer.node", make="setup")
     load_viser()
+    open_when_served(host, port)
     values = {"allow_scan": str(allow_scan).lower(), "host": host, "port": str(port)}
     given = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
     if node.main(["--ros-args", "-r", "__ns:=/eschorty", *given]):
@@ -90,6 +91,7 @@ def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
 
 def _show(cloud: Path, out: Path | None, window: bool, page: tuple[str, int] | None) -> None:
     from eschorty_ros.core.storage import read_cloud
+    from eschorty_ros.viewer.page import open_when_served
 
     try:
         points, own = read_cloud(cloud), True
@@ -100,6 +102,7 @@ def _show(cloud: Path, out: Path | None, window: bool, page: tuple[str, int] | N
         _open_window(points, cloud.name)
         return
     if page is not None:
+        open_when_served(*page)
         serve_cloud(points, *page)
         return
     from eschorty_ros.report import figures
