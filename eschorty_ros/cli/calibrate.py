@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import pairs, progress_bar, show, table
+from eschorty_ros.cli.files import OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.optics import SHIPPED
@@ -38,7 +39,7 @@ _BLOCKS = 8
 )
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     default=Path("calibration.yaml"),
     show_default=True,
     help="Calibration to write; its page goes beside it as .html.",

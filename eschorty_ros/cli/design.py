@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import decimals, show, table
+from eschorty_ros.cli.files import OUT_FILE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,7 +52,7 @@ _LIGHT_S = 0.5 / 70.0
     "--out",
     "outs",
     multiple=True,
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     help="Also write the plots here, .png, .pdf or .svg, or the build, .yaml.",
 )
 def command(

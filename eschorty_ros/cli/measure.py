@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 
 if TYPE_CHECKING:
     from eschorty_ros.surfaces.measure import Measured, Pair, Surface
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command("measure")
-@click.argument("cloud", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("cloud", type=IN_FILE)
 @click.option(
     "--region",
     "regions",
@@ -32,10 +33,10 @@ if TYPE_CHECKING:
     help="Sigma of a range error that all points of one surface share.  [default: 0.1 of the "
     "points' own sigma]",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@json_option
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     help="Also draw the surfaces and their residuals here, .png, .pdf or .svg.",
 )
 def command(

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 
 if TYPE_CHECKING:
     from eschorty_ros.surfaces.mesh import Mesh
 
 
 @click.command("mesh")
-@click.argument("cloud", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("cloud", type=IN_FILE)
 @click.option(
     "--sigmas",
     type=click.FloatRange(0.0, min_open=True),
@@ -25,11 +26,11 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     help="Mesh to write, .ply, .obj or .stl, in m; beside it a picture, .png.  "
     "[default: CLOUD with _mesh.ply]",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@json_option
 def command(cloud: Path, sigmas: float, out: Path | None, as_json: bool) -> None:
     """Make a triangle mesh of CLOUD (.pcd or .ply of this package); needs open3d.
 

@@ -15,6 +15,7 @@ import click
 from eschorty_ros.cli.cluster import on_cluster
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
+from eschorty_ros.cli.files import OUT_FILE
 from eschorty_ros.cli.options import bag_options
 from eschorty_ros.core.base.errors import EschortyError
 
@@ -70,7 +71,7 @@ def setting_options() -> list[click.Parameter]:
 )
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     help="Cloud to write, .pcd or .ply, of one recording.  [default: RECORDING/cloud.pcd]",
 )
 @click.option("--jobs", type=click.IntRange(1, 256), help="Threads.  [default: one per core]")

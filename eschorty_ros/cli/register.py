@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.console import show, table
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,9 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command("register")
-@click.argument(
-    "clouds", nargs=-1, required=True, type=click.Path(exists=True, dir_okay=False, path_type=Path)
-)
+@click.argument("clouds", nargs=-1, required=True, type=IN_FILE)
 @click.option(
     "--start",
     "starts",
@@ -39,12 +38,12 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     default=Path("registered.pcd"),
     show_default=True,
     help="Joined cloud, .pcd or .ply; beside it a picture, .png.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@json_option
 def command(
     clouds: tuple[Path, ...],
     starts: tuple[tuple[float, ...], ...],

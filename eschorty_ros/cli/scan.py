@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
+from eschorty_ros.cli.files import IN_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, page_options, sweep_options
 from eschorty_ros.core.base.errors import DeviceError
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 @click.option(
     "--hardware",
     metavar="CONFIG",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=IN_FILE,
     help="Scan with real devices: a YAML file of parameters by node; docs/hardware.md.",
 )
 @click.option(
@@ -99,7 +100,7 @@ def command(
     from eschorty_ros.cli.view import serve_cloud
     from eschorty_ros.core.base.files import check_writable
     from eschorty_ros.core.storage.recording_writer import make_recording_folder
-    from eschorty_ros.viewer.page import load_viser
+    from eschorty_ros.viewer.page import load_viser, open_when_served
 
     check_sweep(start, stop)
     one_scan = nodes_module("one_process.scan", make="scan")
@@ -126,6 +127,7 @@ def command(
     one_scan.check_job(job)
     if live:
         load_viser()
+        open_when_served(host, port)
         click.echo(f"page at http://{host}:{port}", err=True)
     out.mkdir(parents=True, exist_ok=True)
     check_writable(out / "scan.pcd")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from eschorty_ros.cli.files import IN_FILE, OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import page_options
 from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
@@ -21,12 +22,10 @@ _SHOW_S = 0.3
 
 
 @click.command("view")
-@click.argument(
-    "cloud", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path)
-)
+@click.argument("cloud", required=False, type=IN_FILE)
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=OUT_FILE,
     help="Picture to write, .png, .pdf or .svg; .gif shows the scan growing.  "
     "[default: CLOUD with .png]",
 )
@@ -79,10 +78,11 @@ def command(
 
 
 def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
-    from eschorty_ros.viewer.page import load_viser
+    from eschorty_ros.viewer.page import load_viser, open_when_served
 
     node = nodes_module("viewer.node", make="setup")
     load_viser()
+    open_when_served(host, port)
     values = {"allow_scan": str(allow_scan).lower(), "host": host, "port": str(port)}
     given = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
     if node.main(["--ros-args", "-r", "__ns:=/eschorty", *given]):
@@ -91,6 +91,7 @@ def _serve_instrument(allow_scan: bool, host: str, port: int) -> None:
 
 def _show(cloud: Path, out: Path | None, window: bool, page: tuple[str, int] | None) -> None:
     from eschorty_ros.core.storage import read_cloud
+    from eschorty_ros.viewer.page import open_when_served
 
     try:
         points, own = read_cloud(cloud), True
@@ -101,6 +102,7 @@ def _show(cloud: Path, out: Path | None, window: bool, page: tuple[str, int] | N
         _open_window(points, cloud.name)
         return
     if page is not None:
+        open_when_served(*page)
         serve_cloud(points, *page)
         return
     from eschorty_ros.report import figures

@@ -7,8 +7,11 @@ so a scan could not be started from it.
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import threading
+import time
+import webbrowser
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
@@ -28,6 +31,7 @@ _NAMES = {
     "record": "record into",
 }  # fmt: skip
 _AHEAD = 1.3
+_SERVED_S, _POLL_S = 300.0, 0.5
 
 
 def load_viser() -> ModuleType:
@@ -222,6 +226,30 @@ class Page:
         with self._serving, contextlib.redirect_stdout(None):
             self._stopped = True
             self.server.stop()
+
+
+def open_when_served(host: str, port: int) -> None:
+    """Open the page in the browser of a desktop, if this is one, once its server answers.
+
+    Raises
+    ------
+    ArgumentError
+        When the port is taken already.
+    """
+    _check_free(host, port)
+    if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        return
+
+    def wait() -> None:
+        end_s = time.monotonic() + _SERVED_S
+        while time.monotonic() < end_s:
+            with contextlib.suppress(OSError):
+                socket.create_connection((host, port), 1.0).close()
+                webbrowser.open(f"http://{host}:{port}")
+                return
+            time.sleep(_POLL_S)
+
+    threading.Thread(target=wait, name="browser", daemon=True).start()
 
 
 def _check_free(host: str, port: int) -> None:

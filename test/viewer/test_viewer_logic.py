@@ -1,7 +1,9 @@
 """The page's server without a browser: decimation, text, and when a scan may begin."""
 
+import queue
 import socket
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE, write_cloud
 from eschorty_ros.viewer.growing_cloud import GrowingCloud, colours
+from eschorty_ros.viewer.page import open_when_served
 from eschorty_ros.viewer.scan_control import ABANDONED_S, Conditions, ScanControl, ScanValues
 from eschorty_ros.viewer.status import Status, laser_text
 
@@ -59,8 +62,6 @@ def test_the_pass_follows_from_the_stage_s_direction_whatever_the_batches():
 
 def test_it_follows_1_28_million_points_per_second():
     """A second of points, in 20 batches, in a small part of a second."""
-    import time
-
     cloud = GrowingCloud()
     batches = [numbered(k * 64_000, 64_000) for k in range(20)]
     cloud.add(batches[0])
@@ -166,3 +167,23 @@ def test_a_page_without_viser_or_on_a_taken_port_is_one_line(tmp_path, monkeypat
     done = CliRunner().invoke(main, view)
     assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
     assert "pip install viser" in done.stderr
+
+
+def test_a_page_is_opened_on_a_desktop_once_it_is_served(monkeypatch):
+    opened = queue.Queue()
+    monkeypatch.setattr("webbrowser.open", opened.put)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = probe.getsockname()
+    monkeypatch.setenv("DISPLAY", ":0")
+    open_when_served(*address)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    open_when_served(*address)
+    time.sleep(0.1)
+    assert opened.empty()
+    with socket.create_server(address):
+        assert opened.get(timeout=10.0) == "http://{}:{}".format(*address)
+        with pytest.raises(ArgumentError, match="choose another --port"):
+            open_when_served(*address)
+    assert opened.empty()
