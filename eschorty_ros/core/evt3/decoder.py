@@ -1,9 +1,9 @@
 """Streaming EVT3 decoder: one compiled state machine over the 16-bit words.
 
 The frequent words (ADDR_Y, ADDR_X, complete vector triples, TIME_LOW) are handled in the loop of
-``_decode``, all others in small functions. Each event goes to a sink: ``emit(sink, n, t_us, column,
-row, polarity)``, a kernel that takes event number ``n`` and returns ``n + 1``. `decode_into`
-compiles the state machine for a kernel ``emit``; that of `Decoder` stores the events in arrays.
+``_decode``, all others in small functions. Each event goes to a sink by a kernel ``_emit(sink, n,
+t_us, column, row, polarity)``, which takes event number ``n`` and returns ``n + 1``. `decode_into`
+compiles the state machine for such a kernel; that of `Decoder` stores the events in arrays.
 """
 
 from __future__ import annotations
@@ -464,7 +464,7 @@ def _continue_others(words, i, s, c):
 
 
 @kernel(_nrt=False)
-def emit(sink, n, t_us, column, row, polarity):
+def _emit(sink, n, t_us, column, row, polarity):
     """Store an event."""
     sink.t[n] = t_us
     sink.x[n] = np.uint16(column)
@@ -490,7 +490,7 @@ def _vector(mask, bits, s, c, sink, n):
         if mask >> np.uint64(k) & np.uint64(1):
             column = base + np.int64(k)
             if column < s.limit:
-                n = emit(sink, n, s.t_us, column, s.row, s.polarity)
+                n = _emit(sink, n, s.t_us, column, s.row, s.polarity)
             else:
                 dropped += 1
     if base >= _NO_BASE:
@@ -599,7 +599,7 @@ def _decode(words, i, until_us, through, memory, sink):
         if kind == w3.ADDR_X:
             x = np.int64(word & np.uint32(0x7FF))
             if x < limit:
-                n = emit(sink, n, t, x, row, (word >> np.uint32(11)) & np.uint32(1))
+                n = _emit(sink, n, t, x, row, (word >> np.uint32(11)) & np.uint32(1))
             else:
                 limit_x = width if np.uint64(row) < np.uint64(height) else 0
                 if x < limit_x:
@@ -622,7 +622,7 @@ def _decode(words, i, until_us, through, memory, sink):
                 first = base
                 base += 32
                 while mask != np.uint64(0):
-                    n = emit(sink, n, t, first + np.int64(ctz64(mask)), row, polarity)
+                    n = _emit(sink, n, t, first + np.int64(ctz64(mask)), row, polarity)
                     mask &= mask - one
             else:
                 s.t_us, s.row, s.base, s.polarity = t, row, base, polarity
@@ -700,12 +700,12 @@ def _decode(words, i, until_us, through, memory, sink):
 
 def decode_into(emit: Any, name: str) -> Any:
     """Return ``_decode`` compiled for a kernel ``emit``; ``name`` tells it from others."""
-    vector = with_names(_vector, name, emit=emit)
+    vector = with_names(_vector, name, _emit=emit)
     triple = with_names(_triple_by_words, name, _vector=vector)
-    return with_names(_decode, name, emit=emit, _vector=vector, _triple_by_words=triple)
+    return with_names(_decode, name, _emit=emit, _vector=vector, _triple_by_words=triple)
 
 
-_decode_stored = decode_into(emit, "stored")
+_decode_stored = decode_into(_emit, "stored")
 
 
 @kernel(types.UniTuple(uint64, 2)(_WORDS, _MEMORY, EVENT_ARRAYS))
