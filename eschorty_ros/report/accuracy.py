@@ -351,6 +351,8 @@ def measure_recorded(
 ) -> Accuracy | None:
     """Compare a cloud with the truth of its recording.
 
+    Where several periods make a profile, profiles are counted in place of periods.
+
     Parameters
     ----------
     points : ndarray of POINT_DTYPE, shape (n,)
@@ -384,7 +386,16 @@ def measure_recorded(
     expected_mm = np.where(flat, first + np.clip(share, 0.0, 1.0) * (last - first), nearest)
     error_mm = np.where(number >= 0, profiles.range_mm - expected_mm, np.nan)
     near_mm, far_mm = model.range_limits_mm
-    return _accuracy(points, error_mm, (true_mm >= near_mm) & (true_mm <= far_mm), number)
+    lit = (true_mm >= near_mm) & (true_mm <= far_mm)
+    apart = np.diff(np.unique(profiles.edge_us))
+    every = round(float(np.median(apart)) / recording.modulation.period_us) if apart.size else 1
+    if every > 1 and (number >= 0).any():
+        # A profile stands for the period in its middle.
+        phase = int(number[number >= 0].min()) % every
+        lit = lit[phase::every]
+        profile = np.rint((number - phase) / every).astype(np.int64)
+        number = np.where(number >= 0, np.clip(profile, 0, len(lit) - 1), -1)
+    return _accuracy(points, error_mm, lit, number)
 
 
 def _accuracy(

@@ -7,7 +7,7 @@ import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
 from eschorty_ros.core.storage import POINT_DTYPE, load_recording
 from eschorty_ros.report import accuracy
 from eschorty_ros.simulation.scenes import named
@@ -203,6 +203,10 @@ def test_a_recorded_truth_scores_as_its_scene_does(tmp_path, scene):
     assert scored.off_target == pytest.approx(known.off_target, abs=0.01 * known.points)
     for name in ("error_median_mm", "error_p95_mm", "within_1_sigma", "within_2_sigma"):
         assert getattr(scored, name) == pytest.approx(getattr(known, name), rel=0.02), name
+    longer = reconstruct_recording(recording, Settings(periods_per_profile=4))
+    by_four = accuracy.measure_recorded(longer.points, longer.profiles, recording)
+    assert by_four.periods == pytest.approx(scored.periods / 4, abs=1)
+    assert by_four.completeness == pytest.approx(scored.completeness, abs=0.1)
     (tmp_path / "truth.csv").unlink()
     bare = load_recording(tmp_path)
     assert accuracy.measure_recorded(found.points, found.profiles, bare) is None
