@@ -129,16 +129,22 @@ def relief(y, z):
     return 1300.0 + 6.0 * np.sin(y / 5.0 + 0.3 * np.sin(z / 9.0)) * np.cos(z / 7.0)
 
 
-def test_the_commands_run_in_the_order_of_the_pages(folder, monkeypatch):
-    monkeypatch.chdir(folder)
+@pytest.fixture(scope="module")
+def made(folder):
+    """The folder after the commands of the pages, in their order."""
     ran = 0
-    for text in blocks("eschorty"):
-        if any(part in text for part in ELSEWHERE):
-            continue
-        done = CliRunner().invoke(main, shlex.split(text)[1:], default_map=SHORT)
-        assert done.exit_code == 0, f"{text}\n{done.output}{done.exception!r}"
-        ran += 1
+    with contextlib.chdir(folder):
+        for text in blocks("eschorty"):
+            if any(part in text for part in ELSEWHERE):
+                continue
+            done = CliRunner().invoke(main, shlex.split(text)[1:], default_map=SHORT)
+            assert done.exit_code == 0, f"{text}\n{done.output}{done.exception!r}"
+            ran += 1
     assert ran > 20
+    return folder
+
+
+def test_the_commands_run_in_the_order_of_the_pages(made):
     for name in (
         "rec/cloud.png",
         "planes.png",
@@ -147,23 +153,22 @@ def test_the_commands_run_in_the_order_of_the_pages(folder, monkeypatch):
         "my.png",
         "built.html",
     ):
-        assert (folder / name).stat().st_size > 10_000, name
+        assert (made / name).stat().st_size > 10_000, name
 
 
-def test_the_python_examples_run(folder):
-    """After the commands, in the same folder."""
-    (folder / "mine").mkdir()
-    shutil.copy(folder / "rec" / "events.raw", folder / "mine")
+def test_the_python_examples_run(made):
+    (made / "mine").mkdir()
+    shutil.copy(made / "rec" / "events.raw", made / "mine")
     pages = [README, *(ROOT / "docs" / f"{name}.md" for name in ("python", "calibration"))]
     found = re.findall(r"```python\n(.*?)```", "\n".join(map(Path.read_text, pages)), re.DOTALL)
     done = subprocess.run(
         [sys.executable, "-c", "".join(found) + "es.load_recording('mine')\n"],
-        cwd=folder, capture_output=True, text=True, timeout=300,
+        cwd=made, capture_output=True, text=True, timeout=300,
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.count(" points") == 5
-    assert (folder / "rec" / "cloud.ply").stat().st_size > 10_000
+    assert (made / "rec" / "cloud.ply").stat().st_size > 10_000
 
 
 def test_make_targets_and_extras_exist():
