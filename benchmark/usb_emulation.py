@@ -1,6 +1,6 @@
 """Throughput of the emulated bus in this process and from another, as a table.
 
-The last rows are events of the EVK4 model, one packet of the sensor per read.
+The last row is events of the EVK4 model.
 
 Usage: python benchmark/usb_emulation.py [--megabytes 512]
 """
@@ -21,7 +21,6 @@ from eschorty_ros.emulation.bus import EmulatedBackend, UsbServer
 from eschorty_ros.emulation.bus.usb_remote import backend
 from eschorty_ros.emulation.evk4 import DATA_IN, SEQUENCES, Evk4Model
 
-PERIODS_US = (1008, 4000)
 EVENTS_PER_US = 20
 WARM_UP_READS = 20
 
@@ -57,12 +56,11 @@ class Firehose(Evk4Model):
         return self._data[:size]
 
 
-def streaming_camera(period_us):
+def streaming_camera():
     camera = Evk4Model(Spring())
     for name in ("init", "start"):
         for step in SEQUENCES[name]:
             camera.write(step.address, camera.read(step.address) & ~step.mask | step.value)
-    camera.write(0xB028, period_us)
     return camera
 
 
@@ -79,7 +77,7 @@ ROWS = (
         Row(f"any bytes, reads of {kib} KiB", kib << 10, Firehose, (None,))
         for kib in (16, 128, 512)
     ),
-    *(Row(f"events, packets of {us} us", 128 << 10, streaming_camera, (us,)) for us in PERIODS_US),
+    Row("events", 128 << 10, streaming_camera),
 )
 
 

@@ -79,6 +79,23 @@ def test_bytes_do_not_depend_on_the_times_of_the_reads() -> None:
         assert physics.late_changes == 0
 
 
+@pytest.mark.parametrize("packet_us", [2000, 4000])
+def test_a_packet_leaves_at_the_end_of_its_period(packet_us: int) -> None:
+    clock, physics = started()
+    physics.packet_us = packet_us
+    physics.set_laser(clock.now_ns, True, Modulation(1000.0))
+    zero_ns, before = clock.now_ns, 0
+    for end_us in range(packet_us, 5 * packet_us, packet_us):
+        clock.now_ns = zero_ns + end_us * 1000 - 1
+        assert physics.read(1 << 20, 0.0) == b""
+        clock.now_ns += 1
+        data = physics.read(1 << 20, 0.0)
+        assert data
+        assert physics.late_ns == 0
+        assert physics.statistics()["events"] > before
+        before = physics.statistics()["events"]
+
+
 def test_edges_lie_where_the_generator_puts_them_in_the_sensors_time() -> None:
     made = []
     clock, physics = started(make=lambda: made.append(world()) or made[-1])
