@@ -46,7 +46,7 @@ class Reconstructor:
         meanwhile, not lost).
     settings : Settings
     jobs : int
-        Threads that turn events into rows; with more than one, ``flush`` ends the stream.
+        Threads that decode and turn events into rows.
 
     Attributes
     ----------
