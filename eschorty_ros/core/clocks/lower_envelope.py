@@ -19,6 +19,8 @@ from eschorty_ros.core.clocks.clock_line import DRIFT_MAX_PPB, NS_PER_US, T_US_L
 _BINS = 600
 # Points further above the line are late because of the host and do not count.
 _PROMPT_NS = 5e6
+# A fit costs as much as the window has points: one for each share of them that is new.
+_POINTS_PER_FIT = 1 / 50
 # The cost of a drift is its amount over this span, so that short windows have none.
 _DRIFT_COST_SPAN_US = 1e6
 
@@ -49,6 +51,7 @@ class LowerEnvelope:
         self._bin_us = max(window_ns // (NS_PER_US * _BINS), 1)
         # Number of the bin, sensor time, arrival.
         self._points: deque[tuple[int, int, int]] = deque()
+        self._new_points = 0
         self.line: ClockLine | None = None
         self.touched_us = 0
 
@@ -62,20 +65,20 @@ class LowerEnvelope:
         arrival_ns = integer("arrival_ns", arrival_ns, -TIME_LIMIT, TIME_LIMIT)
         points = self._points
         bin_ = t_us // self._bin_us
-        if self.line is not None and points and points[-1][0] == bin_:
-            late_ns = arrival_ns - self.line.to_ns(t_us)
-            if late_ns < points[-1][2] - self.line.to_ns(points[-1][1]):
-                points[-1] = (bin_, t_us, arrival_ns)
-            if late_ns <= 0:
-                self.line = self.line.shifted(late_ns)
-                self.touched_us = t_us
-            if points[0][2] >= arrival_ns - self._window_ns:
-                return self.line
-        else:
+        if not points or points[-1][0] != bin_:
             points.append((bin_, t_us, arrival_ns))
+            self._new_points += 1
+        elif arrival_ns - points[-1][2] < (t_us - points[-1][1]) * NS_PER_US:
+            points[-1] = (bin_, t_us, arrival_ns)
         while points[0][2] < arrival_ns - self._window_ns:
             points.popleft()
-        self.line = self._fit()
+        if self.line is None or self._new_points > len(points) * _POINTS_PER_FIT:
+            self.line = self._fit()
+            self._new_points = 0
+        late_ns = arrival_ns - self.line.to_ns(t_us)
+        if late_ns <= 0:
+            self.line = self.line.shifted(late_ns)
+            self.touched_us = t_us
         return self.line
 
     def _fit(self) -> ClockLine:
