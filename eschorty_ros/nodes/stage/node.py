@@ -14,7 +14,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 
 from eschorty_ros.action import MoveStage
 from eschorty_ros.control.scan_sequence import SPEED_MIN_MM_S
-from eschorty_ros.control.stage_states import states_since
+from eschorty_ros.control.stage_states import REST_NS, states_since
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.emulation.bench.folder import stage_port
@@ -22,7 +22,6 @@ from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 from eschorty_ros.msg import PositionTrigger
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_ns
-from eschorty_ros.nodes.ros.executor import QueueingGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param
@@ -75,10 +74,8 @@ class StageNode(DeviceNode):
             goal_callback=lambda _: GoalResponse.ACCEPT,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
-        period_s = 1.0 / self.parameters["odom_rate"]
-        self.create_timer(
-            period_s, self._publish_odom, callback_group=QueueingGroup(), clock=self.steady_clock
-        )
+        self._begun = threading.Event()
+        threading.Thread(target=self._stream_odom, name="odometry", daemon=True).start()
         diagnostics.Diagnostics(self, self._report, MutuallyExclusiveCallbackGroup())
         Heartbeat(self, "stage/heartbeat", self._healthy)
 
@@ -186,6 +183,7 @@ class StageNode(DeviceNode):
             )
         stage.move_to(target_mm, speed_mm_s)
         self.moves += 1
+        self._begun.set()
 
     def _follow(self, goal: Any) -> StageState:
         """Wait until the stage rests; return its state."""
@@ -226,6 +224,17 @@ class StageNode(DeviceNode):
     def _result(success: bool, message: str, state: StageState | None) -> MoveStage.Result:
         position_m = m_from_mm(state.position_mm) if state is not None else float("nan")
         return MoveStage.Result(success=success, message=message, position=position_m)
+
+    def _stream_odom(self) -> None:
+        """Publish the odometry until the node ends; a timer of rclpy costs much more."""
+        while not ends(self):
+            with unless_shut_down(self):
+                self._publish_odom()
+            if self._rested:
+                self._begun.wait(REST_NS * 0.5e-9)
+                self._begun.clear()
+            else:
+                time.sleep(1.0 / self.parameters["odom_rate"])
 
     def _publish_odom(self) -> None:
         stage = self._stage
