@@ -1,4 +1,4 @@
-# make setup  everything the others need; then `. .build/setup.sh` for a shell with it
+# make setup  everything the others need, kernels compiled; then `. .build/setup.sh` for a shell with it
 # make scan   a simulated scan: cloud, picture, error against the truth
 # make report the paper's experiments again: report/index.html
 # make tradeoff speed against error again, and the table of docs/tradeoff.md from it
@@ -51,9 +51,9 @@ INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/*
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
-setup: $(SETUP)
+setup: $(SETUP) $(BUILD)/kernels.stamp
 
-scan: $(SETUP)
+scan: $(SETUP) $(BUILD)/kernels.stamp
 	@$(ENTER) eschorty scan --out scan $(SCAN)
 
 report: $(SETUP)
@@ -94,7 +94,7 @@ ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
 else
-test: $(SETUP) $(BUILD)/test.stamp
+test: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=line test-scans test-single
 
@@ -103,7 +103,7 @@ test-scans test-single: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(tests) -o cache_dir=$(BUILD)/$@ || $(call once_more,$(tests))
 endif
 
-quick: $(SETUP) $(BUILD)/test.stamp
+quick: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) --dist worksteal test/core test/live test/control \
 	  --ignore=test/core/base/test_kernel.py
 
@@ -168,10 +168,16 @@ build-package:
 	@export PATH="$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$(PREFIX):$(UNDERLAY)" \
 	  CMAKE_PREFIX_PATH="$(PREFIX):$(UNDERLAY)" LOG="$(BUILD)/$(NAME).log"; \
 	{ cmake -S $(SOURCE) -B $(BUILD)/$(NAME) -DCMAKE_INSTALL_PREFIX=$(PREFIX) \
-	    -DPython3_EXECUTABLE=$(VENV)/bin/python -DBUILD_TESTING=OFF \
+	    -DPython3_EXECUTABLE=$(VENV)/bin/python -DBUILD_TESTING=OFF -DCOMPILE_KERNELS=OFF \
 	  && cmake --build $(BUILD)/$(NAME) --parallel $(JOBS) \
 	  && cmake --install $(BUILD)/$(NAME); } > $$LOG 2>&1 \
 	|| { tail -n 40 $$LOG; echo "Building $(NAME) failed; the whole log is in $$LOG"; exit 1; }
+
+# numba compiles again what has changed since, when it is used.
+$(BUILD)/kernels.stamp: $(SETUP)
+	@echo "Compiling kernels, for a minute or two"
+	@$(ENTER) eschorty compile
+	@touch $@
 
 # The checkout's Python sources come first, the installed interfaces after them.
 $(SETUP): $(BUILD)/interfaces.stamp

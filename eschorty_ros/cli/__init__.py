@@ -24,6 +24,7 @@ COMMANDS = {
     "register": "Join clouds of several passes or poses in one frame.",
     "info": "Show the content of a file or recording.",
     "report": "Rerun the experiments; a page of figures, tables and findings.",
+    "compile": "Compile the numerical kernels before the first run.",
     "design": "Tabulate range, sampling and depth of field of an optical build.",
 }
 INTERRUPTED = 130

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-import time
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -25,7 +25,7 @@ Report = Callable[[float, str], None]
 def progress_bar(title: str) -> Iterator[Report]:
     """Show the share done on stderr: a bar on a terminal, else a line every few seconds.
 
-    The share stays below 100 % until the block ends.
+    The share stays below 100 % until the block ends. The lines come also while nothing is reported.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -41,18 +41,25 @@ def progress_bar(title: str) -> Iterator[Report]:
         disable=not sys.stderr.isatty(),
     )
     task = bar.add_task(title, total=1.0, note="")
-    next_s = time.monotonic() + LINE_EVERY_S
+    newest, ended = (0.0, ""), threading.Event()
 
     def report(share: float, note: str) -> None:
-        nonlocal next_s
-        shown = min(share, LESS_THAN_ALL)
-        bar.update(task, completed=shown, note=note)
-        if bar.disable and time.monotonic() >= next_s:
-            next_s = time.monotonic() + LINE_EVERY_S
-            print(f"{title}: {shown:.0%} {note}".rstrip(), file=sys.stderr, flush=True)
+        nonlocal newest
+        newest = min(share, LESS_THAN_ALL), note
+        bar.update(task, completed=newest[0], note=note)
 
-    with bar:
-        yield report
+    def print_lines() -> None:
+        while not ended.wait(LINE_EVERY_S):
+            share, note = newest
+            print(f"{title}: {share:.0%} {note}".rstrip(), file=sys.stderr, flush=True)
+
+    if bar.disable:
+        threading.Thread(target=print_lines, daemon=True).start()
+    try:
+        with bar:
+            yield report
+    finally:
+        ended.set()
 
 
 def table(title: str, *columns: str) -> Table:

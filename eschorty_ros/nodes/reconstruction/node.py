@@ -57,6 +57,9 @@ _IDLE_S = 0.02
 _JOBS_PER_STEP = 256
 # A step costs as much as the events of some packets of 1 ms; they wait for each other this long.
 _STEP_S = 0.004
+# Loading the compiled kernels takes less.
+_COMPILING_S = 5.0
+_COMPILING = "compiling kernels, for a minute or two at a first start; 'eschorty compile' does it"
 
 
 class ReconstructionNode(Node):
@@ -74,7 +77,10 @@ class ReconstructionNode(Node):
         table = (*TABLE, *from_settings(Settings, dynamic=True))
         self.parameters = Parameters(self, table, self._on_change)
         self.calibration = load_calibration(self.parameters["calibration"])
+        slow = threading.Timer(_COMPILING_S, self.get_logger().info, (_COMPILING,))
+        slow.start()
         warm_up(self.calibration, self.parameters.settings(Settings))
+        slow.cancel()
         self._override = modulation_override(self.parameters)
         self._pipeline = Pipeline(
             self.calibration,
