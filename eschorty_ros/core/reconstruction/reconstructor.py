@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -127,6 +128,10 @@ class Reconstructor:
         data : bytes-like
             EVT3, cut anywhere.
         """
+        return Profiles.concatenate(self.parts(data))
+
+    def parts(self, data: bytes | bytearray | memoryview) -> Iterator[Profiles]:
+        """Push the next bytes as `push` does; iterate over the profiles that they complete."""
         words, begin = self._decoder.words(byte_view("data", data)), 0
         while begin < words.size:
             size = _PIECE_WORDS
@@ -141,9 +146,7 @@ class Reconstructor:
             begin += size
             if events is not None:
                 self._periods.add(self._filtered(events), self._watermark_us)
-        rows = self._with_reflectance(self._assembler.take())
-        rows = self._compensated(rows)
-        return self._with_ranges(rows)
+        return self._taken()
 
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.
@@ -152,15 +155,25 @@ class Reconstructor:
         ``phase_missing`` is set.
         """
         self._periods.finish(self.newest_t_us)
-        rows = self._with_reflectance(self._assembler.take())
-        rows = self._compensated(rows, last=True)
-        return self._with_ranges(rows)
+        left = list(self._taken())
+        left.append(self._with_ranges(self._compensated(LineRows.empty(), last=True)))
+        return Profiles.concatenate(left)
+
+    def _taken(self) -> Iterator[Profiles]:
+        """Iterate over the profiles of a restart and those complete since."""
+        before, self._before_restart = self._before_restart, []
+        yield from before
+        parts = deque(self._assembler.take())
+        while parts:
+            rows = self._with_reflectance(parts.popleft())
+            yield self._with_ranges(self._compensated(rows))
 
     def _add_words(self, words: NDArray[np.uint16]) -> int:
         """Decode words into periods without storing the events; return the number read."""
-        before = self._decoder.counters.events
+        counts = self._decoder.memory.counts
+        before = int(counts.events)
         read = self._periods.add_words(words, self._decoder, self._watermark_us)
-        events = self._decoder.counters.events - before
+        events = int(counts.events) - before
         if events:
             self.newest_t_us = max(self._decoder.newest_us, self._watermark_us)
             self._counts["events"] += events
@@ -223,9 +236,12 @@ class Reconstructor:
         return LineRows.concatenate([rows, self._compensator.flush()]) if last else rows
 
     def _with_ranges(self, rows: LineRows) -> Profiles:
-        """Return ``rows`` with their ranges, after the profiles of a restart."""
-        profiles = Profiles.from_rows(rows, self.model)
-        self._counts["points_beyond_pole"] += len(rows) - len(profiles)
+        """Return ``rows`` with their ranges, as far as they are of interest."""
+        if isinstance(rows, Profiles):
+            profiles = rows
+        else:
+            profiles = Profiles.from_rows(rows, self.model)
+            self._counts["points_beyond_pole"] += len(rows) - len(profiles)
         within = within_ranges(profiles.range_mm, self.settings)
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
@@ -235,8 +251,7 @@ class Reconstructor:
         if self.settings.keep == "good":
             profiles = profiles.select(~flagged)
         self._counts["points"] += len(profiles)
-        before, self._before_restart = self._before_restart, []
-        return Profiles.concatenate([*before, profiles]) if before else profiles
+        return profiles
 
     def set_modulation(self, modulation: Modulation) -> None:
         """Use ``modulation`` for data pushed afterwards; the open period is closed first."""
