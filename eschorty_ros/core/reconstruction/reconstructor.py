@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,9 @@ class Reconstructor:
         alone = integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned"
         self._jobs = 1 if alone else jobs
         self._assembler = (
-            ProfileAssembler(settings, model) if alone else WindowAssembler(settings, model, jobs)
+            ProfileAssembler(settings, model)
+            if alone
+            else WindowAssembler(settings, model, jobs, self._hand_on)
         )
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
@@ -115,6 +118,7 @@ class Reconstructor:
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
         self._before_restart: list[Profiles] = []
+        self._each: Callable[[Profiles], Any]
         self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         self._begin(modulation)
 
@@ -128,10 +132,21 @@ class Reconstructor:
         data : bytes-like
             EVT3, cut anywhere.
         """
-        return Profiles.concatenate(self.parts(data))
+        found: list[Profiles] = []
+        self.push_to(found.append, data)
+        return Profiles.concatenate(found)
 
-    def parts(self, data: bytes | bytearray | memoryview) -> Iterator[Profiles]:
-        """Push the next bytes as `push` does; iterate over the profiles that they complete."""
+    def push_to(
+        self, each: Callable[[Profiles], Any], data: bytes | bytearray | memoryview
+    ) -> None:
+        """Call ``each`` with the profiles that the next bytes complete, in parts, as soon as known.
+
+        Other threads go on with later bytes meanwhile.
+        """
+        self._each = each
+        before, self._before_restart = self._before_restart, []
+        for profiles in before:
+            each(profiles)
         words, begin = self._decoder.words(byte_view("data", data)), 0
         while begin < words.size:
             size = _PIECE_WORDS
@@ -146,7 +161,9 @@ class Reconstructor:
             begin += size
             if events is not None:
                 self._periods.add(self._filtered(events), self._watermark_us)
-        return self._taken()
+        for rows in self._assembler.take():
+            self._hand_on(rows)
+        del self._each
 
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.
@@ -154,19 +171,17 @@ class Reconstructor:
         Without any phase until here the periods are cut from the first event's time on and
         ``phase_missing`` is set.
         """
+        left, self._before_restart = self._before_restart, []
         self._periods.finish(self.newest_t_us)
-        left = list(self._taken())
+        left += map(self._finished, self._assembler.take())
         left.append(self._with_ranges(self._compensated(LineRows.empty(), last=True)))
         return Profiles.concatenate(left)
 
-    def _taken(self) -> Iterator[Profiles]:
-        """Iterate over the profiles of a restart and those complete since."""
-        before, self._before_restart = self._before_restart, []
-        yield from before
-        parts = deque(self._assembler.take())
-        while parts:
-            rows = self._with_reflectance(parts.popleft())
-            yield self._with_ranges(self._compensated(rows))
+    def _hand_on(self, rows: LineRows) -> None:
+        self._each(self._finished(rows))
+
+    def _finished(self, rows: LineRows) -> Profiles:
+        return self._with_ranges(self._compensated(self._with_reflectance(rows)))
 
     def _add_words(self, words: NDArray[np.uint16]) -> int:
         """Decode words into periods without storing the events; return the number read."""

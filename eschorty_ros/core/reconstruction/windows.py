@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -59,21 +60,29 @@ class WindowAssembler:
     model : RangeModel
     jobs : int
         Threads.
+    each : callable
+        Called with the rows of each window as soon as those before it are known.
 
     Notes
     -----
-    Where nothing comes between rows and ranges the threads compute the ranges, too: ``take``
-    returns `Profiles`, and the counts have ``points_beyond_pole``.
+    Where nothing comes between rows and ranges the threads compute the ranges, too: rows are
+    `Profiles`, and the counts have ``points_beyond_pole``.
     """
 
-    def __init__(self, settings: Settings, model: RangeModel, jobs: int) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        model: RangeModel,
+        jobs: int,
+        each: Callable[[LineRows], None],
+    ) -> None:
+        self._each = each
         self._model = model
         self._ranges = "on" not in (settings.reflectance, settings.reflectance_compensation)
         self._jobs = jobs
         self._pool = ThreadPoolExecutor(jobs, "window")
         self._open = ProfileAssembler(settings, model)
         self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs + 1))
-        self._done: list[LineRows] = []
         self._counts: Counter[str] = Counter()
         self._at = Cut(0, 0)
 
@@ -102,10 +111,8 @@ class WindowAssembler:
         self._open.close()
 
     def take(self) -> list[LineRows]:
-        """Return the rows of the periods closed since the last call, in parts."""
-        self._keep(self._rows(self._open, self._at))
-        done, self._done = self._done, []
-        return done
+        """Return the rows of the periods closed since the last pass over words."""
+        return self._counted(self._rows(self._open, self._at))
 
     def merge_words(
         self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
@@ -158,15 +165,19 @@ class WindowAssembler:
         profiles: list[LineRows] = [Profiles.from_rows(part, self._model) for part in rows]
         return _Assembled(end, profiles, sum(map(len, rows)) - sum(map(len, profiles)))
 
-    def _keep(self, done: _Assembled) -> None:
-        """Append the rows that follow those kept so far."""
+    def _counted(self, done: _Assembled) -> list[LineRows]:
         self._at = done.end
-        self._done += done.rows
         self._counts["points_beyond_pole"] += done.beyond_pole
+        return done.rows
+
+    def _hand_on(self, done: _Assembled) -> None:
+        """Hand on the rows that follow those before."""
+        for rows in self._counted(done):
+            self._each(rows)
 
     def _go_on(self) -> bool:
         """Assemble the window behind the last one in this thread; return whether it is over."""
-        self._keep(self._assemble(self._at, self._decoder, self._open))
+        self._hand_on(self._assemble(self._at, self._decoder, self._open))
         return self._open.window_is_over
 
     def _accept(self, window: _Window, going: bool) -> bool:
@@ -176,7 +187,7 @@ class WindowAssembler:
         """
         result, assembler = window.result.result(), window.assembler
         if assembler is self._open:
-            self._keep(result)
+            self._hand_on(result)
             return assembler.window_is_over
         learned = assembler.has_learned or self._open.learns
         if (
@@ -193,7 +204,7 @@ class WindowAssembler:
             self._first_decoder.add_counts(self._decoder)
         self._idle.append(self._open)
         self._open, self._decoder = assembler, window.decoder
-        self._keep(result)
+        self._hand_on(result)
         return assembler.window_is_over
 
 
