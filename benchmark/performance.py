@@ -13,9 +13,9 @@ import platform
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ import scipy
 from eschorty_ros.core.evt3.words import TIME_HIGH
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import save_calibration
-from eschorty_ros.core.reconstruction import Profiles, Settings, reconstruct_recording, warm_up
+from eschorty_ros.core.reconstruction import Settings, reconstruct_recording, warm_up
 from eschorty_ros.core.storage import (
     CALIBRATION_FILE,
     EVENTS_FILE,
@@ -64,10 +64,11 @@ THREADS_TEXT = """
 
 `reconstruct_recording` as `eschorty reconstruct --jobs N` runs it, in a process of its own: the
 recording is read from the disk's cache and cut into windows of two million events, and each of N
-threads decodes windows and turns them into rows. *Wall* is from the file to placed points, *CPU*
-has the check of the laser's frequency, too. The clouds are compared bit for bit. *Memory* is the
-most that the process held, *before* what it held with everything imported and compiled, *points*
-what the result takes.
+threads decodes windows and turns them into points, which go to a file. *Wall* is from the file to
+placed points, *CPU* has the check of the laser's frequency, too. The clouds are compared bit for
+bit. *Memory* is the most of its own that the process held (mapped pages of the files, which the
+system takes back when it needs them, are not its own), *before* what it held with everything
+imported and compiled, *points* the size of their file.
 """
 THREADS = (
     "laser", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s", "times one thread",
@@ -118,20 +119,31 @@ def measure(folder: Path, jobs: int) -> Run:
     """Reconstruct a recording in this process."""
     recording = load_recording(folder)
     warm_up(recording.calibration)
-    before_mb = most_memory_mb()
+    before_mb = memory_mb()
+    most_mb = [before_mb]
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.02):
+            most_mb.append(max(most_mb.pop(), memory_mb()))
+
+    watching = threading.Thread(target=watch)
+    watching.start()
     cpu = time.process_time()
-    result = reconstruct_recording(recording, jobs=jobs)
-    points = hashlib.sha256(result.points.tobytes())
-    arrays = (getattr(result.profiles, item.name) for item in fields(Profiles))
-    size = result.points.nbytes + sum(array.nbytes for array in arrays if array is not None)
-    spent = result.seconds, time.process_time() - cpu
-    memory_mb = most_memory_mb()
-    return Run(*spent, result.events, memory_mb, before_mb, size / 1e6, points.hexdigest())
+    with tempfile.TemporaryDirectory(dir=folder) as made:
+        result = reconstruct_recording(recording, jobs=jobs, folder=Path(made))
+        spent = result.seconds, time.process_time() - cpu
+        ended.set()
+        watching.join()
+        points = hashlib.sha256(result.points).hexdigest()
+        size_mb = result.points.nbytes / 1e6
+    return Run(*spent, result.events, *most_mb, before_mb, size_mb, points)
 
 
-def most_memory_mb() -> float:
-    """Return the most memory that this process held so far."""
-    (line,) = (x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
+def memory_mb() -> float:
+    """Return the memory of this process without pages of files."""
+    status = Path("/proc/self/status").read_text().splitlines()
+    (line,) = (x for x in status if x.startswith("RssAnon"))
     return int(line.split()[1]) / 1e3
 
 

@@ -218,6 +218,7 @@ def _reconstruct(
     loaded: Recording, target: Path, jobs: int | None, given: dict[str, Any], show: bool
 ) -> tuple[dict[str, Any], Accuracy | None]:
     """Write the cloud of ``loaded``; return as `reconstruct_to`."""
+    from eschorty_ros.core.base.files import folder_beside
     from eschorty_ros.core.reconstruction import (
         reconstruct_recording,
         recorded_settings,
@@ -227,17 +228,18 @@ def _reconstruct(
     from eschorty_ros.report.accuracy import measure_recorded
 
     chosen = replace(recorded_settings(loaded), **given)
-    with progress_bar("reconstructing") if show else nullcontext(lambda done, note: None) as report:
+    shown = progress_bar("reconstructing") if show else nullcontext(lambda done, note: None)
+    with shown as report, folder_beside(target) as folder:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)
         result = reconstruct_recording(
-            loaded, chosen, lambda done, total: report(done / max(total, 1), ""), jobs
+            loaded, chosen, lambda done, total: report(done / max(total, 1), ""), jobs, folder
         )
         report(1.0, "scoring and writing")
         measured = measure_recorded(result.points, result.profiles, loaded)
         if len(result.points):
             write_cloud(target, result.points if result.organized is None else result.organized)
-    return summary(result), measured
+        return summary(result), measured
 
 
 def _print(

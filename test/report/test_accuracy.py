@@ -1,5 +1,6 @@
 """Accuracy of a cloud against a scene that is known in closed form."""
 
+import mmap
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.core.reconstruction import Settings, offline, reconstruct_recording
 from eschorty_ros.core.storage import POINT_DTYPE, load_recording
 from eschorty_ros.report import accuracy
 from eschorty_ros.simulation.scenes import named
@@ -210,6 +211,24 @@ def test_a_recorded_truth_scores_as_its_scene_does(tmp_path, scene):
     (tmp_path / "truth.csv").unlink()
     bare = load_recording(tmp_path)
     assert accuracy.measure_recorded(found.points, found.profiles, bare) is None
+
+
+def test_points_in_a_file_are_those_in_memory(tmp_path, monkeypatch):
+    """Also where a profile ends in a later piece of the file."""
+    monkeypatch.setattr(offline, "_PASS_BYTES", mmap.PAGESIZE)
+    narrow = replace(load_calibration("config_3"), columns=24, principal_column=11.5)
+    recording = simulate_recording(tmp_path, named("steps"), narrow, stop_mm=14.0, seed=8)
+    for name in ("with_truth", "without"):
+        (tmp_path / name).mkdir()
+        settings = Settings(organized="on")
+        memory = reconstruct_recording(recording, settings, jobs=1)
+        file = reconstruct_recording(recording, settings, jobs=1, folder=tmp_path / name)
+        assert file.profile_count == memory.profile_count > 5
+        assert file.points.tobytes() == memory.points.tobytes()
+        assert file.organized.tobytes() == memory.organized.tobytes()
+        assert file.organized.shape == memory.organized.shape
+        assert len(file.profiles) == (len(memory.profiles) if name == "with_truth" else 0)
+        (tmp_path / "truth.csv").unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("back", [False, True])

@@ -122,6 +122,20 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 @contextmanager
+def folder_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder for short-lived files in the folder of ``path``, as `temporary_folder`.
+
+    Raises
+    ------
+    ArgumentError
+        When nothing can be written there; names the path and the reason.
+    """
+    target = _target(path)
+    with _named(target), _partial(target.parent) as folder:
+        yield folder
+
+
+@contextmanager
 def temporary_folder() -> Iterator[Path]:
     """Make a folder for short-lived files; one of a run that was killed is removed by the next."""
     with _partial(Path(tempfile.gettempdir()), f"eschorty_{os.getuid()}_", "") as folder:

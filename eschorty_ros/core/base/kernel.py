@@ -28,6 +28,9 @@ def kernel(*arguments: Any, **options: Any) -> Any:
     ``_nrt=False`` is for inner kernels that neither make nor return arrays. They count no
     references to the arrays they use: each count is atomic and costs as much as a column's sums.
     What they call inherits it, but for kernels with ``_nrt=True``.
+
+    ``forceinline=True`` is for kernels that run for every column: a call copies every field of its
+    arguments and results.
     """
     if len(arguments) == 1 and callable(arguments[0]) and hasattr(arguments[0], "__code__"):
         return _compiled(arguments[0], (), options)

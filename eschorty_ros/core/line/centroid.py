@@ -380,7 +380,7 @@ def _search(packed, column, half, estimator):
     return found
 
 
-@kernel(_nrt=False)
+@kernel(_nrt=False, forceinline=True)
 def _find(packed, column, half, estimator, seed):
     """Find the window of a column's line, from the row ``seed`` on if it is 0 or more."""
     if seed >= 0:

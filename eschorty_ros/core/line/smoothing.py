@@ -54,6 +54,51 @@ def _partner(row, k, c, other):
 
 
 @kernel(_nrt=False)
+def _add_pairs(rows, k, j, gate, sums):
+    """Add the neighbours ``j`` columns away to those points of return ``k`` that have all nearer.
+
+    ``sums`` are those of the rows' differences, the variances, the spreads and the points.
+    """
+    row, columns = rows.row, np.uintp(rows.row.shape[1])
+    difference, variance, spread2, used = sums
+    for c in range(np.uintp(j), columns - np.uintp(j)):
+        if used[k, c] == 2 * j - 1 and not np.isnan(row[k, c]):
+            left, before = _partner(row, k, c, c - np.uintp(j))
+            right, after = _partner(row, k, c, c + np.uintp(j))
+            if abs(left) <= gate and abs(right) <= gate:
+                difference[k, c] += left + right
+                variance[k, c] += rows.sigma2[before, c - j] + rows.sigma2[after, c + j]
+                spread2[k, c] += rows.variance[before, c - j] + rows.variance[after, c + j]
+                used[k, c] += 2.0
+
+
+@kernel(_nrt=False)
+def _add_values(values, total, used, j):
+    """Add the values ``j`` columns away to the totals of the points that use these neighbours."""
+    j, columns = np.uintp(j), np.uintp(total.shape[1])
+    number = 2.0 * j + 1.0
+    for c in range(j, columns - j):
+        pair = values[0, c - j] + values[0, c + j]
+        total[0, c] += pair if used[0, c] == number else 0.0
+
+
+@kernel(_nrt=False)
+def _add_only_pairs(rows, j, gate, sums):
+    """Add the neighbours as `_add_pairs` does, where a column has one return: in vectors."""
+    row = rows.row
+    difference, variance, spread2, used = sums
+    number = 2.0 * j - 1.0
+    j, columns = np.uintp(j), np.uintp(row.shape[1])
+    for c in range(j, columns - j):
+        left, right = row[0, c - j] - row[0, c], row[0, c + j] - row[0, c]
+        near = (used[0, c] == number) & (abs(left) <= gate) & (abs(right) <= gate)
+        difference[0, c] += left + right if near else 0.0
+        used[0, c] += 2.0 if near else 0.0
+    _add_values(rows.sigma2, variance, used, j)
+    _add_values(rows.variance, spread2, used, j)
+
+
+@kernel(_nrt=False)
 def _smooth(rows, smoothing):
     """Average each point with symmetric pairs of neighbours; return the number of averaged points.
 
@@ -63,44 +108,35 @@ def _smooth(rows, smoothing):
     variance ``common2`` is shared by neighbours, whose lines cross the pixel rows at the same
     place, and is not reduced.
     """
-    half_width, gate = smoothing.half_width, smoothing.gate_px
-    out_row, out_sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
-    row, sigma2, common2, spread2 = rows.row, rows.sigma2, rows.common2, rows.variance
-    returns, columns = row.shape
+    out_row, out_sigma2 = smoothing.row, smoothing.sigma2
+    out_width, used = smoothing.widths.smoothed, smoothing.widths.used
+    returns, columns = rows.row.shape
+    for k in range(returns):
+        for c in range(columns):
+            out_row[k, c] = 0.0
+            out_sigma2[k, c] = rows.sigma2[k, c]
+        for c in range(columns):
+            out_width[k, c] = rows.variance[k, c]
+            used[k, c] = 1.0
+    sums = out_row, out_sigma2, out_width, used
+    for j in range(1, min(smoothing.half_width, (columns - 1) // 2) + 1):
+        if returns == 1:
+            _add_only_pairs(rows, j, smoothing.gate_px, sums)
+        else:
+            for k in range(returns):
+                _add_pairs(rows, k, j, smoothing.gate_px, sums)
     smoothed = 0
     for k in range(returns):
         for c in range(columns):
-            out_row[k, c] = row[k, c]
-            out_sigma2[k, c] = sigma2[k, c] + common2[k, c]
-            centre = row[k, c]
-            if np.isnan(centre):
-                widths.smoothed[k, c] = np.nan
-                continue
-            total = 0.0
-            variance = sigma2[k, c]
-            width2 = spread2[k, c]
-            used = 1
-            for j in range(1, half_width + 1):
-                if c < j or c + j >= columns:
-                    break
-                before, after = 0, 0
-                left = row[0, c - j] - centre
-                right = row[0, c + j] - centre
-                if returns > 1:
-                    left, before = _partner(row, k, c, c - j)
-                    right, after = _partner(row, k, c, c + j)
-                if not (abs(left) <= gate and abs(right) <= gate):
-                    break
-                total += left + right
-                variance += sigma2[before, c - j] + sigma2[after, c + j]
-                width2 += spread2[before, c - j] + spread2[after, c + j]
-                used += 2
-            widths.smoothed[k, c] = np.sqrt(width2 / used)
-            widths.used[k, c] = used
-            if used > 1:
-                out_row[k, c] = centre + total / used
-                out_sigma2[k, c] = common2[k, c] + variance / (used * used)
-                smoothed += 1
+            n = used[k, c]
+            out_row[k, c] = rows.row[k, c] + out_row[k, c] / n
+            smoothed += n > 1.0
+        for c in range(columns):
+            n = used[k, c]
+            out_sigma2[k, c] = rows.common2[k, c] + out_sigma2[k, c] / (n * n)
+        for c in range(columns):
+            width = np.sqrt(out_width[k, c] / used[k, c])
+            out_width[k, c] = np.nan if np.isnan(rows.row[k, c]) else width
     return smoothed
 
 

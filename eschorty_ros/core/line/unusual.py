@@ -49,7 +49,7 @@ class Widths(NamedTuple):
     state: NDArray[np.float64]
     before: NDArray[np.float64]
     smoothed: NDArray[np.float64]
-    used: NDArray[np.int64]
+    used: NDArray[np.float64]
 
 
 def empty_widths(returns: int, columns: int) -> Widths:
@@ -60,7 +60,7 @@ def empty_widths(returns: int, columns: int) -> Widths:
         state=np.zeros(2),
         before=np.full((2, returns, columns), np.nan),
         smoothed=np.full((returns, columns), np.nan),
-        used=np.ones((returns, columns), np.int64),
+        used=np.ones((returns, columns)),
     )
 
 

@@ -99,7 +99,7 @@ def _padded(packed, start, events):
     return Column(start, events, blocks)
 
 
-@kernel(_nrt=False)
+@kernel(_nrt=False, forceinline=True)
 def _window_sums(packed, column, first, last):
     """Return the sums over rows first..last.
 
@@ -168,7 +168,7 @@ def _full_column(packed, column):
     return Window(np.int64(0), np.int64(ROW_LAST), sums, np.int64(-1))
 
 
-@kernel(_nrt=False)
+@kernel(_nrt=False, forceinline=True)
 def _mean_shift(packed, column, centre, half, first, last):
     """Move a window to the mean of its events, ``_ITERATIONS_MAX`` times at most.
 

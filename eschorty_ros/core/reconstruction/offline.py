@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +19,13 @@ from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings
 from eschorty_ros.core.reconstruction.settings import Settings
-from eschorty_ros.core.storage import Recording, height_map
+from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
-from eschorty_ros.core.storage.recording import SETTINGS_FILE
+from eschorty_ros.core.storage.recording import SETTINGS_FILE, TRUTH_FILE
 
 # Bytes of the file that are mapped at a time, in one thread and in several.
 _PASS_BYTES = 1 << 20
-_WINDOWS_BYTES = 1 << 26
+_WINDOWS_BYTES = 1 << 25
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
 
@@ -37,7 +39,8 @@ class Result:
     points : ndarray of POINT_DTYPE
         In ``eschorty_base``; ``t`` in seconds since the first event.
     profiles : Profiles
-        The same points before placing, with their rows and times.
+        The same points before placing, with their rows and times; none where the points are in a
+        file and the recording has no truth to compare them with.
     counters : dict
         The reconstructor's, and ``points_without_stage``.
     profile_count, events : int
@@ -71,6 +74,7 @@ def reconstruct_recording(
     settings: Settings | None = None,
     progress: Callable[[int, int], Any] | None = None,
     jobs: int | None = None,
+    folder: Path | None = None,
 ) -> Result:
     """Return the points of a recording, placed along the stage's travel.
 
@@ -84,6 +88,9 @@ def reconstruct_recording(
         Called with bytes read so far and bytes in all.
     jobs : int, optional
         Threads; one per core at hand when left out. The points do not depend on it.
+    folder : Path, optional
+        Where the points are written while the recording is read; the result's are maps of files
+        there, and the memory does not grow with the recording. In memory when left out.
 
     Returns
     -------
@@ -101,35 +108,28 @@ def reconstruct_recording(
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
     reader = RawReader(recording.events_path)
-    placed = _Placed(recording)
+    cloud = _Cloud(recording, reconstructor, folder)
     done = 0
     for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
-        for found in _pushed(reconstructor, chunk, done, recording.marks):
-            placed.add(found)
+        _push(reconstructor, cloud.add, chunk, done, recording.marks)
         done += len(chunk)
         if progress is not None:
             progress(done, total)
-    placed.add(reconstructor.flush())
-    profiles, position = placed.joined()
+    cloud.add(reconstructor.flush())
+    profiles, points, organized = cloud.joined()
     origin_us = reconstructor.first_t_us or 0
-    points = place(
-        profiles, reconstructor.model, position, recording.calibration.stage_direction, origin_us
-    )
-    organized = None
-    if settings.organized == "on":
-        organized = height_map(points, profiles.edge_us, reconstructor.model.columns)
     newest_us = reconstructor.newest_t_us
     span_us = None if newest_us is None else (origin_us, newest_us)
     seconds = time.perf_counter() - began
     counters = reconstructor.counters
-    counters["points_without_stage"] = placed.without_stage
+    counters["points_without_stage"] = cloud.without_stage
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
     warnings = [str(line) for line in reader.warnings] + reconstructor.warnings
     return Result(
         points,
         profiles,
         counters,
-        profiles.profile_count,
+        cloud.profile_count,
         reconstructor.periods_per_profile,
         counters["events"],
         seconds,
@@ -138,38 +138,94 @@ def reconstruct_recording(
     )
 
 
-class _Placed:
-    """Profiles with the stage's position at each point, those outside the scan left out."""
+class _Cloud:
+    """Profiles placed along the stage's travel, those outside the scan left out."""
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._parts: list[tuple[Profiles, NDArray[np.float64]]] = []
+    def __init__(
+        self, recording: Recording, reconstructor: Reconstructor, folder: Path | None
+    ) -> None:
+        self._recording, self._reconstructor = recording, reconstructor
+        self._profiles: list[Profiles] = []
+        self._keeps_profiles = folder is None or (recording.path / TRUTH_FILE).exists()
+        self._points = _Array(folder and folder / "points")
+        self._organized: _Array | None = None
+        if reconstructor.settings.organized == "on":
+            self._organized = _Array(folder and folder / "organized")
+        self._newest_edge_us: int | None = None
+        self.profile_count = 0
         self.without_stage = 0
 
     def add(self, profiles: Profiles) -> None:
-        """Append profiles."""
-        position = self._recording.stage.position_mm(profiles.t_us)
+        """Append complete profiles."""
+        recording, model = self._recording, self._reconstructor.model
+        position = recording.stage.position_mm(profiles.t_us)
         known = np.isfinite(position)
         self.without_stage += int(known.size - known.sum())
-        if self._recording.scan is not None:
-            known &= self._recording.scan.between(position)
+        if recording.scan is not None:
+            known &= recording.scan.between(position)
         if not known.all():
             profiles, position = profiles.select(known), position[known]
-        if len(profiles):
-            self._parts.append((profiles, position))
+        if not len(profiles):
+            return
+        self.profile_count += profiles.profile_count
+        self.profile_count -= int(profiles.edge_us[0]) == self._newest_edge_us
+        self._newest_edge_us = int(profiles.edge_us[-1])
+        origin_us = self._reconstructor.first_t_us or 0
+        direction = recording.calibration.stage_direction
+        points = place(profiles, model, position, direction, origin_us)
+        self._points.append(points)
+        if self._organized is not None:
+            self._organized.append(height_map(points, profiles.edge_us, model.columns))
+        if self._keeps_profiles:
+            self._profiles.append(profiles)
 
-    def joined(self) -> tuple[Profiles, NDArray[np.float64]]:
-        """Return all profiles and positions, and free the parts of an array when it is copied."""
-        parts, self._parts = self._parts, []
+    def joined(self) -> tuple[Profiles, NDArray[np.void], NDArray[np.void] | None]:
+        """Return all profiles, points and the height map; free the parts while they are copied."""
+        none = np.empty(
+            0,
+            REFLECTANCE_DTYPE if self._reconstructor.settings.reflectance == "on" else POINT_DTYPE,
+        )
+        points = self._points.joined(none)
+        organized = None
+        if self._organized is not None:
+            organized = self._organized.joined(none.reshape(0, self._reconstructor.model.columns))
+        parts, self._profiles = self._profiles, []
         if not parts:
-            return Profiles.empty(), np.empty(0)
-        position = np.concatenate([position for _, position in parts])
+            return Profiles.empty(), points, organized
         arrays: dict[str, Any] = {
-            item.name: [getattr(profiles, item.name) for profiles, _ in parts]
+            item.name: [getattr(profiles, item.name) for profiles in parts]
             for item in fields(Profiles)
         }
         parts.clear()
-        return Profiles(**{name: _joined(arrays.pop(name)) for name in list(arrays)}), position
+        profiles = Profiles(**{name: _joined(arrays.pop(name)) for name in list(arrays)})
+        return profiles, points, organized
+
+
+class _Array:
+    """An array that grows along its first axis, in memory or in a file."""
+
+    def __init__(self, file: Path | None) -> None:
+        self._parts: list[NDArray[Any]] = []
+        self._stream = None if file is None else file.open("x+b")
+
+    def append(self, part: NDArray[Any]) -> None:
+        """Append a part."""
+        if self._stream is None:
+            self._parts.append(part)
+        else:
+            self._stream.write(part.data)
+
+    def joined(self, none: NDArray[Any]) -> NDArray[Any]:
+        """Return all parts as one array, or ``none`` of them; it has dtype and shape of a part."""
+        if self._stream is None:
+            parts, self._parts = self._parts, []
+            return np.concatenate(parts) if parts else none
+        with self._stream as stream:
+            if not stream.tell():
+                return none
+            stream.flush()
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        return np.frombuffer(data, none.dtype).reshape(-1, *none.shape[1:])
 
 
 def _joined(parts: list[Any]) -> Any:
@@ -197,20 +253,24 @@ def recorded_settings(recording: Recording) -> Settings:
         raise FormatError(f"{file}: {error}") from error
 
 
-def _pushed(
-    reconstructor: Reconstructor, chunk: memoryview, begin: int, marks: NDArray[np.void]
-) -> Iterator[Profiles]:
+def _push(
+    reconstructor: Reconstructor,
+    each: Callable[[Profiles], Any],
+    chunk: memoryview,
+    begin: int,
+    marks: NDArray[np.void],
+) -> None:
     """Push a chunk that begins at a byte of the stream, with what the marks in it say."""
     first, last = np.searchsorted(marks["byte"], (begin, begin + len(chunk)))
     at = 0
     for byte, lost, laser_on in marks[first:last].tolist():
-        yield reconstructor.push(chunk[at : byte - begin])
+        reconstructor.push_to(each, chunk[at : byte - begin])
         at = byte - begin
         if lost:
             reconstructor.note_gap()
         if laser_on:
             reconstructor.restart_phase()
-    yield reconstructor.push(chunk[at:])
+    reconstructor.push_to(each, chunk[at:])
 
 
 def stage_speed_mm_s(recording: Recording) -> float:

@@ -312,11 +312,11 @@ class ProfileAssembler:
             again = Edges(*(np.array([self._state[name]]) for name in ("edge_us", "period")))
             self.merge(none, none, again)
 
-    def take(self) -> LineRows:
-        """Return the rows of the periods closed since the last call."""
+    def take(self) -> list[LineRows]:
+        """Return the rows of the periods closed since the last call, in parts."""
         self._collect()
         done, self._done = self._done, []
-        return done[0] if len(done) == 1 else LineRows.concatenate(done)
+        return done
 
     def _collect(self) -> None:
         """Copy the rows of the output and empty it."""

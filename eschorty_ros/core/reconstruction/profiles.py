@@ -88,6 +88,8 @@ class LineRows:
         kept = [part for part in parts if len(part)]
         if not kept:
             return cls.empty()
+        if len(kept) == 1:
+            return kept[0]
         if any(part.reflectance is not None for part in kept):
             kept = [part if part.reflectance is not None else part._unknown() for part in kept]
         joined: dict[str, Any] = {}

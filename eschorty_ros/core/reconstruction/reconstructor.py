@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +106,9 @@ class Reconstructor:
         alone = integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned"
         self._jobs = 1 if alone else jobs
         self._assembler = (
-            ProfileAssembler(settings, model) if alone else WindowAssembler(settings, model, jobs)
+            ProfileAssembler(settings, model)
+            if alone
+            else WindowAssembler(settings, model, jobs, self._hand_on)
         )
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
@@ -114,6 +118,7 @@ class Reconstructor:
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
         self._before_restart: list[Profiles] = []
+        self._each: Callable[[Profiles], Any]
         self._stage_edges: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         self._begin(modulation)
 
@@ -127,6 +132,21 @@ class Reconstructor:
         data : bytes-like
             EVT3, cut anywhere.
         """
+        found: list[Profiles] = []
+        self.push_to(found.append, data)
+        return Profiles.concatenate(found)
+
+    def push_to(
+        self, each: Callable[[Profiles], Any], data: bytes | bytearray | memoryview
+    ) -> None:
+        """Call ``each`` with the profiles that the next bytes complete, in parts, as soon as known.
+
+        Other threads go on with later bytes meanwhile.
+        """
+        self._each = each
+        before, self._before_restart = self._before_restart, []
+        for profiles in before:
+            each(profiles)
         words, begin = self._decoder.words(byte_view("data", data)), 0
         while begin < words.size:
             size = _PIECE_WORDS
@@ -141,9 +161,9 @@ class Reconstructor:
             begin += size
             if events is not None:
                 self._periods.add(self._filtered(events), self._watermark_us)
-        rows = self._with_reflectance(self._assembler.take())
-        rows = self._compensated(rows)
-        return self._with_ranges(rows)
+        for rows in self._assembler.take():
+            self._hand_on(rows)
+        del self._each
 
     def flush(self) -> Profiles:
         """Close the open period and return all profiles left; call at the end of the stream.
@@ -151,16 +171,24 @@ class Reconstructor:
         Without any phase until here the periods are cut from the first event's time on and
         ``phase_missing`` is set.
         """
+        left, self._before_restart = self._before_restart, []
         self._periods.finish(self.newest_t_us)
-        rows = self._with_reflectance(self._assembler.take())
-        rows = self._compensated(rows, last=True)
-        return self._with_ranges(rows)
+        left += map(self._finished, self._assembler.take())
+        left.append(self._with_ranges(self._compensated(LineRows.empty(), last=True)))
+        return Profiles.concatenate(left)
+
+    def _hand_on(self, rows: LineRows) -> None:
+        self._each(self._finished(rows))
+
+    def _finished(self, rows: LineRows) -> Profiles:
+        return self._with_ranges(self._compensated(self._with_reflectance(rows)))
 
     def _add_words(self, words: NDArray[np.uint16]) -> int:
         """Decode words into periods without storing the events; return the number read."""
-        before = self._decoder.counters.events
+        counts = self._decoder.memory.counts
+        before = int(counts.events)
         read = self._periods.add_words(words, self._decoder, self._watermark_us)
-        events = self._decoder.counters.events - before
+        events = int(counts.events) - before
         if events:
             self.newest_t_us = max(self._decoder.newest_us, self._watermark_us)
             self._counts["events"] += events
@@ -223,9 +251,12 @@ class Reconstructor:
         return LineRows.concatenate([rows, self._compensator.flush()]) if last else rows
 
     def _with_ranges(self, rows: LineRows) -> Profiles:
-        """Return ``rows`` with their ranges, after the profiles of a restart."""
-        profiles = Profiles.from_rows(rows, self.model)
-        self._counts["points_beyond_pole"] += len(rows) - len(profiles)
+        """Return ``rows`` with their ranges, as far as they are of interest."""
+        if isinstance(rows, Profiles):
+            profiles = rows
+        else:
+            profiles = Profiles.from_rows(rows, self.model)
+            self._counts["points_beyond_pole"] += len(rows) - len(profiles)
         within = within_ranges(profiles.range_mm, self.settings)
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
@@ -235,8 +266,7 @@ class Reconstructor:
         if self.settings.keep == "good":
             profiles = profiles.select(~flagged)
         self._counts["points"] += len(profiles)
-        before, self._before_restart = self._before_restart, []
-        return Profiles.concatenate([*before, profiles]) if before else profiles
+        return profiles
 
     def set_modulation(self, modulation: Modulation) -> None:
         """Use ``modulation`` for data pushed afterwards; the open period is closed first."""

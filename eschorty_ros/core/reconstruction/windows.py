@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -16,14 +17,22 @@ from eschorty_ros.core.modulation.held_events import EventArrays
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import profile_assembler
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
-from eschorty_ros.core.reconstruction.profiles import LineRows
+from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings
 
 JOBS_MAX = 256
 
 
+class _Assembled(NamedTuple):
+    """Where a window ends, its rows in parts, and the number of those beyond the pole."""
+
+    end: Cut
+    rows: list[LineRows]
+    beyond_pole: int
+
+
 class _Window(NamedTuple):
-    """A window that a thread assembles: where it begins, and the cut at its end.
+    """A window that a thread assembles: where it begins, and what is to come of it.
 
     ``first`` holds the decoder's state at the beginning.
     """
@@ -32,7 +41,7 @@ class _Window(NamedTuple):
     first: Decoder
     decoder: Decoder
     assembler: ProfileAssembler
-    end: Future[Cut]
+    result: Future[_Assembled]
 
 
 class WindowAssembler:
@@ -51,14 +60,29 @@ class WindowAssembler:
     model : RangeModel
     jobs : int
         Threads.
+    each : callable
+        Called with the rows of each window as soon as those before it are known.
+
+    Notes
+    -----
+    Where nothing comes between rows and ranges the threads compute the ranges, too: rows are
+    `Profiles`, and the counts have ``points_beyond_pole``.
     """
 
-    def __init__(self, settings: Settings, model: RangeModel, jobs: int) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        model: RangeModel,
+        jobs: int,
+        each: Callable[[LineRows], None],
+    ) -> None:
+        self._each = each
+        self._model = model
+        self._ranges = "on" not in (settings.reflectance, settings.reflectance_compensation)
         self._jobs = jobs
         self._pool = ThreadPoolExecutor(jobs, "window")
         self._open = ProfileAssembler(settings, model)
         self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs + 1))
-        self._done: list[LineRows] = []
         self._counts: Counter[str] = Counter()
         self._at = Cut(0, 0)
 
@@ -86,10 +110,9 @@ class WindowAssembler:
         """Close the open period if it has events; it stays open for further ones."""
         self._open.close()
 
-    def take(self) -> LineRows:
-        """Return the rows of the periods closed since the last call."""
-        done, self._done = [*self._done, self._open.take()], []
-        return LineRows.concatenate(done)
+    def take(self) -> list[LineRows]:
+        """Return the rows of the periods closed since the last pass over words."""
+        return self._counted(self._rows(self._open, self._at))
 
     def merge_words(
         self, words: NDArray[np.uint16], decoder: Decoder, span: Span, edges: Edges
@@ -125,19 +148,36 @@ class WindowAssembler:
     def _start(
         self, begin: Cut, first: Decoder, decoder: Decoder, assembler: ProfileAssembler
     ) -> _Window:
-        end = self._pool.submit(self._assemble, begin, decoder, assembler)
-        return _Window(begin, first, decoder, assembler, end)
+        result = self._pool.submit(self._assemble, begin, decoder, assembler)
+        return _Window(begin, first, decoder, assembler, result)
 
-    def _assemble(self, begin: Cut, decoder: Decoder, assembler: ProfileAssembler) -> Cut:
-        """Assemble a window from ``begin`` on; return where it ends."""
+    def _assemble(self, begin: Cut, decoder: Decoder, assembler: ProfileAssembler) -> _Assembled:
+        """Assemble a window from ``begin`` on."""
         words, edges = self._words[begin.word :], self._edges
         later = Edges(edges.t_us[begin.edge :], edges.period[begin.edge :])
         read, used = assembler.merge_words(words, decoder, self._span, later)
-        return Cut(int(begin.word + read), begin.edge + used)
+        return self._rows(assembler, Cut(int(begin.word + read), begin.edge + used))
+
+    def _rows(self, assembler: ProfileAssembler, end: Cut) -> _Assembled:
+        rows = assembler.take()
+        if not self._ranges:
+            return _Assembled(end, rows, 0)
+        profiles: list[LineRows] = [Profiles.from_rows(part, self._model) for part in rows]
+        return _Assembled(end, profiles, sum(map(len, rows)) - sum(map(len, profiles)))
+
+    def _counted(self, done: _Assembled) -> list[LineRows]:
+        self._at = done.end
+        self._counts["points_beyond_pole"] += done.beyond_pole
+        return done.rows
+
+    def _hand_on(self, done: _Assembled) -> None:
+        """Hand on the rows that follow those before."""
+        for rows in self._counted(done):
+            self._each(rows)
 
     def _go_on(self) -> bool:
         """Assemble the window behind the last one in this thread; return whether it is over."""
-        self._at = self._assemble(self._at, self._decoder, self._open)
+        self._hand_on(self._assemble(self._at, self._decoder, self._open))
         return self._open.window_is_over
 
     def _accept(self, window: _Window, going: bool) -> bool:
@@ -145,9 +185,9 @@ class WindowAssembler:
 
         Without ``going`` it is dropped.
         """
-        end, assembler = window.end.result(), window.assembler
+        result, assembler = window.result.result(), window.assembler
         if assembler is self._open:
-            self._at = end
+            self._hand_on(result)
             return assembler.window_is_over
         learned = assembler.has_learned or self._open.learns
         if (
@@ -159,12 +199,12 @@ class WindowAssembler:
             self._idle.append(assembler)
             return going and self._go_on()
         assembler.exchange_footprints(self._open)
-        self._done.append(self._open.take())
         self._counts.update(self._open.counters)
         if self._decoder is not self._first_decoder:
             self._first_decoder.add_counts(self._decoder)
         self._idle.append(self._open)
-        self._open, self._decoder, self._at = assembler, window.decoder, end
+        self._open, self._decoder = assembler, window.decoder
+        self._hand_on(result)
         return assembler.window_is_over
 
 
