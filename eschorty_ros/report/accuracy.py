@@ -377,7 +377,7 @@ def measure_recorded(
     share = (profiles.t_us - times[before]) / np.maximum(times[after] - times[before], 1)
     number = np.where(share < 0.5, before, after)
     apart_us = np.abs(profiles.t_us - times[number])
-    number[apart_us > recording.modulation.period_us] = -1
+    number[apart_us > 0.5 * recording.modulation.period_us] = -1
     first, last = true_mm[before, profiles.column], true_mm[after, profiles.column]
     # Steeper than that is a step: the point is on one of its sides.
     stage_mm = recording.stage.position_mm(times)

@@ -21,7 +21,7 @@ _LIT_SHARE = 0.5
 _OUTLIER_PX = 4.0
 _PAIRED_MAX = 300
 # The events of a moving line lag it by this much, with the opposite sign on the way back.
-_LATE_PX = 0.23
+_LATE_PX = 0.1
 
 
 def moving_target(

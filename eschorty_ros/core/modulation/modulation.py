@@ -68,6 +68,11 @@ class Modulation:
         """Length of one period in microseconds."""
         return 1e6 / self.frequency_hz
 
+    @property
+    def middle_us(self) -> float:
+        """Time from a rising edge to the middle of the light in microseconds."""
+        return self.duty * self.period_us * (1.0 if self.waveform == "sine" else 0.5)
+
     def edge_us(self, index: int) -> int:
         """Return the sensor time of rising edge ``index``, rounded to the microsecond.
 

@@ -15,6 +15,7 @@ from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.line.blinking import Blink, blink
 from eschorty_ros.core.line.centroid import (
     _LEARNED,
+    CENTROIDS,
     FULL_COLUMN_METHODS,
     Estimator,
     Rows,
@@ -35,6 +36,7 @@ from eschorty_ros.core.line.columns import (
     empty_columns,
     wider_columns,
 )
+from eschorty_ros.core.line.delay import Delay, _delay_us, empty_delay, profile_delay
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import Footprint, _forget, _learn, make_footprint
 from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
@@ -128,6 +130,7 @@ class _Memory(NamedTuple):
     footprint: Footprint
     scatter: Scatter
     smoothing: Smoothing
+    delay: Delay
     rows: Rows
     scratch: Scratch
     output: _Output
@@ -185,7 +188,12 @@ class ProfileAssembler:
         ``every`` is the number of periods in a profile.
         """
         self._gate = phase_gate(modulation, self._gate_us)
-        self._memory = self._memory._replace(blink=blink(modulation, every))
+        memory = self._memory
+        delay = memory.delay
+        # Full columns hold background, which comes at any time.
+        if CENTROIDS[memory.estimator.method] not in FULL_COLUMN_METHODS:
+            delay = profile_delay(delay, modulation, every)
+        self._memory = memory._replace(blink=blink(modulation, every), delay=delay)
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
         _begin_window(self._memory, self._state)
@@ -196,7 +204,10 @@ class ProfileAssembler:
         Nothing is counted, and no footprint learned.
         """
         self._gate = before._gate
-        self._memory = self._memory._replace(blink=before._memory.blink)
+        self._memory = self._memory._replace(
+            blink=before._memory.blink,
+            delay=before._memory.delay._replace(sums=self._memory.delay.sums),
+        )
         self._memory.columns.counts[:] = 0
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state["rows"] = 0
@@ -365,6 +376,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             sigma2=np.zeros(shape),
             widths=empty_widths(*shape),
         ),
+        delay=empty_delay(),
         rows=empty_rows(*shape),
         scratch=make_scratch(_WIDER * estimator.half_max),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
@@ -390,6 +402,7 @@ def _begin_window(memory, state):
     memory.scatter.squares[:] = 0.0
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0
+    memory.delay.sums[:] = 0.0
     _restart_widths(memory.smoothing.widths)
 
 
@@ -407,7 +420,7 @@ def _adapted_half(half, sums, half_max):
 
 
 @kernel(_nrt=False)
-def _write(rows, smoothing, state, output):
+def _write(rows, smoothing, delay_us, state, output):
     """Write the period's rows behind ``state.rows``, by column, nearest return first."""
     returns, columns = rows.row.shape
     i = state.rows
@@ -418,7 +431,7 @@ def _write(rows, smoothing, state, output):
                 continue
             output.period[i] = state.period
             output.edge_us[i] = state.edge_us
-            output.t_us[i] = state.edge_us + rows.mean_dt_us[k, c]
+            output.t_us[i] = state.edge_us + rows.mean_dt_us[k, c] - delay_us
             output.column[i] = c
             output.row[i] = smoothing.row[k, c]
             output.sigma_row[i] = np.sqrt(smoothing.sigma2[k, c])
@@ -438,7 +451,7 @@ def _write(rows, smoothing, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, blink, footprint, scatter, smoothing, rows, scratch, output, _ = memory
+    columns, estimator, blink, footprint, scatter, smoothing, delay, rows, scratch, _, _ = memory
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > estimator.half_max
@@ -455,7 +468,7 @@ def _close(memory, state, counters):
     if estimator.method == _LEARNED or footprint.state[3] > 0:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
-    _write(rows, smoothing, state, output)
+    _write(rows, smoothing, _delay_us(rows, delay), state, memory.output)
     if state.window >= memory.window_events and estimator.method != _LEARNED:
         _begin_window(memory, state)
 

@@ -41,7 +41,8 @@ class LineRows:
     edge_us : int64
         Rising edge that begins it, sensor time.
     t_us : int64
-        Mean time of the events used, sensor time.
+        Time of the light on the surface, sensor time: the mean time of the events used, less the
+        delay of the stream's events behind the middle of the light (`delay`) where it is known.
     column : uint16
     row, sigma_row : float64
         Row of the line and its standard deviation, px.

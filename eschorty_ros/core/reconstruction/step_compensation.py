@@ -4,8 +4,8 @@ Rows on the brighter side of a step are lit further out than rows on the darker 
 centroid moves towards the brighter side by up to half the difference: 2.9 px from black to white
 (the paper's Fig. 7). A single profile cannot distinguish this from a change of range. Its
 neighbours can: before and after the step has crossed the beam the line is as wide as either side
-alone makes it, the width between shows how far the step has come, and the stage's motion shows
-from which side.
+alone makes it, and the width between shows how far the step has come. From which side it comes
+depends on the stage's direction and on how the camera is mounted: the rows show it.
 """
 
 from __future__ import annotations
@@ -46,6 +46,13 @@ _REACH_COLUMNS = 2
 """Columns on either side that the median of the widths takes in."""
 
 
+_EVIDENCE_KEPT = 0.7
+"""Share of the evidence for the side that the next profile with a step keeps: a stage may turn."""
+
+_SURE = 5.0
+"""Standard deviations of the evidence against the stated direction from which on it is wrong."""
+
+
 class _History(NamedTuple):
     """The newest profiles, one per line of the arrays, at their number modulo the size."""
 
@@ -56,12 +63,16 @@ class _History(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Points of one profile: how many profiles back and ahead a step is off the line; shifts."""
+    """Points of one profile: how many profiles back and ahead a step is off the line.
+
+    ``shift_px`` is what the widths say, 0 without a step, and ``difference_px`` what the rows do.
+    """
 
     column: NDArray[np.uint16]
     back: NDArray[np.int64]
     ahead: NDArray[np.int64]
     shift_px: Array
+    difference_px: Array
 
 
 class StepCompensator:
@@ -70,7 +81,8 @@ class StepCompensator:
     Parameters
     ----------
     settings : Settings
-        ``stage_speed_mm_s`` gives the speed and, by its sign, the direction of the surface.
+        ``stage_speed_mm_s`` gives the speed, and by its sign the direction of the surface, unless
+        the rows show another one.
     model : RangeModel
     modulation : Modulation
 
@@ -86,6 +98,7 @@ class StepCompensator:
         self._every = settings.periods_per_profile
         # The stage carries the instrument towards +y, and +y appears at lower rows.
         self._sign = -math.copysign(1.0, settings.stage_speed_mm_s)
+        self._evidence = np.zeros(2)
         step_mm = abs(settings.stage_speed_mm_s) * modulation.period_us * 1e-6 * self._every
         self._crossing_mm_px = settings.line_width_px / max(step_mm, 1e-9)
         far_mm = model.range_limits_mm[1]
@@ -166,17 +179,23 @@ class StepCompensator:
 
     def _corrected(self, number: int, profile: LineRows) -> LineRows:
         back, ahead = self._lags(self._model.range_mm(profile.row, profile.column))
-        shift_px = np.zeros(len(profile))
-        points = _Points(profile.column, back, ahead, shift_px)
-        _shifts(points, self._history, number, self._newest, self._sign)
-        moved = shift_px != 0.0
-        if not moved.any():
+        shift_px, difference_px = np.zeros((2, len(profile)))
+        points = _Points(profile.column, back, ahead, shift_px, difference_px)
+        _shifts(points, self._history, number, self._newest)
+        if not shift_px.any():
             return profile
+        product = np.nan_to_num(self._sign * shift_px * difference_px)
+        self._evidence = _EVIDENCE_KEPT * self._evidence + (product.sum(), product @ product)
+        total, variance = self._evidence.tolist()
+        shift_px *= -self._sign if total < -_SURE * math.sqrt(variance) else self._sign
+        # Not where it would not bring a point nearer to its neighbours.
+        shift_px[np.abs(difference_px - shift_px) > np.abs(difference_px)] = 0.0
+        moved = shift_px != 0.0
         self.columns_compensated += int(np.count_nonzero(moved))
         added_px = np.where(moved, np.hypot(_SIGMA_PX, _SIGMA_SHARE * shift_px), 0.0)
         return replace(
             profile,
-            row=profile.row - self._sign * shift_px,
+            row=profile.row - shift_px,
             sigma_row=np.hypot(profile.sigma_row, added_px),
         )
 
@@ -190,12 +209,11 @@ class StepCompensator:
 
 
 @kernel
-def _shifts(points, history, number, newest, sign):
-    """Write the shift of each point of profile ``number``.
+def _shifts(points, history, number, newest):
+    """Write the shift and the difference of each point of profile ``number``.
 
-    Positive towards the rows from which the surface comes; ``sign`` is the sense of these rows.
-    A point is not corrected where a neighbour is missing, nor where the correction would not bring
-    it nearer to its neighbours.
+    The shift is positive towards the rows from which the surface comes, and 0 where a neighbour is
+    missing; the difference from the neighbours is NaN where they have no row.
     """
     size = history.present.size
     present = number % size
@@ -218,9 +236,8 @@ def _shifts(points, history, number, newest, sign):
         width = _median(history.widths_px[present], column, True, scratch)
         shift = _centroid_shift(width_before, width, width_after)
         expected = _interpolated(row_before, row_after, points.back[k], points.ahead[k])
-        difference = history.rows[present, column] - expected
-        if not abs(difference - sign * shift) > abs(difference):
-            points.shift_px[k] = shift
+        points.shift_px[k] = shift
+        points.difference_px[k] = history.rows[present, column] - expected
 
 
 @kernel

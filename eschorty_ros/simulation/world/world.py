@@ -262,13 +262,20 @@ class World:
                 self._remove(t_us)
 
     def _draw(self, t_us: int, level: float) -> None:
-        """Draw the line on the scene at the present stage position."""
+        """Draw the line on the scene where the stage is in the middle of the time to the next draw.
+
+        The first draw behind an edge lasts half as long, as pixels answer to the light of then.
+        """
         position_mm, velocity_mm_s = self._stage.state(t_us)
+        pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
+        pace_us = min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US)
         if self._lit_since_us is None:
             self._lit_since_us = t_us
-        self._line.draw(t_us, position_mm, level)
-        pace_us = STEP_MM / max(abs(velocity_mm_s), 1e-9) * 1e6
-        self._step_us = t_us + int(min(max(pace_us, _STEP_MIN_US), _STEP_MAX_US))
+            pace_us *= 0.5
+        self._step_us = t_us + int(pace_us)
+        end_us = self._laser.next_us(t_us)
+        end_us = self._step_us if end_us is None else min(end_us, self._step_us)
+        self._line.draw(t_us, position_mm + velocity_mm_s * 0.5e-6 * (end_us - t_us), level)
 
     def _remove(self, t_us: int) -> None:
         """Remove the line and log the phase that ends here."""

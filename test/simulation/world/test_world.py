@@ -25,6 +25,7 @@ from eschorty_ros.simulation.world import (
     World,
     simulate_recording,
 )
+from eschorty_ros.simulation.world import world as world_module
 
 SEED = 11
 FULL = load_calibration("config_3")
@@ -198,14 +199,27 @@ def test_moving_surface_is_followed_within_a_lit_phase() -> None:
         under_way = (p == 1) & (t > edge + 1500) & (t < fall_us)
         lead.extend(y[under_way] - row_at[under_way])
         found += int(under_way.sum())
-        # Redrawn every 1190 us: the first step lies before the count, the sixth has no time left.
-        ends = model.row(level + 210e-6 * (edge + redraw_us * np.array([[1], [5]])))
+        # Redrawn every 1190 us from 595 us on, in the middle of the time to the next: the first is
+        # before the count, the last has half of the time left.
+        ends = model.row(level + 210e-6 * (edge + redraw_us * np.array([[1.0], [5.75]])))
         expected += float(np.diff(ends, axis=0).sum())
     assert abs(np.mean(started)) < 0.1
     # While the line moves, each row it newly reaches fires once, at the line's leading flank.
     assert found == pytest.approx(expected, rel=0.1)
     flank = 4.1 * np.sqrt(2.0 * np.log(5.5 / np.expm1(0.25)))
     assert np.mean(lead) == pytest.approx(flank, abs=0.15)
+
+
+def test_a_moving_line_is_where_it_would_be_without_steps(monkeypatch) -> None:
+    rows = []
+    for step_mm in (STEP_MM, 0.2 * STEP_MM):
+        monkeypatch.setattr(world_module, "STEP_MM", step_mm)
+        world = World(Plane(1100.0, 1.5, 0.3), SMALL, seed=SEED, background_hz=0.0)
+        world.set_laser(0, True, Modulation(70.0, on_edge_us=0))
+        world.set_stage(MotionPlan(0, 0.0, 300.0, (10.0,), (0.0,)))
+        rows.append(decoded(world.advance(400_000), 96)[2].mean())
+    # 0.32 rows per millisecond.
+    assert abs(rows[0] - rows[1]) < 0.05, f"seed {SEED}: {rows}"
 
 
 def test_changes_of_the_past_and_unknown_waves_are_refused() -> None:
