@@ -214,6 +214,18 @@ def test_an_interrupted_simulation_leaves_no_half_recording(monkeypatch, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_reconstruction_leaves_nothing(monkeypatch, recording, tmp_path, number):
+    def interrupted(*_):
+        assert list(tmp_path.rglob("points"))
+        signal.raise_signal(number)
+
+    monkeypatch.setattr("eschorty_ros.core.reconstruction.offline.place", interrupted)
+    result = run("reconstruct", recording, "--out", tmp_path / "cloud.pcd")
+    assert result.exit_code == 128 + number
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_simulate_refuses_to_overwrite_a_recording(recording):
     assert_fails_in_one_line(run("simulate", "--out", recording), str(recording))
 

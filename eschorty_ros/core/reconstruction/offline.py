@@ -6,6 +6,7 @@ import mmap
 import os
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -108,15 +109,16 @@ def reconstruct_recording(
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
     total = recording.events_path.stat().st_size
     reader = RawReader(recording.events_path)
-    cloud = _Cloud(recording, reconstructor, folder)
     done = 0
-    for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
-        _push(reconstructor, cloud.add, chunk, done, recording.marks)
-        done += len(chunk)
-        if progress is not None:
-            progress(done, total)
-    cloud.add(reconstructor.flush())
-    profiles, points, organized = cloud.joined()
+    with ExitStack() as files:
+        cloud = _Cloud(recording, reconstructor, folder, files)
+        for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
+            _push(reconstructor, cloud.add, chunk, done, recording.marks)
+            done += len(chunk)
+            if progress is not None:
+                progress(done, total)
+        cloud.add(reconstructor.flush())
+        profiles, points, organized = cloud.joined()
     origin_us = reconstructor.first_t_us or 0
     newest_us = reconstructor.newest_t_us
     span_us = None if newest_us is None else (origin_us, newest_us)
@@ -142,15 +144,19 @@ class _Cloud:
     """Profiles placed along the stage's travel, those outside the scan left out."""
 
     def __init__(
-        self, recording: Recording, reconstructor: Reconstructor, folder: Path | None
+        self,
+        recording: Recording,
+        reconstructor: Reconstructor,
+        folder: Path | None,
+        files: ExitStack,
     ) -> None:
         self._recording, self._reconstructor = recording, reconstructor
         self._profiles: list[Profiles] = []
         self._keeps_profiles = folder is None or (recording.path / TRUTH_FILE).exists()
-        self._points = _Array(folder and folder / "points")
+        self._points = _Array(folder and folder / "points", files)
         self._organized: _Array | None = None
         if reconstructor.settings.organized == "on":
-            self._organized = _Array(folder and folder / "organized")
+            self._organized = _Array(folder and folder / "organized", files)
         self._newest_edge_us: int | None = None
         self.profile_count = 0
         self.without_stage = 0
@@ -204,9 +210,9 @@ class _Cloud:
 class _Array:
     """An array that grows along its first axis, in memory or in a file."""
 
-    def __init__(self, file: Path | None) -> None:
+    def __init__(self, file: Path | None, files: ExitStack) -> None:
         self._parts: list[NDArray[Any]] = []
-        self._stream = None if file is None else file.open("x+b")
+        self._stream = None if file is None else files.enter_context(file.open("x+b"))
 
     def append(self, part: NDArray[Any]) -> None:
         """Append a part."""
@@ -220,11 +226,10 @@ class _Array:
         if self._stream is None:
             parts, self._parts = self._parts, []
             return np.concatenate(parts) if parts else none
-        with self._stream as stream:
-            if not stream.tell():
-                return none
-            stream.flush()
-            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        if not self._stream.tell():
+            return none
+        self._stream.flush()
+        data = mmap.mmap(self._stream.fileno(), 0, access=mmap.ACCESS_READ)
         return np.frombuffer(data, none.dtype).reshape(-1, *none.shape[1:])
 
 
