@@ -34,6 +34,9 @@ _APART = 5
 _STEP = 1.0 / 1024.0
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
 _ROOT_3 = np.sqrt(3.0)
+_ROOT_12 = np.sqrt(12.0)
+# A point is marked when the missing or additional rows may move it by more of its deviations.
+_MARKED = 5.5
 
 
 class Widths(NamedTuple):
@@ -112,9 +115,24 @@ def _update(widths, columns):
     widths.state[0] = (median + 0.5) / _PER_ROW
 
 
+@kernel
+def _at_rest(width, usual, way):
+    """Return the width of a line less what its ``way`` while it is lit may add.
+
+    Rows that it leaves or reaches widen it by the way, hence its standard deviation by up to the
+    way's over the square root of 12.
+    """
+    return min(width, max(usual, width - abs(way) / _ROOT_12))
+
+
 @kernel(_nrt=False)
-def _mark_unusual(rows, row, sigma2, widths):
-    """Mark the mixed points of a profile's smoothed rows and widen their variance ``sigma2``."""
+def _mark_unusual(rows, smoothing, lit_share):
+    """Mark the mixed points of a profile's smoothed rows and widen their variance.
+
+    A line is lit for ``lit_share`` of the time between two profiles. Weak points show no width.
+    """
+    row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
+    events_min = smoothing.isolation_events
     returns, columns = row.shape
     smoothed, before, state = widths.smoothed, widths.before, widths.state
     known = widths.below[_BINS] >= _POINTS_MIN
@@ -123,23 +141,26 @@ def _mark_unusual(rows, row, sigma2, widths):
     for k in range(returns):
         for c in range(columns):
             width, last_width, last_row = smoothed[k, c], before[0, k, c], before[1, k, c]
+            way = row[k, c] - last_row
+            if known and np.isfinite(way):
+                width = _at_rest(width, usual, lit_share * way)
             before[0, k, c], before[1, k, c] = width, row[k, c]
             rows.mixed[k, c] = False
-            if np.isnan(width) or rows.truncated[k, c]:
+            if np.isnan(width) or rows.truncated[k, c] or rows.events[k, c] < events_min:
                 continue
             weight = 1.0
             reach = sigma * np.sqrt(5.0 / widths.used[k, c]) * _PER_ROW
             if known and not _is_usual(widths, width, max(np.int64(np.rint(reach)), 1)):
-                way = row[k, c] - last_row
                 own2 = sigma2[k, c] - rows.common2[k, c]
                 steady = not way * way > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
-                rows.mixed[k, c] = True
-                sigma2[k, c] += _unusual_variance(width, usual)
+                more2 = _unusual_variance(width, usual)
+                rows.mixed[k, c] = more2 > _MARKED**2 * own2
+                sigma2[k, c] += more2
             if not abs(width - last_width) > _STEADY * sigma:
                 widths.number[_bin(width)] += weight
             if c >= _APART and not np.isnan(smoothed[k, c - _APART]):
-                difference = abs(width - smoothed[k, c - _APART])
+                difference = abs(smoothed[k, c] - smoothed[k, c - _APART])
                 if state[1] == 0.0:
                     state[1] = difference
                 pairs += 1.0

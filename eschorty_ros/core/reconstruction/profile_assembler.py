@@ -36,7 +36,7 @@ from eschorty_ros.core.line.columns import (
     empty_columns,
     wider_columns,
 )
-from eschorty_ros.core.line.delay import Delay, _delay_us, empty_delay, profile_delay
+from eschorty_ros.core.line.delay import Light, _delay_us, light
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import Footprint, _forget, _learn, make_footprint
 from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
@@ -130,7 +130,8 @@ class _Memory(NamedTuple):
     footprint: Footprint
     scatter: Scatter
     smoothing: Smoothing
-    delay: Delay
+    light: Light
+    delay: NDArray[np.float64]
     rows: Rows
     scratch: Scratch
     output: _Output
@@ -188,12 +189,11 @@ class ProfileAssembler:
         ``every`` is the number of periods in a profile.
         """
         self._gate = phase_gate(modulation, self._gate_us)
-        memory = self._memory
-        delay = memory.delay
-        # Full columns hold background, which comes at any time.
-        if CENTROIDS[memory.estimator.method] not in FULL_COLUMN_METHODS:
-            delay = profile_delay(delay, modulation, every)
-        self._memory = memory._replace(blink=blink(modulation, every), delay=delay)
+        lit = light(modulation, every)
+        if CENTROIDS[self._memory.estimator.method] in FULL_COLUMN_METHODS:
+            # They hold background, which comes at any time.
+            lit = lit._replace(delay_max_us=Light().delay_max_us)
+        self._memory = self._memory._replace(blink=blink(modulation, every), light=lit)
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
         _begin_window(self._memory, self._state)
@@ -204,10 +204,7 @@ class ProfileAssembler:
         Nothing is counted, and no footprint learned.
         """
         self._gate = before._gate
-        self._memory = self._memory._replace(
-            blink=before._memory.blink,
-            delay=before._memory.delay._replace(sums=self._memory.delay.sums),
-        )
+        self._memory = self._memory._replace(blink=before._memory.blink, light=before._memory.light)
         self._memory.columns.counts[:] = 0
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state["rows"] = 0
@@ -376,7 +373,8 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             sigma2=np.zeros(shape),
             widths=empty_widths(*shape),
         ),
-        delay=empty_delay(),
+        light=Light(),
+        delay=np.zeros(2),
         rows=empty_rows(*shape),
         scratch=make_scratch(_WIDER * estimator.half_max),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
@@ -402,7 +400,7 @@ def _begin_window(memory, state):
     memory.scatter.squares[:] = 0.0
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0
-    memory.delay.sums[:] = 0.0
+    memory.delay[:] = 0.0
     _restart_widths(memory.smoothing.widths)
 
 
@@ -420,7 +418,20 @@ def _adapted_half(half, sums, half_max):
 
 
 @kernel(_nrt=False)
-def _write(rows, smoothing, delay_us, state, output):
+def _few_events(rows, most):
+    """Return the number below which a point's events are few: half of the mean, up to ``most``."""
+    total, points = 0.0, 0
+    returns, columns = rows.row.shape
+    for k in range(returns):
+        for c in range(columns):
+            if not np.isnan(rows.row[k, c]):
+                total += rows.events[k, c]
+                points += 1
+    return min(0.5 * total / max(points, 1), float(most))
+
+
+@kernel(_nrt=False)
+def _write(rows, smoothing, few, delay_us, state, output):
     """Write the period's rows behind ``state.rows``, by column, nearest return first."""
     returns, columns = rows.row.shape
     i = state.rows
@@ -441,7 +452,7 @@ def _write(rows, smoothing, delay_us, state, output):
             output.flags[i] = (
                 (MIXED if rows.mixed[k, c] else 0)
                 | (SENSOR_EDGE if rows.truncated[k, c] else 0)
-                | (FEW_EVENTS if rows.events[k, c] < smoothing.isolation_events else 0)
+                | (FEW_EVENTS if rows.events[k, c] < few else 0)
             )
             index += 1
             i += 1
@@ -451,7 +462,8 @@ def _write(rows, smoothing, delay_us, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, blink, footprint, scatter, smoothing, delay, rows, scratch, _, _ = memory
+    columns, estimator, blink, footprint, scatter, smoothing = memory[:6]
+    light, rows, scratch = memory.light, memory.rows, memory.scratch
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > estimator.half_max
@@ -464,11 +476,13 @@ def _close(memory, state, counters):
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     _scale(rows, scatter, estimator.error_model)
     counters.columns_smoothed += _smooth(rows, smoothing)
-    _mark_unusual(rows, smoothing.row, smoothing.sigma2, smoothing.widths)
+    _mark_unusual(rows, smoothing, light.lit_share)
     if estimator.method == _LEARNED or footprint.state[3] > 0:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
-    _write(rows, smoothing, _delay_us(rows, delay), state, memory.output)
+    few = _few_events(rows, smoothing.isolation_events)
+    delay_us = _delay_us(rows, memory.delay, light)
+    _write(rows, smoothing, few, delay_us, state, memory.output)
     if state.window >= memory.window_events and estimator.method != _LEARNED:
         _begin_window(memory, state)
 

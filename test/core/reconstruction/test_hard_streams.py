@@ -1,7 +1,7 @@
 """Streams that a second, independent pixel model makes hard: background, defects, full columns."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,9 +10,15 @@ from reconstructing import CALIBRATION, reconstruct
 
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
-from eschorty_ros.simulation.scenes import Plane
-from eschorty_ros.simulation.world import World
+from eschorty_ros.core.reconstruction import (
+    Profiles,
+    Reconstructor,
+    Settings,
+    reconstruct_recording,
+)
+from eschorty_ros.report.accuracy import true_range_mm
+from eschorty_ros.simulation.scenes import Plane, named
+from eschorty_ros.simulation.world import World, simulate_recording
 
 MODEL = CALIBRATION.model()
 
@@ -63,6 +69,24 @@ def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows):
     assert np.mean(good[~crossing]) > 0.99, f"seed {camera.seed}"
     assert np.quantile(np.abs(error[crossing & good]), 0.95) < 2.2
     assert np.mean(np.abs(error)[~good] < 2.0 * found.sigma_mm[~good]) > 0.8
+
+
+@pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
+def test_few_events_are_no_flag_where_all_points_have_few(frequency_hz):
+    camera = Camera(frequency_hz=frequency_hz, periods=12)
+    found, _ = points(camera, _kept(camera, 0.22))
+    assert np.median(found.events) < 10
+    assert np.mean(found.flags == 0) > 0.95, f"seed {camera.seed}"
+
+
+def test_good_points_of_a_face_that_is_swept_fast_have_no_flag(tmp_path):
+    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
+    recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep)
+    found = reconstruct_recording(recording).profiles
+    stage_mm = recording.stage.position_mm(found.t_us)
+    error_mm = found.range_mm - true_range_mm(scene, narrow.model(), stage_mm, found.column)
+    assert np.mean(found.flags[np.abs(error_mm) < 1.0] != 0) < 0.015
 
 
 @dataclass(frozen=True)
