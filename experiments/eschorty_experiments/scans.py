@@ -273,8 +273,8 @@ _REMARKS = (
     "reach its speed.",
     "The distance of the 2.2 mm levels is accurate to about a quarter of a row (0.5 mm): on flat "
     "leaves the line crosses the pixel rows at one place, and its footprint changes by full rows.",
-    "Where the range changes along the stage, points lag behind the motion: the face's error "
-    "changes its sign at the nose, with the slope.",
+    "Where the range changes along the stage, pixels remember where the line was: a tenth of a "
+    "row, of opposite signs on the two sides of the nose.",
     "The line is 5 mm thick along the stage at 1.32 m: within 3 mm of a rim it is on both leaves, "
     "or reaches one before the sheet's middle does. These points cause the gross errors and nearly "
     "all of the root mean square error. Occlusion is not modelled: every surface that the laser "

@@ -134,7 +134,7 @@ class Rows(NamedTuple):
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
     neighbours share. A ``doubtful`` one may be background that follows the laser by chance, a
     ``mixed`` one is on two surfaces.
-    ``ambiguous`` and ``shift``, the line's way since the last period in px, have shape (columns,).
+    ``ambiguous`` has shape (columns,).
     """
 
     row: NDArray[np.float64]
@@ -147,7 +147,6 @@ class Rows(NamedTuple):
     doubtful: NDArray[np.bool_]
     mixed: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
-    shift: NDArray[np.float64]
 
 
 class RowEstimate(NamedTuple):
@@ -218,9 +217,8 @@ def empty_rows(returns: int, columns: int) -> Rows:
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
     truncated, doubtful, mixed = np.zeros((3, *shape), np.bool_)
-    ambiguous, shift = np.zeros(columns, np.bool_), np.full(columns, np.nan)
-    flags = truncated, doubtful, mixed
-    return Rows(row, sigma2, common2, variance, events, mean_dt_us, *flags, ambiguous, shift)
+    flags = truncated, doubtful, mixed, np.zeros(columns, np.bool_)
+    return Rows(row, sigma2, common2, variance, events, mean_dt_us, *flags)
 
 
 def estimate(
@@ -527,7 +525,6 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     Events that do not follow the laser are left out, unless ``blink`` is no test.
     """
     out.row[:] = np.nan
-    out.shift[:] = np.nan
     squares = 0.0
     freedom, events, few = np.int64(0), np.int64(0), np.int64(0)
     ambiguous, two = np.int64(0), np.int64(0)
@@ -592,8 +589,6 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             few += found.status == TOO_FEW
             continue
         columns.seeds[c] = neighbour = found.window.centre
-        if last >= 0:
-            out.shift[c] = (neighbour - last) / FRACTION
         two += found.second
         window, other = _reported(estimator.returns, found)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
@@ -618,8 +613,6 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
                 estimate = RowEstimate(best, learned + bias2, estimate.truncated)
             if not windowed:
                 columns.seeds[c] = np.int64(np.rint(FRACTION * row))
-                if last >= 0:
-                    out.shift[c] = (columns.seeds[c] - last) / FRACTION
             out.row[k, c] = estimate.row
             out.sigma2[k, c] = estimate.sigma2
             out.common2[k, c] = model.common**2

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.sigma import _motion_variance
 
 _APART = 5
 # Columns of a block; the differences of a block and its two neighbours count for its points. The
@@ -71,52 +70,24 @@ def _add_differences(rows, scatter):
 
 
 @kernel(_nrt=False)
-def _common_shift(shift, variance, first, last):
-    """Return the mean way of the line in a block of columns, 0 where their scatter explains it."""
-    total, number = 0.0, 0
-    for c in range(first, last):
-        if np.isfinite(shift[c]):
-            total += shift[c]
-            number += 1
-    if number == 0 or total * total <= 8.0 * variance * number:
-        return 0.0
-    return total / number
+def _scale(rows, scatter):
+    """Scale the variances of a profile by the scatter.
 
-
-@kernel(_nrt=False)
-def _scale(rows, scatter, model):
-    """Scale the variances of a profile by the scatter, and add that of the line's motion.
-
-    With a ``factor_max`` of 0, for means over full columns, they are as expected, and every column
-    moves by itself.
+    With a ``factor_max`` of 0, for means over full columns, they are as expected.
     """
     returns, columns = rows.row.shape
     _add_differences(rows, scatter)
     for block in range(1, scatter.number.size - 1):
         near = slice(block - 1, block + 2)
-        number = scatter.number[near].sum()
-        known = number >= _DIFFERENCES_MIN and scatter.factor_max > 0.0
-        factor, variance = 1.0, 0.0
-        if known:
-            squares = scatter.squares[near].sum()
-            factor = min(squares / scatter.expected[near].sum(), scatter.factor_max)
-            variance = squares / (6.0 * number)
-        first, last = (block - 1) * _BLOCK, min(block * _BLOCK, columns)
-        together = _common_shift(rows.shift, variance, first, last)
-        if scatter.factor_max == 0.0:
-            together = 0.0
-        motion2 = _motion_variance(together, model)
+        if scatter.number[near].sum() < _DIFFERENCES_MIN or scatter.factor_max == 0.0:
+            continue
+        ratio = scatter.squares[near].sum() / scatter.expected[near].sum()
+        factor = min(ratio, scatter.factor_max)
         for k in range(returns):
-            for c in range(first, last):
-                scaled = known and not rows.truncated[k, c]
-                own2 = (factor if scaled else 1.0) * rows.sigma2[k, c]
-                common2 = rows.common2[k, c] + motion2
-                if scaled and own2 < _LOCKING:
-                    common2 += _LOCKING - own2
-                # Alone a column's shift counts only beyond what its own scatter explains.
-                alone = rows.shift[c]
-                explained2 = 18.0 * max(own2, variance) if scatter.factor_max > 0.0 else 0.0
-                if alone * alone > explained2 and abs(alone) > abs(together):
-                    common2 += _motion_variance(alone, model) - motion2
+            for c in range((block - 1) * _BLOCK, min(block * _BLOCK, columns)):
+                if rows.truncated[k, c]:
+                    continue
+                own2 = factor * rows.sigma2[k, c]
                 rows.sigma2[k, c] = own2
-                rows.common2[k, c] = common2
+                if own2 < _LOCKING:
+                    rows.common2[k, c] += _LOCKING - own2

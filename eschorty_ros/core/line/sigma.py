@@ -8,9 +8,7 @@ with s the standard deviation of the N rows used and s0 that of the line itself.
 small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
 from the mismatch of the pixels' thresholds, which more events of the same pixels do not reduce. The
 last term is for events that are not the line's, which scatter independently. Neighbouring columns
-share the other part::
-
-    common^2 + motion^2 * shift of the line since the last profile + (jump * that shift)^2
+share the other part, ``common^2``.
 
 The constants are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
 1000 Hz. In a stream the columns' own part is scaled by the scatter of near columns (`scatter`), so
@@ -31,11 +29,6 @@ _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
 
-# A line that moves further is on another surface: its last row carries no information.
-_SHIFT_MAX_PX = 8.0
-# Standard deviation over the shift of a line that jumps.
-_JUMP = 0.2
-
 
 class ErrorModel(NamedTuple):
     """Coefficients of the variance of a row.
@@ -47,19 +40,18 @@ class ErrorModel(NamedTuple):
     factor: float
     floor: float
     background: float
-    motion: float
     median: bool = False
     common: float = 0.0
 
 
 METHOD_ERRORS = {
-    "mode_mean": ErrorModel(0.2, 0.89, 0.4, 0.20),
-    "mean": ErrorModel(0.4, 0.715, 1.0, 0.18),
-    "median": ErrorModel(0.2, 1.0, 1.48, 0.11, median=True),
-    "gauss_ml": ErrorModel(0.2, 0.91, 0.4, 0.20),
-    "edge_mid": ErrorModel(0.243, 0.885, 0.42, 0.18),
+    "mode_mean": ErrorModel(0.2, 0.89, 0.4),
+    "mean": ErrorModel(0.4, 0.82, 1.35),
+    "median": ErrorModel(0.2, 1.06, 1.6, median=True),
+    "gauss_ml": ErrorModel(0.2, 0.91, 0.4),
+    "edge_mid": ErrorModel(0.243, 0.885, 0.42),
     # Before a footprint is learned.
-    "learned": ErrorModel(0.2, 0.89, 0.4, 0.20),
+    "learned": ErrorModel(0.2, 0.89, 0.4),
 }
 
 
@@ -118,13 +110,3 @@ def _own_variance(variance, line_variance, count, row, rows, model):
     if count < 2 or variance == 0.0:
         sigma2 = max(sigma2, 1.0 / 12.0 + floor2)
     return sigma2
-
-
-@kernel
-def _motion_variance(shift, model):
-    """Return the variance that neighbouring columns share, from the line's shift in a period, px.
-
-    A pixel's response depends on the last period, too, so points lag on a surface that recedes.
-    """
-    size = min(abs(shift), _SHIFT_MAX_PX)
-    return model.motion**2 * size + (_JUMP * size) ** 2

@@ -474,7 +474,7 @@ def _close(memory, state, counters):
     counters.columns_unmodulated += sums.unmodulated
     counters.events_unmodulated += sums.events_unmodulated
     counters.columns_isolated += _reject_isolated(rows, smoothing)
-    _scale(rows, scatter, estimator.error_model)
+    _scale(rows, scatter)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _mark_unusual(rows, smoothing, light.lit_share)
     if estimator.method == _LEARNED or footprint.state[3] > 0:
