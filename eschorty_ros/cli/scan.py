@@ -11,11 +11,10 @@ from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.files import IN_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
 from eschorty_ros.cli.options import check_sweep, page_options, sweep_options
-from eschorty_ros.core.base.errors import DeviceError
+from eschorty_ros.core.base.errors import DeviceError, EschortyError
 
 if TYPE_CHECKING:
     from eschorty_ros.nodes.one_process.scan import ScanJob, ScanResult
-    from eschorty_ros.report.accuracy import Accuracy
 
 
 @click.command("scan")
@@ -169,7 +168,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         direction = calibration.stage_direction
         figure = figures.scan_figure(result.points, None, title, direction)
         figures.save(figure, out / "scan.png")
-        pairs(_headline(result, out), _counted(result))
+        _print(result, {}, out)
         return
     truth = scenes.named(job.scene, calibration.model())
     model, direction = calibration.model(), calibration.stage_direction
@@ -181,38 +180,31 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
         f"{job.calibration}; median |error| {measured.error_median_mm:.2f} mm"
     )
     figures.save(figures.scan_figure(result.points, error_mm, title, direction), out / "scan.png")
+    rows = accuracy_rows(measured) | {"seconds of sweep": f"{sweep.seconds:.2f}"}
+    _print(result, rows, out)
     if result.recording:
-        recording = load_recording(result.recording)
-        known = accuracy.recorded_truth(result.points, truth, recording, sweep)
-        columns = (known[name] for name in ("t_us", "column", "range_mm"))
-        write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
-    _print(result, measured, sweep.seconds, out)
+        try:
+            recording = load_recording(result.recording)
+            known = accuracy.recorded_truth(result.points, truth, recording, sweep)
+            columns = (known[name] for name in ("t_us", "column", "range_mm"))
+            write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
+        except EschortyError as error:
+            click.echo(f"eschorty: warning: the recording has no truth: {error}", err=True)
 
 
-def _headline(result: ScanResult, out: Path) -> str:
-    """Return the verdict and the files written."""
-    return f"{result.verdict}, {result.completeness:.1%}: {out / 'scan.pcd'}, {out / 'scan.png'}"
-
-
-def _counted(result: ScanResult) -> dict[str, str]:
-    note = {"note": result.message} if result.message else {}
+def _print(result: ScanResult, rows: dict[str, str], out: Path) -> None:
+    """Print verdict and files, counts, ``rows``, and what was lost."""
     recorded = {"recording": result.recording} if result.recording else {}
-    return {
-        "profiles": f"{result.profiles:,}",
-        "points": f"{len(result.points):,}",
-        "events": f"{result.events:,} ({result.events_dropped:,} dropped, "
-        f"{result.packets_lost:,} packets lost)",
-        **note,
-        **recorded,
-    }
-
-
-def _print(result: ScanResult, measured: Accuracy, seconds: float, out: Path) -> None:
     pairs(
-        _headline(result, out),
+        f"{result.verdict}, {result.completeness:.1%}: {out / 'scan.pcd'}, {out / 'scan.png'}",
         {
-            **_counted(result),
-            **accuracy_rows(measured),
-            "seconds of sweep": f"{seconds:.2f}",
+            "profiles": f"{result.profiles:,}",
+            "points": f"{len(result.points):,}",
+            "events": f"{result.events:,} ({result.events_dropped:,} dropped, "
+            f"{result.packets_lost:,} packets lost)",
+            **recorded,
+            **rows,
         },
     )
+    if result.message:
+        click.echo(f"eschorty: warning: {result.message}", err=True)

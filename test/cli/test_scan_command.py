@@ -143,4 +143,20 @@ def test_what_a_scan_lost_is_printed(tmp_path, capsys):
     points["x"] = points["t"] = points["y"] = points["column"] = [1, 2, 3, 4]
     lost = "7 points had no stage position"
     finish(request, ScanResult(True, lost, points, 4, 100, 0, 0, "complete", 1.0), tmp_path)
-    assert lost in capsys.readouterr().out
+    assert lost in capsys.readouterr().err
+
+
+def test_a_recording_without_room_for_its_truth_is_a_warning_below_the_scan(tmp_path, capsys):
+    rec, given = tmp_path / "rec", ("--start", 20, "--stop", 21, "--speed", 50, "--out")
+    assert CliRunner().invoke(main, list(map(str, ["simulate", *given, rec]))).exit_code == 0
+    (rec / "truth.csv").unlink()
+    # Nothing can be written in its place.
+    (rec / "truth.csv").mkdir()
+    points = np.zeros(4, POINT_DTYPE)
+    points["x"], points["y"], points["sigma"] = 1.3, 0.0205, 3e-4
+    points["column"] = [1, 2, 3, 4]
+    request = ScanJob("steps", "config_3", 20.0, 21.0, 50.0, 70.0)
+    finish(request, ScanResult(True, "", points, 1, 9, 0, 0, "complete", 1.0, str(rec)), tmp_path)
+    printed = capsys.readouterr()
+    assert "complete, 100.0%" in printed.out
+    assert printed.err.startswith("eschorty: warning: the recording has no truth: ")
