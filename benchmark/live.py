@@ -1,6 +1,6 @@
 """What a reconstruction node sustains: packets in, profiles out, through DDS as shipped.
 
-Usage: PYTHONPATH=benchmark:$PYTHONPATH python benchmark/live.py [--frequency HZ...]
+Usage: PYTHONPATH=benchmark:test/support:$PYTHONPATH python benchmark/live.py [--frequency HZ...]
            [--packet-ms MS...] [--rate R...] [--seconds S] [--reliable] [--soak MINUTES]
 
 A process publishes a simulated line of 1280 columns as EventPackets, with the stage's odometry, at
