@@ -116,9 +116,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     ArgumentError
         When it cannot; names the path and the reason.
     """
-    target = _target(path)
-    with _named(target), _partial(target.parent) as folder:
-        (folder / target.name).touch()
+    with folder_beside(path) as folder:
+        (folder / _target(path).name).touch()
 
 
 @contextmanager

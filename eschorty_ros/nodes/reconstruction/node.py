@@ -79,8 +79,10 @@ class ReconstructionNode(Node):
         self.calibration = load_calibration(self.parameters["calibration"])
         slow = threading.Timer(_COMPILING_S, self.get_logger().info, (_COMPILING,))
         slow.start()
-        warm_up(self.calibration, self.parameters.settings(Settings))
-        slow.cancel()
+        try:
+            warm_up(self.calibration, self.parameters.settings(Settings))
+        finally:
+            slow.cancel()
         self._override = modulation_override(self.parameters)
         self._pipeline = Pipeline(
             self.calibration,

@@ -51,7 +51,7 @@ TABLE = (
     Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),
     Param("acceleration", 2.0, "acceleration of the stage, for the run-up", "m/s^2", 1e-3, 100.0),
     Param("approach_speed", 0.1, "speed towards the start", "m/s", 1e-6, 1.0),
-    # A machine's first run compiles for some 20 s before the nodes answer.
+    # Without `eschorty compile` the nodes of a first run answer later still.
     Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
     Param("events_timeout", 3.0, "longest pause of the events while the laser is on", "s",
