@@ -17,12 +17,8 @@ def on_cluster(
 
     The workers have this package and see the same files.
 
-    Raises
-    ------
-    EschortyError
-        When dask.distributed is not installed.
-    DeviceError
-        When no scheduler answers at ``address``.
+    Raises ``EschortyError`` when dask.distributed is not installed. Raises ``DeviceError`` when no
+    scheduler answers at ``address``.
     """
     try:
         from distributed import Client, as_completed

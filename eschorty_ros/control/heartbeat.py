@@ -64,10 +64,8 @@ class HeartbeatSchedule:
     While the device is healthy one is due every 0.1 s, and the last three report that it stopped.
     After a stall of this process a device that was healthy has 0.2 s to be read again.
 
-    Attributes
-    ----------
-    healthy : bool
-        True when the last heartbeat reported a healthy device.
+    Public attributes:
+    - ``healthy``: True when the last heartbeat reported a healthy device.
     """
 
     def __init__(self) -> None:
@@ -79,14 +77,9 @@ class HeartbeatSchedule:
     def check(self, healthy: bool, stall_s: float, now_s: float) -> str | None:
         """Return the text of the heartbeat that is due, ``None`` when none is.
 
-        Parameters
-        ----------
-        healthy : bool
-            Whether the device is healthy now.
-        stall_s : float
-            Stall of this process since the check before.
-        now_s : float
-            Steady clock.
+        - ``healthy``: Whether the device is healthy now.
+        - ``stall_s``: Stall of this process since the check before.
+        - ``now_s``: Steady clock.
         """
         self._recovery_checks = (
             RECOVERY_CHECKS if stall_s > STALL_S else max(self._recovery_checks - 1, 0)

@@ -52,15 +52,10 @@ class ReconstructionStatus:
 class InstrumentMonitor:
     """Newest status of the other components, aged on the steady clock.
 
-    Parameters
-    ----------
-    camera_present : callable
-        Returns whether a node publishes events.
+    - ``camera_present``: Returns whether a node publishes events.
 
-    Attributes
-    ----------
-    samples : deque of (int, float)
-        ROS time (ns) and stage position (mm) since the last ``samples.clear()``.
+    Public attributes:
+    - ``samples``: ROS time (ns) and stage position (mm) since the last ``samples.clear()``.
     """
 
     def __init__(self, camera_present: Callable[[], bool]) -> None:

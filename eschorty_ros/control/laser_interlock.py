@@ -27,29 +27,20 @@ class LaserInterlock:
     While the laser is on, each heartbeat counts only from the sender that had it enabled. An opened
     contact stays open until ``reset_contact``, whatever is reported later.
 
-    Parameters
-    ----------
-    arm_timeout_s : float
-        How long ``arm`` allows enabling.
-    max_on_s : float
-        Longest time on.
-    timeouts_s : mapping of str to float
-        Heartbeat topics that must be fresh, and the age in seconds at which each one is stale. A
-        heartbeat that reports a stop is stale at once, as is one whose sender runs on this host and
-        dies or is stopped.
-    contact_timeout_s : float
-        Age at which a source's report of the closed contact expires: it counts as open then.
-    contact_required : bool
-        Whether the contact counts as open before any source reports it closed.
-    now_s : callable
-        Steady clock in seconds.
+    - ``arm_timeout_s``: How long ``arm`` allows enabling.
+    - ``max_on_s``: Longest time on.
+    - ``timeouts_s``: Heartbeat topics that must be fresh, and the age in seconds at which each one
+      is stale. A heartbeat that reports a stop is stale at once, as is one whose sender runs on
+      this host and dies or is stopped.
+    - ``contact_timeout_s``: Age at which a source's report of the closed contact expires: it counts
+      as open then.
+    - ``contact_required``: Whether the contact counts as open before any source reports it closed.
+    - ``now_s``: Steady clock in seconds.
 
-    Attributes
-    ----------
-    gap_max_s : dict of str to float
-        Longest time between two heartbeats of each topic while on; a timeout below it would trip.
-    strangers : int
-        Heartbeats while on of other senders than those that had the laser enabled.
+    Public attributes:
+    - ``gap_max_s``: Longest time between two heartbeats of each topic while on; a timeout below it
+      would trip.
+    - ``strangers``: Heartbeats while on of other senders than those that had the laser enabled.
     """
 
     def __init__(

@@ -26,17 +26,11 @@ class LaserStatus:
 class LaserRecord:
     """The requested state of a generator and its last read-back; without a lock.
 
-    Attributes
-    ----------
-    requested : LaserOutput
-    modulation : Modulation or None
-        The one that was requested.
-    readback : LaserReadback or None
-        The newest, ``None`` before the first.
-    reason : str
-        Why the output was requested so.
-    unknown : str
-        Why the state of the output is unknown, empty when it is known.
+    Public attributes:
+    - ``modulation``: The one that was requested.
+    - ``readback``: The newest, ``None`` before the first.
+    - ``reason``: Why the output was requested so.
+    - ``unknown``: Why the state of the output is unknown, empty when it is known.
     """
 
     def __init__(self) -> None:

@@ -25,23 +25,14 @@ class LaserSupervisor:
     and disables the output when that is not what was requested. Commands wait for each other;
     disabling waits for none of them, and voids those that would lead to light.
 
-    Parameters
-    ----------
-    interlock : LaserInterlock
-    running : callable
-        Whether the process means to go on; the output is disabled when it does not.
-    publish : callable
-        Called with the status after every change, in order.
-    alarm : callable
-        Called with one line when the device failed or its output is unknown.
-    log : callable
-        Called with one line when a watchdog disabled the output, and for warnings of the generator.
-    readback_period_s : float
+    - ``running``: Whether the process means to go on; the output is disabled when it does not.
+    - ``publish``: Called with the status after every change, in order.
+    - ``alarm``: Called with one line when the device failed or its output is unknown.
+    - ``log``: Called with one line when a watchdog disabled the output, and for warnings of the
+      generator.
 
-    Attributes
-    ----------
-    switch_offs : int
-        How often light ended.
+    Public attributes:
+    - ``switch_offs``: How often light ended.
     """
 
     def __init__(

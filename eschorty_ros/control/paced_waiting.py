@@ -19,22 +19,13 @@ class PacedWaiting:
 
     Its methods block, so they run in a thread of their own.
 
-    Parameters
-    ----------
-    name : str
-        Name of the program that waits, for messages.
-    monitor : InstrumentMonitor
-    now_ns : callable
-        The clock that stamps the events.
-    running : callable
-        Returns whether the program continues.
-    events_timeout_s : float
-        Longest time without progress of the reconstruction while watching.
+    - ``name``: Name of the program that waits, for messages.
+    - ``now_ns``: The clock that stamps the events.
+    - ``running``: Returns whether the program continues.
+    - ``events_timeout_s``: Longest time without progress of the reconstruction while watching.
 
-    Attributes
-    ----------
-    waits_for : str
-        What a wait of more than half a second lacks, ``""`` otherwise.
+    Public attributes:
+    - ``waits_for``: What a wait of more than half a second lacks, ``""`` otherwise.
     """
 
     def __init__(

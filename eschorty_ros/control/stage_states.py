@@ -17,21 +17,12 @@ def states_since(
 ) -> list[StageState]:
     """Return the states since ``last_ns`` in time order; a stall leaves no gap.
 
-    Parameters
-    ----------
-    stage : LinearStage
-    last_ns : int
-        Time of the last published state. Where the clock was set back, only the newest state is
-        returned.
-    period_ns : int
-        Distance of the states that fill a stall.
-    rested : bool
-        Whether the last published state was at rest.
+    - ``last_ns``: Time of the last published state. Where the clock was set back, only the newest
+      state is returned.
+    - ``period_ns``: Distance of the states that fill a stall.
+    - ``rested``: Whether the last published state was at rest.
 
-    Raises
-    ------
-    DeviceError
-        When the stage has failed.
+    Raises ``DeviceError`` when the stage has failed.
     """
     newest = stage.state()
     since_ns = newest.t_ns - last_ns

@@ -15,10 +15,7 @@ _AHEAD_MAX_S, _BEHIND_MAX_S = 0.1, 0.5
 class StampAges:
     """Ages of a node's messages on arrival: the least one of a second is the clocks' difference.
 
-    Parameters
-    ----------
-    name : str
-        The node, for messages.
+    - ``name``: The node, for messages.
     """
 
     def __init__(self, name: str) -> None:

@@ -59,26 +59,16 @@ def bag_to_recording(
     The clock of the sensor is estimated as the nodes do: announced on ``camera/clock``, else from
     the stage's edges, else from the packets' stamps.
 
-    Parameters
-    ----------
-    bag : path
-        Folder of a rosbag2, or one ``.mcap`` or ``.db3`` file.
-    folder : path
-        The recording, made here.
-    calibration : Calibration, optional
-        That of the bag when left out.
-    frequency_hz : float, optional
-        Of the laser, for a bag without ``laser/state``.
-    settings : dict, optional
-        Settings of the reconstruction; the others are those of the recorded scan. Where the stage
-        gives pulses, ``trigger_source`` is ``stage`` if neither has it.
-    packet_period_s : float
-        Time over which the camera collects events before it sends them.
+    - ``bag``: Folder of a rosbag2, or one ``.mcap`` or ``.db3`` file.
+    - ``folder``: The recording, made here.
+    - ``calibration``: That of the bag when left out.
+    - ``frequency_hz``: Of the laser, for a bag without ``laser/state``.
+    - ``settings``: Settings of the reconstruction; the others are those of the recorded scan. Where
+      the stage gives pulses, ``trigger_source`` is ``stage`` if neither has it.
+    - ``packet_period_s``: Time over which the camera collects events before it sends them.
 
-    Raises
-    ------
-    FormatError, ArgumentError, CalibrationError
-        When the bag cannot be read or lacks something.
+    Raises ``FormatError`` or ``ArgumentError`` or ``CalibrationError`` when the bag cannot be read
+    or lacks something.
     """
     path = file_path("bag", bag)
     with BagReader(path) as source:
@@ -193,20 +183,11 @@ def recording_to_bag(
     The camera's clock is announced, so that the way back is exact. Sensor time 0 is the time at
     which the recording's events were written, less their length.
 
-    Parameters
-    ----------
-    recording : Recording
-    bag : path
-        Folder of the bag, made here.
-    storage : str
-        ``mcap`` or ``sqlite3``.
-    progress : callable, optional
-        Called with the share done.
+    - ``bag``: Folder of the bag, made here.
+    - ``storage``: ``mcap`` or ``sqlite3``.
+    - ``progress``: Called with the share done.
 
-    Raises
-    ------
-    ArgumentError
-        When the bag exists or cannot be written.
+    Raises ``ArgumentError`` when the bag exists or cannot be written.
     """
     path = file_path("bag", bag)
     custom = {}

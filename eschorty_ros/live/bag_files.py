@@ -66,10 +66,7 @@ def is_bag(path: Path) -> bool:
 class BagReader:
     """The messages of a bag that a reconstruction needs.
 
-    Raises
-    ------
-    FormatError
-        When it cannot be read, or two topics of a type could be meant.
+    Raises ``FormatError`` when it cannot be read, or two topics of a type could be meant.
     """
 
     def __init__(self, path: Path) -> None:
@@ -145,14 +142,9 @@ class BagReader:
 class BagWriter:
     """Writes a new bag on the instrument's topics.
 
-    Parameters
-    ----------
-    path : Path
-        Its folder; made here.
-    storage : str
-        ``mcap`` or ``sqlite3``.
-    custom : dict of str to str
-        Custom data of the bag's metadata.
+    - ``path``: Its folder; made here.
+    - ``storage``: ``mcap`` or ``sqlite3``.
+    - ``custom``: Custom data of the bag's metadata.
     """
 
     def __init__(self, path: Path, storage: str, custom: dict[str, str]) -> None:

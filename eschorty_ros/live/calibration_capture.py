@@ -55,24 +55,16 @@ class CaptureRequest:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """The targets found in a capture.
-
-    Attributes
-    ----------
-    targets : Targets or None
-        Known targets that were found.
-    posts : int
-        Posts found, known or not.
-    rejected : tuple of str
-        Posts and targets without a match, with the reason.
-    residual_px : ndarray of float64
-        Residuals of the targets in a fit of k' and b'; empty below two targets.
-    """
+    """The targets found in a capture."""
 
     targets: Targets | None = None
+    """Known targets that were found."""
     posts: int = 0
+    """Posts found, known or not."""
     rejected: tuple[str, ...] = ()
+    """Posts and targets without a match, with the reason."""
     residual_px: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    """Residuals of the targets in a fit of k' and b'; empty below two targets."""
 
 
 class Capture(Protocol):
@@ -114,12 +106,7 @@ class _Frame:
 class PostsCapture(_Frame):
     """A capture of targets at rest, side by side.
 
-    Parameters
-    ----------
-    request : CaptureRequest
-    nominal : Calibration
-        The build as designed.
-    line_width_px : float
+    - ``nominal``: The build as designed.
     """
 
     def __init__(self, request: CaptureRequest, nominal: Calibration, line_width_px: float) -> None:
@@ -142,11 +129,7 @@ class PostsCapture(_Frame):
 class SweepCapture(_Frame):
     """A capture of one target that the stage moves along the range.
 
-    Parameters
-    ----------
-    request : CaptureRequest
-        With a sweep.
-    nominal : Calibration
+    - ``request``: With a sweep.
     """
 
     def __init__(self, request: CaptureRequest, nominal: Calibration) -> None:
@@ -180,10 +163,8 @@ class SweepCapture(_Frame):
 def enough_targets(findings: Findings, expected: int) -> Targets:
     """Return the targets found.
 
-    Raises
-    ------
-    FitError
-        For less than three, or than ``expected`` if that is less; gives the first reasons.
+    Raises ``FitError`` for less than three, or than ``expected`` if that is less; gives the first
+    reasons.
     """
     targets = findings.targets
     found = len(targets) if targets is not None else 0

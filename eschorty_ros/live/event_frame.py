@@ -13,11 +13,7 @@ from eschorty_ros.core.evt3 import Decoder
 class EventFrame:
     """Image whose brightness is exp(-age of the pixel's newest event / ``tau_us``).
 
-    Parameters
-    ----------
-    columns, rows : int
-    tau_us : float
-        Age at which the brightness is 1/e.
+    - ``tau_us``: Age at which the brightness is 1/e.
     """
 
     def __init__(self, columns: int, rows: int, tau_us: float = 30_000.0) -> None:

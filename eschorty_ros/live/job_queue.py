@@ -18,15 +18,10 @@ Job = Callable[[], None]
 class JobQueue:
     """Jobs in the order of their arrival, bounded: many small ones, fewer bulk jobs.
 
-    Parameters
-    ----------
-    bulk_max : int
-        Longest queue of bulk jobs.
+    - ``bulk_max``: Longest queue of bulk jobs.
 
-    Attributes
-    ----------
-    overflows : int
-        Jobs refused because the queue was full.
+    Public attributes:
+    - ``overflows``: Jobs refused because the queue was full.
     """
 
     def __init__(self, bulk_max: int) -> None:
@@ -50,10 +45,7 @@ class JobQueue:
     def run(self, job: Job, timeout_s: float, running: Callable[[], bool]) -> tuple[bool, str]:
         """Queue a small job and wait for its end, at most while ``running()``.
 
-        Returns
-        -------
-        bool, str
-            Success, and the reason of a failure.
+        Returns whether it succeeded, and the reason of a failure.
         """
         answered = threading.Event()
         refusal: list[str] = []

@@ -15,17 +15,11 @@ _QUIET_AGES = 5
 class Packetizer:
     """Collects bytes until the packet reaches an age or a size.
 
-    Parameters
-    ----------
-    time_threshold_ns : int
-        Age of a packet's first byte at which it is complete; five times that for under 8 kB.
-    size_threshold : int
-        Bytes of a complete packet, rounded down to 16-bit words.
+    - ``time_threshold_ns``: Age of a packet's first byte at which it is complete; five times that
+      for under 8 kB.
+    - ``size_threshold``: Bytes of a complete packet, rounded down to 16-bit words.
 
-    Raises
-    ------
-    ArgumentError
-        When ``size_threshold`` is not 2 to 256000.
+    Raises ``ArgumentError`` when ``size_threshold`` is not 2 to 256000.
     """
 
     def __init__(self, time_threshold_ns: int, size_threshold: int) -> None:

@@ -46,29 +46,19 @@ class PacketStream:
     packets' stamps give the number of wraps of a stream that is joined later than its first
     packet, or continues after more than half a wrap without packets.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    settings : Settings
-    clock_timeout_s : float
-    packet_period_s : float
-        Time over which the camera collects events before it sends them.
-    held_max : int
-        Packets held while clock or modulation are unknown; further ones count as lost.
+    - ``packet_period_s``: Time over which the camera collects events before it sends them.
+    - ``held_max``: Packets held while clock or modulation are unknown; further ones count as lost.
 
-    Attributes
-    ----------
-    packets, packets_lost, restarts : int
-        Packets reconstructed, missing by their ``seq``, and new starts of the stream.
-    packets_late : int
-        Packets left out because they came twice or after later ones; ``packets_lost`` includes
-        the latter.
-    clock_restarts : int
-        Restarts of the clock because stamps or sensor times went back, or contradict each other.
-    announcements_refused : int
-        Announced zeros that contradict the packets' stamps, which serve instead.
-    announcement_expected : bool
-        True while packets wait for an announcement of the camera's zero.
+    Public attributes:
+    - ``packets``, ``packets_lost``, ``restarts``: Packets reconstructed, missing by their ``seq``,
+      and new starts of the stream.
+    - ``packets_late``: Packets left out because they came twice or after later ones;
+      ``packets_lost`` includes the latter.
+    - ``clock_restarts``: Restarts of the clock because stamps or sensor times went back, or
+      contradict each other.
+    - ``announcements_refused``: Announced zeros that contradict the packets' stamps, which serve
+      instead.
+    - ``announcement_expected``: True while packets wait for an announcement of the camera's zero.
     """
 
     def __init__(

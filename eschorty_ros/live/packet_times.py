@@ -55,17 +55,8 @@ def first_time_high_us(data: Any) -> int | None:
 def first_time_us(data: Any, before_us: int | None, after_us: int | None) -> int | None:
     """Return the latest known sensor time at or before a packet's first bytes.
 
-    Parameters
-    ----------
-    data : buffer of EVT3 words
-    before_us, after_us : int, optional
-        Times the decoder had reached before and after the packet; a time outside comes from a
-        broken word.
-
-    Returns
-    -------
-    int or None
-        us; ``None`` without any time.
+    - ``before_us``, ``after_us``: Times the decoder had reached before and after the packet; a time
+      outside comes from a broken word.
     """
     t_us = _first_word_us(data, before_us)
     if after_us is None or (t_us is not None and (before_us or 0) <= t_us <= after_us):

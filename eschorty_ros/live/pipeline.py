@@ -92,17 +92,11 @@ def _share(part: int, whole: int) -> float:
 class Pipeline:
     """Runs packet stream, stage placement and scan buffer; used by one thread.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    settings : Settings
-    clock_timeout_s, stage_gap_s, stage_timeout_s, packet_period_s : float
-        See ``PacketStream`` and ``StagePlacer``.
+    - ``clock_timeout_s``, ``stage_gap_s``, ``stage_timeout_s``, ``packet_period_s``: See
+      ``PacketStream`` and ``StagePlacer``.
 
-    Attributes
-    ----------
-    capture : Capture or None
-        Receives a calibration's events and placed profiles while it is set.
+    Public attributes:
+    - ``capture``: Receives a calibration's events and placed profiles while it is set.
     """
 
     def __init__(
@@ -135,10 +129,7 @@ class Pipeline:
     def add_packet(self, packet: Packet, now_s: float) -> None:
         """Queue a packet for the next :meth:`process`.
 
-        Raises
-        ------
-        FormatError
-            For a packet without the time of a camera.
+        Raises ``FormatError`` for a packet without the time of a camera.
         """
         check_span(packet.data)
         self.stream.add(packet, now_s)
@@ -176,10 +167,7 @@ class Pipeline:
     def set_calibration(self, calibration: Calibration) -> None:
         """Use ``calibration`` for packets processed later.
 
-        Raises
-        ------
-        ArgumentError
-            While a scan is being collected: one scan has one calibration.
+        Raises ``ArgumentError`` while a scan is being collected: one scan has one calibration.
         """
         if self._buffer is not None:
             raise ArgumentError(
@@ -200,10 +188,7 @@ class Pipeline:
     ) -> None:
         """Start collecting, and recording; a repeated request, after a lost answer, does nothing.
 
-        Raises
-        ------
-        ArgumentError
-            When another scan is being collected already, or for bad limits.
+        Raises ``ArgumentError`` when another scan is being collected already, or for bad limits.
         """
         if self._buffer is not None:
             if self._buffer.scan_id == scan_id:
@@ -227,10 +212,7 @@ class Pipeline:
     def set_capture(self, capture: Capture | None) -> None:
         """Start to feed a calibration's capture, or stop with ``None``.
 
-        Raises
-        ------
-        ArgumentError
-            While a scan is being collected.
+        Raises ``ArgumentError`` while a scan is being collected.
         """
         if capture is not None and self._buffer is not None:
             raise ArgumentError(
@@ -241,10 +223,7 @@ class Pipeline:
     def close_period(self, scan_id: str, now_s: float) -> None:
         """Begin the end of a scan: complete the open period, since the laser is off.
 
-        Raises
-        ------
-        ArgumentError
-            When ``scan_id`` is not the scan being collected.
+        Raises ``ArgumentError`` when ``scan_id`` is not the scan being collected.
         """
         if self._buffer is None or self._buffer.scan_id != scan_id:
             raise ArgumentError(

@@ -64,23 +64,14 @@ class ScanBuffer:
 
     Points whose position is not final are all kept until the end.
 
-    Parameters
-    ----------
-    scan_id : str
-    start_mm, stop_mm : float
-        Limits of the stage position, both included, in either order.
-    points_max : int
-        Points above this number are left out.
+    - ``start_mm``, ``stop_mm``: Limits of the stage position, both included, in either order.
+    - ``points_max``: Points above this number are left out.
 
-    Attributes
-    ----------
-    points_outside, points_over_limit : int
-        Points left out because they are not between the limits, or were too many.
+    Public attributes:
+    - ``points_outside``, ``points_over_limit``: Points left out because they are not between the
+      limits, or were too many.
 
-    Raises
-    ------
-    ArgumentError
-        When a limit is not finite or the identifier is empty.
+    Raises ``ArgumentError`` when a limit is not finite or the identifier is empty.
     """
 
     def __init__(

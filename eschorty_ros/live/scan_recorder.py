@@ -42,18 +42,10 @@ class ScanRecorder:
     the process is killed. `reconstruct_recording` makes the scan's points of it: recording and
     reconstruction begin with the same packet.
 
-    Parameters
-    ----------
-    folder : Path
-        The recording; made by the thread.
-    scan : ScanLog
-    calibration : Calibration
-    settings : mapping
-        Settings of the reconstruction.
-    queue_bytes : int
-        Most bytes of packets that wait for the disk.
-    waits : bool
-        Whether ``packet`` waits for the disk instead of leaving packets out.
+    - ``folder``: The recording; made by the thread.
+    - ``settings``: Settings of the reconstruction.
+    - ``queue_bytes``: Most bytes of packets that wait for the disk.
+    - ``waits``: Whether ``packet`` waits for the disk instead of leaving packets out.
     """
 
     def __init__(

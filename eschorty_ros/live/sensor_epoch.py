@@ -17,18 +17,11 @@ _PULSES_MISSING = 30
 class SensorEpoch:
     """The clock of an interval in which sensor time never goes back.
 
-    Parameters
-    ----------
-    clock : SensorClock
-    pulses : PulseTrain or None
-        Pulses of the stage, ``None`` when they are not wired to the camera's trigger input.
+    - ``pulses``: Pulses of the stage, ``None`` when they are not wired to the camera's trigger
+      input.
 
-    Attributes
-    ----------
-    clock : SensorClock
-    edges : EdgeClock
-    edges_missing : bool
-        True after 30 pulses without an edge that fits.
+    Public attributes:
+    - ``edges_missing``: True after 30 pulses without an edge that fits.
     """
 
     def __init__(self, clock: SensorClock, pulses: PulseTrain | None = None) -> None:

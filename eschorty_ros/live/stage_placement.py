@@ -25,24 +25,15 @@ class StagePlacer:
     A profile's ROS times are computed when its position is known, by the clock of that time.
     Where edges of the stage are expected, a profile waits until edges cover its time.
 
-    Parameters
-    ----------
-    gap_s : float
-        Longest time between two stage samples that is bridged; 0 bridges any.
-    timeout_s : float
-        Longest time (steady clock) a profile waits for a stage position.
+    - ``gap_s``: Longest time between two stage samples that is bridged; 0 bridges any.
+    - ``timeout_s``: Longest time (steady clock) a profile waits for a stage position.
 
-    Attributes
-    ----------
-    points_without_stage : int
-        Points discarded because no position covers their time.
-    waiting : int
-        Points that wait for a stage position.
-    track_restarts : int
-        Restarts of the odometry because its stamps went back: the clock was set, or a recording
-        is played again.
-    track : StageTrack
-        The odometry over ROS time, us, since the last restart.
+    Public attributes:
+    - ``points_without_stage``: Points discarded because no position covers their time.
+    - ``waiting``: Points that wait for a stage position.
+    - ``track_restarts``: Restarts of the odometry because its stamps went back: the clock was set,
+      or a recording is played again.
+    - ``track``: The odometry over ROS time, us, since the last restart.
     """
 
     def __init__(self, gap_s: float, timeout_s: float) -> None:

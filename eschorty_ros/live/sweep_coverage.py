@@ -8,11 +8,7 @@ import numpy as np
 class SweepCoverage:
     """Adds up the stage's motion between two positions.
 
-    Parameters
-    ----------
-    start_mm, stop_mm : float
-    passes : int
-        Times that the stage goes from one to the other.
+    - ``passes``: Times that the stage goes from one to the other.
     """
 
     def __init__(self, start_mm: float, stop_mm: float, passes: int = 1) -> None:

@@ -62,18 +62,9 @@ class Parameter:
 
 
 def calibration_html(report: CalibrationReport, made_with: Mapping[str, str]) -> str:
-    """Return the text of the page.
+    """Return the page, HTML that needs no other file.
 
-    Parameters
-    ----------
-    report : CalibrationReport
-    made_with : mapping of str to str
-        Facts for the head of the page, such as the source of the targets.
-
-    Returns
-    -------
-    str
-        HTML that needs no other file.
+    - ``made_with``: Facts for the head of the page, such as the source of the targets.
     """
     fit, name = report.fit, report.nominal.name
     return render(

@@ -16,18 +16,12 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Size of a run: the same code with more or fewer columns, periods and repeats.
-
-    Attributes
-    ----------
-    fast : bool
-        A coarse run for tests.
-    seed : int
-        Seed of everything random.
-    """
+    """Size of a run: the same code with more or fewer columns, periods and repeats."""
 
     fast: bool = False
+    """A coarse run for tests."""
     seed: int = 1
+    """Seed of everything random."""
 
     def choose(self, full: int, fast: int) -> int:
         """Return ``full``, or ``fast`` in a fast run."""
@@ -36,21 +30,14 @@ class Effort:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One number and the band that it must be within, both ends included.
-
-    Attributes
-    ----------
-    name : str
-        Its name, without the value.
-    value, low, high : float
-        ``-inf`` or ``inf`` for an open end.
-    unit : str
-    """
+    """One number and the band that it must be within, both ends included."""
 
     name: str
+    """Its name, without the value."""
     value: float
     low: float = -math.inf
     high: float = math.inf
+    """``-inf`` or ``inf`` for an open end."""
     unit: str = ""
 
     @property
@@ -61,61 +48,38 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class DataTable:
-    """A table of the report, written as CSV beside the page.
-
-    Attributes
-    ----------
-    columns : sequence of str
-        Names with their units, as in ``range_mm``.
-    rows : sequence of sequence
-        Numbers or text, one entry per column.
-    shown : bool
-        Show it on the page; the data behind a figure need not be.
-    """
+    """A table of the report, written as CSV beside the page."""
 
     columns: Sequence[str]
+    """Names with their units, as in ``range_mm``."""
     rows: Sequence[Sequence[float | int | str]]
+    """Numbers or text, one entry per column."""
     shown: bool = True
+    """Show it on the page; the data behind a figure need not be."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of one experiment.
-
-    Attributes
-    ----------
-    findings : list of Finding
-    tables : dict
-        By file stem.
-    figures : dict
-        By file stem.
-    captions : dict
-        What a table or figure shows, by the same stems.
-    remarks : list of str
-        Sentences for the reader: explained disagreements, costs, omissions.
-    """
+    """Result of one experiment."""
 
     findings: list[Finding] = field(default_factory=list)
     tables: dict[str, DataTable] = field(default_factory=dict)
+    """By file stem."""
     figures: dict[str, Figure] = field(default_factory=dict)
+    """By file stem."""
     captions: dict[str, str] = field(default_factory=dict)
+    """What a table or figure shows, by the same stems."""
     remarks: list[str] = field(default_factory=list)
+    """Sentences for the reader: explained disagreements, costs, omissions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """A part of the report.
-
-    Attributes
-    ----------
-    name : str
-        For the command line and the file names.
-    title : str
-        Heading on the page.
-    run : callable
-        ``run(effort, progress) -> Outcome``.
-    """
+    """A part of the report."""
 
     name: str
+    """For the command line and the file names."""
     title: str
+    """Heading on the page."""
     run: Callable[[Effort, Progress], Outcome]
+    """``run(effort, progress) -> Outcome``."""

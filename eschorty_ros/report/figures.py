@@ -42,18 +42,10 @@ def scan_figure(
 ) -> Figure:
     """Draw depth map and 3-D view; with a known error, its map and its histogram too.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    error_mm : ndarray of float64, shape (n,), optional
-        Measured minus true range; NaN where the truth is unknown.
-    title : str
-    stage_direction : tuple of float
+    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``error_mm``: shape (n,). Measured minus true range; NaN where the truth is unknown.
 
-    Raises
-    ------
-    ArgumentError
-        When the cloud is empty.
+    Raises ``ArgumentError`` when the cloud is empty.
     """
     stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
     grid = grid_of(points, stage_mm)
@@ -85,10 +77,7 @@ def scan_figure(
 def cloud_figure(points: NDArray[np.void], title: str = "") -> Figure:
     """Draw points of which only the places are known: a view along x and a 3-D view.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,), at least one
-    title : str
+    - ``points``: ndarray of POINT_DTYPE, shape (n,), at least one.
     """
     figure = new_figure(12.0, 4.9)
     figure.suptitle(title, parse_math=False)
@@ -145,10 +134,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure; the extension (.png, .pdf, .svg) decides the format.
 
-    Raises
-    ------
-    ArgumentError
-        When the path cannot be written or its extension is unknown.
+    Raises ``ArgumentError`` when the path cannot be written or its extension is unknown.
     """
     target = Path(path)
     try:
@@ -163,32 +149,22 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A cloud as an image: one line per modulation period, one pixel per column.
-
-    Attributes
-    ----------
-    along_mm : ndarray of float64, shape (columns + 1,)
-        Edges of the columns along the line, at the mean range; px where the points do not show it.
-    along_label : str
-    stage_mm : ndarray of float64, shape (profiles,)
-        Median stage position of each line.
-    profile : ndarray of int64, shape (n,)
-        Line of every point.
-    """
+    """A cloud as an image: one line per modulation period, one pixel per column."""
 
     along_mm: NDArray[np.float64]
+    """Shape (columns + 1,). Edges of the columns along the line, at the mean range; px where the
+    points do not show it."""
     along_label: str
     stage_mm: NDArray[np.float64]
+    """Shape (profiles,). Median stage position of each line."""
     profile: NDArray[np.int64]
+    """Shape (n,). Line of every point."""
 
 
 def grid_of(points: NDArray[np.void], stage_mm: NDArray[np.float64]) -> Grid:
     """Return the points sorted into modulation periods.
 
-    Raises
-    ------
-    ArgumentError
-        When the cloud is empty.
+    Raises ``ArgumentError`` when the cloud is empty.
     """
     if len(points) == 0:
         raise ArgumentError("the cloud has 0 points; give one with points to draw")

@@ -41,17 +41,10 @@ def write_growing_scan(
 ) -> None:
     """Write a GIF of the cloud: profile by profile as the stage moves, then from both sides.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    path : path
-        Ends in ``.gif``.
-    stage_direction : tuple of float
+    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``path``: Ends in ``.gif``.
 
-    Raises
-    ------
-    ArgumentError
-        When the cloud is empty, or the path cannot be written.
+    Raises ``ArgumentError`` when the cloud is empty, or the path cannot be written.
     """
     from PIL import Image
 

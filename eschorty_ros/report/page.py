@@ -20,26 +20,12 @@ def write_page(
 ) -> Path:
     """Write ``index.html``; the pictures and tables that it links must exist.
 
-    Parameters
-    ----------
-    folder : Path
-        Existing folder.
-    sections : sequence of Section
-        In the order of the page.
-    made_with : mapping of str to str
-        Facts for the head of the page.
-    pending : int
-        Experiments that have not run yet.
+    - ``folder``: Existing folder.
+    - ``sections``: In the order of the page.
+    - ``made_with``: Facts for the head of the page.
+    - ``pending``: Experiments that have not run yet.
 
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    ArgumentError
-        When the page cannot be written.
+    Raises ``ArgumentError`` when the page cannot be written.
     """
     page = render(
         "page.html.jinja",

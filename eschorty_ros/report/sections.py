@@ -28,20 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure as written.
-
-    Attributes
-    ----------
-    file : str
-        Name beside the page.
-    caption, alt : str
-        Its content in words, and a description of its axes for readers without the picture.
-    width_px, height_px : int
-    """
+    """A figure as written."""
 
     file: str
+    """Name beside the page."""
     caption: str
     alt: str
+    """Its content in words, and a description of its axes for readers without the picture."""
     width_px: int
     height_px: int
 
@@ -57,32 +50,20 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One experiment of the report, done or failed.
-
-    Attributes
-    ----------
-    name, title : str
-    seconds : float
-        Its duration.
-    findings : sequence of Finding
-    pictures : sequence of Picture
-    sheets : sequence of Sheet
-    remarks : sequence of str
-    failure : str
-        One line when the experiment failed, else empty.
-    trace : str
-        Traceback of the failure.
-    """
+    """One experiment of the report, done or failed."""
 
     name: str
     title: str
     seconds: float
+    """Its duration."""
     findings: Sequence[Finding] = field(default_factory=list)
     pictures: Sequence[Picture] = field(default_factory=list)
     sheets: Sequence[Sheet] = field(default_factory=list)
     remarks: Sequence[str] = field(default_factory=list)
     failure: str = ""
+    """One line when the experiment failed, else empty."""
     trace: str = ""
+    """Traceback of the failure."""
 
     @property
     def missed(self) -> list[Finding]:
@@ -101,20 +82,9 @@ def run_sections(
 
     The section of an experiment that fails names its failure, and the next experiment runs.
 
-    Parameters
-    ----------
-    names : sequence of str
-    load : callable
-        Returns the experiment of a name.
-    effort : Effort
-    folder : Path
-        Existing folder for the files, named after experiment and stem.
-    progress : callable
-        Called with the share of all experiments done.
-
-    Yields
-    ------
-    Section
+    - ``load``: Returns the experiment of a name.
+    - ``folder``: Existing folder for the files, named after experiment and stem.
+    - ``progress``: Called with the share of all experiments done.
     """
     for index, name in enumerate(names):
         start = time.perf_counter()

@@ -21,24 +21,17 @@ _LINES_AT_ONCE = 256
 
 
 class CloudGrid(NamedTuple):
-    """A cloud as an image, one line per modulation period; a cell without a point holds NaN.
-
-    Attributes
-    ----------
-    point : ndarray of int64, shape (lines, columns)
-        Place of the cell's point in the cloud, -1 for none; of several the one of most events.
-    first_column : int
-        Column of the image's first one.
-    xyz : ndarray of float64, shape (lines, columns, 3)
-        mm.
-    sigma : ndarray of float64, shape (lines, columns)
-        mm.
-    """
+    """A cloud as an image, one line per modulation period; a cell without a point holds NaN."""
 
     point: NDArray[np.int64]
+    """Shape (lines, columns). Place of the cell's point in the cloud, -1 for none; of several the
+    one of most events."""
     first_column: int
+    """Column of the image's first one."""
     xyz: Array
+    """Shape (lines, columns, 3). mm."""
     sigma: Array
+    """Shape (lines, columns). mm."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -59,14 +52,9 @@ def organise(points: NDArray[np.void]) -> CloudGrid:
     Left out are points without finite place, time or positive sigma, and those whose flags say that
     they are on two surfaces or cut by the sensor's edge.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
+    - ``points``: ndarray of POINT_DTYPE, shape (n,).
 
-    Raises
-    ------
-    ArgumentError
-        When no two periods have a point, or the grid would be too large.
+    Raises ``ArgumentError`` when no two periods have a point, or the grid would be too large.
     """
     kept = np.flatnonzero(
         np.all([np.abs(points[axis]) < 1e6 for axis in "xyz"], axis=0)

@@ -39,21 +39,15 @@ class Region(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """A plane of a part and its flatness.
-
-    Attributes
-    ----------
-    mask : ndarray of bool
-        Its cells in the grid.
-    common_mm : float
-        Standard deviation of the range error that its points share.
-    """
+    """A plane of a part and its flatness."""
 
     mask: NDArray[np.bool_]
+    """Its cells in the grid."""
     part: Part
     plane: Plane
     flat: Flatness
     common_mm: float
+    """Standard deviation of the range error that its points share."""
 
     @property
     def range_mm(self) -> Value:
@@ -62,24 +56,16 @@ class Surface(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A surface against the first one.
-
-    Attributes
-    ----------
-    distance_mm : Value
-        Along the common normal of two parallel planes; farther is positive.
-    angle_deg : Value
-        Between the two planes, each with its own slopes.
-    flush_mm : Value
-        Step where the surfaces face each other, along the first one's normal.
-    gap_mm : Value
-        Space between the facing edges in the first surface; NaN where they overlap.
-    """
+    """A surface against the first one."""
 
     distance_mm: Value
+    """Along the common normal of two parallel planes; farther is positive."""
     angle_deg: Value
+    """Between the two planes, each with its own slopes."""
     flush_mm: Value
+    """Step where the surfaces face each other, along the first one's normal."""
     gap_mm: Value
+    """Space between the facing edges in the first surface; NaN where they overlap."""
 
 
 class Measured(NamedTuple):
@@ -124,19 +110,12 @@ def measure(
 ) -> Measured:
     """Return planes, flatness and what lies between them.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    regions : tuple of Region
-        Without one, the pieces that steps of the range separate, without their rims.
-    common_mm : float, optional
-        Standard deviation of a range error that all points of a surface share, and by which its
-        two ends differ; by default a tenth of the points' own sigma.
+    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``regions``: Without one, the pieces that steps of the range separate, without their rims.
+    - ``common_mm``: Standard deviation of a range error that all points of a surface share, and by
+      which its two ends differ; by default a tenth of the points' own sigma.
 
-    Raises
-    ------
-    ArgumentError
-        When the cloud is no sweep, or a region has too few points.
+    Raises ``ArgumentError`` when the cloud is no sweep, or a region has too few points.
     """
     grid = organise(points)
     masks = [_mask(grid, region) for region in regions] or _found(grid)

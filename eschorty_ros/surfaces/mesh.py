@@ -24,45 +24,29 @@ _STEEPNESS = 2.0
 
 
 class Level(NamedTuple):
-    """One step of the decimation.
-
-    Attributes
-    ----------
-    vertices, triangles : int
-    error_mm : float
-        Distance to the mesh within which 95 % of the cloud's points are.
-    error_sigmas : float
-        The same as a multiple of each point's own sigma.
-    """
+    """One step of the decimation."""
 
     vertices: int
     triangles: int
     error_mm: float
+    """Distance to the mesh within which 95 % of the cloud's points are."""
     error_sigmas: float
+    """The same as a multiple of each point's own sigma."""
 
 
 class Mesh(NamedTuple):
-    """The coarsest mesh within the errors.
-
-    Attributes
-    ----------
-    vertices : ndarray of float64, shape (n, 3)
-        mm.
-    triangles : ndarray of int64, shape (m, 3)
-        Their front faces the sensor.
-    levels : tuple of Level
-        From the finest to the first one beyond the errors.
-    chosen : int
-        Index of the mesh's level.
-    points : int
-        Points of the cloud that the finest mesh holds.
-    """
+    """The coarsest mesh within the errors."""
 
     vertices: Array
+    """Shape (n, 3). mm."""
     triangles: NDArray[np.int64]
+    """Shape (m, 3). Their front faces the sensor."""
     levels: tuple[Level, ...]
+    """From the finest to the first one beyond the errors."""
     chosen: int
+    """Index of the mesh's level."""
     points: int
+    """Points of the cloud that the finest mesh holds."""
 
 
 def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
@@ -71,18 +55,11 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
     The finest mesh joins neighbours of the grid, at the median range of 5 by 5; none over a step
     of the range. Each further level has half the triangles (Garland and Heckbert's quadrics).
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    sigmas : float
-        Gaussian errors alone need 1.96.
+    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``sigmas``: Gaussian errors alone need 1.96.
 
-    Raises
-    ------
-    ArgumentError
-        When the cloud is no sweep, or the finest mesh is beyond the errors.
-    EschortyError
-        Without Open3D.
+    Raises ``ArgumentError`` when the cloud is no sweep, or the finest mesh is beyond the errors.
+    Raises ``EschortyError`` without Open3D.
     """
     positive("sigmas", sigmas)
     open3d = load_open3d("a mesh")
@@ -127,10 +104,7 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
 def write_mesh(path: str | os.PathLike[str], made: Mesh) -> None:
     """Write a mesh in metres as ``.ply``, ``.obj`` or ``.stl``; it appears complete or not at all.
 
-    Raises
-    ------
-    ArgumentError
-        For another extension, or a path that cannot be written.
+    Raises ``ArgumentError`` for another extension, or a path that cannot be written.
     """
     target = check_format(path)
     open3d = load_open3d("a mesh")

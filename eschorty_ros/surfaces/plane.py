@@ -58,26 +58,18 @@ class Part(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """The plane ``x = centre[0] + slope_y (y - centre[1]) + slope_z (z - centre[2])``, mm.
-
-    Attributes
-    ----------
-    centre : ndarray, shape (3,)
-    slopes : ndarray, shape (2,)
-        mm of range per mm of y and of z.
-    covariance : ndarray, shape (3, 3)
-        Of the range at the centre and of both slopes.
-    residual : ndarray, shape (n,)
-        Measured minus fitted range, mm.
-    kept : ndarray of bool, shape (n,)
-        Points of the fit; the others are beyond 4 robust sigma.
-    """
+    """The plane ``x = centre[0] + slope_y (y - centre[1]) + slope_z (z - centre[2])``, mm."""
 
     centre: Array
+    """Shape (3,)."""
     slopes: Array
+    """Shape (2,). mm of range per mm of y and of z."""
     covariance: Array
+    """Shape (3, 3). Of the range at the centre and of both slopes."""
     residual: Array
+    """Shape (n,). Measured minus fitted range, mm."""
     kept: NDArray[np.bool_]
+    """Shape (n,). Points of the fit; the others are beyond 4 robust sigma."""
 
     @property
     def cosine(self) -> float:
@@ -145,12 +137,9 @@ def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bo
 def clustered_covariance(design: Array, residual: Array, part: Part) -> Array:
     """Return the covariance of a weighted least-squares fit whose neighbours share errors.
 
-    Parameters
-    ----------
-    design : ndarray, shape (n, values)
-    residual : ndarray, shape (n,)
-    part : Part
-        Line, column and sigma of each residual.
+    - ``design``: shape (n, values).
+    - ``residual``: shape (n,).
+    - ``part``: Line, column and sigma of each residual.
     """
     weight = 1.0 / part.sigma**2
     own = np.linalg.inv(design.T @ (design * weight[:, None]))

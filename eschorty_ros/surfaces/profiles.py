@@ -20,9 +20,7 @@ def period_s(points: NDArray[np.void]) -> float:
     first estimate; straight-line fits over doubling spans refine it. Two returns of one period are
     a small part of it apart and are left out of the first estimate.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE
+    - ``points``: POINT_DTYPE.
     """
     order = np.lexsort((points["t"], points["column"]))
     t_s = points["t"][order]
@@ -50,16 +48,10 @@ def period_s(points: NDArray[np.void]) -> float:
 def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
     """Return the number of every point's modulation period, the first being 0.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    period : float
-        Modulation period, seconds.
+    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``period``: Modulation period, seconds.
 
-    Raises
-    ------
-    ArgumentError
-        When the period is not positive.
+    Raises ``ArgumentError`` when the period is not positive.
     """
     if not period > 0.0:
         raise ArgumentError(f"period is {period!r} s; give a positive modulation period")

@@ -28,30 +28,21 @@ _WITHOUT_PERIOD_S = 1.0
 
 
 class Pose(NamedTuple):
-    """Where a cloud is in the frame of the first one.
-
-    Attributes
-    ----------
-    transform : ndarray, shape (4, 4)
-        Takes points of the cloud, in m, into the frame of the first one.
-    centre_mm : ndarray, shape (3,)
-        Middle of the overlap, about which the small rotations of the covariance turn.
-    covariance : ndarray, shape (6, 6)
-        Of the rotation about x, y, z (rad) and of the translation along x, y, z (mm).
-    pairs : int
-        Points with a partner.
-    overlap : float
-        Share of the points with a partner.
-    rms_sigmas : float
-        Root mean square distance of the pairs along the normal over its own sigma.
-    """
+    """Where a cloud is in the frame of the first one."""
 
     transform: Array
+    """Shape (4, 4). Takes points of the cloud, in m, into the frame of the first one."""
     centre_mm: Array
+    """Shape (3,). Middle of the overlap, about which the small rotations of the covariance turn."""
     covariance: Array
+    """Shape (6, 6). Of the rotation about x, y, z (rad) and of the translation along x, y, z
+    (mm)."""
     pairs: int
+    """Points with a partner."""
     overlap: float
+    """Share of the points with a partner."""
     rms_sigmas: float
+    """Root mean square distance of the pairs along the normal over its own sigma."""
 
     @property
     def rotation_deg(self) -> Array:
@@ -94,20 +85,12 @@ def register(
     Generalised ICP (Segal, Haehnel and Thrun, 2009) with the covariance of each point: its own
     sigma along the range, free along the surface.
 
-    Parameters
-    ----------
-    first, other : ndarray of POINT_DTYPE
-    start : ndarray, shape (4, 4), optional
-        First guess, metres.
-    reach_mm : float
-        Farthest partner of the first round; each further round halves it.
+    - ``first``, ``other``: POINT_DTYPE.
+    - ``start``: shape (4, 4). First guess, metres.
+    - ``reach_mm``: Farthest partner of the first round; each further round halves it.
 
-    Raises
-    ------
-    ArgumentError
-        When the clouds do not overlap, or slide or turn on each other.
-    EschortyError
-        Without Open3D.
+    Raises ``ArgumentError`` when the clouds do not overlap, or slide or turn on each other. Raises
+    ``EschortyError`` without Open3D.
     """
     positive("reach_mm", reach_mm)
     open3d = load_open3d("registration")

@@ -30,10 +30,7 @@ class Shown(NamedTuple):
 class GrowingCloud:
     """Keeps every n-th point; n doubles whenever the points would exceed the limit.
 
-    Parameters
-    ----------
-    limit : int
-        Points kept at most.
+    - ``limit``: Points kept at most.
     """
 
     def __init__(self, limit: int = POINTS_MAX) -> None:

@@ -49,19 +49,9 @@ def load_viser() -> ModuleType:
 class Page:
     """A page that shows a cloud, and an instrument if there is one.
 
-    Parameters
-    ----------
-    host, port : str, int
-    cloud : GrowingCloud
-    control : ScanControl, optional
-        Without one the page shows a saved cloud only.
+    - ``control``: Without one the page shows a saved cloud only.
 
-    Raises
-    ------
-    ArgumentError
-        When the port is taken.
-    EschortyError
-        Without viser.
+    Raises ``ArgumentError`` when the port is taken. Raises ``EschortyError`` without viser.
     """
 
     def __init__(
@@ -151,14 +141,9 @@ class Page:
     ) -> None:
         """Draw what has changed.
 
-        Parameters
-        ----------
-        text : callable
-            Returns the text, of received points and stride.
-        profile : tuple of ndarray, optional
-            z and range of one period, mm.
-        frame : ndarray of uint8, shape (rows, columns), optional
-            Image of the recent events.
+        - ``text``: Returns the text, of received points and stride.
+        - ``profile``: z and range of one period, mm.
+        - ``frame``: shape (rows, columns). Image of the recent events.
         """
         with self._serving:
             if self._stopped:
@@ -231,10 +216,7 @@ class Page:
 def open_when_served(host: str, port: int) -> None:
     """Open the page in the browser of a desktop, if this is one, once its server answers.
 
-    Raises
-    ------
-    ArgumentError
-        When the port is taken already.
+    Raises ``ArgumentError`` when the port is taken already.
     """
     _check_free(host, port)
     if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):

@@ -62,12 +62,8 @@ class ScanControl:
 
     A page of another site can reach a server on this computer, too: it does not know the code.
 
-    Parameters
-    ----------
-    allowed : bool
-        Whether scans may be started at all.
-    clock : callable
-        Returns monotonic seconds.
+    - ``allowed``: Whether scans may be started at all.
+    - ``clock``: Returns monotonic seconds.
     """
 
     def __init__(self, allowed: bool, clock: Callable[[], float] = time.monotonic) -> None:
@@ -81,10 +77,7 @@ class ScanControl:
     def start(self, values: ScanValues, code: str, conditions: Conditions) -> ScanValues:
         """Return the values of a scan that may begin.
 
-        Raises
-        ------
-        ArgumentError
-            When it may not, with the reason.
+        Raises ``ArgumentError`` when it may not, with the reason.
         """
         if not self.allowed:
             raise ArgumentError("this page may not start scans; start it with --allow-scan")

@@ -31,10 +31,7 @@ def open_regular_file(
 ) -> BinaryIO:
     """Open a regular file for reading; devices and pipes are refused without opening them.
 
-    Raises
-    ------
-    error
-        When there is no such file or it cannot be opened.
+    Raises ``error`` when there is no such file or it cannot be opened.
     """
     file = file_path("path", path)
     flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow_links else os.O_NOFOLLOW)
@@ -79,10 +76,7 @@ def _check_regular(file: Path, found: os.stat_result, error: type[EschortyError]
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a binary file that takes the name ``path`` only when the block ends without error.
 
-    Raises
-    ------
-    ArgumentError
-        When the file cannot be written; names the path and the reason.
+    Raises ``ArgumentError`` when the file cannot be written; names the path and the reason.
     """
     target = _target(path)
     with _named(target), _partial(target.parent) as folder:
@@ -111,10 +105,7 @@ def atomic_files(folder: Path, names: Sequence[str]) -> Iterator[Path]:
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check before long work that ``atomic_write`` can write ``path``; leaves nothing behind.
 
-    Raises
-    ------
-    ArgumentError
-        When it cannot; names the path and the reason.
+    Raises ``ArgumentError`` when it cannot; names the path and the reason.
     """
     with folder_beside(path) as folder:
         (folder / _target(path).name).touch()
@@ -124,10 +115,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 def folder_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Make a folder for short-lived files in the folder of ``path``, as `temporary_folder`.
 
-    Raises
-    ------
-    ArgumentError
-        When nothing can be written there; names the path and the reason.
+    Raises ``ArgumentError`` when nothing can be written there; names the path and the reason.
     """
     target = _target(path)
     with _named(target), _partial(target.parent) as folder:

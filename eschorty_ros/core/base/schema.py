@@ -96,10 +96,7 @@ Record = TypeVar("Record", bound=Schema)
 def validate(schema: type[Record], document: Document, error: type[EschortyError]) -> Record:
     """Return the record that a YAML file describes.
 
-    Raises
-    ------
-    error
-        With one line for the first fault and the number of further ones.
+    Raises ``error`` with one line for the first fault and the number of further ones.
     """
     if not isinstance(document.data, dict):
         required = [field.name for field in fields(schema) if field.default is MISSING]

@@ -49,10 +49,7 @@ def read_yaml(
 ) -> Document:
     """Parse a YAML file.
 
-    Raises
-    ------
-    error
-        When the file cannot be read, is too large or is not plain YAML.
+    Raises ``error`` when the file cannot be read, is too large or is not plain YAML.
     """
     data = read_regular_file(path, BYTES_MAX, error, follow_links)
     return parse_yaml(data, path, error)

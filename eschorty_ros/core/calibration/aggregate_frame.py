@@ -31,15 +31,9 @@ class Pixels(Protocol):
 class AggregateFrame:
     """Events per pixel, both polarities together; its memory does not grow with the capture.
 
-    Parameters
-    ----------
-    columns, rows : int
-
-    Attributes
-    ----------
-    counts : ndarray of uint32, shape (rows, columns)
-    events : int
-        Events counted; those outside the sensor are not.
+    Public attributes:
+    - ``counts``: shape (rows, columns).
+    - ``events``: Events counted; those outside the sensor are not.
     """
 
     def __init__(self, columns: int, rows: int) -> None:
@@ -51,10 +45,7 @@ class AggregateFrame:
     def add(self, events: Pixels) -> None:
         """Count ``events``, in any order.
 
-        Raises
-        ------
-        ArgumentError
-            When columns and rows are not uint16 arrays of one length.
+        Raises ``ArgumentError`` when columns and rows are not uint16 arrays of one length.
         """
         x = exact("x", events.x, np.uint16)
         y = exact("y", events.y, np.uint16, x.size)

@@ -52,62 +52,39 @@ _CHANNELS = ("row", "width", "spacing")
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A target that the fit left out.
-
-    Attributes
-    ----------
-    index : int
-        Index among the targets given.
-    label : str
-    reason : str
-    """
+    """A target that the fit left out."""
 
     index: int
+    """Index among the targets given."""
     label: str
     reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationReport:
-    """A calibration with the diagnostics of its fit.
-
-    Attributes
-    ----------
-    calibration : Calibration
-        Content of the file.
-    nominal : Calibration
-        The design it started from.
-    method : str
-    targets : Targets
-        All that were given; the arrays below are in their order, shape (n,).
-    used : ndarray of bool
-    fit : CalibrationFit
-        On the targets used.
-    residual_px : ndarray of float64
-        Row as measured minus row as fitted.
-    leave_one_out_px : ndarray of float64
-        The same against the fit without that target; NaN where the others do not suffice.
-    rejected : tuple of Rejected
-    profile : KProfile or None
-        Profile likelihood of k where k was fitted.
-    prior_ratio : dict of str to float
-        Posterior over prior standard deviation.
-    verdicts : tuple of str
-        ``identifiable`` where it applies, then every reservation.
-    """
+    """A calibration with the diagnostics of its fit."""
 
     calibration: Calibration
+    """Content of the file."""
     nominal: Calibration
+    """The design it started from."""
     method: Method
     targets: Targets
+    """All that were given; the arrays below are in their order, shape (n,)."""
     used: NDArray[np.bool_]
     fit: CalibrationFit
+    """On the targets used."""
     residual_px: Array
+    """Row as measured minus row as fitted."""
     leave_one_out_px: Array
+    """The same against the fit without that target; NaN where the others do not suffice."""
     rejected: tuple[Rejected, ...]
     profile: KProfile | None
+    """Profile likelihood of k where k was fitted."""
     prior_ratio: dict[str, float]
+    """Posterior over prior standard deviation."""
     verdicts: tuple[str, ...]
+    """``identifiable`` where it applies, then every reservation."""
 
     @property
     def residual_mm(self) -> Array:
@@ -137,32 +114,21 @@ def calibrate(
 ) -> CalibrationReport:
     """Fit a build to targets and diagnose the result.
 
-    Parameters
-    ----------
-    targets : Targets
-        At two different ranges or more.
-    nominal : Calibration
-        The design: fixed parameters, centres of the priors, geometry.
-    method : {"joint", "paper"}
-        ``paper`` fits k' and b' by plain least squares, k and b stay as designed. ``joint`` fits
-        k', b and b', with known sizes or spacings also k and the width bias, under priors.
-    free : sequence of str, optional
-        Parameters of the joint fit instead of these.
-    prior_sigma : mapping of str to float, optional
-        Standard deviations instead of `PRIOR_SIGMA`, for parameters that are free; infinity for
-        no prior.
-    robust : bool, optional
-        Find targets that do not follow the curve and leave them out; needs five targets. By
-        default with ``joint`` alone.
-    date : str, optional
-        ISO date for the file.
+    - ``targets``: At two different ranges or more.
+    - ``nominal``: The design: fixed parameters, centres of the priors, geometry.
+    - ``method``: either "joint" or "paper". ``paper`` fits k' and b' by plain least squares, k and
+      b stay as designed. ``joint`` fits k', b and b', with known sizes or spacings also k and the
+      width bias, under priors.
+    - ``free``: Parameters of the joint fit instead of these.
+    - ``prior_sigma``: Standard deviations instead of `PRIOR_SIGMA`, for parameters that are free;
+      infinity for no prior.
+    - ``robust``: Find targets that do not follow the curve and leave them out; needs five targets.
+      By default with ``joint`` alone.
+    - ``date``: ISO date for the file.
 
-    Raises
-    ------
-    ArgumentError
-        When an argument is out of bounds, a target off the sensor, or two targets are the same.
-    FitError
-        When the targets do not determine the parameters or contradict each other.
+    Raises ``ArgumentError`` when an argument is out of bounds, a target off the sensor, or two
+    targets are the same. Raises ``FitError`` when the targets do not determine the parameters or
+    contradict each other.
 
     Examples
     --------

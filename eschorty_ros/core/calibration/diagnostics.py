@@ -38,20 +38,14 @@ _RARE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KProfile:
-    """Profile likelihood of k: every other parameter at its best for each k.
-
-    Attributes
-    ----------
-    k_mm : ndarray of float64, shape (n,)
-    delta_chi_square : ndarray of float64, shape (n,)
-        Above the smallest; the prior on k is left out, the others count.
-    interval_mm : tuple of float
-        95 % interval; infinite on a side where it ends beyond the profile.
-    """
+    """Profile likelihood of k: every other parameter at its best for each k."""
 
     k_mm: Array
+    """Shape (n,)."""
     delta_chi_square: Array
+    """Shape (n,). Above the smallest; the prior on k is left out, the others count."""
     interval_mm: tuple[float, float]
+    """95 % interval; infinite on a side where it ends beyond the profile."""
 
 
 def k_profile(targets: Targets, design: RangeModel, found: CalibrationFit) -> KProfile | None:

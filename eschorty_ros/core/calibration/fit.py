@@ -56,46 +56,31 @@ _IMPOSSIBLE = 1e50
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationFit:
-    """A build fitted to targets, with its uncertainty.
-
-    Attributes
-    ----------
-    model : RangeModel
-        The fitted range equation.
-    free : tuple of str
-        Names of the fitted parameters, in the order of ``covariance``.
-    covariance : ndarray of float64, shape (p, p)
-        From the stated standard deviations of targets and priors, never from the residuals, so it
-        also holds with no degrees of freedom left. Units of the parameters.
-    residual_px : ndarray of float64, shape (n,)
-        Row as measured minus row as fitted.
-    sigma_px : ndarray of float64, shape (n,)
-        Standard deviation of each residual: row and range error together.
-    width_bias_px : float
-        Columns by which lit targets appear too wide; 0 unless fitted.
-    prior_sigma : dict of str to float
-        Standard deviations of the priors.
-    condition_number : float
-        Of the Jacobian of targets and priors with columns of unit length.
-    dof : int
-        Rows, widths, spacings and priors minus free parameters.
-    chi_square : float
-        Sum of squared residuals of targets and priors over their standard deviations.
-    verdicts : tuple of str
-        One line for each reservation; empty when there is none.
-    """
+    """A build fitted to targets, with its uncertainty."""
 
     model: RangeModel
+    """The fitted range equation."""
     free: tuple[str, ...]
+    """Names of the fitted parameters, in the order of ``covariance``."""
     covariance: Array
+    """Shape (p, p). From the stated standard deviations of targets and priors, never from the
+    residuals, so it also holds with no degrees of freedom left. Units of the parameters."""
     residual_px: Array
+    """Shape (n,). Row as measured minus row as fitted."""
     sigma_px: Array
+    """Shape (n,). Standard deviation of each residual: row and range error together."""
     width_bias_px: float
+    """Columns by which lit targets appear too wide; 0 unless fitted."""
     prior_sigma: dict[str, float]
+    """Standard deviations of the priors."""
     condition_number: float
+    """Of the Jacobian of targets and priors with columns of unit length."""
     dof: int
+    """Rows, widths, spacings and priors minus free parameters."""
     chi_square: float
+    """Sum of squared residuals of targets and priors over their standard deviations."""
     verdicts: tuple[str, ...]
+    """One line for each reservation; empty when there is none."""
 
     @property
     def reduced_chi_square(self) -> float:
@@ -140,29 +125,20 @@ def fit(
 ) -> CalibrationFit:
     """Fit Eq. 2 by weighted least squares, and known sizes with it where k is free.
 
-    Parameters
-    ----------
-    targets : Targets
-        A row weighs with ``sigma_row^2 + (K / (R + b)^2 sigma_range)^2``; the range error that row
-        and width of one target share is accounted for.
-    design : RangeModel
-        Nominal build: values of the parameters that stay fixed, centres of the priors, start of
-        the search.
-    free : sequence of str
-        Parameters to fit, of ``k_mm``, ``k_prime_px``, ``b_mm``, ``b_prime_px``,
-        ``b_prime_1_px``, ``b_prime_2_px``, ``width_bias_px``. The default is the paper's method.
-        It is solved in closed form on centred reciprocal depths with exactly rounded sums: the
-        same targets in any order give the same bits.
-    prior_sigma : mapping of str to float, optional
-        Standard deviations of Gaussian priors on free parameters, centred on ``design``; on a
-        width bias centred on 0. Infinity means no prior.
+    - ``targets``: A row weighs with ``sigma_row^2 + (K / (R + b)^2 sigma_range)^2``; the range
+      error that row and width of one target share is accounted for.
+    - ``design``: Nominal build: values of the parameters that stay fixed, centres of the priors,
+      start of the search.
+    - ``free``: Parameters to fit, of ``k_mm``, ``k_prime_px``, ``b_mm``, ``b_prime_px``,
+      ``b_prime_1_px``, ``b_prime_2_px``, ``width_bias_px``. The default is the paper's method. It
+      is solved in closed form on centred reciprocal depths with exactly rounded sums: the same
+      targets in any order give the same bits.
+    - ``prior_sigma``: Standard deviations of Gaussian priors on free parameters, centred on
+      ``design``; on a width bias centred on 0. Infinity means no prior.
 
-    Raises
-    ------
-    ArgumentError
-        When a target is off the sensor or behind the focal line, or a name is unknown.
-    FitError
-        When the targets do not determine the parameters; names the condition number.
+    Raises ``ArgumentError`` when a target is off the sensor or behind the focal line, or a name is
+    unknown. Raises ``FitError`` when the targets do not determine the parameters; names the
+    condition number.
 
     Notes
     -----
@@ -221,10 +197,7 @@ def solve(
 ) -> tuple[Problem, Values]:
     """Return the problem and the parameters of its smallest sum of squares.
 
-    Raises
-    ------
-    FitError
-        When the targets do not determine the parameters.
+    Raises ``FitError`` when the targets do not determine the parameters.
     """
     closed = set(names) == set(PAPER_FREE) and not priors and not observed.known[:, 1:].any()
     values = values_of(design)
@@ -263,18 +236,10 @@ def _straight_line(observed: Observed, sigma: Array, design: RangeModel) -> Valu
 def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -> Values:
     """Return the values of the smallest sum of squares, from ``start`` on.
 
-    Parameters
-    ----------
-    problem : Problem
-    start : Values
-    cauchy_scale : float, optional
-        Targets count by Cauchy's loss of their squared residuals' sum, in units of the square of
-        this many standard deviations; priors stay squared.
+    - ``cauchy_scale``: Targets count by Cauchy's loss of their squared residuals' sum, in units of
+      the square of this many standard deviations; priors stay squared.
 
-    Raises
-    ------
-    FitError
-        When the search does not converge.
+    Raises ``FitError`` when the search does not converge.
     """
     # Only a calibration needs it, and the import takes 0.3 s.
     from scipy.optimize import least_squares
@@ -321,10 +286,7 @@ def search(problem: Problem, start: Values, cauchy_scale: float | None = None) -
 def build(design: RangeModel, values: Values) -> RangeModel:
     """Return the build with these parameters.
 
-    Raises
-    ------
-    FitError
-        When there is no such build.
+    Raises ``FitError`` when there is no such build.
     """
     try:
         named: dict[str, Any] = {name: values[name] for name in (*PARAMETERS, *COLUMN_TERMS)}

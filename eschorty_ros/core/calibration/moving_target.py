@@ -37,35 +37,22 @@ def moving_target(
     The events of a line that moves over the pixels lag it by a fraction of a row, at any speed:
     join sweeps forth and back (``Targets.concatenate``), and the lag cancels.
 
-    Parameters
-    ----------
-    profiles : Profiles
-        Of the sweep; only the nearest return of a column is used.
-    stage_mm : array_like of float, shape (len(profiles),)
-        Stage position at each point's time, as ``StageTrack.position_mm`` gives it; points with
-        NaN are left out.
-    range_at_zero_mm : float
-        Range of the target with the stage at 0. Its error shifts all targets alike and becomes an
-        error of ``b``, which no number of profiles reveals.
-    range_per_stage : float
-        Range gained per stage travel: 1 when the stage moves the target away along the sheet,
-        -1 towards the sensor, the cosine of the angle in between.
-    blocks : int
-        Targets per profile, side by side: several determine how ``b'`` varies along the line.
+    Targets come by time, then column, in the columns with points in half of the profiles; the
+    label is the stage position in mm. Profiles more than 4 px off the line through the others, or
+    with the target in few columns, are left out.
 
-    Returns
-    -------
-    Targets
-        By time, then column, in the columns with points in half of the profiles; the label is the
-        stage position in mm. Profiles more than 4 px off the line through the others, or with the
-        target in few columns, are left out.
+    - ``profiles``: Of the sweep; only the nearest return of a column is used.
+    - ``stage_mm``: shape (len(profiles),). Stage position at each point's time, as
+      ``StageTrack.position_mm`` gives it; points with NaN are left out.
+    - ``range_at_zero_mm``: Range of the target with the stage at 0. Its error shifts all targets
+      alike and becomes an error of ``b``, which no number of profiles reveals.
+    - ``range_per_stage``: Range gained per stage travel: 1 when the stage moves the target away
+      along the sheet, -1 towards the sensor, the cosine of the angle in between.
+    - ``blocks``: Targets per profile, side by side: several determine how ``b'`` varies along the
+      line.
 
-    Raises
-    ------
-    ArgumentError
-        When ``stage_mm`` has another length than the points, or a value is out of its range.
-    FitError
-        When too few columns or profiles show a target.
+    Raises ``ArgumentError`` when ``stage_mm`` has another length than the points, or a value is out
+    of its range. Raises ``FitError`` when too few columns or profiles show a target.
     """
     position = reals("stage_mm", stage_mm)
     if position.shape != (len(profiles),):

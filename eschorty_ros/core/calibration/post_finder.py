@@ -31,31 +31,22 @@ _EDGE_SIGMA_PX = 12.0**-0.5
 
 @dataclass(frozen=True, slots=True)
 class Post:
-    """One post in a capture.
-
-    Attributes
-    ----------
-    column, row : float
-        Its middle between the two edges, and the line's row there, px.
-    sigma_row : float
-        Standard deviation of ``row``, px: the scatter of its columns and `GRID_SIGMA_PX`.
-    width_px, sigma_width_px : float
-        Columns between its edges, where the counts fall to half of the plateau.
-    events : int
-        Events of its line.
-    row_cut, column_cut : bool
-        The sensor's first or last row cuts the line (its row is biased), or the first or last
-        column the post (its width and middle are unknown).
-    """
+    """One post in a capture."""
 
     column: float
     row: float
+    """Its middle between the two edges, and the line's row there, px."""
     sigma_row: float
+    """Standard deviation of ``row``, px: the scatter of its columns and `GRID_SIGMA_PX`."""
     width_px: float
     sigma_width_px: float
+    """Columns between its edges, where the counts fall to half of the plateau."""
     events: int
+    """Events of its line."""
     row_cut: bool = False
     column_cut: bool = False
+    """The sensor's first or last row cuts the line (its row is biased), or the first or last column
+    the post (its width and middle are unknown)."""
 
 
 def find_posts(frame: AggregateFrame, line_width_px: float = 20.0) -> list[Post]:
@@ -66,21 +57,9 @@ def find_posts(frame: AggregateFrame, line_width_px: float = 20.0) -> list[Post]
     it. The row of a post is that of a parabola through the rows of its inner columns, at its
     middle, which fits flat, tilted and round posts.
 
-    Parameters
-    ----------
-    frame : AggregateFrame
-    line_width_px : float
-        Full width of the line at half maximum, rows.
+    - ``line_width_px``: Full width of the line at half maximum, rows.
 
-    Returns
-    -------
-    list of Post
-        In the order of their columns.
-
-    Raises
-    ------
-    ArgumentError
-        For a width outside the sensor.
+    Raises ``ArgumentError`` for a width outside the sensor.
     """
     width = number("line_width_px", line_width_px, 0.5, len(frame.counts))
     image = _Columns(frame.counts, max(HALF_WIDTH_PER_FWHM * width, 3.0))

@@ -31,29 +31,19 @@ _CLEARLY, _CLOSE = 4.0, 0.02
 class KnownTarget:
     """A target of known range.
 
-    Parameters
-    ----------
-    range_mm, sigma_range_mm : float
-        Range of its front along the sheet from the mechanical datum, and how well it is known.
-    size_mm : float
-        Width along the laser line; NaN when unknown.
-    column, row : float
-        Where it is expected, px; NaN where unknown.
-    label : str
-        Its name in messages; its range by default.
-
-    Raises
-    ------
-    ArgumentError
-        For a range or size that is not positive.
+    Raises ``ArgumentError`` for a range or size that is not positive.
     """
 
     range_mm: float
     sigma_range_mm: float = 0.0
+    """Range of its front along the sheet from the mechanical datum, and how well it is known."""
     size_mm: float = math.nan
+    """Width along the laser line; NaN when unknown."""
     column: float = math.nan
     row: float = math.nan
+    """Where it is expected, px; NaN where unknown."""
     label: str = ""
+    """Its name in messages; its range by default."""
 
     def __post_init__(self) -> None:
         positive("range_mm", self.range_mm)
@@ -75,21 +65,14 @@ class KnownTarget:
 
 @dataclass(frozen=True, slots=True)
 class PostMatch:
-    """Posts matched to known targets, and the unmatched ones of both.
-
-    Attributes
-    ----------
-    targets : Targets or None
-        The matched ones, nearest first; ``None`` when there are none.
-    pairs : tuple of (int, int)
-        Index of the post and of the known target, in the order of ``targets``.
-    rejected : tuple of str
-        One line for each post and each known target left over, with the reason.
-    """
+    """Posts matched to known targets, and the unmatched ones of both."""
 
     targets: Targets | None
+    """The matched ones, nearest first; ``None`` when there are none."""
     pairs: tuple[tuple[int, int], ...]
+    """Index of the post and of the known target, in the order of ``targets``."""
     rejected: tuple[str, ...]
+    """One line for each post and each known target left over, with the reason."""
 
 
 def match_posts(
@@ -102,19 +85,10 @@ def match_posts(
     through two posts whose ``kk'`` and ``b'`` are near the nominal ones, the line that most posts
     agree with is used. Sizes, where known, exclude posts of another width.
 
-    Parameters
-    ----------
-    posts : sequence of Post
-    known : sequence of KnownTarget
-    nominal : RangeModel
-        The build as designed: ``kk'`` holds within 15 %, ``b'`` within 120 rows.
+    - ``nominal``: The build as designed: ``kk'`` holds within 15 %, ``b'`` within 120 rows.
 
-    Raises
-    ------
-    ArgumentError
-        When nothing is known, or two known targets have the same range and no hints.
-    FitError
-        When the posts agree with the known ranges in more than one way.
+    Raises ``ArgumentError`` when nothing is known, or two known targets have the same range and no
+    hints. Raises ``FitError`` when the posts agree with the known ranges in more than one way.
     """
     if not known:
         raise ArgumentError("known is empty; give the targets' ranges")

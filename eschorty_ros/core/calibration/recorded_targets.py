@@ -28,24 +28,13 @@ def recorded_posts(
 ) -> PostMatch:
     """Find the posts in all events of a recording and match them to the known targets.
 
-    Parameters
-    ----------
-    recording : Recording
-        Of posts that keep their range: the stage still, or moving along them.
-    known : sequence of KnownTarget
-    nominal : Calibration
-        The design of the build that made the recording.
-    progress : callable, optional
-        Called with bytes read so far and bytes in all.
+    - ``recording``: Of posts that keep their range: the stage still, or moving along them.
+    - ``nominal``: The design of the build that made the recording.
+    - ``progress``: Called with bytes read so far and bytes in all.
 
-    Raises
-    ------
-    CalibrationError
-        When the design has another sensor.
-    FitError
-        When no post is found, or the posts agree with the ranges in more than one way.
-    FormatError
-        When the event file is not EVT3.
+    Raises ``CalibrationError`` when the design has another sensor. Raises ``FitError`` when no post
+    is found, or the posts agree with the ranges in more than one way. Raises ``FormatError`` when
+    the event file is not EVT3.
     """
     _check_sensor(recording, nominal)
     frame = AggregateFrame(nominal.columns, nominal.rows)
@@ -76,12 +65,9 @@ def recorded_moving_target(
 ) -> Targets:
     """Return a target for every profile of a flat target that the stage moves along the range.
 
-    Parameters
-    ----------
-    recording, nominal, progress
-        As in `recorded_posts`.
-    range_at_zero_mm, range_per_stage, blocks
-        As in `moving_target`, which also lists the errors.
+    - ``recording``, ``nominal``, ``progress``: As in `recorded_posts`.
+    - ``range_at_zero_mm``, ``range_per_stage``, ``blocks``: As in `moving_target`, which also lists
+      the errors.
     """
     _check_sensor(recording, nominal)
     profiles = reconstruct_recording(recording, progress=progress).profiles

@@ -50,28 +50,21 @@ def row_derivative(p: Mapping[str, float], depth_mm: Array, column_u: Array, nam
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Targets as a fit uses them; arrays of shape (n,) or (n, 3).
-
-    Attributes
-    ----------
-    range_mm, column_u : ndarray, shape (n,)
-        Known range; normalised column, 0 where unknown.
-    measured, sigma : ndarray, shape (n, 3)
-        Row, width and spacing, px, and their standard deviations; 0 and 1 where unknown.
-    known : ndarray of bool, shape (n, 3)
-        Channels that were measured and that the fit uses.
-    per_pixel : ndarray, shape (n, 3)
-        Size and spacing over the pixel pitch; 0 for rows and where unknown.
-    sigma_range_mm : ndarray, shape (n,)
-    """
+    """Targets as a fit uses them; arrays of shape (n,) or (n, 3)."""
 
     range_mm: Array
     column_u: Array
+    """Shape (n,). Known range; normalised column, 0 where unknown."""
     measured: Array
     sigma: Array
+    """Shape (n, 3). Row, width and spacing, px, and their standard deviations; 0 and 1 where
+    unknown."""
     known: NDArray[np.bool_]
+    """Shape (n, 3). Channels that were measured and that the fit uses."""
     per_pixel: Array
+    """Shape (n, 3). Size and spacing over the pixel pitch; 0 for rows and where unknown."""
     sigma_range_mm: Array
+    """Shape (n,)."""
 
     @classmethod
     def of(cls, targets: Targets, design: RangeModel, names: Sequence[str]) -> Observed:
@@ -142,17 +135,10 @@ class Observed:
 class Problem:
     """Whitened residuals of targets, then of priors, and their derivatives.
 
-    Parameters
-    ----------
-    observed : Observed
-    design : RangeModel
-        Values of parameters that stay fixed, centres of the priors.
-    names : tuple of str
-        Free parameters.
-    priors : mapping of str to float
-        Standard deviations.
-    at : Values
-        Parameters at which the targets' covariances are evaluated.
+    - ``design``: Values of parameters that stay fixed, centres of the priors.
+    - ``names``: Free parameters.
+    - ``priors``: Standard deviations.
+    - ``at``: Parameters at which the targets' covariances are evaluated.
     """
 
     def __init__(

@@ -39,17 +39,10 @@ def inliers(
 ) -> tuple[Mask, Array]:
     """Find the targets that follow one curve.
 
-    Returns
-    -------
-    kept : ndarray of bool, shape (n,)
-    distance : ndarray of float64, shape (n, 3)
-        Residuals against the curve of the kept targets in standard deviations; those of the
-        others include the uncertainty of that curve.
+    Raises ``FitError`` when no curve fits more than half of the targets.
 
-    Raises
-    ------
-    FitError
-        When no curve fits more than half of the targets.
+    The second array holds the residuals against the curve of the kept targets in standard
+    deviations; those of the others include the uncertainty of that curve.
     """
     values = _least_median(observed, design)
     refuse_singular(Problem(observed, design, names, priors, values), values)

@@ -32,43 +32,31 @@ class Targets:
     Every argument is a scalar for all targets or one entry for each. Attributes are float64 of
     shape (n,) and read-only.
 
-    Parameters
-    ----------
-    row : array_like
-        Where the targets appear, px, on the sensor.
-    range_mm : array_like
-        Their ranges along the sheet from the mechanical datum, mm, positive.
-    sigma_row_px, sigma_range_mm : array_like
-        Standard deviations; of a range 0 or more.
-    column : array_like, optional
-        Column of the target's centre, px; NaN where unknown.
-    width_px, sigma_width_px, size_mm : array_like, optional
-        Columns that the lit target covers, its standard deviation, and the true size along the
-        laser line; NaN where unknown. Blooming widens the image of a lit target.
-    spacing_px, sigma_spacing_px, spacing_mm : array_like, optional
-        Columns between the centres of two marks at this range, its standard deviation, and the
-        true distance; NaN where unknown. Blooming does not move centres.
-    labels : sequence of str, optional
-        Names of the targets in messages and reports; ``1``, ``2``, ... by default.
-
-    Raises
-    ------
-    ArgumentError
-        When an entry is not finite, of the wrong sign or missing; names the target.
+    Raises ``ArgumentError`` when an entry is not finite, of the wrong sign or missing; names the
+    target.
     """
 
     row: Array
+    """Where the targets appear, px, on the sensor."""
     range_mm: Array
+    """Their ranges along the sheet from the mechanical datum, mm, positive."""
     sigma_row_px: Array
     sigma_range_mm: Array
+    """Standard deviations; of a range 0 or more."""
     column: Array
+    """Column of the target's centre, px; NaN where unknown."""
     width_px: Array
     sigma_width_px: Array
     size_mm: Array
+    """Columns that the lit target covers, its standard deviation, and the true size along the laser
+    line; NaN where unknown. Blooming widens the image of a lit target."""
     spacing_px: Array
     sigma_spacing_px: Array
     spacing_mm: Array
+    """Columns between the centres of two marks at this range, its standard deviation, and the true
+    distance; NaN where unknown. Blooming does not move centres."""
     labels: tuple[str, ...]
+    """Names of the targets in messages and reports; ``1``, ``2``, ... by default."""
 
     def __init__(
         self,
@@ -145,10 +133,7 @@ class Targets:
     def concatenate(parts: Sequence[Targets]) -> Targets:
         """Return all targets of ``parts`` in their order, with their labels.
 
-        Raises
-        ------
-        ArgumentError
-            When there is nothing to join.
+        Raises ``ArgumentError`` when there is nothing to join.
         """
         if not parts:
             raise ArgumentError("parts is empty; give at least one Targets")

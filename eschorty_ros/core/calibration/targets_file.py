@@ -47,25 +47,14 @@ def read_targets(
 ) -> Targets:
     """Read targets, one a line.
 
-    Parameters
-    ----------
-    path : path
-        CSV with a header line: ``row`` and ``range_mm``, and any of ``row_sigma``,
-        ``range_sigma_mm``, ``column``, ``width_px``, ``width_sigma_px``, ``size_mm``,
-        ``spacing_px``, ``spacing_sigma_px``, ``spacing_mm``, ``label``, in any order. An empty
-        cell means unknown; lines that begin with ``#`` are comments.
-    sigma_row_px, sigma_range_mm : float
-        Standard deviations where the file gives none.
+    - ``path``: CSV with a header line: ``row`` and ``range_mm``, and any of ``row_sigma``,
+      ``range_sigma_mm``, ``column``, ``width_px``, ``width_sigma_px``, ``size_mm``, ``spacing_px``,
+      ``spacing_sigma_px``, ``spacing_mm``, ``label``, in any order. An empty cell means unknown;
+      lines that begin with ``#`` are comments.
+    - ``sigma_row_px``, ``sigma_range_mm``: Standard deviations where the file gives none.
 
-    Returns
-    -------
-    Targets
-        Labelled ``line N`` where the file has no label.
-
-    Raises
-    ------
-    FormatError
-        Names file, line, column and value.
+    Raises ``FormatError``: names file, line, column and value.
+    Targets are labelled ``line N`` where the file has no label.
     """
     table = _read(file_path("path", path), TARGET_COLUMNS, ("row", "range_mm"))
     default = {
@@ -84,16 +73,9 @@ def read_targets(
 def write_targets(path: str | os.PathLike[str], targets: Targets) -> None:
     """Write targets so that :func:`read_targets` gives the same ones, to the last bit.
 
-    Parameters
-    ----------
-    path : path
-        Written atomically.
-    targets : Targets
+    - ``path``: Written atomically.
 
-    Raises
-    ------
-    ArgumentError
-        When the file cannot be written.
+    Raises ``ArgumentError`` when the file cannot be written.
     """
     columns = [getattr(targets, attribute).tolist() for attribute in _COLUMNS.values()]
     text = io.StringIO()
@@ -110,18 +92,11 @@ def read_distances(
 ) -> list[KnownTarget]:
     """Read the known distances of the posts of a recording, one a line.
 
-    Parameters
-    ----------
-    path : path
-        CSV with a header line: ``range_mm``, and any of ``range_sigma_mm``, ``size_mm``,
-        ``column`` and ``row`` (where the post is expected), ``label``.
-    sigma_range_mm : float
-        Standard deviation where the file gives none.
+    - ``path``: CSV with a header line: ``range_mm``, and any of ``range_sigma_mm``, ``size_mm``,
+      ``column`` and ``row`` (where the post is expected), ``label``.
+    - ``sigma_range_mm``: Standard deviation where the file gives none.
 
-    Raises
-    ------
-    FormatError
-        Names file, line, column and value.
+    Raises ``FormatError``: names file, line, column and value.
     """
     return [
         KnownTarget(

@@ -27,22 +27,14 @@ class ClockLine:
     ``ns = origin_ns + (t - origin_us) 1000 (1 + drift_ppb 1e-9)``, rounded down to the nanosecond
     from exact integers, so its precision does not depend on the uptime. Strictly increasing.
 
-    Parameters
-    ----------
-    origin_us, origin_ns : int
-        Sensor time (us) and ROS time (ns) at one instant.
-    drift_ppb : int
-        How much more ROS time passes than sensor time, parts in 10^9; within 200 000.
-
-    Raises
-    ------
-    ArgumentError
-        When a value is outside its range.
+    Raises ``ArgumentError`` when a value is outside its range.
     """
 
     origin_us: int
     origin_ns: int
+    """Sensor time (us) and ROS time (ns) at one instant."""
     drift_ppb: int = 0
+    """How much more ROS time passes than sensor time, parts in 10^9; within 200 000."""
 
     def __post_init__(self) -> None:
         integer("origin_us", self.origin_us, -T_US_LIMIT, T_US_LIMIT)

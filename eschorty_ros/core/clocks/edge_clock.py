@@ -20,14 +20,11 @@ _REFIT_US = 50_000
 class EdgeClock:
     """The edges of the last minute, fitted whenever the odometry covers new ones.
 
-    Attributes
-    ----------
-    fit : EdgeFit or None
-        The last successful fit.
-    pulses : PulseTrain or None
-        The pulses that the stage sends; without them no fit is made.
-    edges_dropped : int
-        Edges dropped because more than 8192 came in the last minute, faster than from a stage.
+    Public attributes:
+    - ``fit``: The last successful fit.
+    - ``pulses``: The pulses that the stage sends; without them no fit is made.
+    - ``edges_dropped``: Edges dropped because more than 8192 came in the last minute, faster than
+      from a stage.
     """
 
     def __init__(self, pulses: PulseTrain | None = None) -> None:
@@ -69,14 +66,9 @@ class EdgeClock:
     def update(self, track: StageTrack, arrivals: ClockLine, *, now: bool = False) -> bool:
         """Fit again when there are new edges; return whether ``fit`` has changed.
 
-        Parameters
-        ----------
-        track : StageTrack
-            Odometry over ROS time, us.
-        arrivals : ClockLine
-            The clock from the packets' arrivals.
-        now : bool
-            Fit as soon as there is a new edge, not only after 50 ms of them.
+        - ``track``: Odometry over ROS time, us.
+        - ``arrivals``: The clock from the packets' arrivals.
+        - ``now``: Fit as soon as there is a new edge, not only after 50 ms of them.
         """
         last_us = track.last_us
         if self.pulses is None or last_us is None or self._t_us.size == 0:

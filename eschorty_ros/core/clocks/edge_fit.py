@@ -48,27 +48,19 @@ _ITERATIONS = 6
 
 @dataclass(frozen=True, slots=True)
 class EdgeFit:
-    """Relation of the clocks from the edges.
-
-    Attributes
-    ----------
-    line : ClockLine
-        ROS time, as the odometry's stamps count it, against sensor time.
-    used, spurious, missing : int
-        Edges on the line, edges that fit no pulse, and pulses without an edge between used ones.
-    residual_mm : float
-        Root mean square distance of the used edges from their pulses.
-    first_us, last_us : int
-        Sensor times of the first and the last edge used.
-    """
+    """Relation of the clocks from the edges."""
 
     line: ClockLine
+    """ROS time, as the odometry's stamps count it, against sensor time."""
     used: int
     spurious: int
     missing: int
+    """Edges on the line, edges that fit no pulse, and pulses without an edge between used ones."""
     residual_mm: float
+    """Root mean square distance of the used edges from their pulses."""
     first_us: int
     last_us: int
+    """Sensor times of the first and the last edge used."""
 
 
 def fit_edges(
@@ -76,21 +68,12 @@ def fit_edges(
 ) -> EdgeFit | None:
     """Return the clock that aligns the edges with the pulses.
 
-    Parameters
-    ----------
-    t_us : ndarray of int64, shape (n,)
-        Sensor times of the pulses' first edges, in time order.
-    track : StageTrack
-        Odometry over ROS time, us.
-    pulses : PulseTrain
-    arrivals : ClockLine
-        The clock from the packets' arrivals; late rather than early.
+    - ``t_us``: shape (n,). Sensor times of the pulses' first edges, in time order.
+    - ``track``: Odometry over ROS time, us.
+    - ``arrivals``: The clock from the packets' arrivals; late rather than early.
 
-    Returns
-    -------
-    EdgeFit or None
-        ``None`` when fewer than 8 edges have a position, too many fit no pulse, or the drift
-        is out of its bounds: the edges are then not those of this stage.
+    Returns ``None`` when fewer than 8 edges have a position, too many fit no pulse, or the drift
+    is out of its bounds: the edges are then not those of this stage.
     """
     t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     if t_us.size < EDGES_MIN or pulses.count == 0:

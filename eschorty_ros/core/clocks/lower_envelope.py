@@ -33,17 +33,11 @@ class LowerEnvelope:
     count the same, so a host that lags for seconds neither shifts nor tilts the line as long as
     the window contains some packets without delay.
 
-    Parameters
-    ----------
-    window_ns : int
-        Length of the sliding window, ns of arrival time.
+    - ``window_ns``: Length of the sliding window, ns of arrival time.
 
-    Attributes
-    ----------
-    line : ClockLine or None
-        Never above a point observed since the last fit.
-    touched_us : int
-        Sensor time of the newest point on the line.
+    Public attributes:
+    - ``line``: Never above a point observed since the last fit.
+    - ``touched_us``: Sensor time of the newest point on the line.
     """
 
     def __init__(self, window_ns: int) -> None:

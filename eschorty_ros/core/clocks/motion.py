@@ -15,23 +15,16 @@ from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
 
 @dataclass(frozen=True, slots=True)
 class MotionPlan:
-    """Position as a function of time from ``start_ns`` on; at rest after the last piece.
-
-    Parameters
-    ----------
-    start_ns : int
-        Time the plan begins, ns of any clock.
-    position_mm, velocity_mm_s : float
-        State at ``start_ns``.
-    durations_s, accelerations_mm_s2 : tuple of float
-        One entry per piece.
-    """
+    """Position as a function of time from ``start_ns`` on; at rest after the last piece."""
 
     start_ns: int
+    """Time the plan begins, ns of any clock."""
     position_mm: float
     velocity_mm_s: float = 0.0
+    """State at ``start_ns``."""
     durations_s: tuple[float, ...] = ()
     accelerations_mm_s2: tuple[float, ...] = ()
+    """One entry per piece."""
 
     def __post_init__(self) -> None:
         integer("start_ns", self.start_ns, -TIME_LIMIT, TIME_LIMIT)
@@ -85,14 +78,7 @@ class MotionPlan:
     def passing_s(self, position_mm: ArrayLike) -> NDArray[np.float64]:
         """Return the time after ``start_ns`` (s) at which each position is first reached.
 
-        Parameters
-        ----------
-        position_mm : array_like, shape (n,)
-
-        Returns
-        -------
-        ndarray of float64, shape (n,)
-            NaN where it is never reached.
+        NaN where it is never reached.
         """
         place = vector("position_mm", position_mm)
         passing = np.where(place == self.position_mm, 0.0, np.nan)
@@ -134,10 +120,7 @@ def plan_move(
 ) -> MotionPlan:
     """Return the trapezoid from rest at ``position_mm`` to rest at ``target_mm``.
 
-    Raises
-    ------
-    ArgumentError
-        When speed or acceleration is not positive or a value is not finite.
+    Raises ``ArgumentError`` when speed or acceleration is not positive or a value is not finite.
     """
     for name, place in (("position_mm", position_mm), ("target_mm", target_mm)):
         number(name, place, -POSITION_LIMIT_MM, POSITION_LIMIT_MM)
@@ -161,10 +144,7 @@ def plan_move(
 def plan_stop(plan: MotionPlan, at_ns: int, deceleration_mm_s2: float) -> MotionPlan:
     """Return the profiled stop of ``plan`` from ``at_ns`` on.
 
-    Raises
-    ------
-    ArgumentError
-        When the deceleration is not positive.
+    Raises ``ArgumentError`` when the deceleration is not positive.
     """
     positive("deceleration_mm_s2", deceleration_mm_s2)
     integer("at_ns", at_ns, -TIME_LIMIT, TIME_LIMIT)

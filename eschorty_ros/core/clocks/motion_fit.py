@@ -44,15 +44,10 @@ class MotionFit:
 
     All times are int64 nanoseconds of one clock. Not thread-safe.
 
-    Parameters
-    ----------
-    tolerance_mm : float
-        Largest deviation of the carriage from its ordered motion, and from rest.
+    - ``tolerance_mm``: Largest deviation of the carriage from its ordered motion, and from rest.
 
-    Attributes
-    ----------
-    late_readings : int
-        Readings not later than the one before, which were not used.
+    Public attributes:
+    - ``late_readings``: Readings not later than the one before, which were not used.
     """
 
     def __init__(self, tolerance_mm: float = 1e-3) -> None:
@@ -88,17 +83,11 @@ class MotionFit:
     ) -> None:
         """Add one reading.
 
-        Parameters
-        ----------
-        position_mm : float
-        latest_ns, earliest_ns : int
-            Bounds of the time at which it was taken: its receipt, less the transfer time of the
-            serial line, and its request.
+        - ``latest_ns``, ``earliest_ns``: Bounds of the time at which it was taken: its receipt,
+          less the transfer time of the serial line, and its request.
 
-        Raises
-        ------
-        ArgumentError
-            When a value is not finite or the earliest time is after the latest.
+        Raises ``ArgumentError`` when a value is not finite or the earliest time is after the
+        latest.
         """
         number("position_mm", position_mm, -POSITION_LIMIT_MM, POSITION_LIMIT_MM)
         latest_ns = integer("latest_ns", latest_ns, -TIME_LIMIT, TIME_LIMIT)
@@ -151,10 +140,7 @@ class MotionFit:
 
         Beyond :attr:`until_ns` they follow the ordered motion, or hold the last reading.
 
-        Raises
-        ------
-        ArgumentError
-            Before the first reading.
+        Raises ``ArgumentError`` before the first reading.
         """
         at_ns = times("t_ns", t_ns)
         if not self._at_ns:
@@ -251,14 +237,9 @@ class _Leg:
 class _Move(_Leg):
     """A trapezoid that begins some time after ``planned.start_ns``.
 
-    Parameters
-    ----------
-    planned : MotionPlan
-        Starts at rest, at the earliest possible time.
-    tolerance_mm : float
-        Largest deviation of a reading from the motion.
-    usual : _Delays
-        Of the readings of earlier motions.
+    - ``planned``: Starts at rest, at the earliest possible time.
+    - ``tolerance_mm``: Largest deviation of a reading from the motion.
+    - ``usual``: Of the readings of earlier motions.
     """
 
     def __init__(self, planned: MotionPlan, tolerance_mm: float, usual: _Delays) -> None:
@@ -481,15 +462,10 @@ def _start_of(
     two are averaged with the inverse squares of that as weights. The usual delay counts as one
     more reading.
 
-    Parameters
-    ----------
-    earliest_s, latest_s : float64, shape (n,)
-        ``-inf`` for an unknown earliest.
-    slack_s : float64, shape (n,)
-        Uncertainty of time due to that of the position.
-    speed : float64, shape (n,)
-    usual : _Delays
-        Of earlier motions.
+    - ``earliest_s``, ``latest_s``: shape (n,). ``-inf`` for an unknown earliest.
+    - ``slack_s``: shape (n,). Uncertainty of time due to that of the position.
+    - ``speed``: shape (n,).
+    - ``usual``: Of earlier motions.
     """
     begin, end = _widest_agreement(earliest_s - slack_s, latest_s + slack_s)
     middle = 0.5 * (begin + end) if np.isfinite(begin) else end

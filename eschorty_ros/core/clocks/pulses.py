@@ -22,10 +22,8 @@ from eschorty_ros.core.base.errors import ArgumentError
 class PulseTrain:
     """Pulses of a stage: number n, below ``count``, begins at ``first_mm + n interval_mm``.
 
-    Raises
-    ------
-    ArgumentError
-        When a number is not finite, the interval not positive or the count negative.
+    Raises ``ArgumentError`` when a number is not finite, the interval not positive or the count
+    negative.
     """
 
     first_mm: float
@@ -56,12 +54,8 @@ def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArr
     rising ones, or is the shorter one if both vary alike. Edges of one kind only are returned
     unchanged.
 
-    Parameters
-    ----------
-    t_us : ndarray of int64, shape (n,)
-        In time order.
-    polarity : ndarray of uint8, shape (n,)
-        1 for rising.
+    - ``t_us``: shape (n,). In time order.
+    - ``polarity``: shape (n,). 1 for rising.
     """
     t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)

@@ -19,19 +19,12 @@ class SensorClock:
     two observations are strictly monotone. When arrival or sensor time goes back (clock set,
     camera restarted) the window is dropped.
 
-    Parameters
-    ----------
-    zero_ns : int, optional
-        ROS time (ns) at which the sensor's clock read zero.
-    window_ns : int
-        Length of the sliding window, ns of arrival time.
+    - ``zero_ns``: ROS time (ns) at which the sensor's clock read zero.
+    - ``window_ns``: Length of the sliding window, ns of arrival time.
 
-    Attributes
-    ----------
-    restarts : int
-        Times the window was dropped.
-    residual_ns : int or None
-        Lateness of the last observed packet by this clock.
+    Public attributes:
+    - ``restarts``: Times the window was dropped.
+    - ``residual_ns``: Lateness of the last observed packet by this clock.
     """
 
     def __init__(self, zero_ns: int | None = None, window_ns: int = 60_000_000_000) -> None:

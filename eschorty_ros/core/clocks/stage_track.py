@@ -18,10 +18,7 @@ def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np
     Positions read from text with six decimals and from ROS metres give the same integers, so a
     recording and the live nodes place points identically. ``name`` is used in errors.
 
-    Raises
-    ------
-    ArgumentError
-        When a position is not finite or farther than 1e9 mm.
+    Raises ``ArgumentError`` when a position is not finite or farther than 1e9 mm.
     """
     position = reals(name, position_mm)
     wrong = ~(np.abs(position) <= POSITION_LIMIT_MM)

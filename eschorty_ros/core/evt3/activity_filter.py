@@ -44,18 +44,11 @@ class FilterCounters:
 class ActivityFilter:
     """Streaming background-activity filter; the result does not depend on how events are split.
 
-    Parameters
-    ----------
-    width, height : int
-        Sensor size in pixels, 1 to 2048.
-    window_us : int
-        Longest age of a supporting event, 1 to 1 000 000 us. The default spans a laser edge's
-        burst; a longer one keeps hardly more of the line and more background.
+    - ``width``, ``height``: Sensor size in pixels, 1 to 2048.
+    - ``window_us``: Longest age of a supporting event, 1 to 1 000 000 us. The default spans a laser
+      edge's burst; a longer one keeps hardly more of the line and more background.
 
-    Raises
-    ------
-    ArgumentError
-        When a value is outside its range.
+    Raises ``ArgumentError`` when a value is outside its range.
 
     Notes
     -----
@@ -92,10 +85,7 @@ class ActivityFilter:
     def filter(self, events: Events) -> Events:
         """Return the supported events: views of reused buffers, valid until the next call.
 
-        Raises
-        ------
-        ArgumentError
-            When the arrays are not those of a decoder, or times fall.
+        Raises ``ArgumentError`` when the arrays are not those of a decoder, or times fall.
         """
         t_us = exact("t", events.t, np.int64)
         size = t_us.size

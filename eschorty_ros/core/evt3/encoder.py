@@ -36,15 +36,9 @@ class Encoder:
     The stream carries 24 bits of time: a decoder that starts with it finds the same times when the
     first lies below 2**24 us, otherwise modulo 2**24.
 
-    Parameters
-    ----------
-    width, height : int
-        Sensor size in pixels, 1 to 2048.
+    - ``width``, ``height``: Sensor size in pixels, 1 to 2048.
 
-    Raises
-    ------
-    ArgumentError
-        When a size is outside its range.
+    Raises ``ArgumentError`` when a size is outside its range.
     """
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
@@ -74,26 +68,17 @@ class Encoder:
     ) -> bytes:
         """Return the bytes of the next events, triggers and notes of dropped events.
 
-        Parameters
-        ----------
-        t : array_like of int, shape (n,)
-            Microseconds, not falling, not before the time the stream has reached.
-        x, y, p : array_like of int, shape (n,)
-            Column, row, polarity (0 or 1).
-        trigger_t, trigger_edge : array_like of int, shape (m,), optional
-            Trigger times (not falling) and edges (1 = rising), channel 0; at equal times a
-            trigger comes before the events.
-        drop_t : array_like of int, shape (k,), optional
-            Times (not falling) at which the stream notes that the sensor dropped events.
-        rate_counts : array_like of int, shape (j, 3), optional
-            Reports of the event-rate control: time (not falling), events before and after it in
-            the period that ends there, below 2**28.
+        - ``t``: shape (n,). Microseconds, not falling, not before the time the stream has reached.
+        - ``x``, ``y``, ``p``: shape (n,). Column, row, polarity (0 or 1).
+        - ``trigger_t``, ``trigger_edge``: shape (m,). Trigger times (not falling) and edges (1 =
+          rising), channel 0; at equal times a trigger comes before the events.
+        - ``drop_t``: shape (k,). Times (not falling) at which the stream notes that the sensor
+          dropped events.
+        - ``rate_counts``: shape (j, 3). Reports of the event-rate control: time (not falling),
+          events before and after it in the period that ends there, below 2**28.
 
-        Raises
-        ------
-        ArgumentError
-            For falling times, values outside the sensor, unequal lengths, or more than an hour
-            without events. Nothing is encoded then.
+        Raises ``ArgumentError`` for falling times, values outside the sensor, unequal lengths, or
+        more than an hour without events. Nothing is encoded then.
         """
         times = integer_vector("t", t, np.int64, 0, _T_MAX)
         columns = integer_vector("x", x, np.uint16, 0, self.width - 1)
@@ -144,10 +129,8 @@ class Encoder:
     def advance(self, t_us: int) -> bytes:
         """Return the time words that bring a stream without events to ``t_us``.
 
-        Raises
-        ------
-        ArgumentError
-            When ``t_us`` lies before the time the stream has reached, or more than an hour after.
+        Raises ``ArgumentError`` when ``t_us`` lies before the time the stream has reached, or more
+        than an hour after.
         """
         integer("t_us", t_us, 0, _T_MAX)
         self._refuse_fall("t_us", np.array([t_us], np.int64))
@@ -219,20 +202,10 @@ def sort_readout(
 ) -> EventArrays:
     """Return events in the order a sensor reads them out: by time, row, polarity, column.
 
-    Parameters
-    ----------
-    t, x, y, p : integer vectors of one length
-        Times (us) within 2**40 us (12 days) of each other; x, y below 2048, p 0 or 1.
+    - ``t``, ``x``, ``y``, ``p``: Times (us) within 2**40 us (12 days) of each other; x, y below
+      2048, p 0 or 1.
 
-    Returns
-    -------
-    EventArrays
-        Sorted copies.
-
-    Raises
-    ------
-    ArgumentError
-        When the times span more, or a value is outside its range.
+    Raises ``ArgumentError`` when the times span more, or a value is outside its range.
     """
     times = integer_vector("t", t, np.int64, 0, _T_MAX)
     columns = integer_vector("x", x, np.uint16, 0, w3.ADDRESSES - 1)

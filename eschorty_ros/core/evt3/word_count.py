@@ -29,16 +29,12 @@ class WordCounter:
     It does not check the words: events that a decoder drops (no row, outside the sensor) are
     counted too.
 
-    Attributes
-    ----------
-    off, on : int
-        Events by polarity.
-    triggers : int
-        Edges at the trigger input.
-    drop_words : int
-        Reports of the sensor that it dropped time words or events.
-    erc_events_in, erc_events_out : int
-        Events before and after the event-rate control, by its own reports.
+    Public attributes:
+    - ``off``, ``on``: Events by polarity.
+    - ``triggers``: Edges at the trigger input.
+    - ``drop_words``: Reports of the sensor that it dropped time words or events.
+    - ``erc_events_in``, ``erc_events_out``: Events before and after the event-rate control, by its
+      own reports.
     """
 
     def __init__(self) -> None:
@@ -54,10 +50,7 @@ class WordCounter:
     def add(self, data: bytes | bytearray | memoryview) -> None:
         """Count complete 16-bit words; a single last byte is left out.
 
-        Raises
-        ------
-        ArgumentError
-            For anything but bytes.
+        Raises ``ArgumentError`` for anything but bytes.
         """
         view = byte_view("data", data)
         _count(np.frombuffer(view[: len(view) & ~1], "<u2"), self._counts)

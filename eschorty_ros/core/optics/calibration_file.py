@@ -195,16 +195,9 @@ def load_named_calibration(folder: str | os.PathLike[str], name: str) -> Calibra
 
     Bounded in size and time whatever lies in the folder: links, pipes and devices are refused.
 
-    Parameters
-    ----------
-    folder : path
-    name : str
-        As `save_named_calibration` takes it; with or without ``.yaml``.
+    - ``name``: As `save_named_calibration` takes it; with or without ``.yaml``.
 
-    Raises
-    ------
-    CalibrationError
-        One line naming file, key, value and remedy.
+    Raises ``CalibrationError``: one line naming file, key, value and remedy.
     """
     path = _named_path(folder, name)
     if os.path.lexists(path):
@@ -222,20 +215,11 @@ def save_named_calibration(
 ) -> Path:
     """Write a calibration into ``folder``, made when missing, and return the file's path.
 
-    Parameters
-    ----------
-    folder : path
-    calibration : Calibration
-    name : str
-        Without path separators, not beginning with a dot; ``""``: the calibration's id, or its
-        name when it has none.
+    - ``name``: Without path separators, not beginning with a dot; ``""``: the calibration's id, or
+      its name when it has none.
 
-    Raises
-    ------
-    CalibrationError
-        When the name is no bare name, or stands for something other than a regular file.
-    ArgumentError
-        When the file cannot be written.
+    Raises ``CalibrationError`` when the name is no bare name, or stands for something other than a
+    regular file. Raises ``ArgumentError`` when the file cannot be written.
     """
     path = _named_path(folder, (calibration.id or calibration.name) if name == "" else name)
     try:
@@ -292,15 +276,9 @@ def save_calibration(calibration: Calibration, path: str | os.PathLike[str]) -> 
 def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None:
     """Refuse a calibration that was made with another sensor, window or build.
 
-    Parameters
-    ----------
-    candidate, active : Calibration
-        The one that is to replace, and the one that is in use.
+    - ``candidate``, ``active``: The one that is to replace, and the one that is in use.
 
-    Raises
-    ------
-    CalibrationError
-        Names the first key that differs and both values.
+    Raises ``CalibrationError``: names the first key that differs and both values.
     """
     for key, meaning in _OF_THE_INSTRUMENT.items():
         theirs, ours = getattr(candidate, key), getattr(active, key)
@@ -338,10 +316,7 @@ def _find(name_or_path: str | os.PathLike[str]) -> Path:
 def config_file(name: str) -> Path:
     """Return the path of a file in ``config/``.
 
-    Raises
-    ------
-    CalibrationError
-        When there is none of that name.
+    Raises ``CalibrationError`` when there is none of that name.
     """
     wanted = file_path("name", name)
     for folder in config_folders():

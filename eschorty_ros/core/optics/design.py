@@ -29,36 +29,24 @@ from eschorty_ros.core.optics.range_model import (
 
 @dataclass(frozen=True, slots=True)
 class DesignTable:
-    """Properties of a build at some ranges; arrays of one shape, float64, NaN out of reach.
-
-    Attributes
-    ----------
-    range_mm : ndarray
-        Range from the mechanical datum.
-    row : ndarray
-        Its row, px; may be off the sensor, see ``in_view``.
-    in_view : ndarray of bool
-        True where the row is on the sensor.
-    magnification : ndarray
-        Image size over object size.
-    range_per_row_mm : ndarray
-        Range step of one row (Eq. 4).
-    depth_of_field_mm : ndarray
-        In focus within plus and minus this (Eq. 3).
-    lateral_pitch_mm : ndarray
-        Distance of neighbouring columns along the laser line.
-    swath_mm : ndarray
-        Length of the laser line over all columns.
-    """
+    """Properties of a build at some ranges; arrays of one shape, float64, NaN out of reach."""
 
     range_mm: Array
+    """Range from the mechanical datum."""
     row: Array
+    """Its row, px; may be off the sensor, see ``in_view``."""
     in_view: NDArray[np.bool_]
+    """True where the row is on the sensor."""
     magnification: Array
+    """Image size over object size."""
     range_per_row_mm: Array
+    """Range step of one row (Eq. 4)."""
     depth_of_field_mm: Array
+    """In focus within plus and minus this (Eq. 3)."""
     lateral_pitch_mm: Array
+    """Distance of neighbouring columns along the laser line."""
     swath_mm: Array
+    """Length of the laser line over all columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,26 +171,15 @@ def design(
 ) -> Design:
     """Return the build of a lens, two tilts and a row offset (Eq. 1).
 
-    Parameters
-    ----------
-    focal_length_mm, f_number : float
-        The lens.
-    theta_deg : float
-        Tilt of the light sheet, above 0 up to 90.
-    theta_prime_deg, baseline_mm : float
-        Exactly one: tilt of the sensor, or the distance from lens centre to Scheimpflug line
-        that implies it.
-    b_prime_px, near_mm : float
-        Exactly one: the row offset, or the range at row 0.
-    b_mm : float
-        Mechanical datum to front focal line.
-    pixel_um, columns, rows
-        The sensor.
+    - ``focal_length_mm``, ``f_number``: The lens.
+    - ``theta_deg``: Tilt of the light sheet, above 0 up to 90.
+    - ``theta_prime_deg``, ``baseline_mm``: Exactly one: tilt of the sensor, or the distance from
+      lens centre to Scheimpflug line that implies it.
+    - ``b_prime_px``, ``near_mm``: Exactly one: the row offset, or the range at row 0.
+    - ``b_mm``: Mechanical datum to front focal line.
+    - ``pixel_um``, ``columns``, ``rows``: The sensor.
 
-    Raises
-    ------
-    ArgumentError
-        When a value is out of its range or a choice is not made exactly once.
+    Raises ``ArgumentError`` when a value is out of its range or a choice is not made exactly once.
 
     Examples
     --------
@@ -260,10 +237,8 @@ def design_for_ranges(
     The two ranges fix ``K`` and ``b'``; the lens fixes ``k``, so ``k'`` and the sensor tilt
     follow. Parameters as in :func:`design`.
 
-    Raises
-    ------
-    ArgumentError
-        When ``0 < near + b < far + b`` does not hold or no sensor tilt reaches both ranges.
+    Raises ``ArgumentError`` when ``0 < near + b < far + b`` does not hold or no sensor tilt reaches
+    both ranges.
     """
     _check_lens(focal_length_mm, f_number, theta_deg, pixel_um)
     integer("rows", rows, 2, PIXELS_MAX)

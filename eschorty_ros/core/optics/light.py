@@ -21,39 +21,24 @@ VISIBLE_NM, INFRARED_NM = (400.0, 700.0), (700.0, 1050.0)
 
 
 class LaserClass(NamedTuple):
-    """An estimate.
-
-    Attributes
-    ----------
-    accessible_mw : float
-        Power through a pupil of 7 mm at 100 mm from the line's origin.
-    limits_mw : dict of str to float
-        Accessible emission limit of each class.
-    name : str
-        Lowest class within its limit.
-    """
+    """An estimate."""
 
     accessible_mw: float
+    """Power through a pupil of 7 mm at 100 mm from the line's origin."""
     limits_mw: dict[str, float]
+    """Accessible emission limit of each class."""
     name: str
+    """Lowest class within its limit."""
 
 
 def laser_class(power_mw: float, wavelength_nm: float, fan_deg: float) -> LaserClass:
     """Return the estimated class of a line of light at its peak power.
 
-    Parameters
-    ----------
-    power_mw : float
-        Peak power of the line, mW: modulation is not counted in its favour.
-    wavelength_nm : float
-        400 to 1050.
-    fan_deg : float
-        Full angle of the fan, degrees.
+    - ``power_mw``: Peak power of the line, mW: modulation is not counted in its favour.
+    - ``wavelength_nm``: 400 to 1050.
+    - ``fan_deg``: Full angle of the fan, degrees.
 
-    Raises
-    ------
-    ArgumentError
-        For values out of range.
+    Raises ``ArgumentError`` for values out of range.
 
     Examples
     --------
@@ -91,17 +76,10 @@ def photons_per_column(
     The line is spread evenly over the columns, the target is matt (Lambert) and faces the sensor;
     lens and filter lose nothing.
 
-    Parameters
-    ----------
-    build : Design
-    range_mm : float
-        From the mechanical datum.
-    power_mw, wavelength_nm : float
-        Of the light.
-    seconds : float
-        Time of light, such as half a modulation period.
-    reflectance : float
-        Of the target.
+    - ``range_mm``: From the mechanical datum.
+    - ``power_mw``, ``wavelength_nm``: Of the light.
+    - ``seconds``: Time of light, such as half a modulation period.
+    - ``reflectance``: Of the target.
     """
     depth_mm = positive("range_mm + b_mm", range_mm + build.model.b_mm)
     energy_j = power_mw * 1e-3 * positive("seconds", seconds) / build.model.columns

@@ -27,10 +27,8 @@ PIXELS_MAX = 1 << 16
 def object_scale_mm(focal_mm: float, theta_deg: float) -> float:
     """Return ``k = f / sin(theta)`` in mm, unrounded (Eq. 1).
 
-    Raises
-    ------
-    ArgumentError
-        When the focal length is not positive or the tilt not between 0 and 180 degrees.
+    Raises ``ArgumentError`` when the focal length is not positive or the tilt not between 0 and 180
+    degrees.
     """
     return positive("focal_mm", focal_mm) / _sheet_sine(theta_deg)
 
@@ -46,25 +44,15 @@ def depth_of_field_mm(
 
     A focus tolerance, not a ranging error.
 
-    Parameters
-    ----------
-    magnification : array_like, any shape
-        Image size over object size; 0 (the pole) gives infinity.
-    f_number : float
-    theta_deg, theta_prime_deg : float
-        Tilt of the light sheet and of the sensor against the lens plane; signs do not matter.
-    pixel_um : float
-        Pixel pitch, taken as the circle of confusion.
+    - ``magnification``: Image size over object size; 0 (the pole) gives infinity.
+    - ``theta_deg``, ``theta_prime_deg``: Tilt of the light sheet and of the sensor against the lens
+      plane; signs do not matter.
+    - ``pixel_um``: Pixel pitch, taken as the circle of confusion.
 
-    Returns
-    -------
-    ndarray of float64, shape of ``magnification``
-        The object is in focus within plus and minus this length.
+    Raises ``ArgumentError`` when the magnification is no array of numbers or an optical constant is
+    impossible.
 
-    Raises
-    ------
-    ArgumentError
-        When the magnification is no array of numbers or an optical constant is impossible.
+    The object is in focus within plus and minus this length.
     """
     m = reals("magnification", magnification)
     sine = _sheet_sine(abs(number("theta_deg", theta_deg)))
@@ -85,33 +73,7 @@ def _sheet_sine(theta_deg: float) -> float:
 class RangeModel:
     """The calibrated range equation of one build (Eq. 2): rows to ranges and back, and scales.
 
-    Parameters
-    ----------
-    k_mm : float
-        ``f / sin(theta)``, mm, positive.
-    k_prime_px : float
-        ``-f / (p sin|theta'|)``, px, negative.
-    b_mm : float
-        Distance from the mechanical datum to the front focal line, mm.
-    b_prime_px : float
-        Row offset, px, at most -1.
-    pixel_um : float
-        Pixel pitch, um.
-    columns, rows : int
-        Sensor size; columns run along the laser line, rows along the range.
-    principal_column : float
-        Column of zero scan angle; pixel centres are integers.
-    theta_deg : float
-        Tilt of the light sheet against the lens plane, above 0 up to 90. Ranging needs only
-        ``k`` and ``k'``; points off the sheet (:meth:`rows_per_mm_off_sheet`) need it too.
-    b_prime_1_px, b_prime_2_px : float
-        Row offset across the columns, px: ``b'(column) = b' + b'1 u + b'2 u^2`` with ``u`` the
-        :meth:`normalised_column`. Roll of the sheet against the sensor, and smile.
-
-    Raises
-    ------
-    ArgumentError
-        When a parameter has the wrong sign or is not finite.
+    Raises ``ArgumentError`` when a parameter has the wrong sign or is not finite.
 
     Examples
     --------
@@ -127,16 +89,27 @@ class RangeModel:
     """
 
     k_mm: float
+    """``f / sin(theta)``, mm, positive."""
     k_prime_px: float
+    """``-f / (p sin|theta'|)``, px, negative."""
     b_mm: float
+    """Distance from the mechanical datum to the front focal line, mm."""
     b_prime_px: float
+    """Row offset, px, at most -1."""
     pixel_um: float = PIXEL_UM
+    """Pixel pitch, um."""
     columns: int = COLUMNS
     rows: int = ROWS
+    """Sensor size; columns run along the laser line, rows along the range."""
     principal_column: float = PRINCIPAL_COLUMN
+    """Column of zero scan angle; pixel centres are integers."""
     theta_deg: float = 90.0
+    """Tilt of the light sheet against the lens plane, above 0 up to 90. Ranging needs only ``k``
+    and ``k'``; points off the sheet (:meth:`rows_per_mm_off_sheet`) need it too."""
     b_prime_1_px: float = 0.0
     b_prime_2_px: float = 0.0
+    """Row offset across the columns, px: ``b'(column) = b' + b'1 u + b'2 u^2`` with ``u`` the
+    :meth:`normalised_column`. Roll of the sheet against the sensor, and smile."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -275,19 +248,8 @@ class RangeModel:
         row is *lower* by this number. Across the line's width, rows ``d`` above the centre show
         the surface ``d / rows_per_mm_off_sheet`` behind it (towards -y).
 
-        Parameters
-        ----------
-        range_mm : array_like, any shape
-
-        Returns
-        -------
-        ndarray of float64, shape of ``range_mm``
-            NaN where ``range + b <= 0``.
-
-        Raises
-        ------
-        ArgumentError
-            When no sensor tilt gives this ``k'`` with this lens.
+        NaN where ``range + b <= 0``. Raises ``ArgumentError`` when no sensor tilt gives this ``k'``
+        with this lens.
         """
         if not self.tilt_sine < 1.0:
             raise ArgumentError(

@@ -140,19 +140,12 @@ def read_cloud(path: str | os.PathLike[str], *, organized: bool = False) -> Poin
 def height_map(points: Points, profile: NDArray[np.integer[Any]], columns: int) -> Points:
     """Return the cloud as a map: one row for each profile, one column for each of the sensor.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
-        At most one point in each column of a profile.
-    profile : ndarray of integers, shape (n,)
-        What tells a point's profile from others, increasing with time.
-    columns : int
-        Columns of the sensor.
+    - ``points``: ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,). At most one point in each
+      column of a profile.
+    - ``profile``: shape (n,). What tells a point's profile from others, increasing with time.
+    - ``columns``: Columns of the sensor.
 
-    Returns
-    -------
-    ndarray of the dtype of ``points``, shape (profiles, columns)
-        Where nothing is, all numbers with a fraction are NaN and ``flags`` 0.
+    Where nothing is, all numbers with a fraction are NaN and ``flags`` 0.
 
     Examples
     --------
@@ -186,10 +179,7 @@ def finite_points(points: Points) -> Points:
 def join_points(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Return all points of ``parts``; a field that some of them lack is NaN in theirs, flags 0.
 
-    Parameters
-    ----------
-    parts : sequence of structured arrays, at least one
-        The fields of each begin with those of every shorter one.
+    - ``parts``: The fields of each begin with those of every shorter one.
     """
     known = isinstance(parts, list | tuple) and len(parts) > 0
     if not known or not all(_is_points(part) for part in parts):

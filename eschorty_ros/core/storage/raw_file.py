@@ -87,10 +87,7 @@ class RawReader:
 
         ``begin`` is the number of bytes to leave out before them.
 
-        Raises
-        ------
-        ArgumentError
-            When ``size`` is not positive or ``begin`` negative.
+        Raises ``ArgumentError`` when ``size`` is not positive or ``begin`` negative.
         """
         integer("size", size, 1, 1 << 40)
         return self._chunks(size, integer("begin", begin, 0, 1 << 62))
@@ -209,24 +206,13 @@ class RawReader:
 class RawWriter:
     """Writes an EVT3 RAW file with the header keys that older and newer readers need.
 
-    Parameters
-    ----------
-    path : path-like
-        The file to write; replaced when it exists.
-    serial : str
-        Serial number, 8 hexadecimal digits.
-    width, height : int
-        Sensor size in pixels.
-    sensor_name : str
-    date : datetime, optional
-        Time of the recording; now (UTC) when left out.
+    - ``path``: The file to write; replaced when it exists.
+    - ``serial``: Serial number, 8 hexadecimal digits.
+    - ``width``, ``height``: Sensor size in pixels.
+    - ``date``: Time of the recording; now (UTC) when left out.
 
-    Raises
-    ------
-    ArgumentError
-        When a value is not allowed in a header.
-    FormatError
-        When the file cannot be written.
+    Raises ``ArgumentError`` when a value is not allowed in a header. Raises ``FormatError`` when
+    the file cannot be written.
     """
 
     def __init__(

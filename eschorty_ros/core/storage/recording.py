@@ -133,10 +133,7 @@ class Recording:
     def truth(self) -> NDArray[np.void] | None:
         """True ranges, TRUTH_DTYPE, read on first use; ``None`` when there are none.
 
-        Raises
-        ------
-        FormatError
-            When ``truth.csv`` is malformed.
+        Raises ``FormatError`` when ``truth.csv`` is malformed.
         """
         file = self.path / TRUTH_FILE
         return read_truth_csv(file) if file.exists() else None
@@ -177,10 +174,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
 def read_scan_yaml(path: str | os.PathLike[str]) -> ScanLog:
     """Read ``scan.yaml``.
 
-    Raises
-    ------
-    FormatError
-        One line naming the file, the key, the value and the remedy.
+    Raises ``FormatError``: one line naming the file, the key, the value and the remedy.
     """
     return validate(ScanLog, read_yaml(path, FormatError), FormatError)
 
@@ -209,10 +203,7 @@ def read_marks_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
 def read_laser_yaml(path: str | os.PathLike[str]) -> Modulation:
     """Read ``laser.yaml``.
 
-    Raises
-    ------
-    FormatError
-        One line naming the file, the key, the value and the remedy.
+    Raises ``FormatError``: one line naming the file, the key, the value and the remedy.
     """
     laser = validate(_LaserFile, read_yaml(path, FormatError), FormatError)
     try:
@@ -276,10 +267,7 @@ def write_truth_csv(
 ) -> None:
     """Write ``truth.csv`` at ``path``: arrays of shape (n,), ranges to the nanometre.
 
-    Raises
-    ------
-    ArgumentError
-        When a range is not finite or the path cannot be written.
+    Raises ``ArgumentError`` when a range is not finite or the path cannot be written.
     """
     _write_csv(path, _columns(TRUTH_DTYPE, t_us=t_us, column=column, range_mm=range_mm))
 
@@ -325,10 +313,7 @@ def csv_lines(table: NDArray[np.void]) -> bytes:
 def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
     """Read ``stage.csv``: STAGE_DTYPE, shape (n,), at least one sample, in time order.
 
-    Raises
-    ------
-    FormatError
-        One line naming the file, the line and the remedy.
+    Raises ``FormatError``: one line naming the file, the line and the remedy.
     """
     path = file_path("path", path)
     samples = _read_csv(path, STAGE_DTYPE)
@@ -348,10 +333,7 @@ def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
 def read_truth_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
     """Read ``truth.csv``: TRUTH_DTYPE, shape (n,).
 
-    Raises
-    ------
-    FormatError
-        One line naming the file, the line and the remedy.
+    Raises ``FormatError``: one line naming the file, the line and the remedy.
     """
     return _read_csv(file_path("path", path), TRUTH_DTYPE)
 

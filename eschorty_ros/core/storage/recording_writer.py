@@ -43,26 +43,14 @@ SCAN_CLOUD_FILE = "scan.pcd"
 class RecordingWriter:
     """Writes the files of a recording; each call either writes all of its data or nothing.
 
-    Parameters
-    ----------
-    folder : path
-        Made here; it must not exist, or be empty.
-    calibration : Calibration
-    modulation : Modulation
-    scan : ScanLog, optional
-    settings : mapping, optional
-        Settings of the reconstruction, written with ``scan``.
+    - ``folder``: Made here; it must not exist, or be empty.
+    - ``settings``: Settings of the reconstruction, written with ``scan``.
 
-    Attributes
-    ----------
-    path : Path
-    event_bytes : int
-        Bytes of the stream in ``events.raw``.
+    Public attributes:
+    - ``event_bytes``: Bytes of the stream in ``events.raw``.
 
-    Raises
-    ------
-    ArgumentError, FormatError
-        When the folder holds files already or cannot be written.
+    Raises ``ArgumentError`` or ``FormatError`` when the folder holds files already or cannot be
+    written.
     """
 
     def __init__(

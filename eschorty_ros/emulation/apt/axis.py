@@ -29,16 +29,9 @@ class PulsePattern:
 class Axis:
     """The true motion of the carriage.
 
-    Parameters
-    ----------
-    at_ns : int
-    position_mm : float
-    travel_mm : tuple of float
-        Hard ends.
-    on_plan : callable
-        Called with every new motion.
-    sampled_pulses : bool
-        Pulses begin at the controller's next cycle of 102.4 us only.
+    - ``travel_mm``: Hard ends.
+    - ``on_plan``: Called with every new motion.
+    - ``sampled_pulses``: Pulses begin at the controller's next cycle of 102.4 us only.
     """
 
     def __init__(

@@ -18,11 +18,7 @@ Values = dict[str, int]
 class Memory:
     """Settings of one axis and of its trigger output, by the messages that set them.
 
-    Parameters
-    ----------
-    scale : Scale
-    rack : bool
-        True for a rack, whose trigger output has messages of its own.
+    - ``rack``: True for a rack, whose trigger output has messages of its own.
     """
 
     def __init__(self, scale: Scale, rack: bool) -> None:

@@ -25,39 +25,24 @@ class AptModel:
 
     Not thread-safe: hold a lock around ``feed`` and ``step``.
 
-    Parameters
-    ----------
-    clock_ns : callable
-    controller : {"kbd101", "bbd30x"}
-    bay : int
-        Bay of the rack that holds the axis, from 1.
-    travel_mm : tuple of float
-        Hard ends of the carriage.
-    power_up_mm : float
-        Position of the carriage at power-up; the encoder reads 0 there.
-    speed_max_mm_s, acceleration_max_mm_s2 : float
-        Limits that the stage data report and the controller applies.
-    late_ns : callable, optional
-        Extra delay of each frame to the host, as a USB adapter adds.
-    on_plan : callable, optional
-        Called with every new motion, in the clock's time.
-    sampled_pulses : bool
-        Trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
-    seed : int
-        Seed of random disturbances.
+    - ``controller``: either "kbd101" or "bbd30x".
+    - ``bay``: Bay of the rack that holds the axis, from 1.
+    - ``travel_mm``: Hard ends of the carriage.
+    - ``power_up_mm``: Position of the carriage at power-up; the encoder reads 0 there.
+    - ``speed_max_mm_s``, ``acceleration_max_mm_s2``: Limits that the stage data report and the
+      controller applies.
+    - ``late_ns``: Extra delay of each frame to the host, as a USB adapter adds.
+    - ``on_plan``: Called with every new motion, in the clock's time.
+    - ``sampled_pulses``: Trigger pulses begin at the next cycle of 102.4 us, as a KBD101's do.
+    - ``seed``: Seed of random disturbances.
 
-    Attributes
-    ----------
-    axis : Axis
-        The carriage.
-    disturbance : Disturbance
-        Faults of its bytes.
-    gone, mute, panel_disabled, ignores_moves : bool
-        Unplugged; never answers; cannot be enabled; accepts moves without moving.
-    extra_bits : int
-        Status bits set on top.
-    withheld : set of str
-        Names of messages it never sends.
+    Public attributes:
+    - ``axis``: The carriage.
+    - ``disturbance``: Faults of its bytes.
+    - ``gone``, ``mute``, ``panel_disabled``, ``ignores_moves``: Unplugged; never answers; cannot be
+      enabled; accepts moves without moving.
+    - ``extra_bits``: Status bits set on top.
+    - ``withheld``: Names of messages it never sends.
     """
 
     def __init__(

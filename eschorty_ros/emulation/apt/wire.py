@@ -13,10 +13,7 @@ BYTE_NS = 86_806
 class Wire:
     """One direction of a serial line; bytes leave in order, one after the other.
 
-    Parameters
-    ----------
-    late_ns : callable, optional
-        Extra delay of each write, on top of the line's own time.
+    - ``late_ns``: Extra delay of each write, on top of the line's own time.
     """
 
     def __init__(self, late_ns: Callable[[], int] | None = None) -> None:
@@ -42,18 +39,12 @@ class Wire:
 class Disturbance:
     """Faults of the controller's bytes; every count falls as its fault happens.
 
-    Attributes
-    ----------
-    garbage : bytes
-        Sent between two frames, once.
-    loss_share : float
-        Share of the frames that lose one byte.
-    flips : int
-        Frames still to get one bit of their payload flipped.
-    flip_bit : int or None
-        Index of that bit in the payload; ``None`` for a random one.
-    repeats : int
-        Frames still to be sent twice.
+    Public attributes:
+    - ``garbage``: Sent between two frames, once.
+    - ``loss_share``: Share of the frames that lose one byte.
+    - ``flips``: Frames still to get one bit of their payload flipped.
+    - ``flip_bit``: Index of that bit in the payload; ``None`` for a random one.
+    - ``repeats``: Frames still to be sent twice.
     """
 
     def __init__(self, seed: int = 0) -> None:

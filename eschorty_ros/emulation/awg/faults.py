@@ -6,27 +6,19 @@ from __future__ import annotations
 class AwgFaults:
     """Switches of faults; a count runs down to 0 with each time its fault strikes.
 
-    Attributes
-    ----------
-    lost_replies : int
-        Replies that never arrive.
-    late_replies : int
-        Replies that arrive one request late: the next request gets them, unless cleared before.
-    wrong_tags, wrong_kinds, short_headers, oversized, empty_packets : int
-        Reply transfers with a wrong bTag, a wrong MsgID, fewer than 12 bytes, a TransferSize
-        above what follows, an empty packet before them.
-    transfer_bytes : int
-        Cut replies into transfers of this size without EOM; 0 = uncut.
-    newline : bool
-        End replies with a newline.
-    pending_clears : int
-        CHECK_CLEAR replies "pending" this often.
-    no_clear : bool
-        INITIATE_CLEAR stalls, as an unsupported request does.
-    ignored : set of str
-        Paths (long form, such as ``BASE:FREQuency``) whose settings have no effect.
-    changed : dict
-        Path to the text that is set instead of the requested one.
+    Public attributes:
+    - ``lost_replies``: Replies that never arrive.
+    - ``late_replies``: Replies that arrive one request late: the next request gets them, unless
+      cleared before.
+    - ``wrong_tags``, ``wrong_kinds``, ``short_headers``, ``oversized``, ``empty_packets``: Reply
+      transfers with a wrong bTag, a wrong MsgID, fewer than 12 bytes, a TransferSize above what
+      follows, an empty packet before them.
+    - ``transfer_bytes``: Cut replies into transfers of this size without EOM; 0 = uncut.
+    - ``newline``: End replies with a newline.
+    - ``pending_clears``: CHECK_CLEAR replies "pending" this often.
+    - ``no_clear``: INITIATE_CLEAR stalls, as an unsupported request does.
+    - ``ignored``: Paths (long form, such as ``BASE:FREQuency``) whose settings have no effect.
+    - ``changed``: Path to the text that is set instead of the requested one.
     """
 
     def __init__(self) -> None:

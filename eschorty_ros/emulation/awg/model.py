@@ -50,34 +50,20 @@ OnChange = Callable[[int, bool, Modulation], None]
 class AwgModel(EmulatedUsbDevice):
     """The generator; channel 1 modulates the laser.
 
-    Parameters
-    ----------
-    clock_ns : callable
-        Clock of ``on_change``, ns.
-    log_path : path, optional
-        File for a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and each time the waveform
-        starts or stops at output 1, before the command is answered.
-    serial : str
-    wait : callable
-        As for ``EmulatedUsbDevice``.
-    steady_ns : callable
-        Clock of the bursts, ns.
+    - ``clock_ns``: Clock of ``on_change``, ns.
+    - ``log_path``: File for a line ``<CLOCK_MONOTONIC ns> ON|OFF`` at power-up and each time the
+      waveform starts or stops at output 1, before the command is answered.
+    - ``wait``: As for ``EmulatedUsbDevice``.
+    - ``steady_ns``: Clock of the bursts, ns.
 
-    Attributes
-    ----------
-    burst_trigger : {"extends", "restarts", "ignored", ""}
-        Effect of a trigger while a burst runs; empty: a generator without bursts.
-    channels : list of ChannelState
-    locked : bool
-        True while the front panel is locked.
-    faults : AwgFaults
-    errors : deque of str or None
-        The error queue; ``None`` by default, because the family has none.
-    commands : deque of str
-        The last 4096 commands received, in order.
-    on_change : callable or None
-        ``on_change(since_ns, lit, modulation)`` at each change of the light or its modulation;
-        ``since_ns`` is the time of a rising edge.
+    Public attributes:
+    - ``burst_trigger``: one of "extends", "restarts", "ignored" and "". Effect of a trigger while a
+      burst runs; empty: a generator without bursts.
+    - ``locked``: True while the front panel is locked.
+    - ``errors``: The error queue; ``None`` by default, because the family has none.
+    - ``commands``: The last 4096 commands received, in order.
+    - ``on_change``: ``on_change(since_ns, lit, modulation)`` at each change of the light or its
+      modulation; ``since_ns`` is the time of a rising edge.
     """
 
     def __init__(

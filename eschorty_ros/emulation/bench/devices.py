@@ -20,49 +20,30 @@ from eschorty_ros.simulation.world import BACKGROUND_HZ, SensorControl, World, w
 
 @dataclass(frozen=True, slots=True)
 class BenchSettings:
-    """Scene, optical build, pixels and wiring of the bench.
-
-    Attributes
-    ----------
-    scene : str
-        A scene's name or a mesh file.
-    calibration : str
-        The actual optical build, a name or a file.
-    pixels : str
-        Preset of the event pixels.
-    seed : int
-    background_hz : float
-        Background events of one pixel.
-    trigger : {"none", "laser", "stage"}
-        Output that is wired to the camera's trigger input.
-    imperfections : Imperfections
-    laser_log : str
-        File with one line per change of the generator's output; empty for none.
-    """
+    """Scene, optical build, pixels and wiring of the bench."""
 
     scene: str = "steps"
+    """A scene's name or a mesh file."""
     calibration: str = "config_3"
+    """The actual optical build, a name or a file."""
     pixels: str = "paper"
+    """Preset of the event pixels."""
     seed: int = 1
     background_hz: float = BACKGROUND_HZ
+    """Background events of one pixel."""
     trigger: str = "stage"
+    """One of "none", "laser" and "stage". Output that is wired to the camera's trigger input."""
     imperfections: Imperfections = field(default_factory=Imperfections)
     laser_log: str = ""
+    """File with one line per change of the generator's output; empty for none."""
 
 
 class Bench:
     """Models of camera, generator and stage that act on each other as real ones do.
 
-    Parameters
-    ----------
-    settings : BenchSettings
-    clock_ns : callable
-        The bench's clock.
+    - ``clock_ns``: The bench's clock.
 
-    Raises
-    ------
-    EschortyError
-        For a scene or calibration that cannot be used.
+    Raises ``EschortyError`` for a scene or calibration that cannot be used.
     """
 
     def __init__(

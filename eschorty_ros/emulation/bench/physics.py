@@ -40,28 +40,18 @@ _PPB = 1_000_000_000
 class Imperfections:
     """Deviations of the bench from an ideal one.
 
-    Parameters
-    ----------
-    sensor_ppm, generator_ppm : float
-        Rate error of the sensor's and the generator's clock.
-    usb_jitter_ms : float
-        Largest delay of the camera's bytes, uniformly distributed from 0.
-    missing_edges : float
-        Share of the trigger edges that the camera misses.
-    seed : int
-        Seed of jitter and missing edges.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
+    Raises ``ArgumentError`` for a value outside its range.
     """
 
     sensor_ppm: float = 0.0
     generator_ppm: float = 0.0
+    """Rate error of the sensor's and the generator's clock."""
     usb_jitter_ms: float = 0.0
+    """Largest delay of the camera's bytes, uniformly distributed from 0."""
     missing_edges: float = 0.0
+    """Share of the trigger edges that the camera misses."""
     seed: int = 0
+    """Seed of jitter and missing edges."""
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -104,34 +94,20 @@ class Physics:
     every change is then set before the world reaches its time. The camera calls ``read``, ``start``
     and ``stop``.
 
-    Parameters
-    ----------
-    make_world : callable
-        Makes a new world for each start of the stream.
-    clock_ns : callable
-        The bench's clock.
-    imperfections : Imperfections
-    trigger : {"none", "laser", "stage"}
-        Output that is wired to the camera's trigger input.
-    pulses : Pulses, optional
-        The stage's trigger output.
+    - ``make_world``: Makes a new world for each start of the stream.
+    - ``clock_ns``: The bench's clock.
+    - ``trigger``: one of "none", "laser" and "stage". Output that is wired to the camera's trigger
+      input.
+    - ``pulses``: The stage's trigger output.
 
-    Attributes
-    ----------
-    lock : threading.RLock
-    packet_us : int
-        Sensor time after which a packet of bytes leaves, at least a millisecond.
-    late_ns : int
-        Bench time between the end of the bytes simulated last and their simulation.
-    late_changes : int
-        Changes set after the world had passed their time.
-    edges, edges_missed : int
-        Trigger edges on the wire, and those of them that the camera misses.
+    Public attributes:
+    - ``packet_us``: Sensor time after which a packet of bytes leaves, at least a millisecond.
+    - ``late_ns``: Bench time between the end of the bytes simulated last and their simulation.
+    - ``late_changes``: Changes set after the world had passed their time.
+    - ``edges``, ``edges_missed``: Trigger edges on the wire, and those of them that the camera
+      misses.
 
-    Raises
-    ------
-    ArgumentError
-        For an unknown ``trigger``.
+    Raises ``ArgumentError`` for an unknown ``trigger``.
     """
 
     def __init__(

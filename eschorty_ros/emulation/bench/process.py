@@ -31,10 +31,7 @@ def bench_command(folder: Path, options: Mapping[str, object]) -> list[str]:
 def bench_process(folder: Path, options: Mapping[str, object]) -> Iterator[subprocess.Popen[str]]:
     """Run a bench in ``folder`` inside the context; it is ready on entry.
 
-    Raises
-    ------
-    DeviceError
-        When the bench does not start; with the message of the bench.
+    Raises ``DeviceError`` when the bench does not start; with the message of the bench.
     """
     # A group of its own: Ctrl-C reaches the nodes only, which need their devices. No session of
     # its own: Linux may share the cores by sessions, which starved a bench for seconds.

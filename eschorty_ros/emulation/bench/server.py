@@ -41,10 +41,7 @@ def serving(bench: Bench, folder: Path) -> Iterator[UsbServer]:
 
     The file ``ready`` holds this process's id while socket and port exist.
 
-    Raises
-    ------
-    DeviceError
-        When socket or port cannot be made there.
+    Raises ``DeviceError`` when socket or port cannot be made there.
     """
     ready = folder / READY_FILE
     with (
@@ -98,10 +95,8 @@ class _Termination:
 def serve(folder: Path, settings: BenchSettings) -> None:
     """Serve a bench in ``folder`` until a signal or the end of the parent process.
 
-    Raises
-    ------
-    EschortyError
-        When the folder cannot be used, another bench uses it, or the settings are refused.
+    Raises ``EschortyError`` when the folder cannot be used, another bench uses it, or the settings
+    are refused.
     """
     termination = _Termination()
     with _locked(folder):

@@ -37,18 +37,10 @@ class PtyPort:
     While the model is ``gone`` there is no port, and an open one hangs up, as with an unplugged
     USB adapter.
 
-    Parameters
-    ----------
-    model : SerialModel
-    link : path
-        Path of the port; an old link is replaced.
-    lock : threading.RLock, optional
-        Held while the model acts.
+    - ``link``: Path of the port; an old link is replaced.
+    - ``lock``: Held while the model acts.
 
-    Raises
-    ------
-    DeviceError
-        When the link cannot be made.
+    Raises ``DeviceError`` when the link cannot be made.
     """
 
     def __init__(

@@ -59,10 +59,7 @@ class Handle:
 class EmulatedBackend(DescriptorBackend):
     """pyusb's backend interface for models.
 
-    Parameters
-    ----------
-    models : callable
-        Returns the devices on the bus.
+    - ``models``: Returns the devices on the bus.
     """
 
     def __init__(self, models: Callable[[], Sequence[EmulatedUsbDevice]]):

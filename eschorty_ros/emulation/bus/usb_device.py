@@ -144,30 +144,18 @@ class _InPipe:
 class EmulatedUsbDevice:
     """Base of the models, which override ``control``, ``bulk_out`` and ``bulk_in`` as needed.
 
-    Parameters
-    ----------
-    identity : UsbIdentity
-    wait : callable
-        Waits for data: ``wait(condition, seconds)``, False on a time-out. With
-        ``lambda *_: False`` every wait times out at once, for tests without sleeps.
+    - ``wait``: Waits for data: ``wait(condition, seconds)``, False on a time-out. With ``lambda *_:
+      False`` every wait times out at once, for tests without sleeps.
 
-    Attributes
-    ----------
-    gone : bool
-        Unplugged: every transfer fails with ENODEV, the bus does not list it.
-    stalled : set of int
-        Halted endpoints: they refuse with EPIPE until the halt is cleared.
-    mute : bool
-        Every transfer times out.
-    denied : bool
-        Opening fails with EACCES.
-    kernel_driver : str or None
-        Driver that holds the interface until it is detached.
-    address : int
-        Address on the bus; a new one after every ``replug``.
-    late_ns : int
-        Time by which the data of the last read would have come earlier from a real device, because
-        the emulation takes longer.
+    Public attributes:
+    - ``gone``: Unplugged: every transfer fails with ENODEV, the bus does not list it.
+    - ``stalled``: Halted endpoints: they refuse with EPIPE until the halt is cleared.
+    - ``mute``: Every transfer times out.
+    - ``denied``: Opening fails with EACCES.
+    - ``kernel_driver``: Driver that holds the interface until it is detached.
+    - ``address``: Address on the bus; a new one after every ``replug``.
+    - ``late_ns``: Time by which the data of the last read would have come earlier from a real
+      device, because the emulation takes longer.
     """
 
     def __init__(self, identity: UsbIdentity, *, wait: Wait = threading.Condition.wait):

@@ -151,10 +151,7 @@ def _forwarded(op: Op) -> Callable[..., int]:
 class RemoteBackend(DescriptorBackend):
     """pyusb's backend interface on the socket of a ``UsbServer``; the bus is empty without one.
 
-    Parameters
-    ----------
-    path : str
-        Path of the socket.
+    - ``path``: Path of the socket.
     """
 
     def __init__(self, path: str):

@@ -36,17 +36,10 @@ from eschorty_ros.emulation.bus.usb_wire import (
 class UsbServer:
     """Serves the models on a Unix socket until closed.
 
-    Parameters
-    ----------
-    path : path
-        Path of the socket; a socket left by an earlier server is replaced.
-    models : callable
-        Returns the devices on the bus.
+    - ``path``: Path of the socket; a socket left by an earlier server is replaced.
+    - ``models``: Returns the devices on the bus.
 
-    Raises
-    ------
-    DeviceError
-        When the socket cannot be made.
+    Raises ``DeviceError`` when the socket cannot be made.
     """
 
     def __init__(

@@ -40,32 +40,19 @@ _PULL_BYTES = 96 << 10
 class Evk4Model(EmulatedUsbDevice):
     """EVK4 with an IMX636.
 
-    Parameters
-    ----------
-    source : SensorSource
-        Returns the pixels' words while the sensor streams; read only when the host reads.
-    board : BoardIdentity
-    factory_dacs : mapping, optional
-        The camera's bias trim by name.
-    clock_ns : callable, optional
-        With a clock the waits of the register sequences are checked, too.
-    wait : callable
-        As for ``EmulatedUsbDevice``.
+    - ``source``: Returns the pixels' words while the sensor streams; read only when the host reads.
+    - ``factory_dacs``: The camera's bias trim by name.
+    - ``clock_ns``: With a clock the waits of the register sequences are checked, too.
+    - ``wait``: As for ``EmulatedUsbDevice``.
 
-    Attributes
-    ----------
-    registers : Registers
-    watch : SequenceWatch
-        Phase and violations.
-    board : TreuzellBoard
-        Answers requests.
-    buffer_bytes : int or None
-        Size of the device's buffer. None: nothing is lost however late the host reads. Otherwise
-        words since the last read that do not fit are dropped, with the sensor's mark.
-    configure : callable or None
-        Called with ``SensorSettings`` after a write that changes them.
-    lateness_ns : callable or None
-        Returns ``late_ns`` of the words that the source has returned.
+    Public attributes:
+    - ``watch``: Phase and violations.
+    - ``board``: Answers requests.
+    - ``buffer_bytes``: Size of the device's buffer. None: nothing is lost however late the host
+      reads. Otherwise words since the last read that do not fit are dropped, with the sensor's
+      mark.
+    - ``configure``: Called with ``SensorSettings`` after a write that changes them.
+    - ``lateness_ns``: Returns ``late_ns`` of the words that the source has returned.
     """
 
     def __init__(

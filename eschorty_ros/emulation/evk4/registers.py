@@ -52,15 +52,10 @@ SENSOR_RESET = 0x400004
 class Registers:
     """Addresses (multiples of 4) to 32-bit values.
 
-    Parameters
-    ----------
-    factory_dacs : mapping
-        The camera's trim, DAC value by bias name; the default is a typical one.
+    - ``factory_dacs``: The camera's trim, DAC value by bias name; the default is a typical one.
 
-    Attributes
-    ----------
-    temperature_c : float
-        Temperature that the sensor reports.
+    Public attributes:
+    - ``temperature_c``: Temperature that the sensor reports.
     """
 
     def __init__(self, factory_dacs: Mapping[str, int] | None = None):

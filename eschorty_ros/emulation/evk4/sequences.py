@@ -86,16 +86,10 @@ class Phase(Enum):
 class SequenceWatch:
     """Follows every register write and recognises complete sequences.
 
-    Parameters
-    ----------
-    clock_ns : callable, optional
-        With a clock the waits of the sequences are checked, too.
+    - ``clock_ns``: With a clock the waits of the sequences are checked, too.
 
-    Attributes
-    ----------
-    phase : Phase
-    violations : list of str
-        Broken sequences, sequences in the wrong phase, short waits.
+    Public attributes:
+    - ``violations``: Broken sequences, sequences in the wrong phase, short waits.
     """
 
     def __init__(self, clock_ns: Callable[[], int] | None = None):

@@ -30,36 +30,24 @@ SETTING_ADDRESSES = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class SensorSettings:
-    """Settings of the sensor.
-
-    Attributes
-    ----------
-    biases : tuple of (name, int)
-        DAC offsets from the camera's trim.
-    columns_off, rows_off : frozenset of int
-        Masked columns and rows.
-    pixels_off : frozenset of (column, row)
-        Masked pixels.
-    trigger_in : bool
-    packet_period_us : int
-        Period of the sensor's packets.
-    event_rate : (int, int) or None
-        Events that the event-rate control passes per period, and the period (us); None when off.
-    flicker_band_hz : (float, float) or None
-        Band that the anti-flicker filter removes, None when off.
-    noise_filter : (str, int) or None
-        ``stc`` or ``trail`` with its threshold in us, None when off.
-    """
+    """Settings of the sensor."""
 
     biases: tuple[tuple[str, int], ...]
+    """DAC offsets from the camera's trim."""
     columns_off: frozenset[int]
     rows_off: frozenset[int]
+    """Masked columns and rows."""
     pixels_off: frozenset[tuple[int, int]]
+    """Masked pixels."""
     trigger_in: bool
     packet_period_us: int
+    """Period of the sensor's packets."""
     event_rate: tuple[int, int] | None
+    """Events that the event-rate control passes per period, and the period (us); None when off."""
     flicker_band_hz: tuple[float, float] | None
+    """Band that the anti-flicker filter removes, None when off."""
     noise_filter: tuple[str, int] | None
+    """``stc`` or ``trail`` with its threshold in us, None when off."""
 
 
 def read_settings(registers: Registers) -> SensorSettings:

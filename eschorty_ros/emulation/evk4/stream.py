@@ -34,12 +34,8 @@ class SensorSource(Protocol):
 class PixelMask:
     """Removes masked pixels from EVT3 words; keeps row and vector base across calls.
 
-    Parameters
-    ----------
-    columns_off, rows_off : iterable of int
-        A pixel is off when its column or its row is.
-    pixels_off : iterable of (column, row)
-        Single pixels.
+    - ``columns_off``, ``rows_off``: A pixel is off when its column or its row is.
+    - ``pixels_off``: Single pixels.
     """
 
     def __init__(

@@ -46,13 +46,7 @@ def _words(*values: int) -> bytes:
 
 
 class TreuzellBoard:
-    """A board with one sensor, device 0, that answers requests.
-
-    Parameters
-    ----------
-    identity : BoardIdentity
-    registers : RegisterAccess
-    """
+    """A board with one sensor, device 0, that answers requests."""
 
     def __init__(self, identity: BoardIdentity, registers: RegisterAccess):
         self._registers = registers

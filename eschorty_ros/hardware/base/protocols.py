@@ -24,40 +24,26 @@ class DeviceIdentity:
 
 @dataclass(frozen=True, slots=True)
 class EventChunk:
-    """Bytes that arrived together.
-
-    Parameters
-    ----------
-    data : bytes
-        Complete 16-bit EVT3 words.
-    arrival_ns : int
-        Host time at which they were received.
-    gap : bool
-        Bytes were lost between the previous chunk and this one.
-    restarted : bool
-        The stream restarts here: earlier sensor time and decoder state are void.
-    """
+    """Bytes that arrived together."""
 
     data: bytes
+    """Complete 16-bit EVT3 words."""
     arrival_ns: int
+    """Host time at which they were received."""
     gap: bool = False
+    """Bytes were lost between the previous chunk and this one."""
     restarted: bool = False
+    """The stream restarts here: earlier sensor time and decoder state are void."""
 
 
 class EventSource(Protocol):
-    """A camera that streams raw EVT3 bytes.
-
-    Attributes
-    ----------
-    width, height : int
-        Columns and rows of the sensor.
-    on_loss : callable
-        Called with one line, from any thread, when a streaming camera is lost and searched for.
-    """
+    """A camera that streams raw EVT3 bytes."""
 
     width: int
     height: int
+    """Columns and rows of the sensor."""
     on_loss: Callable[[str], None]
+    """Called with one line, from any thread, when a streaming camera is lost and searched for."""
 
     @property
     def identity(self) -> DeviceIdentity:
@@ -180,16 +166,11 @@ class StageState:
 
 
 class LinearStage(Protocol):
-    """A linear stage with absolute moves that end by themselves.
-
-    Attributes
-    ----------
-    trigger : PulseTrain or None
-        Pulses for the camera's trigger input, in either direction; ``None`` when there are none.
-    """
+    """A linear stage with absolute moves that end by themselves."""
 
     identity: DeviceIdentity
     trigger: PulseTrain | None
+    """Pulses for the camera's trigger input, in either direction; ``None`` when there are none."""
     travel_mm: tuple[float, float]
     speed_max_mm_s: float
     acceleration_mm_s2: float

@@ -16,15 +16,10 @@ class StallMeter:
     heartbeat old at once. A watchdog excludes that time, and compares ages as of ``measured_s``: a
     stall may begin after a measurement. The end of another process is noticed by other means.
 
-    Parameters
-    ----------
-    period_s : float
-        Time between two turns of the loop.
+    - ``period_s``: Time between two turns of the loop.
 
-    Attributes
-    ----------
-    measured_s : float
-        Time of the last measurement, steady clock.
+    Public attributes:
+    - ``measured_s``: Time of the last measurement, steady clock.
     """
 
     def __init__(self, period_s: float) -> None:

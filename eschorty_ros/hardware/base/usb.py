@@ -45,11 +45,7 @@ _KINDS: dict[int, tuple[type[DeviceError], str]] = {
 def translate(error: usb.core.USBError, what: str) -> DeviceError:
     """Return the ``DeviceError`` for pyusb's error, by ``errno``: texts differ by platform.
 
-    Parameters
-    ----------
-    error : usb.core.USBError
-    what : str
-        Device and operation, such as ``"EVK4 00051234: reading register 0x0014"``.
+    - ``what``: Device and operation, such as ``"EVK4 00051234: reading register 0x0014"``.
     """
     code = error.errno if error.errno is not None else 0
     kind, remedy = _KINDS.get(code, (DeviceError, str(error.strerror or error)))
@@ -59,19 +55,12 @@ def translate(error: usb.core.USBError, what: str) -> DeviceError:
 def open_backend(spec: str) -> usb.backend.IBackend:
     """Return the pyusb backend that ``spec`` names.
 
-    Parameters
-    ----------
-    spec : str
-        ``libusb``: the system's libusb, else that of the package ``libusb-package``.
-        ``module:callable`` or ``module:callable?argument``: the result of ``callable()`` or
-        ``callable(argument)``.
+    - ``spec``: ``libusb``: the system's libusb, else that of the package ``libusb-package``.
+      ``module:callable`` or ``module:callable?argument``: the result of ``callable()`` or
+      ``callable(argument)``.
 
-    Raises
-    ------
-    ArgumentError
-        For a name that cannot be imported.
-    DeviceError
-        Without libusb.
+    Raises ``ArgumentError`` for a name that cannot be imported. Raises ``DeviceError`` without
+    libusb.
     """
     if spec == "libusb":
         return _libusb()
@@ -107,22 +96,12 @@ def find_device(
 ) -> usb.core.Device:
     """Find and open the one device that matches; returns a new ``Device`` on every call.
 
-    Parameters
-    ----------
-    backend : usb.backend.IBackend
-    name : str
-        Name of the device in messages.
-    matches : callable
-        May read descriptors only: the device is not open yet.
-    serial : str
-        Serial string, upper or lower case; ``""`` for the only match.
+    - ``name``: Name of the device in messages.
+    - ``matches``: May read descriptors only: the device is not open yet.
+    - ``serial``: Serial string, upper or lower case; ``""`` for the only match.
 
-    Raises
-    ------
-    DeviceGoneError
-        None matches.
-    DeviceError
-        Several match, or opening is refused.
+    Raises ``DeviceGoneError`` when none matches. Raises ``DeviceError`` when several match, or
+    opening is refused.
     """
     try:
         found = list(usb.core.find(find_all=True, backend=backend, custom_match=matches))
@@ -184,10 +163,7 @@ def _serial(device: usb.core.Device, name: str) -> str:
 def claim(device: usb.core.Device, interface: int, name: str) -> bool:
     """Claim the interface for this process; returns whether a kernel driver was detached.
 
-    Raises
-    ------
-    DeviceError
-        Another program holds it, or the kernel driver cannot be detached.
+    Raises ``DeviceError`` when another program holds it, or the kernel driver cannot be detached.
     """
     detached = False
     try:

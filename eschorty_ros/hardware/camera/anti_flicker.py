@@ -27,22 +27,14 @@ _HALF_DUTY = 8
 class AntiFlicker:
     """Band of the filter.
 
-    Parameters
-    ----------
-    low_hz, high_hz : int
-        Band edges, 50 to 520 Hz.
-    band_pass : bool
-        Keep only light that flickers in the band.
-
-    Raises
-    ------
-    ArgumentError
-        For band edges outside the range.
+    Raises ``ArgumentError`` for band edges outside the range.
     """
 
     low_hz: int = 50
     high_hz: int = 520
+    """Band edges, 50 to 520 Hz."""
     band_pass: bool = False
+    """Keep only light that flickers in the band."""
 
     def __post_init__(self) -> None:
         low, high = ANTI_FLICKER_HZ
@@ -61,10 +53,7 @@ class AntiFlicker:
 def set_anti_flicker(registers: Registers, band: AntiFlicker | None) -> None:
     """Switch the filter on with ``band``, off with ``None``.
 
-    Raises
-    ------
-    DeviceError
-        When the filter's memory does not become ready.
+    Raises ``DeviceError`` when the filter's memory does not become ready.
     """
     registers.write(_PIPELINE, _BYPASS)
     if band is None:

@@ -44,21 +44,12 @@ BIASES: Mapping[str, BiasInfo] = {
 class BiasBank:
     """Biases of an initialised sensor.
 
-    Parameters
-    ----------
-    registers : Registers
-    wide : bool
-        Allow the wide ranges, which may make the sensor noisy or insensitive.
+    - ``wide``: Allow the wide ranges, which may make the sensor noisy or insensitive.
 
-    Attributes
-    ----------
-    factory : dict of str to int
-        DAC values read before anything was written.
+    Public attributes:
+    - ``factory``: DAC values read before anything was written.
 
-    Raises
-    ------
-    DeviceError
-        When the camera does not answer.
+    Raises ``DeviceError`` when the camera does not answer.
     """
 
     def __init__(self, registers: Registers, wide: bool = False) -> None:
@@ -78,12 +69,8 @@ class BiasBank:
 
         The DAC is clamped to 0..255, so the offset read back may be nearer to 0.
 
-        Raises
-        ------
-        ArgumentError
-            For an unknown name or an offset outside the range.
-        DeviceError
-            When the camera reads back another value than was written.
+        Raises ``ArgumentError`` for an unknown name or an offset outside the range. Raises
+        ``DeviceError`` when the camera reads back another value than was written.
         """
         info = check_offset(name, offset, self._wide)
         dac = min(max(self.factory[name] + offset, 0), _DAC)
@@ -112,10 +99,7 @@ def load_bias_file(path: str | os.PathLike[str]) -> dict[str, int]:
 
     Biases that users do not set (``bias_diff``) are skipped.
 
-    Raises
-    ------
-    FormatError
-        For a file that cannot be read or a line that is no bias.
+    Raises ``FormatError`` for a file that cannot be read or a line that is no bias.
     """
     try:
         lines = read_regular_file(path, _BYTES_MAX, FormatError).decode().splitlines()

@@ -149,16 +149,9 @@ class AsyncReader:
     A time-out with data counts as completed, one without is queued again. A stall or an error
     stops the queue until ``resume`` or ``start``.
 
-    Parameters
-    ----------
-    library : module
-        ``usb1.libusb1`` on the libusb that opened ``handle``.
-    handle, context : ctypes pointers
-        Device handle and context, as pyusb keeps them.
-    synchronous : SyncReader
-        Clears and empties the endpoint before the first transfer is queued.
-    endpoint : int
-    clock_ns : callable
+    - ``library``: ``usb1.libusb1`` on the libusb that opened ``handle``.
+    - ``handle``, ``context``: Device handle and context, as pyusb keeps them.
+    - ``synchronous``: Clears and empties the endpoint before the first transfer is queued.
     """
 
     def __init__(

@@ -73,12 +73,8 @@ def _is_camera(device: usb.core.Device) -> bool:
 class CameraUsb:
     """A claimed camera; a :class:`~eschorty_ros.hardware.camera.treuzell.ControlLink`.
 
-    Attributes
-    ----------
-    device : usb.core.Device
-    endpoints : Endpoints
-    slow : bool
-        True when the link is slower than 5 Gbit/s.
+    Public attributes:
+    - ``slow``: True when the link is slower than 5 Gbit/s.
     """
 
     def __init__(self, device: usb.core.Device) -> None:
@@ -141,12 +137,8 @@ def open_camera(backend: usb.backend.IBackend, serial: str = "") -> CameraUsb:
 
     The serial is read over the control protocol, because USB descriptors need not hold it.
 
-    Raises
-    ------
-    DeviceGoneError
-        When none is there, or none with that serial.
-    DeviceError
-        When several are there and no serial is given, or it cannot be opened.
+    Raises ``DeviceGoneError`` when none is there, or none with that serial. Raises ``DeviceError``
+    when several are there and no serial is given, or it cannot be opened.
     """
     if not serial:
         return CameraUsb(bus.find_device(backend, name=NAME, matches=_is_camera))

@@ -15,16 +15,11 @@ BYTES_MAX = 64 << 20
 class ChunkQueue:
     """Chunks of complete 16-bit words in order; a gap or restart marks the next chunk.
 
-    Parameters
-    ----------
-    bytes_max : int
-        Bytes that may wait; more is dropped and counted.
+    - ``bytes_max``: Bytes that may wait; more is dropped and counted.
 
-    Attributes
-    ----------
-    received_bytes, dropped_bytes, drops, gaps, restarts : int
-        Bytes put in, bytes and chunks dropped because the queue was full, gaps of any origin,
-        and starts of the stream.
+    Public attributes:
+    - ``received_bytes``, ``dropped_bytes``, ``drops``, ``gaps``, ``restarts``: Bytes put in, bytes
+      and chunks dropped because the queue was full, gaps of any origin, and starts of the stream.
     """
 
     def __init__(self, bytes_max: int = BYTES_MAX) -> None:
@@ -103,10 +98,7 @@ class ChunkQueue:
     def get(self, timeout_s: float) -> EventChunk | None:
         """Return the oldest chunk, ``None`` after ``timeout_s`` without one or after ``close``.
 
-        Raises
-        ------
-        DeviceError
-            The error that was given to ``fail``.
+        Raises ``DeviceError``: the error that was given to ``fail``.
         """
         end_s = time.monotonic() + timeout_s
         with self._changed:

@@ -26,30 +26,16 @@ class EndedError(DeviceError):
 class Connection:
     """Session of one camera; thread-safe.
 
-    Parameters
-    ----------
-    backend : usb.backend.IBackend
-    clock_ns : callable
-    serial : str
-        ``""`` for the only camera. After the first opening only the same camera is opened again.
-    settings : CameraSettings
-        Written in every new session.
-    attempts_max : int
-        Searches for a lost camera.
-    sleep : callable
-        Waits some seconds; raises :class:`EndedError` when the stream ends.
-    settle : callable
-        Waits milliseconds, always to the end.
+    - ``serial``: ``""`` for the only camera. After the first opening only the same camera is opened
+      again.
+    - ``settings``: Written in every new session.
+    - ``attempts_max``: Searches for a lost camera.
+    - ``sleep``: Waits some seconds; raises :class:`EndedError` when the stream ends.
+    - ``settle``: Waits milliseconds, always to the end.
 
-    Attributes
-    ----------
-    session : Session or None
-        The open camera.
-    identity : DeviceIdentity
-    settings : CameraSettings
-    loss : str
-        Reason of the loss, one line; empty while there is a session.
-    losses, reconnects, attempts : int
+    Public attributes:
+    - ``session``: The open camera.
+    - ``loss``: Reason of the loss, one line; empty while there is a session.
     """
 
     def __init__(
@@ -112,12 +98,8 @@ class Connection:
     def reopen(self, start: Callable[[Session], None]) -> None:
         """Open the same camera again and ``start`` it.
 
-        Raises
-        ------
-        EndedError
-            When the stream ends before.
-        DeviceGoneError
-            After the last attempt.
+        Raises ``EndedError`` when the stream ends before. Raises ``DeviceGoneError`` after the last
+        attempt.
         """
         last = self.loss
         wait_s = _FIRST_WAIT_S

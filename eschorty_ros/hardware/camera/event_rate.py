@@ -47,10 +47,7 @@ def initialise(registers: Registers) -> None:
 def set_event_rate(registers: Registers, enabled: bool, rate: int) -> int:
     """Switch the control and set its limit (events/s); returns the limit read back.
 
-    Raises
-    ------
-    ArgumentError
-        For a rate outside 5000 to 3.2e9 events/s.
+    Raises ``ArgumentError`` for a rate outside 5000 to 3.2e9 events/s.
     """
     count = rate * PERIOD_US // 1_000_000
     if not 1 <= count <= COUNT_MAX:

@@ -50,12 +50,8 @@ TIMING = _timing()
 def set_event_trail(registers: Registers, kind: str, threshold_us: int) -> int:
     """Switch a filter of :data:`TRAIL_TYPES` on; returns the threshold in force (us).
 
-    Raises
-    ------
-    ArgumentError
-        For an unknown kind, or a threshold outside 1000 to 100000 us.
-    DeviceError
-        When the filter's memory does not become ready.
+    Raises ``ArgumentError`` for an unknown kind, or a threshold outside 1000 to 100000 us. Raises
+    ``DeviceError`` when the filter's memory does not become ready.
     """
     if kind not in TRAIL_TYPES:
         raise ArgumentError(

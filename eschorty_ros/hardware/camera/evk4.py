@@ -37,20 +37,14 @@ class Evk4:
     unplugged cable: it releases the camera, waits, searches for the same serial, initialises it,
     writes its settings and streams. The stream then restarts (``EventChunk.restarted``).
 
-    Parameters
-    ----------
-    backend : usb.backend.IBackend
-    clock_ns : callable
-        Clock of the arrival times.
-    serial : str
-        Hex serial, ``""`` for the only camera. After a loss only the same camera is opened again.
-    settings : CameraSettings, optional
-    reconnect_attempts : int
-        Searches for a lost camera: after 0.5 s, then with waits doubling up to 8 s.
-    queue_bytes : int
-        Bytes that may wait to be read; more is dropped, counted and reported as a gap.
-    sleep : callable, optional
-        Replaces waits of some seconds, for tests.
+    - ``clock_ns``: Clock of the arrival times.
+    - ``serial``: Hex serial, ``""`` for the only camera. After a loss only the same camera is
+      opened again.
+    - ``reconnect_attempts``: Searches for a lost camera: after 0.5 s, then with waits doubling up
+      to 8 s.
+    - ``queue_bytes``: Bytes that may wait to be read; more is dropped, counted and reported as a
+      gap.
+    - ``sleep``: Replaces waits of some seconds, for tests.
     """
 
     width = WIDTH
@@ -118,10 +112,7 @@ class Evk4:
     def open(self) -> None:
         """Find, initialise and set up the camera: 2.6 s; ``close`` interrupts it.
 
-        Raises
-        ------
-        DeviceError
-            When no camera, or not the one with this serial, can be opened.
+        Raises ``DeviceError`` when no camera, or not the one with this serial, can be opened.
         """
         self._refuse_closed()
         self._ending.clear()
@@ -130,10 +121,7 @@ class Evk4:
     def start(self) -> None:
         """Start streaming; sensor time starts at 0.
 
-        Raises
-        ------
-        DeviceError
-            When closed or the camera fails.
+        Raises ``DeviceError`` when closed or the camera fails.
         """
         self._refuse_closed()
         if self._thread is not None:
@@ -153,10 +141,7 @@ class Evk4:
     def read(self, timeout_s: float) -> EventChunk | None:
         """Return the next chunk, ``None`` when none came in ``timeout_s``.
 
-        Raises
-        ------
-        DeviceError
-            When closed, or the camera was lost and did not come back.
+        Raises ``DeviceError`` when closed, or the camera was lost and did not come back.
         """
         self._refuse_closed()
         return self._queue.get(timeout_s)
@@ -164,10 +149,8 @@ class Evk4:
     def stop(self) -> None:
         """End streaming; idempotent.
 
-        Raises
-        ------
-        DeviceError
-            When the camera fails, or the receiving thread hangs; ``close`` is then needed.
+        Raises ``DeviceError`` when the camera fails, or the receiving thread hangs; ``close`` is
+        then needed.
         """
         self._ending.set()
         self._health.stop()
@@ -206,12 +189,8 @@ class Evk4:
     def set_bias(self, name: str, offset: int) -> int:
         """Set one bias; returns the offset the camera reads back.
 
-        Raises
-        ------
-        ArgumentError
-            For an unknown bias or an offset outside its range.
-        DeviceError
-            When the camera is not open or reads back another value.
+        Raises ``ArgumentError`` for an unknown bias or an offset outside its range. Raises
+        ``DeviceError`` when the camera is not open or reads back another value.
         """
         settings = self._connection.settings.with_bias(name, offset)
         kept = self._connection.require(name).set_bias(name, offset)

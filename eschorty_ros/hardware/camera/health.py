@@ -20,17 +20,11 @@ _JOIN_S = 0.5
 class HealthMonitor:
     """Polls the camera in a thread of its own, so that a late answer delays no events.
 
-    Parameters
-    ----------
-    session : callable
-        Returns the streaming session, ``None`` without one.
+    - ``session``: Returns the streaming session, ``None`` without one.
 
-    Attributes
-    ----------
-    temperature_c : float
-        Last reading; NaN before the first and after a failed one.
-    failures : int
-        Requests without an answer.
+    Public attributes:
+    - ``temperature_c``: Last reading; NaN before the first and after a failed one.
+    - ``failures``: Requests without an answer.
     """
 
     def __init__(self, session: Callable[[], Session | None]) -> None:

@@ -46,10 +46,7 @@ def end_monitors(registers: Registers, sleep: Sleep) -> None:
 def read_temperature_c(registers: Registers, sleep: Sleep) -> float:
     """Return the temperature of the sensor (C).
 
-    Raises
-    ------
-    DeviceError
-        When the ADC does not finish.
+    Raises ``DeviceError`` when the ADC does not finish.
     """
     run_sequence(registers, _ADC_BEGIN, sleep)
     value = await_bits(registers, _ADC_STATUS, _ADC_DONE, _ADC_TRIES, "the temperature ADC")
@@ -62,10 +59,7 @@ def set_packet_period(registers: Registers, period_us: int) -> int:
 
     It is rounded down to a multiple of 16 us. Too short a period corrupts data.
 
-    Raises
-    ------
-    ArgumentError
-        Outside 16 to 65520 us.
+    Raises ``ArgumentError`` outside 16 to 65520 us.
     """
     low, high = PACKET_PERIOD_US
     if not low <= period_us <= high:

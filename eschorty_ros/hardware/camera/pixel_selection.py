@@ -30,10 +30,7 @@ _VALID = 1 << 31
 def windows_of(flat: Sequence[int]) -> tuple[Window, ...]:
     """Return the windows of a flat list x, y, width, height, x, ...
 
-    Raises
-    ------
-    ArgumentError
-        When a window is incomplete, empty or outside the sensor.
+    Raises ``ArgumentError`` when a window is incomplete, empty or outside the sensor.
     """
     if len(flat) % 4:
         raise ArgumentError(f"roi has {len(flat)} numbers; give x, y, width, height per window")
@@ -61,10 +58,7 @@ def set_windows(registers: Registers, windows: Sequence[Window]) -> None:
 def set_hot_pixels(registers: Registers, pixels: Sequence[tuple[int, int]]) -> None:
     """Mask up to 64 pixels given as (column, row).
 
-    Raises
-    ------
-    ArgumentError
-        For too many, or one outside the sensor.
+    Raises ``ArgumentError`` for too many, or one outside the sensor.
     """
     if len(pixels) > HOT_PIXELS_MAX:
         raise ArgumentError(

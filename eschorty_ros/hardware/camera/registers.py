@@ -53,10 +53,7 @@ Step = Write | Wait
 def parse_sequence(text: str) -> tuple[Step, ...]:
     """Parse a sequence: ``addr=value`` and ``addr[mask]=value`` in hex, ``/1ms/`` waits.
 
-    Raises
-    ------
-    ValueError
-        For any other token.
+    Raises ``ValueError`` for any other token.
     """
     return tuple(_steps(text.split()))
 
@@ -93,10 +90,7 @@ def update(registers: Registers, address: int, mask: int, value: int) -> None:
 def await_bits(registers: Registers, address: int, mask: int, tries: int, what: str) -> int:
     """Read until all bits of ``mask`` are set; returns the last value.
 
-    Raises
-    ------
-    DeviceError
-        When they are not set after ``tries`` reads; names ``what``.
+    Raises ``DeviceError`` when they are not set after ``tries`` reads; names ``what``.
     """
     value = 0
     for _ in range(tries):

@@ -26,36 +26,19 @@ _FIRMWARE_OLDEST = 0x030800
 class Session:
     """A camera, initialised and set up; stopped until ``start``.
 
-    Parameters
-    ----------
-    backend : usb.backend.IBackend
-    serial : str
-        Hex serial number, ``""`` for the only camera.
-    settings : CameraSettings
-    clock_ns : callable
-        Clock of the arrival times.
-    sleep : callable
-        Waits some seconds; may raise to end the opening.
-    settle : callable
-        Waits milliseconds, always to the end.
+    - ``serial``: Hex serial number, ``""`` for the only camera.
+    - ``clock_ns``: Clock of the arrival times.
+    - ``sleep``: Waits some seconds; may raise to end the opening.
+    - ``settle``: Waits milliseconds, always to the end.
 
-    Attributes
-    ----------
-    identity : DeviceIdentity
-    warnings : tuple of str
-        One line each.
-    applied : dict of str to float
-        Settings as read back.
-    control : Treuzell
-    reader : BulkReader
-        For one thread.
-    streaming : bool
-        True from ``start`` to ``stop_sensor``.
+    Public attributes:
+    - ``warnings``: One line each.
+    - ``applied``: Settings as read back.
+    - ``reader``: For one thread.
+    - ``streaming``: True from ``start`` to ``stop_sensor``.
 
-    Raises
-    ------
-    DeviceError
-        When it cannot be opened, is no IMX636 or refuses its settings; nothing stays open then.
+    Raises ``DeviceError`` when it cannot be opened, is no IMX636 or refuses its settings; nothing
+    stays open then.
     """
 
     def __init__(

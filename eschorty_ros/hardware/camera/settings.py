@@ -21,38 +21,24 @@ LEAVE = -1
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Settings of an EVK4; the defaults leave the sensor as its initialisation made it.
-
-    Parameters
-    ----------
-    biases : mapping of str to int
-        Offsets from the factory trim; biases not named keep it.
-    wide_biases : bool
-        Allow the wide ranges.
-    packet_period_us : int
-        Period of the sensor's packets, the latency of the stream; -1 leaves 4000 us.
-    erc_rate : int or None
-        Events/s beyond which the sensor drops some; ``None`` switches the control off.
-    anti_flicker : AntiFlicker or None
-    trail_filter : str
-        ``""`` (off) or a type of :mod:`~eschorty_ros.hardware.camera.event_trail`.
-    trail_threshold_us : int
-    windows : tuple of (int, int, int, int)
-        Regions of interest: first column, first row, width, height.
-    hot_pixels : tuple of (int, int)
-        Columns and rows to mask, at most 64.
-    trigger_input : bool
-    """
+    """Settings of an EVK4; the defaults leave the sensor as its initialisation made it."""
 
     biases: Mapping[str, int] = field(default_factory=dict)
+    """Offsets from the factory trim; biases not named keep it."""
     wide_biases: bool = False
+    """Allow the wide ranges."""
     packet_period_us: int = LEAVE
+    """Period of the sensor's packets, the latency of the stream; -1 leaves 4000 us."""
     erc_rate: int | None = None
+    """Events/s beyond which the sensor drops some; ``None`` switches the control off."""
     anti_flicker: AntiFlicker | None = None
     trail_filter: str = ""
+    """``""`` (off) or a type of :mod:`~eschorty_ros.hardware.camera.event_trail`."""
     trail_threshold_us: int = 10_000
     windows: tuple[Window, ...] = ()
+    """Regions of interest: first column, first row, width, height."""
     hot_pixels: tuple[tuple[int, int], ...] = ()
+    """Columns and rows to mask, at most 64."""
     trigger_input: bool = False
 
     def __post_init__(self) -> None:
@@ -69,12 +55,8 @@ def apply_settings(
 ) -> dict[str, float]:
     """Write every setting; returns the values read back, by name with unit.
 
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
-    DeviceError
-        When the camera does not answer or reads back another value.
+    Raises ``ArgumentError`` for a value outside its range. Raises ``DeviceError`` when the camera
+    does not answer or reads back another value.
     """
     for name, offset in settings.biases.items():
         biases.write(name, offset)

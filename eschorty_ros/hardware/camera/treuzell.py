@@ -48,12 +48,8 @@ def request_frame(property_id: int, payload: bytes = b"") -> bytes:
 def answer_payload(property_id: int, frame: bytes) -> bytes:
     """Check an answer and return its payload.
 
-    Raises
-    ------
-    FrameError
-        When it is short, has another size than its header says, or answers another request.
-    DeviceError
-        When the camera refused.
+    Raises ``FrameError`` when it is short, has another size than its header says, or answers
+    another request. Raises ``DeviceError`` when the camera refused.
     """
     if len(frame) < _HEADER.size:
         raise FrameError(
@@ -91,12 +87,9 @@ class Treuzell:
     After a time-out, a stall or an answer to another request the link is cleared and the request
     sent once more: every request here is idempotent. A second failure is raised.
 
-    Attributes
-    ----------
-    requests, recoveries : int
-        Requests answered, and times the link was cleared.
-    retries : bool
-        Whether a failed request is sent once more.
+    Public attributes:
+    - ``requests``, ``recoveries``: Requests answered, and times the link was cleared.
+    - ``retries``: Whether a failed request is sent once more.
     """
 
     def __init__(self, link: ControlLink) -> None:
@@ -109,11 +102,8 @@ class Treuzell:
     def request(self, property_id: int, payload: bytes = b"") -> bytes:
         """Send a request and return the answer's payload.
 
-        Raises
-        ------
-        DeviceError
-            ``DeviceGoneError`` when unplugged, ``DeviceTimeoutError`` without an answer,
-            :class:`FrameError` for a wrong one, plain when the camera refused.
+        Raises ``DeviceError``: ``DeviceGoneError`` when unplugged, ``DeviceTimeoutError`` without
+        an answer, :class:`FrameError` for a wrong one, plain when the camera refused.
         """
         frame = request_frame(property_id, payload)
         with self._lock:

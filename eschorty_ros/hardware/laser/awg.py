@@ -61,21 +61,12 @@ class AwgLaser:
     gives up before its next USB transfer. Light is a burst of counted cycles where the generator
     can: it ends after ``light_grant`` unless ``renew`` is called.
 
-    Parameters
-    ----------
-    settings : AwgSettings
-    clock_ns : callable
-        The clock of ``LaserReadback.output_since_ns``.
+    - ``clock_ns``: The clock of ``LaserReadback.output_since_ns``.
 
-    Attributes
-    ----------
-    identity : DeviceIdentity
-        As ``*IDN?`` reads.
+    Public attributes:
+    - ``identity``: As ``*IDN?`` reads.
 
-    Raises
-    ------
-    DeviceError
-        No generator, or it does not confirm that its output is off.
+    Raises ``DeviceError`` when no generator, or it does not confirm that its output is off.
     """
 
     def __init__(self, settings: AwgSettings, clock_ns: Callable[[], int] = time.time_ns) -> None:
@@ -122,12 +113,9 @@ class AwgLaser:
     def configure(self, modulation: Modulation) -> None:
         """Make every setting and read it back; an output that is on is off meanwhile.
 
-        Raises
-        ------
-        ArgumentError
-            For a modulation the generator cannot make; nothing has changed then.
-        DeviceError
-            When the generator fails, or reads back something else; its output is off then.
+        Raises ``ArgumentError`` for a modulation the generator cannot make; nothing has changed
+        then. Raises ``DeviceError`` when the generator fails, or reads back something else; its
+        output is off then.
         """
         with self._command():
             bursts = self._settings.light_grant > 0.0
@@ -469,12 +457,8 @@ def _open_link(settings: AwgSettings, profile: AwgProfile, serial: str) -> UsbTm
 def open_laser(**settings: Any) -> RenewedLaser:
     """Open the generator from keywords, those of ``AwgSettings``.
 
-    Raises
-    ------
-    ArgumentError
-        For a keyword or value that is not accepted.
-    DeviceError
-        As ``AwgLaser``.
+    Raises ``ArgumentError`` for a keyword or value that is not accepted. Raises ``DeviceError`` as
+    ``AwgLaser``.
     """
     try:
         return AwgLaser(AwgSettings(**settings))

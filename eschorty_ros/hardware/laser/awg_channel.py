@@ -30,10 +30,7 @@ def requested_settings(
     ``counted``: as a burst of counted cycles. It starts in the middle of the dark part of a period,
     since some generators hold the level of that phase between bursts.
 
-    Raises
-    ------
-    ArgumentError
-        For a modulation the generator cannot make.
+    Raises ``ArgumentError`` for a modulation the generator cannot make.
     """
     if modulation.waveform not in profile.waveforms:
         raise ArgumentError(
@@ -77,19 +74,10 @@ class AwgChannel:
     with ``best_effort`` nothing is read back after it, with ``off`` nothing ever is. A reply that
     contradicts a setting is always a failure.
 
-    Parameters
-    ----------
-    link : UsbTmc
-    settings : AwgSettings
-    profile : AwgProfile
-    refuse_void : callable
-        Called before every transfer but those of ``disable``; raises to give up.
-    before_query : callable
-        Called before every query of a setting.
-    warn : callable
-        Called with one line for an oddity that is no failure.
-    counters : dict
-        See ``Scpi``.
+    - ``refuse_void``: Called before every transfer but those of ``disable``; raises to give up.
+    - ``before_query``: Called before every query of a setting.
+    - ``warn``: Called with one line for an oddity that is no failure.
+    - ``counters``: See ``Scpi``.
     """
 
     def __init__(

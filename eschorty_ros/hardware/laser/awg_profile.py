@@ -155,10 +155,7 @@ class AwgProfile(Schema):
 def load_profile(name_or_path: str | os.PathLike[str]) -> AwgProfile:
     """Load a profile by name (``utg900e`` = ``config/awg_utg900e.yaml``) or by path.
 
-    Raises
-    ------
-    ArgumentError
-        When there is none, or it does not fit the schema.
+    Raises ``ArgumentError`` when there is none, or it does not fit the schema.
     """
     path = _find(os.fspath(file_path("profile", name_or_path)))
     try:

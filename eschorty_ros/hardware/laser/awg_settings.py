@@ -22,11 +22,8 @@ def _field(default: Any, description: str, unit: str = "", **more: Any) -> Any:
 class AwgSettings:
     """Generator, wiring and limits; the fields are the laser node's parameters.
 
-    Raises
-    ------
-    ArgumentError
-        For a HIGH above ``high_max_v``, a LOW below 0, LOW not below HIGH, and values out of
-        range.
+    Raises ``ArgumentError`` for a HIGH above ``high_max_v``, a LOW below 0, LOW not below HIGH, and
+    values out of range.
     """
 
     profile: str = _field("utg900e", "command set: config/awg_<name>.yaml, or a path")

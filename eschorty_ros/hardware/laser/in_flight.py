@@ -20,10 +20,9 @@ class CommandsInFlight:
     The supervisor, the guard and the generator's driver hold one each: a disabling voids what
     waits at its own level before it waits for any lock. Thread-safe.
 
-    Attributes
-    ----------
-    disabling_now : int
-        Disablings in progress; a ticket is void during them, also one that was taken meanwhile.
+    Public attributes:
+    - ``disabling_now``: Disablings in progress; a ticket is void during them, also one that was
+      taken meanwhile.
     """
 
     def __init__(self) -> None:

@@ -23,14 +23,8 @@ class Scpi:
     Every command is absolute and may be sent twice: after a fault the link is cleared and the
     command is sent once more; a second fault is raised.
 
-    Parameters
-    ----------
-    link : UsbTmc
-    profile : AwgProfile
-    refuse_void : callable
-        Called before every transfer; raises to give up.
-    counters : dict
-        ``faults`` counts transfers that failed, ``retries`` those sent once more.
+    - ``refuse_void``: Called before every transfer; raises to give up.
+    - ``counters``: ``faults`` counts transfers that failed, ``retries`` those sent once more.
     """
 
     def __init__(

@@ -44,18 +44,10 @@ def _is_tmc(interface: Any) -> bool:
 class UsbTmc:
     """A USBTMC instrument on a pyusb device; the interface is claimed until ``close``.
 
-    Parameters
-    ----------
-    device : usb.core.Device
-    name : str
-        Name of the instrument in errors.
-    timeout_s : float
-        Longest wait for one transfer.
+    - ``name``: Name of the instrument in errors.
+    - ``timeout_s``: Longest wait for one transfer.
 
-    Raises
-    ------
-    DeviceError
-        When there is no USBTMC interface, or another program holds it.
+    Raises ``DeviceError`` when there is no USBTMC interface, or another program holds it.
     """
 
     def __init__(self, device: usb.core.Device, *, name: str, timeout_s: float) -> None:

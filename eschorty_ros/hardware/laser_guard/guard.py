@@ -45,11 +45,8 @@ class Guard:
     beside the worker: the generator's driver lets ``disable`` overtake other commands. A third one
     renews light that ends by itself, as long as the watching thread has taken a turn of late.
 
-    Parameters
-    ----------
-    wire : Wire
-    owner_pid : int
-        Process to watch, the parent of this one; 0 for one that cannot be seen from here.
+    - ``owner_pid``: Process to watch, the parent of this one; 0 for one that cannot be seen from
+      here.
     """
 
     def __init__(self, wire: Wire, owner_pid: int) -> None:

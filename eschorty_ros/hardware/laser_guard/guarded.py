@@ -48,23 +48,15 @@ class GuardedLaser:
     ``disable`` overtakes every other call. Should the guard itself die or be stopped, this process
     opens the generator to disable it; every call but ``disable`` and ``close`` then fails.
 
-    Parameters
-    ----------
-    make : str
-        ``module:callable`` that opens the generator, in the guard.
-    settings : mapping
-        Its keywords; JSON values.
-    heartbeat_timeout_s : float
-        Without a heartbeat from this process for so long the guard disables the output.
-    answer_timeout_s : float
-        Longest wait for an answer.
-    guard : str
-        Socket of the guard's service (see ``service``); empty: a process that this one starts.
+    - ``make``: ``module:callable`` that opens the generator, in the guard.
+    - ``settings``: Its keywords; JSON values.
+    - ``heartbeat_timeout_s``: Without a heartbeat from this process for so long the guard disables
+      the output.
+    - ``answer_timeout_s``: Longest wait for an answer.
+    - ``guard``: Socket of the guard's service (see ``service``); empty: a process that this one
+      starts.
 
-    Raises
-    ------
-    EschortyError
-        As opening the generator does.
+    Raises ``EschortyError`` as opening the generator does.
     """
 
     def __init__(

@@ -26,10 +26,7 @@ _BACKLOG = 4
 def serve(path: str) -> None:
     """Serve at the socket ``path`` until a signal ends the process.
 
-    Raises
-    ------
-    DeviceError
-        When the socket cannot be made, or another process serves it.
+    Raises ``DeviceError`` when the socket cannot be made, or another process serves it.
     """
     with _listening(path) as listener:
         print(f"laser guard: at {path}", flush=True)

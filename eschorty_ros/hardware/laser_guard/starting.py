@@ -35,11 +35,8 @@ def start_guard(end: socket.socket, owner_pid: int) -> subprocess.Popen[bytes]:
 class OwnGuard:
     """A guard process that this process has started.
 
-    Attributes
-    ----------
-    end : socket.socket
-        This process's end of the wire.
-    pid : int
+    Public attributes:
+    - ``end``: This process's end of the wire.
     """
 
     def __init__(self) -> None:
@@ -72,10 +69,7 @@ class OwnGuard:
 class ServedGuard:
     """A guard process that the service at a socket has started; attributes as ``OwnGuard``.
 
-    Raises
-    ------
-    DeviceGoneError
-        When nothing serves the socket.
+    Raises ``DeviceGoneError`` when nothing serves the socket.
     """
 
     pid = 0

@@ -13,10 +13,9 @@ class AptFramer:
     What is no frame is skipped byte by byte up to the next one, and so is a frame that is
     incomplete 50 ms after its last byte.
 
-    Attributes
-    ----------
-    frames, skipped_bytes, broken_frames : int
-        Frames returned, bytes that belonged to none, incomplete frames.
+    Public attributes:
+    - ``frames``, ``skipped_bytes``, ``broken_frames``: Frames returned, bytes that belonged to
+      none, incomplete frames.
     """
 
     def __init__(self) -> None:

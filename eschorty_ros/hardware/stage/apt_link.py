@@ -59,22 +59,11 @@ def _port_failure(error: Exception) -> DeviceGoneError:
 class AptLink:
     """Frames to and from one controller.
 
-    Parameters
-    ----------
-    port : SerialPort
-        Owned from here on.
-    on_frame : callable
-        Called for every frame with its time of receipt, in the reader's thread.
-    on_lost : callable
-        Called once when the port or a thread fails, with the reason.
-    now_ns : callable
-        Steady clock.
-    wait : callable
-        Waits for an answer; without threads it has to advance the time.
-
-    Attributes
-    ----------
-    framer : AptFramer
+    - ``port``: Owned from here on.
+    - ``on_frame``: Called for every frame with its time of receipt, in the reader's thread.
+    - ``on_lost``: Called once when the port or a thread fails, with the reason.
+    - ``now_ns``: Steady clock.
+    - ``wait``: Waits for an answer; without threads it has to advance the time.
     """
 
     def __init__(
@@ -124,10 +113,7 @@ class AptLink:
 
         Tried even on a link that has failed: the controller may still obey a stop.
 
-        Raises
-        ------
-        DeviceGoneError
-            When the port fails or is closed.
+        Raises ``DeviceGoneError`` when the port fails or is closed.
         """
         self._check_open()
         # The writer holds the lock for one frame at most. If it hangs, two frames may mix, which is
@@ -158,12 +144,8 @@ class AptLink:
     def request(self, frame: bytes, answer: str, source: int, timeout_s: float) -> Frame:
         """Send ``frame`` and return the message ``answer`` from ``source``.
 
-        Raises
-        ------
-        DeviceTimeoutError
-            When it does not come in time.
-        DeviceError
-            When the link fails.
+        Raises ``DeviceTimeoutError`` when it does not come in time. Raises ``DeviceError`` when the
+        link fails.
         """
         key = (answer, source)
         future: Future[Frame] = Future()

@@ -219,10 +219,7 @@ def pack(name: str, destination: int, **values: int) -> bytes:
 def parse(frame: bytes) -> Frame:
     """Return the fields of one complete frame from the controller.
 
-    Raises
-    ------
-    ArgumentError
-        When the frame is none of ``FROM_CONTROLLER``.
+    Raises ``ArgumentError`` when the frame is none of ``FROM_CONTROLLER``.
     """
     layout = _layout(frame)
     if layout is None or len(frame) != HEADER_BYTES + layout.payload_bytes:
@@ -253,18 +250,12 @@ def _layout(header: bytes) -> Layout | None:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Counts of one axis to millimetres and seconds.
-
-    Parameters
-    ----------
-    counts_per_mm : float
-        Encoder counts; 20 000 for a DDS220.
-    cycle_s : float
-        Servo cycle of the brushless controllers.
-    """
+    """Counts of one axis to millimetres and seconds."""
 
     counts_per_mm: float = 20_000.0
+    """Encoder counts; 20 000 for a DDS220."""
     cycle_s: float = 102.4e-6
+    """Servo cycle of the brushless controllers."""
 
     def position(self, mm: float) -> int:
         """Return the counts of a position."""

@@ -46,12 +46,7 @@ class _Port(serial.Serial):
 def find_port(controller: str, serial_number: str = "") -> str:
     """Return the device name of the port with this USB serial number, or of the only fitting one.
 
-    Raises
-    ------
-    DeviceGoneError
-        When none is there.
-    DeviceError
-        When several fit.
+    Raises ``DeviceGoneError`` when none is there. Raises ``DeviceError`` when several fit.
     """
     ports = [port for port in list_ports.comports() if port.serial_number]
     if serial_number:
@@ -77,12 +72,8 @@ def find_port(controller: str, serial_number: str = "") -> str:
 def open_port(name: str) -> SerialPort:
     """Return the port ``name``, a device or a URL of pyserial, opened for this process alone.
 
-    Raises
-    ------
-    DeviceGoneError
-        When there is no such port.
-    DeviceError
-        When access is denied or another program holds it.
+    Raises ``DeviceGoneError`` when there is no such port. Raises ``DeviceError`` when access is
+    denied or another program holds it.
     """
     try:
         make = serial.serial_for_url if "://" in name else _Port

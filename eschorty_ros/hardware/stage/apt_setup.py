@@ -28,35 +28,24 @@ _ARM, _DISARM = 1, 2
 
 @dataclass(frozen=True, slots=True)
 class AptSettings:
-    """Connection and limits of the stage.
-
-    Parameters
-    ----------
-    controller : {"kbd101", "bbd30x"}
-    bay : int
-        Bay of a rack, from 1.
-    speed_max_mm_s, acceleration_mm_s2 : float
-        Caps on what the controller reports.
-    travel_mm : tuple of float
-        Cap on the travel it reports.
-    homing_mm_s : float
-    poll_hz : float
-        Rate of status requests.
-    trigger_interval_mm : float
-        Distance of the pulses for the camera; 0 for none.
-    trigger_port : int
-        Output that gives the pulses: 1 or 2 of a KBD101, 1 to 3 of a BBD30x.
-    """
+    """Connection and limits of the stage."""
 
     controller: str = "kbd101"
+    """Either "kbd101" or "bbd30x"."""
     bay: int = 1
+    """Bay of a rack, from 1."""
     speed_max_mm_s: float = 250.0
     acceleration_mm_s2: float = 2000.0
+    """Caps on what the controller reports."""
     travel_mm: tuple[float, float] = (0.0, 220.0)
+    """Cap on the travel it reports."""
     homing_mm_s: float = 25.0
     poll_hz: float = 50.0
+    """Rate of status requests."""
     trigger_interval_mm: float = 2.0
+    """Distance of the pulses for the camera; 0 for none."""
     trigger_port: int = 1
+    """Output that gives the pulses: 1 or 2 of a KBD101, 1 to 3 of a BBD30x."""
 
     def __post_init__(self) -> None:
         if self.controller not in CONTROLLERS:
@@ -93,13 +82,7 @@ class AxisData:
 
 
 class AptSetup:
-    """Requests and settings over a link.
-
-    Parameters
-    ----------
-    link : AptLink
-    settings : AptSettings
-    """
+    """Requests and settings over a link."""
 
     def __init__(self, link: AptLink, settings: AptSettings) -> None:
         self._link = link
@@ -126,10 +109,7 @@ class AptSetup:
     def read_axis(self) -> AxisData:
         """Return the data of controller and stage.
 
-        Raises
-        ------
-        DeviceError
-            When the bay is empty or the stage's data make no sense.
+        Raises ``DeviceError`` when the bay is empty or the stage's data make no sense.
         """
         settings = self._settings
         rack = settings.controller == "bbd30x"
@@ -177,10 +157,7 @@ class AptSetup:
     def write_velocity(self, axis: AxisData, speed_mm_s: float) -> tuple[float, float]:
         """Set speed and acceleration; return them as the controller has them (mm/s, mm/s2).
 
-        Raises
-        ------
-        DeviceError
-            When the controller reads back other values.
+        Raises ``DeviceError`` when the controller reads back other values.
         """
         requested = {
             "acceleration": axis.scale.acceleration(axis.acceleration_mm_s2),
@@ -202,10 +179,8 @@ class AptSetup:
     def write_trigger(self, axis: AxisData) -> PulseTrain | None:
         """Program the pulses for the camera over the travel; return them, ``None`` for none.
 
-        Raises
-        ------
-        DeviceError
-            When the interval does not fit or the controller reads back another pattern.
+        Raises ``DeviceError`` when the interval does not fit or the controller reads back another
+        pattern.
         """
         scale, (low, high) = axis.scale, axis.travel_mm
         interval = scale.position(self._settings.trigger_interval_mm)

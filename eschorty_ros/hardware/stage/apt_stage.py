@@ -37,10 +37,7 @@ def open_stage(
 ) -> AptStage:
     """Return the stage on ``port``, or on the port whose USB serial number is ``serial``.
 
-    Raises
-    ------
-    DeviceError
-        When there is no such port or no such stage behind it.
+    Raises ``DeviceError`` when there is no such port or no such stage behind it.
     """
     opened = open_port(port or find_port(settings.controller, serial))
 
@@ -57,18 +54,11 @@ def open_stage(
 class AptStage:
     """Linear stage over APT; its positions are those of ``lag_s`` ago, between two readings.
 
-    Parameters
-    ----------
-    make_link : callable
-        Makes a link from its callbacks for a frame and for a lost port.
-    clock_ns : callable
-        Clock of ``state().t_ns``.
-    settings : AptSettings
+    - ``make_link``: Makes a link from its callbacks for a frame and for a lost port.
+    - ``clock_ns``: Clock of ``state().t_ns``.
 
-    Raises
-    ------
-    DeviceError
-        When the controller does not answer, refuses a setting, or does not enable the axis.
+    Raises ``DeviceError`` when the controller does not answer, refuses a setting, or does not
+    enable the axis.
     """
 
     def __init__(
@@ -180,10 +170,7 @@ class AptStage:
     def state(self, t_ns: int | None = None) -> StageState:
         """Return position, velocity and flags at ``t_ns``, by default the newest time known.
 
-        Raises
-        ------
-        DeviceError
-            When the stage has failed, with the reason.
+        Raises ``DeviceError`` when the stage has failed, with the reason.
         """
         with self._lock:
             if self._tracker.failure is not None:

@@ -56,10 +56,8 @@ class Status:
 class StatusChecks:
     """Compares each status message with the one before and with the expected motion.
 
-    Attributes
-    ----------
-    rejected : int
-        Messages that were not used.
+    Public attributes:
+    - ``rejected``: Messages that were not used.
     """
 
     def __init__(self) -> None:
@@ -76,13 +74,8 @@ class StatusChecks:
     ) -> Plausibility:
         """Return the plausibility of one message.
 
-        Parameters
-        ----------
-        status : Status
-        expected_mm : tuple of float or None
-            Where the ordered motion can be; ``None`` when unknown.
-        speed_mm_s : float
-            Fastest the carriage may move now; 0 at rest.
+        - ``expected_mm``: Where the ordered motion can be; ``None`` when unknown.
+        - ``speed_mm_s``: Fastest the carriage may move now; 0 at rest.
         """
         last, implausible = self._last, self._implausible
         if last is None:

@@ -66,28 +66,15 @@ class Actions(Protocol):
 class Tracker:
     """State of the axis; not thread-safe.
 
-    Parameters
-    ----------
-    actions : Actions
-    now_ns : callable
-        Steady clock.
-    clock_ns : callable
-        Clock of ``StageState.t_ns``.
+    - ``now_ns``: Steady clock.
+    - ``clock_ns``: Clock of ``StageState.t_ns``.
 
-    Attributes
-    ----------
-    scale : Scale
-    fit : MotionFit
-    checks : StatusChecks
-    motion : Motion or None
-        The motion under way.
-    status : Status or None
-        The newest message that was used.
-    failure : DeviceError or None
-    blocked_sense : int
-        Sign of the direction that a limit has barred.
-    clock_sets : int
-        Times the clock was set. The rest of a motion under way then follows readings alone.
+    Public attributes:
+    - ``motion``: The motion under way.
+    - ``status``: The newest message that was used.
+    - ``blocked_sense``: Sign of the direction that a limit has barred.
+    - ``clock_sets``: Times the clock was set. The rest of a motion under way then follows readings
+      alone.
     """
 
     def __init__(
@@ -317,15 +304,7 @@ class Tracker:
 
 @dataclass(slots=True)
 class Motion:
-    """One ordered motion; times are the link's steady ones (ns).
-
-    Parameters
-    ----------
-    kind : Kind
-    start_mm, target_mm : float
-    speed_mm_s : float
-    begun_ns, deadline_ns : int
-    """
+    """One ordered motion; times are the link's steady ones (ns)."""
 
     kind: Kind
     start_mm: float

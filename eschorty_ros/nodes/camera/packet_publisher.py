@@ -20,22 +20,13 @@ class PacketPublisher:
     A gap skips one number, a restart resets it to 0, so that subscribers notice both. Bytes
     without a subscriber count as a gap after the first packet.
 
-    Parameters
-    ----------
-    publisher : rclpy publisher of EventPacket
-    width, height : int
-    frame_id : str
-
-    Attributes
-    ----------
-    seq : int
-        Number of the next packet.
-    packets, published_bytes, unsubscribed_bytes : int
-        Packets and bytes published, and bytes without a subscriber.
-    late_s : float
-        Time by which the newest chunk waited for publication, or an emulated camera is late.
-    words : WordCounter
-        Counts of the words in all of them.
+    Public attributes:
+    - ``seq``: Number of the next packet.
+    - ``packets``, ``published_bytes``, ``unsubscribed_bytes``: Packets and bytes published, and
+      bytes without a subscriber.
+    - ``late_s``: Time by which the newest chunk waited for publication, or an emulated camera is
+      late.
+    - ``words``: Counts of the words in all of them.
     """
 
     def __init__(self, publisher: Any, width: int, height: int, frame_id: str) -> None:

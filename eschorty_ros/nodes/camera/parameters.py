@@ -104,12 +104,8 @@ EVK4_TABLE = (
 def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
     """Return the settings of an EVK4 from the node's parameters.
 
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
-    FormatError
-        For a malformed bias file.
+    Raises ``ArgumentError`` for a value outside its range. Raises ``FormatError`` for a malformed
+    bias file.
     """
     roi = tuple(parameters["roi"])
     enabled = parameters["erc_mode"] == "enabled"

@@ -24,23 +24,16 @@ from eschorty_ros.nodes.reconstruction.calibration_messages import target_messag
 
 @dataclass(frozen=True, slots=True)
 class CalibrationJob:
-    """A calibration on emulated devices.
-
-    Attributes
-    ----------
-    targets : tuple of KnownTarget
-        The known targets of the scene.
-    folder : str
-        Folder for the calibration.
-    calibration, as_built : str
-        The build as designed, and that of the simulated world.
-    """
+    """A calibration on emulated devices."""
 
     targets: tuple[KnownTarget, ...]
+    """The known targets of the scene."""
     folder: str
+    """Folder for the calibration."""
     scene: str = "posts"
     calibration: str = "config_3"
     as_built: str = "config_3_as_built"
+    """The build as designed, and that of the simulated world."""
     method: str = "joint"
     capture_s: float = 1.0
     frequency_hz: float = 70.0
@@ -50,40 +43,26 @@ class CalibrationJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """The action's result.
-
-    Attributes
-    ----------
-    success : bool
-    message : str
-        Reason of a failure, ``""`` on success.
-    calibration : Calibration or None
-        As read back from ``file``.
-    file : str
-    verdicts, rejected : tuple of str
-    targets : Targets or None
-        The targets found, to which it was fitted.
-    frame : ndarray of uint8, shape (rows, columns)
-        All events of the capture.
-    """
+    """The action's result."""
 
     success: bool
     message: str
+    """Reason of a failure, ``""`` on success."""
     calibration: Calibration | None
+    """As read back from ``file``."""
     file: str
     verdicts: tuple[str, ...]
     rejected: tuple[str, ...]
     targets: Targets | None
+    """The targets found, to which it was fitted."""
     frame: NDArray[np.uint8]
+    """Shape (rows, columns). All events of the capture."""
 
 
 def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult:
     """Run all nodes on emulated devices, calibrate once through the action, end them.
 
-    Raises
-    ------
-    DeviceError
-        When a node fails, or the action refuses the goal or takes far too long.
+    Raises ``DeviceError`` when a node fails, or the action refuses the goal or takes far too long.
     """
     tables = bench_parameters()
     tables["reconstruction"] |= {"calibration": job.calibration, "calibration_folder": job.folder}

@@ -91,10 +91,7 @@ class Composition:
     def wait_until_active(self) -> None:
         """Wait until every node is active and the action's server has been discovered.
 
-        Raises
-        ------
-        DeviceError
-            When a node failed or takes far too long.
+        Raises ``DeviceError`` when a node failed or takes far too long.
         """
         wait(
             lambda: self._active() and self._action.server_is_ready(),
@@ -105,10 +102,8 @@ class Composition:
     def result(self, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
         """Send a goal once all nodes are active; return its result. An interruption cancels it.
 
-        Raises
-        ------
-        DeviceError
-            When a node fails, or the server refuses the goal or sends no feedback any more.
+        Raises ``DeviceError`` when a node fails, or the server refuses the goal or sends no
+        feedback any more.
         """
         self.wait_until_active()
         newest_s = time.monotonic()

@@ -49,10 +49,8 @@ def read_parameters(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
     The file has the format of launch files and ``--params-file``, with full node names:
     ``/eschorty/laser: {ros__parameters: {high_v: 3.3}}``.
 
-    Raises
-    ------
-    FormatError
-        When the file cannot be read, or has a node, a parameter or a value that does not exist.
+    Raises ``FormatError`` when the file cannot be read, or has a node, a parameter or a value that
+    does not exist.
     """
     document = read_yaml(path, FormatError)
     data = document.data or {}

@@ -101,32 +101,21 @@ REPLAY = (
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a launch file starts.
-
-    Attributes
-    ----------
-    nodes : dict
-        Parameters by node; those of ``file`` override them.
-    file : str
-    bench : dict or None
-        Options of ``eschorty-bench``; ``None`` without an emulated bench.
-    view : str
-        RViz's view to show; empty for none.
-    """
+    """What a launch file starts."""
 
     nodes: Tables
+    """Parameters by node; those of ``file`` override them."""
     file: str
     bench: dict[str, str] | None = None
+    """Options of ``eschorty-bench``; ``None`` without an emulated bench."""
     view: str = ""
+    """RViz's view to show; empty for none."""
 
 
 def scan(given: Mapping[str, str]) -> Description:
     """Return the nodes of ``scan.launch.py`` for the texts of its arguments.
 
-    Raises
-    ------
-    EschortyError
-        For an argument or a file that a node would refuse; names it.
+    Raises ``EschortyError`` for an argument or a file that a node would refuse; names it.
     """
     _check_choices(SCAN, given)
     nodes = _instrument(given, ())

@@ -87,10 +87,7 @@ def check_job(job: ScanJob) -> None:
 def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
     """Run all nodes, scan once through the action, end them; the laser is off on every exit.
 
-    Raises
-    ------
-    DeviceError
-        When a node fails, or the scanner refuses the goal or takes far too long.
+    Raises ``DeviceError`` when a node fails, or the scanner refuses the goal or takes far too long.
     """
     tables = bench_parameters() if job.hardware is None else {**job.hardware}
     own = {"calibration": job.calibration, "keep": job.keep}

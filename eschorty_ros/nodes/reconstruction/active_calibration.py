@@ -31,19 +31,11 @@ Use = Callable[[Calibration], None]
 class ActiveCalibration:
     """Holds the active calibration, publishes it latched, loads and saves it by service.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    calibration : Calibration
-        The first one; every later one must have the same sensor and build.
-    file : str
-        Its file.
-    folder : str
-        Folder for calibrations; ``""``: ``eschorty`` in ROS's home.
-    paths : bool
-        Whether the services take paths, too: any file that the process may read or write.
-    use : callable
-        Changes the calibration in use, or raises an ``EschortyError`` and changes nothing.
+    - ``calibration``: The first one; every later one must have the same sensor and build.
+    - ``file``: Its file.
+    - ``folder``: Folder for calibrations; ``""``: ``eschorty`` in ROS's home.
+    - ``paths``: Whether the services take paths, too: any file that the process may read or write.
+    - ``use``: Changes the calibration in use, or raises an ``EschortyError`` and changes nothing.
     """
 
     def __init__(
@@ -75,11 +67,8 @@ class ActiveCalibration:
     def store(self, calibration: Calibration, targets: Targets) -> str:
         """Write ``calibration`` and its targets, then use it; return the calibration's path.
 
-        Raises
-        ------
-        EschortyError
-            When it belongs to another instrument, cannot be written or cannot be used now; the
-            active one then stays.
+        Raises ``EschortyError`` when it belongs to another instrument, cannot be written or cannot
+        be used now; the active one then stays.
         """
         refuse_other_instrument(calibration, self.calibration)
         path = save_named_calibration(self.folder, calibration)

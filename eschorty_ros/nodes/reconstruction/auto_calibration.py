@@ -21,18 +21,9 @@ from eschorty_ros.nodes.reconstruction.calibration_messages import target_messag
 class AutoCalibration:
     """Sends one goal to the ``calibrate`` action as soon as its server is discovered.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    distances : str
-        File of the known targets: a name in ``config/`` or a path.
-    method : str
-    capture_s : float
+    - ``distances``: File of the known targets: a name in ``config/`` or a path.
 
-    Raises
-    ------
-    FormatError, CalibrationError
-        When the file cannot be read or is not found.
+    Raises ``FormatError`` or ``CalibrationError`` when the file cannot be read or is not found.
     """
 
     def __init__(self, node: Node, distances: str, method: str, capture_s: float) -> None:

@@ -19,10 +19,7 @@ from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_
 def request_from_goal(goal: Any) -> CaptureRequest:
     """Return the request of a ``Calibrate`` goal.
 
-    Raises
-    ------
-    ArgumentError
-        For a target whose range or size is not positive.
+    Raises ``ArgumentError`` for a target whose range or size is not positive.
     """
     sweep = None
     if goal.sweep_speed != 0.0:

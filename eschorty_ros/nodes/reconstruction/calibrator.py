@@ -47,20 +47,13 @@ class Calibrator:
     A goal that cannot be done is accepted and aborted at once, because only a result can carry
     the reason to the client.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        The reconstruction node.
-    active : ActiveCalibration
-    in_worker : callable
-        Runs a job in the reconstruction's worker; returns success and the reason of a failure.
-    set_capture : callable
-        Sets the capture to feed, or ``None``; called in the worker. Raises an ``EschortyError``
-        when that is refused.
-    line_width_px : callable
-        Returns the width of the line in the node's settings.
-    timeouts_s : tuple of float
-        Those of ``InstrumentClient``.
+    - ``node``: The reconstruction node.
+    - ``in_worker``: Runs a job in the reconstruction's worker; returns success and the reason of a
+      failure.
+    - ``set_capture``: Sets the capture to feed, or ``None``; called in the worker. Raises an
+      ``EschortyError`` when that is refused.
+    - ``line_width_px``: Returns the width of the line in the node's settings.
+    - ``timeouts_s``: Those of ``InstrumentClient``.
     """
 
     def __init__(

@@ -17,21 +17,12 @@ _INTERVAL_M = 1e-6, 1.0
 
 
 def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
-    """Return the modulation of a ``LaserState`` and its times.
+    """Return the modulation of a ``LaserState``, its epoch and since when the laser is on, ns.
 
-    Returns
-    -------
-    modulation : Modulation
-        Without ``on_edge_us``, which needs the camera's clock.
-    epoch_ns : int or None
-        ROS time of one rising edge, ``None`` when ``phase_epoch`` is zero, which means unknown.
-    on_since_ns : int or None
-        Since when the laser is on, ``None`` when it is off.
-
-    Raises
-    ------
-    ArgumentError
-        When frequency, duty or waveform is out of range.
+    The modulation is without ``on_edge_us``, which needs the camera's clock. The epoch is the ROS
+    time of one rising edge, ``None`` when ``phase_epoch`` is zero, which means unknown; the last
+    is ``None`` while the laser is off. Raises ``ArgumentError`` when frequency, duty or waveform
+    is out of range.
     """
     check_text("waveform", state.waveform)
     modulation = Modulation(
@@ -47,10 +38,7 @@ def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
 def pulse_train(trigger: Any) -> PulseTrain | None:
     """Return the stage's pulses that a ``PositionTrigger`` describes, ``None`` without pulses.
 
-    Raises
-    ------
-    ArgumentError
-        When a position is not finite or the interval is not one of a stage.
+    Raises ``ArgumentError`` when a position is not finite or the interval is not one of a stage.
     """
     interval_mm = mm_from_m(float(trigger.interval))
     count = int(trigger.count)
@@ -63,10 +51,7 @@ def pulse_train(trigger: Any) -> PulseTrain | None:
 def packet_from_message(message: Any, source: bytes) -> Packet:
     """Return the packet of an ``EventPacket``.
 
-    Raises
-    ------
-    ArgumentError
-        When it has another encoding or more bytes than a packet may have.
+    Raises ``ArgumentError`` when it has another encoding or more bytes than a packet may have.
     """
     size = len(message.events)
     if size > _PACKET_MAX_BYTES:

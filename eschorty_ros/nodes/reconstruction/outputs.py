@@ -35,12 +35,7 @@ class Outputs:
 
     Only the worker thread calls the methods, except the constructor.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    calibration : Calibration
-    profile_rate_max_hz : float
-        Profiles per second of sensor time that are published at most.
+    - ``profile_rate_max_hz``: Profiles per second of sensor time that are published at most.
     """
 
     def __init__(self, node: Node, calibration: Calibration, profile_rate_max_hz: float) -> None:

@@ -20,12 +20,9 @@ from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 class Reports:
     """State and diagnostics of a pipeline that another thread runs; numbers may differ in time.
 
-    Attributes
-    ----------
-    faults : int
-        Unexpected exceptions of the worker, counted by the worker.
-    packet_ages : StampAges
-        Ages of the packets on arrival.
+    Public attributes:
+    - ``faults``: Unexpected exceptions of the worker, counted by the worker.
+    - ``packet_ages``: Ages of the packets on arrival.
     """
 
     def __init__(self, node: Node, pipeline: Pipeline, jobs: JobQueue) -> None:

@@ -38,23 +38,14 @@ _RECORD_S = 5.0
 class ScanServices:
     """Services that begin and end scans in the worker thread and wait for it.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    pipeline : Pipeline
-        Used by the worker alone.
-    topics : callable
-        Returns the topics that a scan needs one publisher of.
-    in_worker : callable
-        Runs a job in the worker; returns whether it succeeded, and the reason of a failure.
-    running : callable
-        Returns whether the worker runs.
-    stage_timeout_s : float
-        Longest wait of points for the stage after the end.
-    publish : callable
-        Publishes a finished scan, given the ROS time (ns) for one without points.
-    recorder : callable
-        Returns a recorder for a scan's log, ``None`` when scans are not recorded.
+    - ``pipeline``: Used by the worker alone.
+    - ``topics``: Returns the topics that a scan needs one publisher of.
+    - ``in_worker``: Runs a job in the worker; returns whether it succeeded, and the reason of a
+      failure.
+    - ``running``: Returns whether the worker runs.
+    - ``stage_timeout_s``: Longest wait of points for the stage after the end.
+    - ``publish``: Publishes a finished scan, given the ROS time (ns) for one without points.
+    - ``recorder``: Returns a recorder for a scan's log, ``None`` when scans are not recorded.
     """
 
     def __init__(

@@ -48,10 +48,7 @@ class SecondNodes:
     def look(self) -> None:
         """Look if it is time to.
 
-        Raises
-        ------
-        DeviceError
-            When another node of a name runs, or has begun to start earlier.
+        Raises ``DeviceError`` when another node of a name runs, or has begun to start earlier.
         """
         now_s = time.monotonic()
         if self._looking and now_s - self._looked_s >= _POLL_S:

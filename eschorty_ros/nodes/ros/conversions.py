@@ -39,9 +39,6 @@ def m_from_mm(millimetres: float) -> float:
 def stage_position_mm(message: Any) -> float:
     """Return the stage's position in an ``Odometry``.
 
-    Raises
-    ------
-    ArgumentError
-        When the position is not within 1 km.
+    Raises ``ArgumentError`` when the position is not within 1 km.
     """
     return mm_from_m(number("pose.pose.position.y", message.pose.pose.position.y, -1e3, 1e3))

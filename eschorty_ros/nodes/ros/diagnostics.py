@@ -40,14 +40,9 @@ class Rate:
 class Diagnostics:
     """Publishes the result of ``report`` in every lifecycle state.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    report : callable
-        Returns level (``OK``, ``WARN``, ``ERROR``), one line, and named values with their units
-        in the names. A node whose ``waiting`` is not empty is at ``WARN`` with that line.
-    callback_group : rclpy.callback_groups.CallbackGroup, optional
-        Group of the timer; the node's default group when omitted.
+    - ``report``: Returns level (``OK``, ``WARN``, ``ERROR``), one line, and named values with their
+      units in the names. A node whose ``waiting`` is not empty is at ``WARN`` with that line.
+    - ``callback_group``: Group of the timer; the node's default group when omitted.
     """
 
     def __init__(

@@ -26,10 +26,7 @@ def free_domain() -> int:
     next call, in another process or one of the next 23 here, returns another domain as long as
     there is one.
 
-    Raises
-    ------
-    DeviceError
-        When every domain is taken.
+    Raises ``DeviceError`` when every domain is taken.
     """
     domains = list(_DOMAINS)
     random.SystemRandom().shuffle(domains)

@@ -32,27 +32,13 @@ def make(
 ) -> Device:
     """Return the device that the parameter ``driver`` names.
 
-    Parameters
-    ----------
-    node : str
-        A name in ``REAL``.
-    driver : callable
-        Makes the device from the parameters.
-    at_bench : callable
-        Returns the parameters with which it uses the emulated bench in a folder.
-    parameters : mapping
-    clock_ns : callable
+    - ``node``: A name in ``REAL``.
+    - ``driver``: Makes the device from the parameters.
+    - ``at_bench``: Returns the parameters with which it uses the emulated bench in a folder.
 
-    Raises
-    ------
-    ArgumentError
-        For an unknown name.
-    DeviceGoneError
-        When no bench runs in the folder.
-    DeviceNotReadyError
-        When none runs yet: the launcher of this process starts one.
-    EschortyError
-        When the driver refuses its parameters.
+    Raises ``ArgumentError`` for an unknown name. Raises ``DeviceGoneError`` when no bench runs in
+    the folder. Raises ``DeviceNotReadyError`` when none runs yet: the launcher of this process
+    starts one. Raises ``EschortyError`` when the driver refuses its parameters.
     """
     name = parameters["driver"]
     if name == "fake":

@@ -251,12 +251,8 @@ class ThreadsExecutor(_Redirecting, MultiThreadedExecutor):
 class Spinning:
     """An executor that a thread spins, from ``start`` to ``end``.
 
-    Parameters
-    ----------
-    threads : int
-        Threads that run callbacks.
-    context : rclpy.context.Context, optional
-        The default one when omitted.
+    - ``threads``: Threads that run callbacks.
+    - ``context``: The default one when omitted.
     """
 
     def __init__(self, threads: int, context: Context | None = None) -> None:

@@ -21,13 +21,8 @@ class Heartbeat:
     node on the same host detects its end. It runs in a thread of its own, because a busy executor
     is no failure of the device; it ends with the node's context.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    topic : str
-        ``camera/heartbeat`` or the like.
-    healthy : callable
-        Returns whether the device works now; called in the thread, must not wait.
+    - ``topic``: ``camera/heartbeat`` or the like.
+    - ``healthy``: Returns whether the device works now; called in the thread, must not wait.
     """
 
     def __init__(self, node: Node, topic: str, healthy: Callable[[], bool]) -> None:

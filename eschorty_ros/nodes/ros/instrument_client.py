@@ -60,13 +60,9 @@ _CLOCKS_S = 20.0
 class InstrumentClient(PacedWaiting):
     """Laser and stage over the other nodes' topics, services and action.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    node_timeout_s, service_timeout_s, events_timeout_s : float
-        Longest wait for the nodes to appear, for an answer, and for the events to continue.
-    services : mapping of str to service type
-        Further services that a sequence needs, by name.
+    - ``node_timeout_s``, ``service_timeout_s``, ``events_timeout_s``: Longest wait for the nodes to
+      appear, for an answer, and for the events to continue.
+    - ``services``: Further services that a sequence needs, by name.
     """
 
     def __init__(

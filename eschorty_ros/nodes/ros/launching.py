@@ -37,11 +37,7 @@ def description(arguments: Sequence[Any], check: Callable[[Mapping[str, str]], A
     It ends, with an exit code that is not 0, when a process of it refuses to run. After a process
     was killed the others go on, and the exit code is not 0 in the end.
 
-    Parameters
-    ----------
-    arguments : sequence of Argument
-    check : callable
-        Returns a ``Description`` for the texts of the arguments, or raises.
+    - ``check``: Returns a ``Description`` for the texts of the arguments, or raises.
     """
 
     def described(context: LaunchContext) -> list[Any]:

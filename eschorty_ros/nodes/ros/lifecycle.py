@@ -34,21 +34,14 @@ class DeviceNode(LifecycleNode):
     when it changes, holds it in ``waiting`` and retries every 2 s. After a failure in operation
     nothing restarts by itself: the user has to configure and activate again.
 
-    Parameters
-    ----------
-    name : str
-        Node name.
-    table : iterable of Param
-        The node's parameters besides ``auto_start``.
-    on_change : callable, optional
-        See ``Parameters``.
+    - ``name``: Node name.
+    - ``table``: The node's parameters besides ``auto_start``.
+    - ``on_change``: See ``Parameters``.
 
-    Attributes
-    ----------
-    failure : str
-        The last failure, empty after a successful configure.
-    waiting : str
-        The reason for waiting and the time of the next attempt, ``""`` when it does not wait.
+    Public attributes:
+    - ``failure``: The last failure, empty after a successful configure.
+    - ``waiting``: The reason for waiting and the time of the next attempt, ``""`` when it does not
+      wait.
     """
 
     def __init__(

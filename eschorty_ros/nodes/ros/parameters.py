@@ -33,32 +33,21 @@ Value = bool | int | float | str | tuple[int, ...]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Param:
-    """One parameter of a node.
-
-    Parameters
-    ----------
-    name : str
-    default : bool, int, float, str or tuple of int
-        Its type is the parameter's type; an integer is accepted for a float.
-    description : str
-    unit : str
-        SI.
-    minimum, maximum : float, optional
-        Inclusive bounds of a number; both or neither.
-    choices : tuple of str
-        The accepted strings; empty means any.
-    dynamic : bool
-        Whether the value may change after the node has started.
-    """
+    """One parameter of a node."""
 
     name: str
     default: Value
+    """Its type is the parameter's type; an integer is accepted for a float."""
     description: str
     unit: str = ""
+    """SI."""
     minimum: float | None = None
     maximum: float | None = None
+    """Inclusive bounds of a number; both or neither."""
     choices: tuple[str, ...] = ()
+    """The accepted strings; empty means any."""
     dynamic: bool = False
+    """Whether the value may change after the node has started."""
 
     def descriptor(self) -> ParameterDescriptor:
         """Return the ROS descriptor: description with unit, range, constraint, read-only flag."""
@@ -149,20 +138,12 @@ def from_settings(settings_class: type[Any], *, dynamic: bool = False) -> tuple[
 class Parameters(Mapping[str, Any]):
     """The declared parameters of a node, read as a mapping of names to values.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    table : iterable of Param
-    on_change : callable, optional
-        Called with all values as they would be after a change, before it is accepted. It applies
-        the change, so that a device can refuse it: an ``EschortyError`` refuses the change and
-        its text is the reason that the caller receives.
+    - ``on_change``: Called with all values as they would be after a change, before it is accepted.
+      It applies the change, so that a device can refuse it: an ``EschortyError`` refuses the change
+      and its text is the reason that the caller receives.
 
-    Raises
-    ------
-    ArgumentError
-        When a value given at start has the wrong type, is out of range or not a choice, or a name
-        is unknown.
+    Raises ``ArgumentError`` when a value given at start has the wrong type, is out of range or not
+    a choice, or a name is unknown.
     """
 
     def __init__(

@@ -31,10 +31,7 @@ class OnePublisher:
     def check(self, info: Mapping[str, Any]) -> bytes:
         """Return the publisher of the message with this information, ``b""`` where unknown.
 
-        Raises
-        ------
-        ArgumentError
-            When another publisher's stream goes on.
+        Raises ``ArgumentError`` when another publisher's stream goes on.
         """
         publisher, received_ns = _publisher(info), int(info["received_timestamp"])
         if publisher != self._publisher and abs(received_ns - self._received_ns) < _SILENCE_NS:
@@ -48,16 +45,8 @@ class LatchedState:
 
     Then those that are left give theirs again.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    kind : message type
-    topic : str
-    take : callable
-        Receives each message.
-    forget : callable
-        Called when the publisher of the newest message has ended.
-    group : rclpy.callback_groups.CallbackGroup, optional
+    - ``take``: Receives each message.
+    - ``forget``: Called when the publisher of the newest message has ended.
     """
 
     def __init__(

@@ -119,20 +119,12 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
 
     Signals stay ignored afterwards, because the process is to end.
 
-    Parameters
-    ----------
-    factories : callables
-        Each makes one node in the context.
-    threads : int
-        Threads of the executor; more than one where a callback waits (actions).
-    args : sequence of str, optional
-        Command line; that of the process when omitted.
+    - ``factories``: Each makes one node in the context.
+    - ``threads``: Threads of the executor; more than one where a callback waits (actions).
+    - ``args``: Command line; that of the process when omitted.
 
-    Returns
-    -------
-    int
-        0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built, another of its name
-        runs, or a callback failed (one line for an ``EschortyError``).
+    Returns 0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built, another of its
+    name runs, or a callback failed (one line for an ``EschortyError``).
     """
     nodes: list[Node] = []
     spinning: Spinning | None = None
