@@ -162,6 +162,28 @@ class RangeModel:
         near, far = self.range_mm([0.0, self.rows - 1.0])
         return float(near), math.inf if math.isnan(far) else float(far)
 
+    @property
+    def pupil_mm(self) -> tuple[float, float]:
+        """Range of the lens's foot on the sheet and its distance from the sheet, mm.
+
+        With ``L = f (cot(theta) + cot|theta'|)`` from the lens to the Scheimpflug line these are
+        ``L cos(theta) - k - b`` and ``L sin(theta)``; the lens is on the sheet's -y side.
+
+        Raises
+        ------
+        ArgumentError
+            When no sensor tilt gives this ``k'`` with this lens.
+        """
+        if not self.tilt_sine < 1.0:
+            raise ArgumentError(
+                f"k_prime_px is {self.k_prime_px!r}: no tilt of a {self.pixel_um!r} um sensor "
+                f"gives it behind a {self.focal_mm:g} mm lens; check k_mm, k_prime_px and pixel_um"
+            )
+        theta, tilt = math.radians(self.theta_deg), math.asin(self.tilt_sine)
+        baseline_mm = self.focal_mm * (1.0 / math.tan(theta) + 1.0 / math.tan(tilt))
+        along_mm = baseline_mm * math.cos(theta) - self.k_mm - self.b_mm
+        return along_mm, baseline_mm * math.sin(theta)
+
     def normalised_column(self, column: ArrayLike) -> Array:
         """Return ``u``: 0 at the principal column, 1 half a sensor further, any shape."""
         return np.asarray((reals("column", column) - self.principal_column) / (0.5 * self.columns))
@@ -238,11 +260,8 @@ class RangeModel:
     def rows_per_mm_off_sheet(self, range_mm: ArrayLike) -> Array:
         """Return the rows by which a point 1 mm beside the light sheet appears nearer, px per mm.
 
-        The chief ray through a lens whose object plane is the sheet and whose image plane is the
-        sensor: with depth ``R~ = R + b``, ``z = f + R~ sin(theta)`` along the optical axis and
-        ``L = f (cot(theta) + cot|theta'|)`` from the lens to the Scheimpflug line,
-        ``-drow/dn = (k / R~)**2 (z - L sin(theta) cos(theta)) / (f p sin(theta + |theta'|))``.
-        Little more than ``k / (p R~)``, one over the lateral pitch.
+        The ray to the lens at :attr:`pupil_mm` crosses the sheet nearer by ``(R - along) / beside``
+        mm per mm. Little more than ``k / (p (R + b))``, one over the lateral pitch.
 
         Positive for a point on the sheet's far side from the lens, +y in ``eschorty_link``: its
         row is *lower* by this number. Across the line's width, rows ``d`` above the centre show
@@ -251,20 +270,11 @@ class RangeModel:
         NaN where ``range + b <= 0``. Raises ``ArgumentError`` when no sensor tilt gives this ``k'``
         with this lens.
         """
-        if not self.tilt_sine < 1.0:
-            raise ArgumentError(
-                f"k_prime_px is {self.k_prime_px!r}: no tilt of a {self.pixel_um!r} um sensor "
-                f"gives it behind a {self.focal_mm:g} mm lens; check k_mm, k_prime_px and pixel_um"
-            )
-        pitch_mm, focal_mm = self.pixel_um * 1e-3, self.focal_mm
-        theta, tilt = math.radians(self.theta_deg), math.asin(self.tilt_sine)
-        baseline_mm = focal_mm * (math.cos(theta) / math.sin(theta) + 1.0 / math.tan(tilt))
+        along_mm, beside_mm = self.pupil_mm
         depth = self._depth_mm(range_mm)
-        axial = focal_mm + depth * math.sin(theta)
-        lever = axial - baseline_mm * math.sin(theta) * math.cos(theta)
-        scale = focal_mm * pitch_mm * math.sin(theta + tilt)
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray((self.k_mm / depth) ** 2 * lever / scale)
+            lever = (depth - self.b_mm - along_mm) / beside_mm
+            return np.asarray(-self.product_mm_px / (depth * depth) * lever)
 
     def _image_px(self, row: ArrayLike, column: ArrayLike | None) -> Array:
         """Return ``row + b'``, NaN from one pixel before the pole on."""
