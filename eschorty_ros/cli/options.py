@@ -52,13 +52,21 @@ _SWEEP = (
         help="Preset of the event pixels.",
     ),
     click.option(
+        "--effects",
+        default="none",
+        show_default=True,
+        metavar="NAME=VALUE,...",
+        help="ambient, falloff_mm, defocus_mm, ghost and ghost_mm, occlusion, row_time_us: what "
+        "the simulated world leaves out otherwise; docs/accuracy.md.",
+    ),
+    click.option(
         "--seed", type=click.IntRange(0), default=0, show_default=True, help="Noise seed."
     ),
 )
 
 
 def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of scene, laser, stage, optical build, pixels and seed to a command."""
+    """Add the options of scene, laser, stage, build, pixels, effects and seed to a command."""
     for option in reversed(_SWEEP):
         command = option(command)
     return command

@@ -68,6 +68,7 @@ def command(
     stop: float,
     calibration: str,
     pixels: str,
+    effects: str,
     seed: int,
     keep: str,
     hardware: Path | None,
@@ -83,9 +84,9 @@ def command(
 
     The nodes run in this process over ordinary ROS 2 topics, their drivers at devices that another
     process emulates around a simulated scene, or with --hardware at real ones, without --scene,
-    --pixels and --seed. Written are scan.pcd (the cloud, metres, in eschorty_base) and scan.png
-    (depth map, 3-D view, and of a simulated scene the error map); the error of a simulated scene
-    is printed, too. The noise depends on timing, so two runs differ slightly.
+    --pixels, --effects and --seed. Written are scan.pcd (the cloud, metres, in eschorty_base) and
+    scan.png (depth map, 3-D view, and of a simulated scene the error map); the error of a simulated
+    scene is printed, too. The noise depends on timing, so two runs differ slightly.
 
     \b
     Examples:
@@ -103,7 +104,7 @@ def command(
 
     check_sweep(start, stop)
     one_scan = nodes_module("one_process.scan", make="scan")
-    _check(scene, calibration)
+    _check(scene, calibration, effects)
     tables = None
     if hardware is not None:
         tables = nodes_module("one_process.hardware_file", make="scan").read_hardware(hardware)
@@ -116,6 +117,7 @@ def command(
         frequency_hz=frequency,
         seed=seed,
         pixels=pixels,
+        effects=effects,
         keep=keep,
         hardware=tables,
         record=record,
@@ -140,13 +142,15 @@ def command(
         serve_cloud(result.points, host, port)
 
 
-def _check(scene: str, calibration: str) -> None:
-    """Refuse an unknown scene or calibration before any node starts."""
+def _check(scene: str, calibration: str, effects: str) -> None:
+    """Refuse an unknown scene, calibration or effect before any node starts."""
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.simulation.scenes import named
+    from eschorty_ros.simulation.world import Effects
 
     named(scene)
     load_calibration(calibration)
+    Effects.parse(effects)
 
 
 def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
@@ -155,6 +159,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     from eschorty_ros.core.storage import TRUTH_FILE, load_recording, write_cloud, write_truth_csv
     from eschorty_ros.report import accuracy, figures
     from eschorty_ros.simulation.scenes import names as scenes
+    from eschorty_ros.simulation.world import Effects
 
     if result.success or len(result.points):
         cloud = result.points if result.organized is None else result.organized
@@ -174,7 +179,8 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     model, direction = calibration.model(), calibration.stage_direction
     error_mm = accuracy.range_error_mm(result.points, truth, model, direction)
     sweep = accuracy.Sweep(job.start_mm, job.stop_mm, job.speed_mm_s, job.frequency_hz, job.passes)
-    measured = accuracy.measure(result.points, truth, model, sweep, direction, error_mm)
+    seen = Effects.parse(job.effects).scene(truth, model)
+    measured = accuracy.measure(result.points, seen, model, sweep, direction, error_mm)
     title = (
         f"{job.scene}: {job.frequency_hz:g} Hz, {job.speed_mm_s:g} mm/s, "
         f"{job.calibration}; median |error| {measured.error_median_mm:.2f} mm"
@@ -185,7 +191,7 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     if result.recording:
         try:
             recording = load_recording(result.recording)
-            known = accuracy.recorded_truth(result.points, truth, recording, sweep)
+            known = accuracy.recorded_truth(result.points, seen, recording, sweep)
             columns = (known[name] for name in ("t_us", "column", "range_mm"))
             write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)
         except EschortyError as error:

@@ -38,6 +38,7 @@ def command(
     stop: float,
     calibration: str,
     pixels: str,
+    effects: str,
     seed: int,
 ) -> None:
     """Simulate a recording of a scene, with its truth. Needs no ROS.
@@ -49,6 +50,7 @@ def command(
     Examples:
       eschorty simulate --scene steps --out rec
       eschorty simulate --scene sphere --frequency 300 --speed 200 --seed 7 --out rec300
+      eschorty simulate --scene plane --effects ambient=0.5,ghost=0.4,ghost_mm=16 --out sunny
     """  # noqa: D301
     check_sweep(start, stop)
     remove_abandoned(out)
@@ -58,7 +60,7 @@ def command(
     from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.simulation.pixels import preset
     from eschorty_ros.simulation.scenes import named
-    from eschorty_ros.simulation.world import simulate_recording
+    from eschorty_ros.simulation.world import Effects, simulate_recording
 
     build = load_calibration(calibration)
     with ended_by_signals(), progress_bar("simulating") as report:
@@ -72,6 +74,7 @@ def command(
             speed_mm_s=speed,
             seed=seed,
             parameters=preset(pixels),
+            effects=Effects.parse(effects),
             progress=lambda done, total: report(done / max(total, 1), ""),
         )
     truth = recording.truth

@@ -277,7 +277,7 @@ _REMARKS = (
     "row, of opposite signs on the two sides of the nose.",
     "The line is 5 mm thick along the stage at 1.32 m: within 3 mm of a rim it is on both leaves, "
     "or reaches one before the sheet's middle does. These points cause the gross errors and nearly "
-    "all of the root mean square error. Occlusion is not modelled: every surface that the laser "
-    "sheet hits first is visible to the camera.",
+    "all of the root mean square error. The effect `occlusion` is off: the camera sees every "
+    "surface that the laser sheet hits first.",
 )
 EXPERIMENT = Experiment("scans", "Fig. 8: leaves and a face at 300 mm/s", run)

@@ -15,7 +15,7 @@ from eschorty_ros.emulation.evk4 import Evk4Model, SensorSettings
 from eschorty_ros.simulation.pixels import LIMITS, Biases, preset
 from eschorty_ros.simulation.readout import EventRate
 from eschorty_ros.simulation.scenes import named
-from eschorty_ros.simulation.world import BACKGROUND_HZ, SensorControl, World, warm_up
+from eschorty_ros.simulation.world import BACKGROUND_HZ, Effects, SensorControl, World, warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,8 @@ class BenchSettings:
     imperfections: Imperfections = field(default_factory=Imperfections)
     laser_log: str = ""
     """File with one line per change of the generator's output; empty for none."""
+    effects: str = "none"
+    """Effects of the world, as ``Effects.parse`` reads them."""
 
 
 class Bench:
@@ -53,10 +55,18 @@ class Bench:
         self._model = calibration.model()
         self._scene = named(settings.scene, self._model)
         pixels = preset(settings.pixels)
+        effects = Effects.parse(settings.effects)
         warm_up(calibration)
 
         def world() -> World:
-            return World(self._scene, calibration, pixels, settings.seed, settings.background_hz)
+            return World(
+                self._scene,
+                calibration,
+                pixels,
+                settings.seed,
+                settings.background_hz,
+                effects=effects,
+            )
 
         self.physics = Physics(
             world,

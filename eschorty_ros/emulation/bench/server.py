@@ -143,6 +143,8 @@ def _locked(folder: Path) -> Iterator[None]:
               help="The actual optical build: a name in config/ or a file.")  # fmt: skip
 @click.option("--pixels", type=click.Choice(tuple(PRESETS)), default="paper", show_default=True,
               help="Preset of the event pixels.")  # fmt: skip
+@click.option("--effects", default="none", show_default=True, metavar="NAME=VALUE,...",
+              help="Effects of the world, such as ambient=0.5,occlusion=1.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="Seed of pixels, noise, jitter and missing edges.")  # fmt: skip
 @click.option("--background", type=click.FloatRange(0.0, 100.0), default=BACKGROUND_HZ,
@@ -165,6 +167,7 @@ def command(
     scene: str,
     calibration: str,
     pixels: str,
+    effects: str,
     seed: int,
     background: float,
     trigger: str,
@@ -200,6 +203,7 @@ def command(
             trigger,
             Imperfections(sensor_ppm, generator_ppm, usb_jitter, missing_edges, seed),
             str(laser_log or ""),
+            effects,
         ),
     )
 

@@ -68,13 +68,16 @@ def bench_parameters() -> Tables:
     return tables
 
 
-def bench_options(scene: str, calibration: str, seed: int, pixels: str) -> dict[str, object]:
+def bench_options(
+    scene: str, calibration: str, seed: int, pixels: str, effects: str = "none"
+) -> dict[str, object]:
     """Return options of a bench whose stage triggers the camera."""
     return {
         "scene": scene,
         "calibration": calibration,
         "seed": seed,
         "pixels": pixels,
+        "effects": effects,
         "trigger": "stage",
     }
 

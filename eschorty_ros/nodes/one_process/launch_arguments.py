@@ -54,6 +54,7 @@ _DEVICES = (
              ("none", "laser", "stage")),
     Argument("pixels", "paper", "event pixels of an emulated camera",
              ("paper", "ideal", "noisy", "narrow")),
+    Argument("effects", "none", "effects of an emulated world, such as ambient=0.5,occlusion=1"),
     Argument("frequency", "70.0", "laser modulation, Hz, 16 to 20000: one profile per period"),
 )  # fmt: skip
 _FILE = Argument(
@@ -206,7 +207,7 @@ def _described(given: Mapping[str, str], nodes: Tables, built: str | None) -> De
             ) from error
     bench = None
     if built is not None and given["fake"] == "true":
-        bench = {name: given[name] for name in ("scene", "pixels", "trigger")}
+        bench = {name: given[name] for name in ("scene", "pixels", "effects", "trigger")}
         bench["calibration"] = built
     return Description(nodes, given["parameters"], bench, view)
 
@@ -257,8 +258,13 @@ def _check_build(given: Mapping[str, str], values: Tables, built: str) -> None:
     with _naming("calibration"):
         load_calibration(values["reconstruction"]["calibration"])
     if given["fake"] == "true":
+        # Here, as it loads the pixels' kernels.
+        from eschorty_ros.simulation.world import Effects
+
         with _naming("scene"):
             named(given["scene"])
+        with _naming("effects"):
+            Effects.parse(given["effects"])
         with _naming("as_built" if "as_built" in given else "calibration"):
             load_calibration(built)
 

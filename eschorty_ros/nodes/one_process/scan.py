@@ -45,6 +45,7 @@ class ScanJob:
     frequency_hz: float
     seed: int = 0
     pixels: str = "paper"
+    effects: str = "none"
     keep: str = "all"
     hardware: Tables | None = None
     record: Path | None = None
@@ -101,7 +102,7 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         tables["reconstruction"]["organized"] = "on"
     bench = None
     if job.hardware is None:
-        bench = bench_options(job.scene, job.calibration, job.seed, job.pixels)
+        bench = bench_options(job.scene, job.calibration, job.seed, job.pixels, job.effects)
     goal = Scan.Goal(
         start=job.start_mm * 1e-3,
         stop=job.stop_mm * 1e-3,

@@ -58,15 +58,14 @@ class _Sensor(NamedTuple):
 
 
 class _Optics(NamedTuple):
-    """Width of the line, least contrast drawn, light without the laser."""
+    """Least contrast drawn, light without the laser."""
 
-    sigma_rows: float
     least_contrast: float
     background: float
 
 
 class _Line(NamedTuple):
-    """Patches of the line (n, patches, 4): row, contrast, rows between which it is lit."""
+    """Patches of the line (n, patches, 5): row, contrast, rows between which it is lit, width."""
 
     columns: NDArray[np.int64]
     patches: NDArray[np.float64]
@@ -159,7 +158,7 @@ class PixelArray:
 
     def _use(self, p: PixelParameters) -> None:
         self.parameters = p
-        self._optics = _Optics(p.sigma_rows, p.least_contrast, p.background_intensity)
+        self._optics = _Optics(p.least_contrast, p.background_intensity)
         correlation_us = max(p.follower_us, DECISION_US)
         risks = noise_table(correlation_us)
         self._model = Model(
@@ -198,6 +197,7 @@ class PixelArray:
         reflectance: NDArray[np.float64],
         low_row: NDArray[np.float64] | None = None,
         high_row: NDArray[np.float64] | None = None,
+        sigma_rows: NDArray[np.float64] | None = None,
     ) -> None:
         """Place the line at ``line_row`` (rows) in ``columns`` from ``t_us`` on.
 
@@ -212,6 +212,8 @@ class PixelArray:
         low_row, high_row : ndarray of float64, same shape, optional
             Rows between which a patch is lit (edges between rows, so ``y - 0.5`` to ``y + 0.5``
             is one row); the complete footprint when left out.
+        sigma_rows : ndarray of float64, same shape, optional
+            Gaussian width of each patch, that of the parameters when left out.
 
         Raises
         ------
@@ -222,9 +224,15 @@ class PixelArray:
             raise ArgumentError(
                 f"reflectance reaches {reflectance.min()} to {reflectance.max()}; choose 0 to 1"
             )
-        patches = np.empty((columns.size, 1 if line_row.ndim == 1 else line_row.shape[1], 4))
+        patches = np.empty((columns.size, 1 if line_row.ndim == 1 else line_row.shape[1], 5))
         for k, (values, otherwise) in enumerate(
-            ((line_row, 0.0), (reflectance, 0.0), (low_row, -np.inf), (high_row, np.inf))
+            (
+                (line_row, 0.0),
+                (reflectance, 0.0),
+                (low_row, -np.inf),
+                (high_row, np.inf),
+                (sigma_rows, self.parameters.sigma_rows),
+            )
         ):
             patches[:, :, k] = otherwise if values is None else values.reshape(patches.shape[:2])
         patches[:, :, 1] *= self.parameters.amplitude
@@ -320,7 +328,7 @@ def _window(patch, optics, rows):
     line_row, contrast, least = patch[0], patch[1], optics.least_contrast
     if not (contrast > least and abs(line_row) < 1e6):
         return 0, 0
-    half = optics.sigma_rows * math.sqrt(2.0 * math.log(contrast / least))
+    half = patch[4] * math.sqrt(2.0 * math.log(contrast / least))
     first = max(math.ceil(line_row - half), math.floor(max(patch[2] + 0.5, 0.0)))
     last = min(math.floor(line_row + half), math.ceil(min(patch[3] - 0.5, rows - 1.0)))
     begin = min(max(0, first), rows)
@@ -328,12 +336,12 @@ def _window(patch, optics, rows):
 
 
 @kernel
-def _add_patch(light, begin, end, patch, sigma):
+def _add_patch(light, begin, end, patch):
     """Add a patch of the line to ``light`` in rows [begin, end): a Gaussian by recurrence.
 
     A row that is lit in part gets its share.
     """
-    offset = begin - patch[0]
+    offset, sigma = begin - patch[0], patch[4]
     value = patch[1] * math.exp(-0.5 * offset * offset / (sigma * sigma))
     ratio = math.exp(-(offset + 0.5) / (sigma * sigma))
     step_ratio = math.exp(-1.0 / (sigma * sigma))
@@ -368,7 +376,7 @@ def _relight(sensor, line, begin, optics, model, t_us, out, n):
         light[lo:hi] = optics.background
         for j in range(patches.shape[0]):
             first, last = _window(patches[j], optics, rows)
-            _add_patch(light, first, last, patches[j], optics.sigma_rows)
+            _add_patch(light, first, last, patches[j])
         # One run over both spans, unless they lie apart: what is between stays untouched.
         first, last = (min(lo, old_lo), max(hi, old_hi)) if hi > lo else (old_lo, old_hi)
         apart = hi < old_lo or lo > old_hi

@@ -1,6 +1,6 @@
 """A face: smooth, with nose bridge, eye sockets, lips and ears, as a height field.
 
-Every ray ends at the first surface it meets. Occlusion is not modelled, as in every scene.
+Every ray ends at the first surface it meets, which the camera sees unless an effect hides it.
 """
 
 from __future__ import annotations

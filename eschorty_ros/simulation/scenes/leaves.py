@@ -1,6 +1,6 @@
 """A collage of leaves: three layers that overlap, with leaves 2.2 mm apart within a layer.
 
-Every ray ends at the first leaf it meets. Occlusion is not modelled, as in every scene.
+Every ray ends at the first leaf it meets, which the camera sees unless an effect hides it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
 """Scene, laser, stage and pixels over sensor time: bytes out, with the truth known."""
 
+from eschorty_ros.simulation.world.effects import Effects
 from eschorty_ros.simulation.world.footprint import footprint
 from eschorty_ros.simulation.world.line_bench import LineEvents, simulate_line
 from eschorty_ros.simulation.world.recorder import simulate_recording
@@ -10,6 +11,7 @@ from eschorty_ros.simulation.world.world import BACKGROUND_HZ, STEP_MM, World
 __all__ = [
     "BACKGROUND_HZ",
     "STEP_MM",
+    "Effects",
     "Gate",
     "LaserTimeline",
     "LineEvents",

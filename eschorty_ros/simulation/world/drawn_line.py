@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from eschorty_ros.core.optics import RangeModel
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.optics import Calibration
 from eschorty_ros.simulation.pixels import PixelArray
 from eschorty_ros.simulation.scenes import Scene
+from eschorty_ros.simulation.world.effects import Effects
 from eschorty_ros.simulation.world.footprint import footprint
+from eschorty_ros.simulation.world.off_sheet import off_sheet
 
 _ROW_STEP = 0.02
 _REFLECTANCE_STEP = 0.01
+
+
+class _Patches(NamedTuple):
+    """Arguments of :meth:`PixelArray.relight`, shape (columns, patches)."""
+
+    row: Array
+    reflectance: Array
+    low_row: Array
+    high_row: Array
 
 
 class DrawnLine:
@@ -19,14 +34,19 @@ class DrawnLine:
     Parameters
     ----------
     scene : Scene
-    model : RangeModel
+    calibration : Calibration
     pixels : PixelArray
+    effects : Effects
     """
 
-    def __init__(self, scene: Scene, model: RangeModel, pixels: PixelArray) -> None:
+    def __init__(
+        self, scene: Scene, calibration: Calibration, pixels: PixelArray, effects: Effects
+    ) -> None:
         self._scene = scene
-        self._model = model
+        self._calibration = calibration
+        self._model = model = calibration.model()
         self._pixels = pixels
+        self._effects = effects
         self._every_column = np.arange(model.columns)
         self._position_mm = np.nan
         self._level = 0.0
@@ -61,23 +81,43 @@ class DrawnLine:
         moved &= ~(np.isnan(seen.row) & np.isnan(self._row))
         with np.errstate(invalid="ignore"):
             moved |= np.abs(seen.reflectance - self._reflectance) > _REFLECTANCE_STEP
-        moved |= self._was_split
+        moved |= self._was_split | (self._effects.ghost > 0.0)
         moved[seen.split] = False
         if moved.any():
             columns = self._every_column[moved]
-            self._pixels.relight(
-                t_us, columns, seen.row[moved], seen.reflectance[moved] * self._level
-            )
+            row, reflectance = seen.row[moved, np.newaxis], seen.reflectance[moved, np.newaxis]
+            whole = np.full_like(row, np.inf)
+            self._place(t_us, position_mm, columns, _Patches(row, reflectance, -whole, whole))
             self._row[moved] = seen.row[moved]
             self._reflectance[moved] = seen.reflectance[moved]
         self._was_split[:] = False
         if seen.split.size:
             self._was_split[seen.split] = True
-            self._pixels.relight(
-                t_us,
-                seen.split,
-                seen.patch_row,
-                seen.patch_reflectance * self._level,
-                seen.low_row,
-                seen.high_row,
-            )
+            parts = (seen.patch_row, seen.patch_reflectance, seen.low_row, seen.high_row)
+            self._place(t_us, position_mm, seen.split, _Patches(*parts))
+
+    def _place(
+        self, t_us: int, position_mm: float, columns: NDArray[np.int64], patches: _Patches
+    ) -> None:
+        """Place patches on the pixels, out of focus and beside a ghost where there are these."""
+        effects, sharp = self._effects, self._pixels.parameters.sigma_rows
+        each = columns[:, np.newaxis]
+        sigma = np.full_like(patches.row, sharp)
+        if effects.defocus_mm:
+            range_mm = self._model.range_mm(patches.row, each)
+            blur = off_sheet(self._calibration, range_mm, each, effects.defocus_mm).blur_rows
+            sigma = np.hypot(sharp, blur)
+        if effects.ghost:
+            there_mm = np.array([position_mm + effects.ghost_mm])
+            range_mm = self._scene.range_mm(there_mm, columns, self._model).T
+            ghost = off_sheet(self._calibration, range_mm, each, effects.ghost_mm)
+            light = effects.ghost * self._scene.reflectance(there_mm, columns, self._model).T
+            whole = np.full_like(light, np.inf)
+            added = _Patches(ghost.row, light, -whole, whole)
+            patches = _Patches(*map(np.hstack, zip(patches, added, strict=True)))
+            sigma = np.hstack((sigma, np.hypot(sharp, ghost.blur_rows)))
+        # A blurred line has the same light on more rows.
+        reflectance = patches.reflectance * self._level * (sharp / sigma)
+        self._pixels.relight(
+            t_us, columns, patches.row, reflectance, patches.low_row, patches.high_row, sigma
+        )

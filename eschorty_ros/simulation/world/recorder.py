@@ -31,6 +31,7 @@ from eschorty_ros.core.storage.raw_file import RawWriter
 from eschorty_ros.core.storage.recording import MARKS_FILE, SCAN_FILE, SETTINGS_FILE
 from eschorty_ros.simulation.pixels import PixelParameters
 from eschorty_ros.simulation.scenes import Scene
+from eschorty_ros.simulation.world.effects import Effects
 from eschorty_ros.simulation.world.world import BACKGROUND_HZ, World
 
 ACCELERATION_MM_S2 = 2000.0
@@ -53,6 +54,7 @@ def simulate_recording(
     seed: int = 0,
     background_hz: float = BACKGROUND_HZ,
     parameters: PixelParameters | None = None,
+    effects: Effects | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Recording:
     """Scan ``scene`` from ``start_mm`` to ``stop_mm`` and write the recording folder.
@@ -75,6 +77,8 @@ def simulate_recording(
     background_hz : float
         Background events per pixel and second.
     parameters : PixelParameters, optional
+    effects : Effects, optional
+        None by default.
     progress : callable, optional
         Called with the microseconds done and in total.
 
@@ -94,7 +98,7 @@ def simulate_recording(
     )
     off_us = move.end_ns // 1000 + LEAD_US
     end_us = off_us + LEAD_US
-    world = World(scene, calibration, parameters, seed, background_hz)
+    world = World(scene, calibration, parameters, seed, background_hz, effects=effects)
     world.set_laser(LASER_ON_US, True, wave)
     world.set_laser(off_us, False)
     # The plan rests at its first position before it starts.

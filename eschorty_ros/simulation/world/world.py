@@ -23,6 +23,7 @@ from eschorty_ros.simulation.pixels import (
 from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.scenes import Scene
 from eschorty_ros.simulation.world.drawn_line import DrawnLine
+from eschorty_ros.simulation.world.effects import Effects
 from eschorty_ros.simulation.world.timeline import (
     LaserTimeline,
     SensorControl,
@@ -63,6 +64,9 @@ class World:
     background_hz : float
         Background events per pixel and second.
     readout : ReadoutParameters, optional
+        Replaces that of ``effects``.
+    effects : Effects, optional
+        None by default.
 
     Attributes
     ----------
@@ -78,23 +82,28 @@ class World:
         seed: int = 0,
         background_hz: float = BACKGROUND_HZ,
         readout: ReadoutParameters | None = None,
+        effects: Effects | None = None,
     ) -> None:
-        self.scene = scene
+        effects = effects or Effects()
         self.model = calibration.model()
         self.columns = self.model.columns
         self.rows = self.model.rows
         self.events = 0
         self.trigger_input: EdgeSource | None = None
-        self._factory = parameters or PixelParameters()
+        parameters = parameters or PixelParameters()
+        self._factory = effects.pixels(parameters, self.model)
+        background_hz *= self._factory.background_intensity / parameters.background_intensity
         self._pixels = PixelArray(self.columns, self.rows, self._factory, seed, background_hz)
+        readout = readout or ReadoutParameters(effects.row_time_us)
         self._readout = Readout(self.rows, readout)
         self._encoder = Encoder(self.columns, self.rows)
         self._laser = LaserTimeline()
         self._stage = StageTimeline()
         self._control = SensorControl()
         self._controls: Timeline[SensorControl] = Timeline()
-        self._truth = TruthLog(scene, self.model)
-        self._line = DrawnLine(scene, self.model, self._pixels)
+        seen = effects.scene(scene, self.model)
+        self._truth = TruthLog(seen, self.model)
+        self._line = DrawnLine(seen, calibration, self._pixels, effects)
         self._now_us = 0
         self._handled_us = -1
         self._lit_since_us: int | None = None

@@ -14,16 +14,18 @@ from eschorty_ros.nodes.one_process import launch_arguments
 from eschorty_ros.nodes.one_process.launch_arguments import CALIBRATE, REPLAY, SCAN
 
 FILES = {
-    "scan": (SCAN, "fake camera parameters trigger scene pixels calibration frequency speed start"
-             " stop rviz auto_scan"),
-    "calibrate": (CALIBRATE, "fake camera parameters trigger scene pixels calibration as_built"
-                  " frequency distances method capture_time calibration_folder auto_calibrate"),
+    "scan": (SCAN, "fake camera parameters trigger scene pixels effects calibration frequency"
+             " speed start stop rviz auto_scan"),
+    "calibrate": (CALIBRATE, "fake camera parameters trigger scene pixels effects calibration"
+                  " as_built frequency distances method capture_time calibration_folder"
+                  " auto_calibrate"),
     "replay": (REPLAY, "recording rate parameters rviz"),
 }  # fmt: skip
 BAD = """scan speed fast 0 0.5 nan 1e400; scan frequency abc 5; scan scene foo
     scan calibration /nope
-    scan start -1; scan stop 0.01 9; scan pixels bad; scan trigger camera; scan fake maybe
-    scan camera no; scan auto_scan 1; scan rviz yes true; scan parameters /nope.yaml
+    scan start -1; scan stop 0.01 9; scan pixels bad; scan effects foo=1; scan trigger camera
+    scan fake maybe; scan camera no; scan auto_scan 1; scan rviz yes true
+    scan parameters /nope.yaml
     calibrate as_built /nope; calibrate distances /nope.csv; calibrate method guess
     calibrate capture_time 0; replay recording /nope; replay rate -1"""
 ROWS = (row.split() for row in BAD.replace("\n", ";").split(";"))
@@ -118,5 +120,5 @@ def test_another_driver_in_place_of_the_camera() -> None:
 
 def test_the_bench_has_the_build_of_its_argument() -> None:
     plan = launch_arguments.calibrate(Given("calibrate"))
-    assert plan.bench == {"scene": "posts", "pixels": "paper", "trigger": "stage",
-                          "calibration": "config_3_as_built"}  # fmt: skip
+    assert plan.bench == {"scene": "posts", "pixels": "paper", "effects": "none",
+                          "trigger": "stage", "calibration": "config_3_as_built"}  # fmt: skip
