@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.simulation.pixels import PixelArray, PixelParameters, unpack
-from eschorty_ros.simulation.readout import Readout, ReadoutParameters
 from eschorty_ros.simulation.world.timeline import LaserTimeline
 
 
@@ -53,7 +52,6 @@ def simulate_line(
     background_hz: float = 0.0,
     seed: int = 0,
     rows: int = 720,
-    readout: ReadoutParameters | None = None,
 ) -> LineEvents:
     """Return the events of a resting line; no two columns share noise or thresholds.
 
@@ -81,8 +79,6 @@ def simulate_line(
         Same seed, same events.
     rows : int
         Height of the sensor, at most 1024.
-    readout : ReadoutParameters, optional
-        By default every event leaves the sensor at its request.
 
     Raises
     ------
@@ -115,10 +111,7 @@ def simulate_line(
         pixels.relight(t_us, every, line, bright * laser.level(t_us), low, high)
         t_us = laser.next_us(t_us)
     pixels.run_until(duration_us)
-    keys = pixels.take(duration_us)
-    if readout is not None:
-        keys = Readout(rows, readout).read_out(keys, duration_us).keys
-    t, x, y, p = unpack(keys)
+    t, x, y, p = unpack(pixels.take(duration_us))
     return LineEvents(t, x, y, p, centre)
 
 

@@ -18,11 +18,6 @@ class Visible:
 
     The ray from each hit to the lens is compared with the scene's first surface in the same column
     at every stage position that it passes; behind its first surface a scene counts as solid.
-
-    Parameters
-    ----------
-    scene : Scene
-    model : RangeModel
     """
 
     def __init__(self, scene: Scene, model: RangeModel) -> None:
