@@ -15,13 +15,13 @@ from eschorty_ros.live.calibration_capture import CaptureRequest
 CAPTURE_MAX_S = 120.0
 _DRAIN_S = 10.0
 _DRAIN_WITHIN_S = 120.0
-_SETTLE_MM_S = 100.0
+_APPROACH_MM_S = 100.0
 
 
 class CaptureInstrument(Instrument, Protocol):
     """Instrument for a capture, which lasts for a given time."""
 
-    def hold(self, duration_s: float) -> None:
+    def collect(self, duration_s: float) -> None:
         """Wait until the reconstruction has passed this much sensor time."""
 
 
@@ -84,12 +84,12 @@ def run_capture(
         instrument.check_nodes()
         instrument.configure_laser(request.frequency_hz, request.duty)
         if sweep is not None:
-            instrument.move(sweep.start_mm, _SETTLE_MM_S)
+            instrument.move(sweep.start_mm, _APPROACH_MM_S)
         instrument.laser_on()
         instrument.watch(True)
         instrument.report("capturing")
         if sweep is None:
-            instrument.hold(request.capture_s)
+            instrument.collect(request.capture_s)
         else:
             instrument.move(sweep.stop_mm, sweep.speed_mm_s)
             instrument.move(sweep.start_mm, sweep.speed_mm_s)

@@ -99,7 +99,7 @@ class PacedWaiting:
                     f"{within_s:.0f} s; look at the computer's load and at the hosts' clocks"
                 )
 
-    def hold(self, duration_s: float) -> None:
+    def collect(self, duration_s: float) -> None:
         """Wait until the reconstruction has passed this much sensor time from now on."""
         target_ns = self._now_ns() + round(duration_s * 1e9)
         self.monitor.restart_progress()

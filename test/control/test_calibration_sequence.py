@@ -19,7 +19,7 @@ MOVING = CaptureRequest(TWO[:1], "joint", sweep=Sweep(10.0, 60.0, 20.0, 1.0))
 @pytest.mark.parametrize(
     ("request_", "steps"),
     [
-        (RESTING, ["begin", "check_nodes", "configure_laser", "laser_on", "hold"]),
+        (RESTING, ["begin", "check_nodes", "configure_laser", "laser_on", "collect"]),
         (MOVING, ["begin", "check_nodes", "configure_laser", "move", "laser_on", "move", "move"]),
     ],
 )

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from held_laser import HeldLaser
+from delayed_laser import DelayedLaser
 from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
@@ -16,13 +16,13 @@ from eschorty_ros.core.modulation import Modulation
 
 
 @pytest.fixture
-def laser() -> Iterator[HeldLaser]:
-    made = HeldLaser()
+def laser() -> Iterator[DelayedLaser]:
+    made = DelayedLaser()
     yield made
     made.go.set()
 
 
-def opened(laser: HeldLaser, interlock: LaserInterlock) -> LaserSupervisor:
+def opened(laser: DelayedLaser, interlock: LaserInterlock) -> LaserSupervisor:
     made = LaserSupervisor(
         interlock, running=lambda: True, publish=lambda status: None, alarm=print, log=print,
         readback_period_s=0.02,
@@ -33,7 +33,7 @@ def opened(laser: HeldLaser, interlock: LaserInterlock) -> LaserSupervisor:
 
 
 @pytest.fixture
-def supervisor(laser: HeldLaser) -> Iterator[LaserSupervisor]:
+def supervisor(laser: DelayedLaser) -> Iterator[LaserSupervisor]:
     made = opened(laser, LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0}))
     yield made
     laser.go.set()
@@ -76,7 +76,7 @@ def test_enabled_twice_it_stays_on(supervisor, laser):
 
 
 def test_arming_does_not_outlive_disabling(supervisor, laser):
-    laser.hold = "arm"
+    laser.delayed = "arm"
     failures: list[str] = []
     arming = in_thread(supervisor.arm, failures)
     assert laser.reached.wait(DEADLINE_S)
@@ -90,7 +90,7 @@ def test_arming_does_not_outlive_disabling(supervisor, laser):
 
 
 def test_commands_that_waited_while_it_was_disabled_are_void(supervisor, laser):
-    laser.hold = "configure"
+    laser.delayed = "configure"
     supervisor._commands = turns = Turns()  # type: ignore[assignment]
     failures: list[str] = []
     begun = [in_thread(lambda: supervisor.configure(Modulation(80.0)), failures)]
@@ -107,7 +107,7 @@ def test_commands_that_waited_while_it_was_disabled_are_void(supervisor, laser):
     assert laser.enablings == 0
 
 
-class Interrupted(HeldLaser):
+class Interrupted(DelayedLaser):
     """``enable`` lasts until ``disable`` interrupts it, which then lasts 50 ms longer."""
 
     def enable(self) -> None:
@@ -138,7 +138,7 @@ def test_reason_is_that_of_the_disabling_not_of_the_command_it_interrupts(superv
 
 def test_stall_of_this_process_leaves_light_on(monkeypatch):
     clock = StallClock(monkeypatch)
-    laser = HeldLaser()
+    laser = DelayedLaser()
     interlock = LaserInterlock(10.0, 600.0, {CLIENT_HEARTBEAT: 1.0}, now_s=clock.monotonic)
     supervisor = opened(laser, interlock)
     try:
@@ -155,11 +155,11 @@ def test_stall_of_this_process_leaves_light_on(monkeypatch):
 
 
 def test_opened_again_it_is_watched_once(supervisor, laser):
-    laser.hold = "readback"
+    laser.delayed = "readback"
     assert laser.reached.wait(DEADLINE_S)
     supervisor.close()
-    laser.hold = ""
-    supervisor.open(HeldLaser(), Modulation(70.0))
+    laser.delayed = ""
+    supervisor.open(DelayedLaser(), Modulation(70.0))
     laser.go.set()
 
     once = ["laser read-back", "laser watchdog"]

@@ -11,15 +11,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from command_process import CommandProcess, run_commands
 from short_folder import short_folder
-from told_process import ToldProcess, obey
 from waiting import wait_until
 
 from eschorty_ros.emulation.awg.model import AwgModel, read_output_log
 from eschorty_ros.emulation.bus import UsbServer
 
 
-class AwgProcess(ToldProcess):
+class AwgProcess(CommandProcess):
     def __init__(self, log: Path, path: Path) -> None:
         self.log = log
         self.backend = f"eschorty_ros.emulation.bus.usb_remote:backend?{path}"
@@ -67,7 +67,7 @@ def serve(path: str, log: str) -> None:
             setattr(model, name, value)
 
     with UsbServer(path, lambda: [model]):
-        obey(do)
+        run_commands(do)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from command_process import CommandProcess, run_commands
 from short_folder import short_folder
-from told_process import ToldProcess, obey
 
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench.server import serving
@@ -25,19 +25,22 @@ def bench_here(**settings: Any) -> Iterator[tuple[Bench, Path]]:
 
 
 @contextlib.contextmanager
-def remote_bench(**settings: Any) -> Iterator[tuple[ToldProcess, Path]]:
+def remote_bench(**settings: Any) -> Iterator[tuple[CommandProcess, Path]]:
     """Yield a bench with these ``BenchSettings`` in another process, and its folder.
 
-    What it is told to do is the scene from the next start of the stream on.
+    The command is the scene from the next start of the stream on.
     """
-    with short_folder() as folder, ToldProcess(__file__, folder, json.dumps(settings)) as process:
+    with (
+        short_folder() as folder,
+        CommandProcess(__file__, folder, json.dumps(settings)) as process,
+    ):
         yield process, folder
 
 
 def serve(folder: str, settings: str) -> None:
     bench = Bench(BenchSettings(**json.loads(settings)))
     with serving(bench, Path(folder)):
-        obey(bench.set_scene)
+        run_commands(bench.set_scene)
 
 
 if __name__ == "__main__":

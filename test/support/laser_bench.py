@@ -20,18 +20,18 @@ OFF_LIMIT_S = 0.25
 
 
 class LaserBench:
-    """Generator, laser node and what they publish; ``held`` ends the processes."""
+    """Generator, laser node and what they publish; ``stack`` ends the processes."""
 
     def __init__(
         self,
-        held: contextlib.ExitStack,
+        stack: contextlib.ExitStack,
         folder: Path,
         module: str = "eschorty_ros.nodes.laser.node",
         **parameters: Any,
     ) -> None:
-        self._held = held
-        self.observer = observer = held.enter_context(Observer())
-        self.awg = held.enter_context(awg_process(folder))
+        self._stack = stack
+        self.observer = observer = stack.enter_context(Observer())
+        self.awg = stack.enter_context(awg_process(folder))
         # No report of the contact that a loaded machine delays may end the light.
         defaults = {"driver": "awg", "backend": self.awg.backend, "interlock_timeout": 60.0}
         parameters = {**defaults, **parameters}
@@ -42,8 +42,8 @@ class LaserBench:
     def start(self, module: str, parameters: dict[str, Any]) -> NodeProcess:
         """Start another process of this bench, whose output is printed at its end."""
         process = NodeProcess(module, parameters, domain=self.observer.domain)
-        self._held.enter_context(process)
-        self._held.callback(lambda: print(f"--- {process.module}\n{process.output}"))
+        self._stack.enter_context(process)
+        self._stack.callback(lambda: print(f"--- {process.module}\n{process.output}"))
         return process
 
     def arm(self) -> Any:

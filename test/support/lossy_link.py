@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from told_process import ToldProcess, obey
+from command_process import CommandProcess, run_commands
 
 SEED = 20261122
 CLONE_NEWNET = 0x40000000
@@ -52,7 +52,7 @@ class TwoHosts:
             for space in spaces:
                 _ip("netns", "add", space)
                 ending.callback(_ip, "netns", "del", space)
-            self._link = ending.enter_context(ToldProcess(__file__, *spaces))
+            self._link = ending.enter_context(CommandProcess(__file__, *spaces))
             self._ending = ending.pop_all()
         return self
 
@@ -124,7 +124,7 @@ def _end(space: str, number: int) -> int:
 def _main(spaces: list[str]) -> None:
     link = _Link(spaces)
     threading.Thread(target=link.carry, daemon=True).start()
-    obey(lambda share: setattr(link, "lost", float(share)))
+    run_commands(lambda share: setattr(link, "lost", float(share)))
 
 
 if __name__ == "__main__":

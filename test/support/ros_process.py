@@ -186,22 +186,22 @@ class Observer:
         use_profile()
         self.domain = free_domain() if domain is None else domain
         context = rclpy.Context()
-        with contextlib.ExitStack() as held:
+        with contextlib.ExitStack() as stack:
             rclpy.init(context=context, domain_id=self.domain)
-            held.callback(context.try_shutdown)
+            stack.callback(context.try_shutdown)
             self.node = Node("observer", namespace=NAMESPACE, context=context)
-            held.callback(self.node.destroy_node)
+            stack.callback(self.node.destroy_node)
             spinning = Spinning(1, context)
             spinning.executor.add_node(self.node)
-            held.callback(spinning.end)
+            stack.callback(spinning.end)
             spinning.start()
-            self._held = held.pop_all()
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> Observer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._held.close()
+        self._stack.close()
 
     def action_client(self, kind: Any, name: str) -> ActionClient:
         """An action's client."""

@@ -27,12 +27,12 @@ TIMEOUTS = {f"{name}_timeout": 60.0 for name in ("heartbeat", "camera", "stage")
 
 
 class SafetyBench(LaserBench):
-    """Generator, laser node and senders, each a process; ``held`` ends them."""
+    """Generator, laser node and senders, each a process; ``stack`` ends them."""
 
     def __init__(
-        self, held: contextlib.ExitStack, folder: Path, senders: tuple[str, ...], **parameters: Any
+        self, stack: contextlib.ExitStack, folder: Path, senders: tuple[str, ...], **parameters: Any
     ) -> None:
-        super().__init__(held, folder, "breakable_laser", **TIMEOUTS, **parameters)
+        super().__init__(stack, folder, "breakable_laser", **TIMEOUTS, **parameters)
         self._names = senders
         self.senders: dict[str, NodeProcess] = {}
         self.start_senders()
@@ -93,8 +93,8 @@ class SafetyBench(LaserBench):
 def running(
     folder: Path, senders: tuple[str, ...] = (" ".join(SENDERS),), **parameters: Any
 ) -> Iterator[SafetyBench]:
-    with contextlib.ExitStack() as held:
-        yield SafetyBench(held, folder, senders, **parameters)
+    with contextlib.ExitStack() as stack:
+        yield SafetyBench(stack, folder, senders, **parameters)
 
 
 def guard_of(pid: int) -> int:

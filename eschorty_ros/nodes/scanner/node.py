@@ -63,9 +63,9 @@ TABLE = (
 )  # fmt: skip
 
 _FEEDBACK_S = 0.1
-_COUNT_S = 0.5
+_COUNT_CLIENTS_S = 0.5
 # A client that has just been discovered may not be counted yet.
-_FOLLOWED_S = 5.0
+_CLIENT_TIMEOUT_S = 5.0
 # Time for the other nodes to start before a missing one is logged.
 _STARTING_S = 5.0
 
@@ -104,7 +104,7 @@ class ScannerNode(Node):
         self._idle = threading.Event()
         self._idle.set()
         self._scans = 0
-        self._followed_s = self._counted_s = 0.0
+        self._client_seen_s = self._clients_counted_s = 0.0
         self._last = "no scan yet"
         self.waiting = ""
         self._begun_s = time.monotonic()
@@ -156,7 +156,7 @@ class ScannerNode(Node):
 
     def _scan(self, goal: Any, request: ScanRequest) -> Any:
         self._scans += 1
-        self._followed_s = time.monotonic()
+        self._client_seen_s = time.monotonic()
         self._client.prepare(partial(self._canceled, goal), self._feedback(goal, request))
         outcome = run_scan(self._client, request, self._limits)
         result = self._result(request, outcome)
@@ -179,12 +179,12 @@ class ScannerNode(Node):
     def _canceled(self, goal: Any) -> bool:
         """Return whether the goal is canceled; ``ScanFailure`` when no client is left."""
         now_s = time.monotonic()
-        if now_s - self._followed_s > _FOLLOWED_S:
+        if now_s - self._client_seen_s > _CLIENT_TIMEOUT_S:
             raise ScanFailure("scanner: no client of the scan is left; the scan ends")
-        if now_s - self._counted_s > _COUNT_S:
-            self._counted_s = now_s
+        if now_s - self._clients_counted_s > _COUNT_CLIENTS_S:
+            self._clients_counted_s = now_s
             if self.count_clients(f"{self.resolve_service_name('scan')}/_action/get_result"):
-                self._followed_s = now_s
+                self._client_seen_s = now_s
         return bool(goal.is_cancel_requested)
 
     def _refuse(self, goal: Any, reason: str) -> Any:
@@ -227,7 +227,7 @@ class ScannerNode(Node):
         summary = outcome.summary
         note = summary.message if summary.verdict == "complete" else summary.line
         if outcome.message and not summary.points:
-            # The other reason is that of the missing points, too.
+            # The message already says why there are no points.
             note = ""
         result = Scan.Result(
             success=outcome.end is End.SUCCEEDED,

@@ -181,7 +181,7 @@ class Owner:
                 sys.executable,
                 "-c",
                 OWNER,
-                "lazy_awg:open_laser",
+                "guard_only_awg:open_laser",
                 awg.backend,
                 str(timeout_s),
                 guard,

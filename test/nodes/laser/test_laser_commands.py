@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from delayed_laser import DelayedLaser
 from eschorty_ros.msg import LaserState
-from held_laser import HeldLaser
 from ros_process import Observer, nodes_here, wait_until
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
@@ -22,24 +22,24 @@ from eschorty_ros.nodes.ros import drivers, qos
 
 
 @pytest.fixture
-def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[HeldLaser]:
-    held = HeldLaser()
-    monkeypatch.setattr(drivers, "make", lambda *_: held)
+def laser(monkeypatch: pytest.MonkeyPatch, observer: Observer) -> Iterator[DelayedLaser]:
+    made = DelayedLaser()
+    monkeypatch.setattr(drivers, "make", lambda *_: made)
     # One heartbeat and one arming must last, whatever delays this process.
     given = {"watch": "none", "heartbeat_timeout": 60.0, "arm_timeout": 3600.0}
     with nodes_here(observer.domain, THREADS) as start:
         start(LaserNode, **given)
         observer.wait_for_state("laser", "active")
-        yield held
-        held.go.set()
+        yield made
+        made.go.set()
 
 
-def test_disabling_does_not_wait_for_enabling(observer: Observer, laser: HeldLaser) -> None:
+def test_disabling_does_not_wait_for_enabling(observer: Observer, laser: DelayedLaser) -> None:
     heartbeat = observer.publisher(Header, CLIENT_HEARTBEAT, qos.heartbeat())
     wait_until(heartbeat.get_subscription_count, "the heartbeat's subscriber")
     heartbeat.publish(Header())
     wait_until(lambda: observer.call(Trigger, "laser/arm").success, "arming")
-    laser.hold = "enable"
+    laser.delayed = "enable"
     with ThreadPoolExecutor() as pool:
         pool.submit(observer.call, SetBool, "laser/enable", SetBool.Request(data=True))
         assert laser.reached.wait(DEADLINE_S)
@@ -50,7 +50,7 @@ def test_disabling_does_not_wait_for_enabling(observer: Observer, laser: HeldLas
 
 
 def test_interlock_that_is_reported_open_repeatedly_switches_off_once(
-    observer: Observer, laser: HeldLaser
+    observer: Observer, laser: DelayedLaser
 ) -> None:
     states = observer.collect(LaserState, "laser/state", qos.latched(qos.STATE_HISTORY))
     before = laser.offs

@@ -37,12 +37,12 @@ PARAMETERS = {
 class Bench(LaserBench):
     """A laser node with a heartbeat that can be switched."""
 
-    def __init__(self, held: contextlib.ExitStack, folder: Path, **parameters: Any) -> None:
-        super().__init__(held, folder, **{**PARAMETERS, **parameters})
+    def __init__(self, stack: contextlib.ExitStack, folder: Path, **parameters: Any) -> None:
+        super().__init__(stack, folder, **{**PARAMETERS, **parameters})
         observer, self.alive = self.observer, False
         self._heartbeat = observer.publisher(Header, CLIENT_HEARTBEAT, qos.stream(10))
         timer = observer.node.create_timer(0.03, self._send)
-        held.callback(observer.node.destroy_timer, timer)
+        stack.callback(observer.node.destroy_timer, timer)
         observer.wait_for_state("laser", "active")
         wait_until(self._heartbeat.get_subscription_count, "the heartbeat's subscriber")
         wait_until(lambda: self.states, "a laser state")
@@ -76,8 +76,8 @@ class Bench(LaserBench):
 
 @contextlib.contextmanager
 def running(folder: Path, **parameters: Any) -> Iterator[Bench]:
-    with contextlib.ExitStack() as held:
-        yield Bench(held, folder, **parameters)
+    with contextlib.ExitStack() as stack:
+        yield Bench(stack, folder, **parameters)
 
 
 @pytest.fixture(scope="module")

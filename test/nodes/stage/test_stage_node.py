@@ -28,19 +28,19 @@ SLOW_M_S = 0.01
 
 
 class Stage:
-    """A stage node and a client of it, which ``held`` ends."""
+    """A stage node and a client of it, which ``stack`` ends."""
 
     def __init__(
-        self, held: contextlib.ExitStack, observer: Observer, emulated: Bench, folder: Path
+        self, stack: contextlib.ExitStack, observer: Observer, emulated: Bench, folder: Path
     ) -> None:
         self.emulated = emulated
-        self.process = held.enter_context(
+        self.process = stack.enter_context(
             NodeProcess("eschorty_ros.nodes.stage.node", {"bench": folder}, domain=observer.domain)
         )
         self.odometry = observer.collect(Odometry, "stage/odom", qos.stream(2000))
         self.observer = observer
         self._client = observer.action_client(MoveStage, "stage/move")
-        held.callback(self._client.destroy)
+        stack.callback(self._client.destroy)
         observer.wait_for_state("stage", "active")
         wait_until(self._client.server_is_ready, "stage/move")
         wait_until(lambda: self.odometry, "odometry")
@@ -66,8 +66,12 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage() -> Iterator[Stage]:
-    with bench_here() as (emulated, folder), Observer() as observer, contextlib.ExitStack() as held:
-        yield Stage(held, observer, emulated, folder)
+    with (
+        bench_here() as (emulated, folder),
+        Observer() as observer,
+        contextlib.ExitStack() as stack,
+    ):
+        yield Stage(stack, observer, emulated, folder)
 
 
 def test_activate_homes(stage: Stage) -> None:

@@ -1,4 +1,4 @@
-"""A process that does what a test tells it."""
+"""A process that carries out a test's commands."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import sys
 from collections.abc import Callable
 
 
-class ToldProcess:
-    """``python FILE ARGUMENTS``, which calls ``obey``; it ends with the ``with`` or the tests."""
+class CommandProcess:
+    """``python FILE ARGUMENTS``, which calls ``run_commands``; ends with the ``with``."""
 
     def __init__(self, file: str, *arguments: object) -> None:
         command = [sys.executable, file, *map(str, arguments)]
@@ -16,7 +16,7 @@ class ToldProcess:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
-    def __enter__(self) -> ToldProcess:
+    def __enter__(self) -> CommandProcess:
         try:
             self._answer()
         except BaseException:
@@ -38,8 +38,8 @@ class ToldProcess:
         assert answer == "done", answer
 
 
-def obey(do: Callable[[str], object]) -> None:
-    """In the process: do what comes on standard input, until it ends."""
+def run_commands(do: Callable[[str], object]) -> None:
+    """In the process: carry out the lines of standard input, until it ends."""
     print("done", flush=True)
     for line in sys.stdin:
         do(line.strip())

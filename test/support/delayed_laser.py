@@ -11,12 +11,12 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserOutput, LaserReadback
 
 
-class HeldLaser:
-    """The command named in ``hold`` waits for ``go``; ``disabled`` is set by a ``disable`` then."""
+class DelayedLaser:
+    """The command named in ``delayed`` waits for ``go``; a ``disable`` then sets ``disabled``."""
 
     def __init__(self) -> None:
-        self.identity = DeviceIdentity("held", "1")
-        self.hold = ""
+        self.identity = DeviceIdentity("delayed", "1")
+        self.delayed = ""
         self.reached, self.go = threading.Event(), threading.Event()
         self.disabled = threading.Event()
         self.lit = self.armed = False
@@ -24,7 +24,7 @@ class HeldLaser:
         self.enablings = self.offs = 0
 
     def _wait(self, command: str) -> None:
-        if self.hold == command:
+        if self.delayed == command:
             self.reached.set()
             assert self.go.wait(DEADLINE_S)
 
@@ -46,7 +46,7 @@ class HeldLaser:
     def disable(self) -> None:
         self.armed = self.lit = False
         self.offs += 1
-        if self.hold:
+        if self.delayed:
             self.disabled.set()
 
     def readback(self) -> LaserReadback:
