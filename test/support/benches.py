@@ -30,11 +30,8 @@ def remote_bench(**settings: Any) -> Iterator[tuple[CommandProcess, Path]]:
 
     The command is the scene from the next start of the stream on.
     """
-    with (
-        short_folder() as folder,
-        CommandProcess(__file__, folder, json.dumps(settings)) as process,
-    ):
-        yield process, folder
+    with short_folder() as folder, CommandProcess(__file__, folder, json.dumps(settings)) as other:
+        yield other, folder
 
 
 def serve(folder: str, settings: str) -> None:

@@ -165,7 +165,7 @@ class GuardedLaser:
             self._guard.release()
 
     def _close_at_exit(self) -> None:
-        # What it could report, the guard prints.
+        # The guard prints what fails here.
         with contextlib.suppress(EschortyError):
             self.close()
 
@@ -210,7 +210,7 @@ class GuardedLaser:
             messages = self._wire.receive()
             if messages is None:
                 if not self._dismissed:
-                    # One that serves no more, whatever its process still does.
+                    # It no longer serves, even if its process runs on.
                     self._guard.kill()
                 break
             for message in messages:
@@ -222,7 +222,7 @@ class GuardedLaser:
                 heartbeat_at_s = now_s + self._heartbeat_s
                 self._wire.send({"do": "heartbeat"})
             if self._guard.pid and process_fault(self._guard.pid):
-                # Also one that dumps core, which is not waited for.
+                # Also while it dumps core, before its end.
                 self._guard.kill()
 
     def _replace_guard(self) -> None:

@@ -52,7 +52,7 @@ def _listening(path: str) -> Iterator[socket.socket]:
             if _served(path):
                 raise DeviceError(f"guard socket {path}: another guard serves it; end that first")
             Path(path).unlink(missing_ok=True)
-            # Nobody else may connect: what is opened is named by the client.
+            # This user alone may connect: a client names the code that opens the generator.
             mask = os.umask(0o177)
             try:
                 listener.bind(path)

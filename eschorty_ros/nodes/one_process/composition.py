@@ -208,7 +208,7 @@ def _running(
         yield made
     finally:
         with signals_ignored():
-            spinning.hold()
+            spinning.stop_callbacks()
             make_safe(nodes)
             # An ended context also ends callbacks that wait, such as homing.
             rclpy.try_shutdown()

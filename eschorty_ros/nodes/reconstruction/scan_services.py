@@ -27,7 +27,7 @@ from eschorty_ros.srv import BeginScan, EndScan
 
 _END = "reconstruction/end_scan"
 _CHECK_S = 0.2
-_FOLLOWED_S = 5.0
+_CLIENT_TIMEOUT_S = 5.0
 _CONNECT_S = 3.0
 _WORKER_S = 10.0
 _ASSEMBLE_S = 30.0
@@ -75,7 +75,7 @@ class ScanServices:
             node.create_service(kind, name, callback, callback_group=group)
         self._client = OnePublisher()
         self._sender: Sender | None = None
-        self._begun_s, self._followed = 0.0, False
+        self._begun_s, self._had_client = 0.0, False
         node.create_subscription(Header, CLIENT_HEARTBEAT, self._on_heartbeat, qos.heartbeat())
         node.create_timer(
             _CHECK_S, self._check_client, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -132,17 +132,17 @@ class ScanServices:
         """Publish the points so far of a scan whose client has ended."""
         now_s, scan_id = time.monotonic(), self._pipeline.scan_id
         if not scan_id or self._ended is not None:
-            self._sender, self._begun_s, self._followed = None, now_s, False
+            self._sender, self._begun_s, self._had_client = None, now_s, False
             return
         fault = self._sender.fault() if self._sender is not None else ""
-        if now_s - self._begun_s > _FOLLOWED_S:
+        if now_s - self._begun_s > _CLIENT_TIMEOUT_S:
             # A command line's client is there for its one call only.
             clients = self._node.count_clients(self._node.resolve_service_name(_END))
-            if self._followed and not clients:
+            if self._had_client and not clients:
                 fault = "no client is left"
-            self._followed = clients > 0
+            self._had_client = clients > 0
         if fault:
-            self._sender, self._followed = None, False
+            self._sender, self._had_client = None, False
             self._node.get_logger().warning(f"{scan_id} was left open ({fault}); ending it")
             self._in_worker(partial(self._begin_end, scan_id, lambda _: None), 0.0)
 

@@ -275,13 +275,13 @@ class Spinning:
         if self.executor.error is not None:
             raise self.executor.error
 
-    def hold(self) -> None:
+    def stop_callbacks(self) -> None:
         """Begin no more callbacks."""
         self.executor.ending = True
 
     def end(self, timeout_s: float = 1.0) -> None:
         """Begin no more callbacks, and wait for the thread as long as that."""
-        self.hold()
+        self.stop_callbacks()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.

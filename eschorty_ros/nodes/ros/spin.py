@@ -163,7 +163,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         _ignore_signals()
         # A callback must not switch on what has been made safe.
         if spinning is not None:
-            spinning.hold()
+            spinning.stop_callbacks()
         make_safe(nodes)
         _tear_down(nodes, spinning)
     return code

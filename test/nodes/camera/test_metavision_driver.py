@@ -84,7 +84,7 @@ def publish(driver: Driver, observer: Observer, recording, states) -> None:
 
 
 @pytest.mark.parametrize("driver", [OURS, METAVISION], ids=lambda driver: driver.node)
-def test_a_driver_s_stream_gives_the_recording_s_points(driver, recording, observer):
+def test_the_stream_of_each_driver_gives_the_points_of_the_recording(driver, recording, observer):
     parameters = {
         "frequency": recording.modulation.frequency_hz,
         "camera/events": Remap(driver.topic),
