@@ -83,10 +83,10 @@ def show(made: Table) -> None:
     console.print(made)
 
 
-def decimals(values: Iterable[float], digits: int = 3) -> int:
-    """Return the decimals with which each of ``values`` shows that many digits or more."""
+def decimals(values: Iterable[float]) -> int:
+    """Return the decimals with which each of ``values`` shows three digits or more."""
     sizes = [abs(value) for value in values if value and math.isfinite(value)]
-    return max(digits - 1 - math.floor(math.log10(min(sizes))), 0) if sizes else 0
+    return max(2 - math.floor(math.log10(min(sizes))), 0) if sizes else 0
 
 
 def pairs(title: str, rows: dict[str, str]) -> None:

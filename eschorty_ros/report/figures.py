@@ -74,7 +74,7 @@ def scan_figure(
     return figure
 
 
-def cloud_figure(points: NDArray[np.void], title: str = "") -> Figure:
+def cloud_figure(points: NDArray[np.void], title: str) -> Figure:
     """Draw points of which only the places are known: a view along x and a 3-D view.
 
     - ``points``: ndarray of POINT_DTYPE, shape (n,), at least one.

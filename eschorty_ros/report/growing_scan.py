@@ -34,11 +34,7 @@ class _Surface(NamedTuple):
     profile: NDArray[np.int64]
 
 
-def write_growing_scan(
-    points: NDArray[np.void],
-    path: str | os.PathLike[str],
-    stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
-) -> None:
+def write_growing_scan(points: NDArray[np.void], path: str | os.PathLike[str]) -> None:
     """Write a GIF of the cloud: profile by profile as the stage moves, then from both sides.
 
     - ``points``: ndarray of POINT_DTYPE, shape (n,).
@@ -48,7 +44,7 @@ def write_growing_scan(
     """
     from PIL import Image
 
-    surface = _surface(points, stage_direction)
+    surface = _surface(points)
     last = int(surface.profile.max())
     growing = [
         _frame(surface, round(last * share), TURN_DEG * (share - 1.0) * 0.5)
@@ -67,10 +63,10 @@ def write_growing_scan(
         )  # fmt: skip
 
 
-def _surface(points: NDArray[np.void], stage_direction: tuple[float, float, float]) -> _Surface:
+def _surface(points: NDArray[np.void]) -> _Surface:
     from matplotlib import colormaps
 
-    stage_mm, range_mm = stage_and_range_mm(points, stage_direction)
+    stage_mm, range_mm = stage_and_range_mm(points, (0.0, 1.0, 0.0))
     grid = grid_of(points, stage_mm)
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64) * 1e3
     low, high = central(range_mm)

@@ -35,6 +35,6 @@ def range_error_mm(model: RangeModel, truth: RangeModel = TRUTH) -> np.ndarray:
     return model.range_mm(truth.row(CHECK_MM)) - CHECK_MM
 
 
-def scale_error(model: RangeModel, truth: RangeModel = TRUTH) -> float:
+def scale_error(model: RangeModel) -> float:
     """Relative error of a lateral length at mid-range."""
-    return float(model.lateral_mm(COLUMN, 1320.0) / truth.lateral_mm(COLUMN, 1320.0)) - 1.0
+    return float(model.lateral_mm(COLUMN, 1320.0) / TRUTH.lateral_mm(COLUMN, 1320.0)) - 1.0

@@ -243,13 +243,13 @@ def _positions_mm() -> np.ndarray:
     return 1e3 * (START_M + (STOP_M - START_M) * (np.arange(PERIODS) + 0.5) / PERIODS)
 
 
-def full_scan(bench: Bench, completeness: float = BUT_ONE) -> None:
+def full_scan(bench: Bench) -> None:
     """A scan to its end gives the expected cloud."""
     before = len(bench.clouds)
     status, result = bench.scan()
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     assert result.success, result.message
-    completeness -= bench.dark_periods() / PERIODS
+    completeness = BUT_ONE - bench.dark_periods() / PERIODS
     assert result.verdict == "complete" or result.completeness > completeness, result.message
     points, _ = bench.lit_part(bench.cloud_after(before, result.points))
     assert len(points) >= 0.99 * result.points

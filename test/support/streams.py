@@ -44,10 +44,10 @@ def recording_like_words(rng: np.random.Generator, time_steps: int) -> list[int]
     return words
 
 
-def sparse_events(rng: np.random.Generator, count: int, rate_per_us: float = 10.0) -> Vectors:
-    """Uniform noise."""
+def sparse_events(rng: np.random.Generator, count: int) -> Vectors:
+    """Uniform noise of 10 events per microsecond."""
     return (
-        np.sort(rng.integers(0, max(int(count / rate_per_us), 1), count)),
+        np.sort(rng.integers(0, max(count // 10, 1), count)),
         rng.integers(0, 1280, count).astype(np.uint16),
         rng.integers(0, 720, count).astype(np.uint16),
         rng.integers(0, 2, count).astype(np.uint8),

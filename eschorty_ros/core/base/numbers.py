@@ -24,11 +24,11 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
     return real
 
 
-def number_or_nan(name: str, value: Any, low: float = -math.inf) -> float:
-    """Return ``value`` as a float from ``low`` on, NaN where it is unknown."""
+def number_or_nan(name: str, value: Any) -> float:
+    """Return ``value`` as a finite float, NaN where it is unknown."""
     if isinstance(value, Real) and value != value:
         return math.nan
-    return number(name, value, low)
+    return number(name, value)
 
 
 def positive(name: str, value: Any) -> float:

@@ -64,25 +64,19 @@ def laser_class(power_mw: float, wavelength_nm: float, fan_deg: float) -> LaserC
 
 
 def photons_per_column(
-    build: Design,
-    range_mm: float,
-    power_mw: float,
-    wavelength_nm: float,
-    seconds: float,
-    reflectance: float = 1.0,
+    build: Design, range_mm: float, power_mw: float, wavelength_nm: float, seconds: float
 ) -> float:
     """Return the photons that one column of the line sends through the lens.
 
-    The line is spread evenly over the columns, the target is matt (Lambert) and faces the sensor;
-    lens and filter lose nothing.
+    The line is spread evenly over the columns, the target is white, matt (Lambert) and faces the
+    sensor; lens and filter lose nothing.
 
     - ``range_mm``: From the mechanical datum.
     - ``power_mw``, ``wavelength_nm``: Of the light.
     - ``seconds``: Time of light, such as half a modulation period.
-    - ``reflectance``: Of the target.
     """
     depth_mm = positive("range_mm + b_mm", range_mm + build.model.b_mm)
     energy_j = power_mw * 1e-3 * positive("seconds", seconds) / build.model.columns
     aperture_mm = build.focal_length_mm / build.f_number
-    collected = reflectance * (0.5 * aperture_mm / depth_mm) ** 2
+    collected = (0.5 * aperture_mm / depth_mm) ** 2
     return energy_j * min(collected, 1.0) * positive("wavelength_nm", wavelength_nm) / _JOULE_NM

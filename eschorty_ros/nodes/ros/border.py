@@ -15,7 +15,8 @@ from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 
 _LOG_S = 5.0
 _LINE_MAX = 300
-INT32_MAX, UINT32_MAX, UINT64_MAX = (1 << 31) - 1, (1 << 32) - 1, (1 << 64) - 1
+_TEXT_MAX = 200
+UINT32_MAX, UINT64_MAX = (1 << 32) - 1, (1 << 64) - 1
 
 
 class Refusals:
@@ -29,9 +30,9 @@ class Refusals:
         self._logged_s: dict[str, float] = {}
         self.counts: Counter[str] = Counter()
 
-    def add(self, name: str, reason: str, count: int = 1) -> None:
+    def add(self, name: str, reason: str) -> None:
         """Count what came by ``name``; log the reason when that is due."""
-        self.counts[name] += count
+        self.counts[name] += 1
         now_s = time.monotonic()
         if now_s - self._logged_s.get(name, -math.inf) < _LOG_S:
             return
@@ -69,10 +70,10 @@ def _name(node: Node, entity: Any) -> str:
     return str(full).removeprefix(f"{node.get_namespace()}/")
 
 
-def check_text(name: str, text: str, limit: int = 200) -> str:
-    """Return ``text`` unless it is longer than ``limit``."""
-    if len(text) > limit:
-        raise ArgumentError(f"{name} has {len(text)} characters; send {limit} at most")
+def check_text(name: str, text: str) -> str:
+    """Return ``text`` unless it is longer than 200 characters."""
+    if len(text) > _TEXT_MAX:
+        raise ArgumentError(f"{name} has {len(text)} characters; send {_TEXT_MAX} at most")
     return text
 
 
