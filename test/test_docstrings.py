@@ -1,7 +1,5 @@
 """What docstrings show and promise holds."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib

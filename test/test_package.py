@@ -1,7 +1,5 @@
 """What the package promises to other ROS 2 software and to those who install it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Messages, requests and goals from the types' extremes to every node, then a good scan."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import time

@@ -1,7 +1,5 @@
 """docs/interfaces.md describes every topic, service, action and parameter of the nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

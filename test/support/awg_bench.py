@@ -1,7 +1,5 @@
 """A generator model and the driver on it, in one process, without waiting."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

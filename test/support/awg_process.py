@@ -3,8 +3,6 @@
 It does ``gone``, ``back``, ``mute``, ``speak``, ``replug``, ``reboot``, ``touch PATH TEXT``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import time

@@ -1,7 +1,5 @@
 """The laser node with the topic ``test/break``, which makes it fail."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

@@ -1,7 +1,5 @@
 """The Monte Carlo set-up that the calibration's numbers are stated for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Scenarios of a calibration with their assertions, for the process and the launch tests."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The contact of the laser's interlock, as a node of the instrument publishes it."""
 
-from __future__ import annotations
-
 import threading
 
 from ros_process import Observer, wait_until

@@ -1,7 +1,5 @@
 """A laser in memory whose commands can be delayed."""
 
-from __future__ import annotations
-
 import threading
 
 from waiting import DEADLINE_S

@@ -1,7 +1,5 @@
 """A slow EVT3 decoder in plain Python, written from the format and not from the kernels."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 

@@ -1,7 +1,5 @@
 """The generator's driver, imported only in the guard: its owner is small and ends quickly."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from eschorty_ros.hardware.base.protocols import RenewedLaser

@@ -1,7 +1,5 @@
 """Stand-in for a scanner, a camera or a stage; SIGUSR1 makes its heartbeats report a stop."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

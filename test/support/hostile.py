@@ -1,7 +1,5 @@
 """Hostile values by kind of argument, and calls that take them."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ apart) and gives one event per threshold of the swing of the logarithmic intensi
 late. Nothing is remembered from one laser edge to the next.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

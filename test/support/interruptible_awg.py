@@ -1,7 +1,5 @@
 """The generator's driver with a read-back that ends only by ``disable``, or ends the process."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

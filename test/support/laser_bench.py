@@ -1,7 +1,5 @@
 """The laser node with its real driver and guard on an emulated generator, each a process."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from pathlib import Path

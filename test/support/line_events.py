@@ -1,7 +1,5 @@
 """Laser lines as event streams with known rows, for the tests of the reconstruction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 

@@ -1,7 +1,5 @@
 """A node between publishers and subscribers that loses messages at random."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager

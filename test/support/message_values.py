@@ -1,7 +1,5 @@
 """Hypothesis strategies of ROS messages: every field at the extremes of its type."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Camera drivers' packets of a recording: those of our node and those of metavision_driver."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The paper's Table 1 and its range equation with 50 digits."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 

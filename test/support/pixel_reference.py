@@ -1,7 +1,5 @@
 """The pixel model stepped finely in time, straight from its equations: slow and plain."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Streams reconstructed at once or in pieces; every event is in one of the counters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import fields
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A laser node that can be broken, with the processes that send it heartbeats."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Scenarios of a scan with their assertions, for the process tests and the launch tests."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re

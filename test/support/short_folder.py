@@ -1,7 +1,5 @@
 """Where Unix sockets of tests lie: their paths are limited to 107 bytes."""
 
-from __future__ import annotations
-
 import contextlib
 import tempfile
 from collections.abc import Iterator

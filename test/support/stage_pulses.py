@@ -1,7 +1,5 @@
 """A stage that gives pulses to a camera with a drifting clock; the truth is known."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

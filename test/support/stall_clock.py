@@ -1,7 +1,5 @@
 """A steady clock that a test sets, for a loop that measures its own stalls."""
 
-from __future__ import annotations
-
 import time
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Generated EVT3 streams whose content is known."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -8,7 +8,7 @@ _TIMEOUT_NS = 50_000_000
 
 
 class AptFramer:
-    """Strict framer: known identifier, its exact length, for the host, from a known source.
+    """Cuts bytes into frames: known identifier, its exact length, for the host, known source.
 
     What is no frame is skipped byte by byte up to the next one, and so is a frame that is
     incomplete 50 ms after its last byte.

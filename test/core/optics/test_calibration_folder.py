@@ -1,7 +1,5 @@
 """Calibrations of a folder by bare name: whatever lies there, nothing else is read or written."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The emulated stage controller, asked with thorlabs-apt-protocol's own frames."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

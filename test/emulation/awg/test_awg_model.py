@@ -1,7 +1,5 @@
 """The generator model: parses, ignores and clamps as the instrument does."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings that the EVK4 driver makes on the emulated camera, and their effect on the events."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

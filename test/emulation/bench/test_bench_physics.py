@@ -1,7 +1,5 @@
 """The bench's physics: laser, stage and sensor, each with its clock, without device models."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The bench as a process: where it is found, how it ends, what it refuses."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Devices of a served bench that are unplugged while drivers use them."""
 
-from __future__ import annotations
-
 import time
 
 from benches import bench_here

@@ -1,7 +1,5 @@
 """A model behind a pseudo-terminal, as pyserial sees it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Stalls of this process are measured by how late the turns of a loop are."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

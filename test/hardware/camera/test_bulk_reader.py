@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - without the packages the file skips before it imports what needs them
 
-from __future__ import annotations
-
 import ctypes
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Words, gaps, restarts and failures in the queue between receiving and publishing."""
 
-from __future__ import annotations
-
 import pytest
 
 from eschorty_ros.core.base.errors import DeviceGoneError

@@ -1,7 +1,5 @@
 """The driver on the emulated camera: life cycle, settings, read-back."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor

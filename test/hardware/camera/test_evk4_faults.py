@@ -2,8 +2,6 @@
 
 # ruff: noqa: E501 - a fault's line of the table in the docs is its docstring
 
-from __future__ import annotations
-
 import errno
 import threading
 import time

@@ -1,7 +1,5 @@
 """What the facilities write into the sensor, against the maker's register descriptions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

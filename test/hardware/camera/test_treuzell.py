@@ -1,7 +1,5 @@
 """Control frames: requests, answers and refusals."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

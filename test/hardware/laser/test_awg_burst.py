@@ -1,7 +1,5 @@
 """Light as a burst of counted cycles: it ends by itself unless it is renewed."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace

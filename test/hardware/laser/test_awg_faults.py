@@ -1,7 +1,5 @@
 """Faults of the laser's generator: what the driver does, and what its user reads."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The laser's generator: off by default, enabled only as configured and read back."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Profiles of generators: read from YAML, refused in one line when they are wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

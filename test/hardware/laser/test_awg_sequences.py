@@ -1,7 +1,5 @@
 """Any sequence of calls and faults: an output that is on is never reported as off."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from awg_bench import AwgBench

@@ -1,7 +1,5 @@
 """SCPI layer: any reply is a value of the kind that was requested, or a typed error."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """USBTMC client on the emulated bus: checked headers, one request for a reply, recovery."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

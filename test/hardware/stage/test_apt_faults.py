@@ -1,7 +1,5 @@
 """Faults of a stage on a serial line: what the driver does, what the user reads."""
 
-from __future__ import annotations
-
 import itertools
 import random
 

@@ -1,7 +1,5 @@
 """The framer finds frames in a stream without checksum or sync byte."""
 
-from __future__ import annotations
-
 import random
 import struct
 

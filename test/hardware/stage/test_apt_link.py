@@ -1,7 +1,5 @@
 """The link on a port that fails."""
 
-from __future__ import annotations
-
 import errno
 import threading
 

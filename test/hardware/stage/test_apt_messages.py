@@ -1,7 +1,5 @@
 """APT layouts against thorlabs-apt-protocol, the manual's frames, and the protocol's scaling."""
 
-from __future__ import annotations
-
 import io
 import struct
 from typing import Any

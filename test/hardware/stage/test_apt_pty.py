@@ -1,7 +1,5 @@
 """The driver with its threads, on a pseudo-terminal in real time."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -1,7 +1,5 @@
 """The stage driver on the emulated controller, in virtual time."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

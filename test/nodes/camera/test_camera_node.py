@@ -1,7 +1,5 @@
 """The camera node at an emulated bench publishes the sensor's bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The camera node as a process on the emulated bus of another: it ends well in every phase."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

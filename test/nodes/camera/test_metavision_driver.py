@@ -1,7 +1,5 @@
 """metavision_driver as the camera: the same points as from our node's packets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The laser node's services while one of them is in progress."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,7 +1,5 @@
 """The laser node as a process: the emulated generator's own log shows when it was on."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import time

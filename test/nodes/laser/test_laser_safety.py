@@ -3,8 +3,6 @@
 Scanner, camera and stage are processes that only send heartbeats.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """The launch files' arguments: every bad one is refused before anything starts, and named."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Ctrl-C with both cores busy: every node ends quickly and silently, alone or with the others."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """The transports of the nodes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

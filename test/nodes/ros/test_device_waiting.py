@@ -1,7 +1,5 @@
 """A node whose device is missing at the start: reason logged once, retried, no traceback."""
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Iterator

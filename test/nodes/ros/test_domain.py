@@ -1,7 +1,5 @@
 """No two instruments on a host get the same ROS domain."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """Executors with and without rclpy's EventsExecutor: callback groups, errors, bounded queues."""
 
-from __future__ import annotations
-
 import functools
 import threading
 import time

@@ -1,7 +1,5 @@
 """Of two nodes of one name the second one refuses to start."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest

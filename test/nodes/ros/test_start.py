@@ -1,7 +1,5 @@
 """A node that cannot run as it is started ends with exit code 1 and one line."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

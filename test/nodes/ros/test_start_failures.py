@@ -1,7 +1,5 @@
 """A node that ROS cannot start ends with exit code 1 and one line."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

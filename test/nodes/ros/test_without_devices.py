@@ -1,7 +1,5 @@
 """Real drivers without devices: each node reports what it waits for, and ends normally."""
 
-from __future__ import annotations
-
 import signal
 import time
 from collections.abc import Iterator

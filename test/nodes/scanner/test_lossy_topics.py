@@ -1,7 +1,5 @@
 """Scans with another camera driver, losses between the nodes, and nodes that stop answering."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

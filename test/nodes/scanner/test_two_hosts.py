@@ -3,8 +3,6 @@
 They change the network of the host, so they run only where ``ESCHORTY_TWO_HOSTS`` is set.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The stage node on its real driver, a pseudo-terminal between it and the emulated controller."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The stage node as a process at an emulated bench: odometry, moves and their refusals."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
