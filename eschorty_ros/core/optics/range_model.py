@@ -42,7 +42,7 @@ def depth_of_field_mm(
 ) -> Array:
     """Return half the depth of field along the sheet, mm (Eq. 3).
 
-    A focus tolerance, not a ranging error.
+    The object is in focus within plus and minus this length: a tolerance, not a ranging error.
 
     - ``magnification``: Image size over object size; 0 (the pole) gives infinity.
     - ``theta_deg``, ``theta_prime_deg``: Tilt of the light sheet and of the sensor against the lens
@@ -51,8 +51,6 @@ def depth_of_field_mm(
 
     Raises ``ArgumentError`` when the magnification is no array of numbers or an optical constant is
     impossible.
-
-    The object is in focus within plus and minus this length.
     """
     m = reals("magnification", magnification)
     sine = _sheet_sine(abs(number("theta_deg", theta_deg)))
