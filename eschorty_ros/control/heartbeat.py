@@ -15,7 +15,7 @@ from functools import cache
 from eschorty_ros.hardware.base.stalls import process_fault
 
 _STOPPED = "stopped"
-# Anybody may publish a heartbeat: more than this is no text of ours, and is not read.
+# Any program may publish a heartbeat; a text of another form or length is not read.
 _TEXT = re.compile(rf"(\S{{1,200}}) ([0-9]{{1,10}})( {_STOPPED})?", re.ASCII)
 CHECK_S = 0.02
 PERIOD_S = 0.1

@@ -25,7 +25,7 @@ class LaserInterlock:
     """Decides on a steady clock whether the laser may be enabled and whether it must be disabled.
 
     While the laser is on, each heartbeat counts only from the sender that had it enabled. An opened
-    contact stays open until ``reset_contact``, whatever is reported later.
+    contact stays open until ``reset_contact``, even when it is reported closed later.
 
     - ``arm_timeout_s``: How long ``arm`` allows enabling.
     - ``max_on_s``: Longest time on.
@@ -138,7 +138,7 @@ class LaserInterlock:
         if self._on_s is not None and known is not None and owner == identity:
             gap_s = now_s - known.received_s
             self.gap_max_s[topic] = max(gap_s, self.gap_max_s.get(topic, 0.0))
-        # The newest last; a crowd of strangers never displaces the owner.
+        # The newest last; other senders, however many, never displace the owner.
         kept = {key: heartbeats[key] for key in list(heartbeats)[1 - _KEPT :] if key != identity}
         if owner in heartbeats:
             kept[owner] = heartbeats[owner]

@@ -179,7 +179,7 @@ class ScanRecorder:
             with self._arrived:
                 self._waiting_bytes -= size
                 self._arrived.notify_all()
-            # It holds a packet.
+            # Frees the packet before the next job comes.
             del job
 
     @contextlib.contextmanager

@@ -56,7 +56,7 @@ def test_a_recording_a_bag_and_back(tmp_path, request, which, storage):
     assert again.calibration == recording.calibration
 
 
-def test_another_camera_driver_s_bag_needs_frequency_and_calibration(tmp_path, source):
+def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path, source):
     """Only the driver's events and an odometry, and no clock but the packets' stamps."""
     recording = replace(source, modulation=replace(source.modulation, on_edge_us=None))
     recording_to_bag(recording, tmp_path / "all")

@@ -28,7 +28,7 @@ def numbered(first, count):
 
 
 @pytest.mark.parametrize("batch", [1, 7, 64, 1000])
-def test_every_nth_point_is_kept_whatever_the_batches(batch):
+def test_every_nth_point_is_kept_in_any_batches(batch):
     cloud = GrowingCloud(limit=64)
     for first in range(0, 1000, batch):
         cloud.add(numbered(first, min(batch, 1000 - first)))
@@ -41,7 +41,7 @@ def test_every_nth_point_is_kept_whatever_the_batches(batch):
     assert len(cloud.shown().xyz) == 0
 
 
-def test_the_pass_follows_from_the_stage_s_direction_whatever_the_batches():
+def test_the_pass_follows_from_the_direction_of_the_stage_in_any_batches():
     """Forth, back and forth at 50 mm/s and 70 Hz; events of a profile within 6 ms."""
     t_s = (np.arange(90)[:, None] / 70.0 + np.arange(40) % 7 * 1e-3).ravel()
     points = numbered(0, len(t_s))

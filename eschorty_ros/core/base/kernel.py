@@ -45,7 +45,7 @@ def _compiled(function: Callable[..., Any], signatures: tuple[Any, ...], options
     try:
         index._load_index()
     except Exception:
-        # It names a type of an earlier version that exists no more.
+        # The cache names a type that only an earlier version had.
         index.flush()
     for signature in signatures:
         dispatcher.compile(signature)

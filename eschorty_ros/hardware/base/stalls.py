@@ -44,7 +44,7 @@ def process_fault(pid: int) -> str:
     except (FileNotFoundError, ProcessLookupError):
         return "gone"
     except OSError:
-        # Such as too many open files: this says nothing about that process.
+        # Such as too many open files here, which says nothing about that process.
         return ""
     if "\nCoreDumping:\t1" in status:
         return "dumping core"

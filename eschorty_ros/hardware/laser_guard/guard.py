@@ -43,7 +43,7 @@ class Guard:
 
     A worker thread carries out what may take long. The watching thread disables the output at once,
     beside the worker: the generator's driver lets ``disable`` overtake other commands. A third one
-    renews light that ends by itself, as long as the watching thread has taken a turn of late.
+    renews light that ends by itself, as long as the watching thread has taken a turn recently.
 
     - ``owner_pid``: Process to watch, the parent of this one; 0 for one that cannot be seen from
       here.

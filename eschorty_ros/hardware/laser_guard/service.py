@@ -1,4 +1,4 @@
-"""The laser's guard as a service of its own: it outlives whatever ends the laser node's container.
+"""The laser's guard as a service of its own: it outlives the laser node's container.
 
 ``python -m eschorty_ros.hardware.laser_guard.service /run/eschorty/guard.sock``; the laser node's
 parameter ``guard`` names the same socket. Each laser node that connects gets a guard process, one

@@ -123,7 +123,7 @@ class Composition:
             raise DeviceError("the goal was refused; see the message above")
         finished = handle.get_result_async()
         try:
-            # A slow machine may take any time: only silence ends the wait.
+            # A slow machine may take any time: only a lack of feedback ends the wait.
             while not finished.done():
                 self._spinning.raise_error()
                 if time.monotonic() - newest_s > SILENCE_S:

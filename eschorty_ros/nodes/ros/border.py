@@ -52,7 +52,7 @@ def refusals(node: Node) -> Refusals:
 
 def note_error(node: Node, entity: Any, error: Exception) -> None:
     """Count and log what a callback of ``entity`` raised."""
-    # After a signal whatever uses the context fails.
+    # After a signal every use of the context fails.
     if not node.context.ok():
         return
     name = _name(node, entity)

@@ -155,7 +155,7 @@ class Parameters(Mapping[str, Any]):
         self._node = node
         self._table = {param.name: param for param in table}
         self._on_change = on_change
-        # The node's own: a name that no table has would be ignored, and with it what it protects.
+        # ROS ignores an unknown name: a misspelt safety limit would have no effect.
         for name in node._parameter_overrides:
             if not of_ros(name):
                 check_name(name, f"parameter of {node.get_name()}", tuple(self._table))

@@ -171,7 +171,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
 
 def _initialise(args: Sequence[str] | None) -> None:
     """Start rclpy; raise ``ArgumentError`` with its reason on one line."""
-    # Its log would give the same reason on lines of its own.
+    # rclpy's log would repeat the reason.
     rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.FATAL)
     try:
         rclpy.init(

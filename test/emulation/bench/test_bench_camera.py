@@ -28,7 +28,7 @@ def stepped(setup: CameraOnBench, name: str, offsets: tuple[int, ...], ms: int) 
     return counts
 
 
-def test_default_settings_simulate_the_factory_s_sensor(tmp_path: Path) -> None:
+def test_default_settings_simulate_the_sensor_as_delivered(tmp_path: Path) -> None:
     with CameraOnBench(tmp_path) as setup:
         assert sensor_control(setup.bench.camera.settings) == SensorControl()
 

@@ -14,7 +14,7 @@ from eschorty_ros.emulation.evk4 import BoardIdentity, Evk4Model, Phase
 from eschorty_ros.hardware.camera import AntiFlicker, CameraSettings, Evk4
 
 
-def test_open_start_stop_close_follow_the_sensor_s_sequences_and_waits() -> None:
+def test_open_start_stop_close_follow_the_sequences_and_waits_of_the_sensor() -> None:
     now_ns = [0]
 
     def sleep(seconds: float) -> None:

@@ -22,7 +22,7 @@ sys.stdin.readline()
 """
 
 
-def test_a_domain_stays_its_process_s_before_anybody_is_on_it() -> None:
+def test_a_chosen_domain_stays_reserved_before_any_node_is_on_it() -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     found: list[int] = []
     with contextlib.ExitStack() as running:
