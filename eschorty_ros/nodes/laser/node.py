@@ -27,7 +27,7 @@ from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param, from_settings
-from eschorty_ros.nodes.ros.publishers import Publishers
+from eschorty_ros.nodes.ros.peers import Publishers
 from eschorty_ros.nodes.ros.spin import run
 
 STATE_RATE_HZ = 20.0

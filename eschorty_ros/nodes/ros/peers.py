@@ -1,4 +1,4 @@
-"""Topics with one publisher: while it goes on, messages of another are refused."""
+"""The publishers of messages: their nodes' names, and topics that allow one publisher alone."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
 _SILENCE_NS = 250_000_000
 _CHECK_S = 1.0
+_NAMES_MAX = 64
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
 
 class OnePublisher:
@@ -38,6 +40,35 @@ class OnePublisher:
             raise ArgumentError("another node publishes it, too; stop all but one")
         self._publisher, self._received_ns = publisher, received_ns
         return publisher
+
+
+class Publishers:
+    """The publishers of one topic and the names of their nodes.
+
+    rclpy before Kilted does not identify a message's publisher: it is ``""`` then, without a name.
+    """
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node = node
+        self._topic = node.resolve_topic_name(topic)
+        self._names: dict[bytes, str] = {}
+
+    def id(self, info: Mapping[str, Any]) -> str:
+        """Return the identity of a message's publisher as text."""
+        return _publisher(info).hex()
+
+    def name(self, info: Mapping[str, Any]) -> str:
+        """Return the full name of the node that published a message, ``""`` while it is unknown."""
+        publisher = _publisher(info)
+        if publisher and publisher not in self._names:
+            for end in self._node.get_publishers_info_by_topic(self._topic):
+                if end.node_name == _UNKNOWN:
+                    continue
+                if len(self._names) >= _NAMES_MAX:
+                    self._names.clear()
+                name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
+                self._names[bytes(end.endpoint_gid)] = name
+        return self._names.get(publisher, "")
 
 
 class LatchedState:
