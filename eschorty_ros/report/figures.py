@@ -42,8 +42,8 @@ def scan_figure(
 ) -> Figure:
     """Draw depth map and 3-D view; with a known error, its map and its histogram too.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,).
-    - ``error_mm``: shape (n,). Measured minus true range; NaN where the truth is unknown.
+    - ``points``: POINT_DTYPE, shape (n,).
+    - ``error_mm``: Shape (n,). Measured minus true range; NaN where the truth is unknown.
 
     Raises ``ArgumentError`` when the cloud is empty.
     """
@@ -77,7 +77,7 @@ def scan_figure(
 def cloud_figure(points: NDArray[np.void], title: str) -> Figure:
     """Draw points of which only the places are known: a view along x and a 3-D view.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,), at least one.
+    - ``points``: POINT_DTYPE, shape (n,), at least one.
     """
     figure = new_figure(12.0, 4.9)
     figure.suptitle(title, parse_math=False)

@@ -37,7 +37,7 @@ class _Surface(NamedTuple):
 def write_growing_scan(points: NDArray[np.void], path: str | os.PathLike[str]) -> None:
     """Write a GIF of the cloud: profile by profile as the stage moves, then from both sides.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``points``: POINT_DTYPE, shape (n,).
     - ``path``: Ends in ``.gif``.
 
     Raises ``ArgumentError`` when the cloud is empty, or the path cannot be written.

@@ -23,7 +23,7 @@ POINTS_SHOWN = 20_000
 def measured_figure(points: NDArray[np.void], measured: Measured, title: str) -> Figure:
     """Draw the range with every surface's number, and the residuals of the planes.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,). The cloud that was measured.
+    - ``points``: POINT_DTYPE, shape (n,). The cloud that was measured.
     """
     points = points[measured.grid.point[measured.grid.known]]
     residual = np.full(measured.grid.point.shape, np.nan)

@@ -29,9 +29,9 @@ class CloudGrid(NamedTuple):
     first_column: int
     """Column of the image's first one."""
     xyz: Array
-    """Shape (lines, columns, 3). mm."""
+    """Shape (lines, columns, 3), mm."""
     sigma: Array
-    """Shape (lines, columns). mm."""
+    """Shape (lines, columns), mm."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -52,7 +52,7 @@ def organise(points: NDArray[np.void]) -> CloudGrid:
     Left out are points without finite place, time or positive sigma, and those whose flags say that
     they are on two surfaces or cut by the sensor's edge.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``points``: POINT_DTYPE, shape (n,).
 
     Raises ``ArgumentError`` when no two periods have a point, or the grid would be too large.
     """

@@ -110,7 +110,7 @@ def measure(
 ) -> Measured:
     """Return planes, flatness and what lies between them.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``points``: POINT_DTYPE, shape (n,).
     - ``regions``: Without one, the pieces that steps of the range separate, without their rims.
     - ``common_mm``: Standard deviation of a range error that all points of a surface share, and by
       which its two ends differ; by default a tenth of the points' own sigma.

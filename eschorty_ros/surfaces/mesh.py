@@ -38,7 +38,7 @@ class Mesh(NamedTuple):
     """The coarsest mesh within the errors."""
 
     vertices: Array
-    """Shape (n, 3). mm."""
+    """Shape (n, 3), mm."""
     triangles: NDArray[np.int64]
     """Shape (m, 3). Their front faces the sensor."""
     levels: tuple[Level, ...]
@@ -55,7 +55,7 @@ def mesh(points: NDArray[np.void], sigmas: float = 2.0) -> Mesh:
     The finest mesh joins neighbours of the grid, at the median range of 5 by 5; none over a step
     of the range. Each further level has half the triangles (Garland and Heckbert's quadrics).
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``points``: POINT_DTYPE, shape (n,).
     - ``sigmas``: Gaussian errors alone need 1.96.
 
     Raises ``ArgumentError`` when the cloud is no sweep, or the finest mesh is beyond the errors.

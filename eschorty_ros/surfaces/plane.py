@@ -137,8 +137,8 @@ def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bo
 def clustered_covariance(design: Array, residual: Array, part: Part) -> Array:
     """Return the covariance of a weighted least-squares fit whose neighbours share errors.
 
-    - ``design``: shape (n, values).
-    - ``residual``: shape (n,).
+    - ``design``: Shape (n, values).
+    - ``residual``: Shape (n,).
     - ``part``: Line, column and sigma of each residual.
     """
     weight = 1.0 / part.sigma**2

@@ -48,7 +48,7 @@ def period_s(points: NDArray[np.void]) -> float:
 def profile_index(points: NDArray[np.void], period: float) -> NDArray[np.int64]:
     """Return the number of every point's modulation period, the first being 0.
 
-    - ``points``: ndarray of POINT_DTYPE, shape (n,).
+    - ``points``: POINT_DTYPE, shape (n,).
     - ``period``: Modulation period, seconds.
 
     Raises ``ArgumentError`` when the period is not positive.

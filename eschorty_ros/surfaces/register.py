@@ -86,7 +86,7 @@ def register(
     sigma along the range, free along the surface.
 
     - ``first``, ``other``: POINT_DTYPE.
-    - ``start``: shape (4, 4). First guess, metres.
+    - ``start``: Shape (4, 4). First guess, metres.
     - ``reach_mm``: Farthest partner of the first round; each further round halves it.
 
     Raises ``ArgumentError`` when the clouds do not overlap, or slide or turn on each other. Raises

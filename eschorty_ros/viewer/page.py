@@ -143,7 +143,7 @@ class Page:
 
         - ``text``: Returns the text, of received points and stride.
         - ``profile``: z and range of one period, mm.
-        - ``frame``: shape (rows, columns). Image of the recent events.
+        - ``frame``: Shape (rows, columns). Image of the recent events.
         """
         with self._serving:
             if self._stopped:

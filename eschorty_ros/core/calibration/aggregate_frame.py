@@ -32,7 +32,7 @@ class AggregateFrame:
     """Events per pixel, both polarities together; its memory does not grow with the capture.
 
     Public attributes:
-    - ``counts``: shape (rows, columns).
+    - ``counts``: Shape (rows, columns).
     - ``events``: Events counted; those outside the sensor are not.
     """
 

@@ -116,8 +116,8 @@ def calibrate(
 
     - ``targets``: At two different ranges or more.
     - ``nominal``: The design: fixed parameters, centres of the priors, geometry.
-    - ``method``: either "joint" or "paper". ``paper`` fits k' and b' by plain least squares, k and
-      b stay as designed. ``joint`` fits k', b and b', with known sizes or spacings also k and the
+    - ``method``: ``paper`` fits k' and b' by plain least squares, k and b stay as designed.
+      ``joint`` fits k', b and b', with known sizes or spacings also k and the
       width bias, under priors.
     - ``free``: Parameters of the joint fit instead of these.
     - ``prior_sigma``: Standard deviations instead of `PRIOR_SIGMA`, for parameters that are free;

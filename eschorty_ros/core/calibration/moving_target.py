@@ -42,7 +42,7 @@ def moving_target(
     with the target in few columns, are left out.
 
     - ``profiles``: Of the sweep; only the nearest return of a column is used.
-    - ``stage_mm``: shape (len(profiles),). Stage position at each point's time, as
+    - ``stage_mm``: Shape (len(profiles),). Stage position at each point's time, as
       ``StageTrack.position_mm`` gives it; points with NaN are left out.
     - ``range_at_zero_mm``: Range of the target with the stage at 0. Its error shifts all targets
       alike and becomes an error of ``b``, which no number of profiles reveals.

@@ -68,7 +68,7 @@ def fit_edges(
 ) -> EdgeFit | None:
     """Return the clock that aligns the edges with the pulses.
 
-    - ``t_us``: shape (n,). Sensor times of the pulses' first edges, in time order.
+    - ``t_us``: Shape (n,). Sensor times of the pulses' first edges, in time order.
     - ``track``: Odometry over ROS time, us.
     - ``arrivals``: The clock from the packets' arrivals; late rather than early.
 

@@ -462,9 +462,9 @@ def _start_of(
     two are averaged with the inverse squares of that as weights. The usual delay counts as one
     more reading.
 
-    - ``earliest_s``, ``latest_s``: shape (n,). ``-inf`` for an unknown earliest.
-    - ``slack_s``: shape (n,). Uncertainty of time due to that of the position.
-    - ``speed``: shape (n,).
+    - ``earliest_s``, ``latest_s``: Shape (n,). ``-inf`` for an unknown earliest.
+    - ``slack_s``: Shape (n,). Uncertainty of time due to that of the position.
+    - ``speed``: Shape (n,).
     - ``usual``: Of earlier motions.
     """
     begin, end = _widest_agreement(earliest_s - slack_s, latest_s + slack_s)

@@ -54,8 +54,8 @@ def leading_edges(t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> NDArr
     rising ones, or is the shorter one if both vary alike. Edges of one kind only are returned
     unchanged.
 
-    - ``t_us``: shape (n,). In time order.
-    - ``polarity``: shape (n,). 1 for rising.
+    - ``t_us``: Shape (n,). In time order.
+    - ``polarity``: Shape (n,). 1 for rising.
     """
     t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     polarity = integer_vector("polarity", polarity, np.uint8, 0, 1)

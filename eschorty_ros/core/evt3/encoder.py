@@ -68,13 +68,13 @@ class Encoder:
     ) -> bytes:
         """Return the bytes of the next events, triggers and notes of dropped events.
 
-        - ``t``: shape (n,). Microseconds, not falling, not before the time the stream has reached.
-        - ``x``, ``y``, ``p``: shape (n,). Column, row, polarity (0 or 1).
-        - ``trigger_t``, ``trigger_edge``: shape (m,). Trigger times (not falling) and edges (1 =
+        - ``t``: Shape (n,). Microseconds, not falling, not before the time the stream has reached.
+        - ``x``, ``y``, ``p``: Shape (n,). Column, row, polarity (0 or 1).
+        - ``trigger_t``, ``trigger_edge``: Shape (m,). Trigger times (not falling) and edges (1 =
           rising), channel 0; at equal times a trigger comes before the events.
-        - ``drop_t``: shape (k,). Times (not falling) at which the stream notes that the sensor
+        - ``drop_t``: Shape (k,). Times (not falling) at which the stream notes that the sensor
           dropped events.
-        - ``rate_counts``: shape (j, 3). Reports of the event-rate control: time (not falling),
+        - ``rate_counts``: Shape (j, 3). Reports of the event-rate control: time (not falling),
           events before and after it in the period that ends there, below 2**28.
 
         Raises ``ArgumentError`` for falling times, values outside the sensor, unequal lengths, or

@@ -140,9 +140,9 @@ def read_cloud(path: str | os.PathLike[str], *, organized: bool = False) -> Poin
 def height_map(points: Points, profile: NDArray[np.integer[Any]], columns: int) -> Points:
     """Return the cloud as a map: one row for each profile, one column for each of the sensor.
 
-    - ``points``: ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,). At most one point in each
+    - ``points``: POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,). At most one point in each
       column of a profile.
-    - ``profile``: shape (n,). What tells a point's profile from others, increasing with time.
+    - ``profile``: Shape (n,). What tells a point's profile from others, increasing with time.
     - ``columns``: Columns of the sensor.
 
     Where nothing is, all numbers with a fraction are NaN and ``flags`` 0.

@@ -25,7 +25,7 @@ class AptModel:
 
     Not thread-safe: hold a lock around ``feed`` and ``step``.
 
-    - ``controller``: either "kbd101" or "bbd30x".
+    - ``controller``: ``kbd101`` or ``bbd30x``.
     - ``bay``: Bay of the rack that holds the axis, from 1.
     - ``travel_mm``: Hard ends of the carriage.
     - ``power_up_mm``: Position of the carriage at power-up; the encoder reads 0 there.

@@ -57,8 +57,8 @@ class AwgModel(EmulatedUsbDevice):
     - ``steady_ns``: Clock of the bursts, ns.
 
     Public attributes:
-    - ``burst_trigger``: one of "extends", "restarts", "ignored" and "". Effect of a trigger while a
-      burst runs; empty: a generator without bursts.
+    - ``burst_trigger``: What a trigger does while a burst runs: ``extends``, ``restarts`` or
+      ``ignored``; empty for a generator without bursts.
     - ``locked``: True while the front panel is locked.
     - ``errors``: The error queue; ``None`` by default, because the family has none.
     - ``commands``: The last 4096 commands received, in order.

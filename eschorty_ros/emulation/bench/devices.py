@@ -32,7 +32,7 @@ class BenchSettings:
     background_hz: float = BACKGROUND_HZ
     """Background events of one pixel."""
     trigger: str = "stage"
-    """One of "none", "laser" and "stage". Output that is wired to the camera's trigger input."""
+    """Output that is wired to the camera's trigger input: ``none``, ``laser`` or ``stage``."""
     imperfections: Imperfections = field(default_factory=Imperfections)
     laser_log: str = ""
     """File with one line per change of the generator's output; empty for none."""

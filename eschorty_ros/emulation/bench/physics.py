@@ -96,8 +96,8 @@ class Physics:
 
     - ``make_world``: Makes a new world for each start of the stream.
     - ``clock_ns``: The bench's clock.
-    - ``trigger``: one of "none", "laser" and "stage". Output that is wired to the camera's trigger
-      input.
+    - ``trigger``: Output that is wired to the camera's trigger input: ``none``, ``laser`` or
+      ``stage``.
     - ``pulses``: The stage's trigger output.
 
     Public attributes:

@@ -31,7 +31,7 @@ class AptSettings:
     """Connection and limits of the stage."""
 
     controller: str = "kbd101"
-    """Either "kbd101" or "bbd30x"."""
+    """``kbd101`` or ``bbd30x``."""
     bay: int = 1
     """Bay of a rack, from 1."""
     speed_max_mm_s: float = 250.0
