@@ -1,1 +1,1 @@
-"""Figures and accuracy figures of a scan."""
+"""Figures, pages and the accuracy of scans and calibrations."""

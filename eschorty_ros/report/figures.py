@@ -149,7 +149,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A cloud as an image: one line per modulation period, one pixel per column."""
+    """Axes of a cloud's map, one line per modulation period, one pixel per column."""
 
     along_mm: NDArray[np.float64]
     """Shape (columns + 1,). Edges of the columns along the line, at the mean range; px where the

@@ -21,7 +21,7 @@ VISIBLE_NM, INFRARED_NM = (400.0, 700.0), (700.0, 1050.0)
 
 
 class LaserClass(NamedTuple):
-    """An estimate."""
+    """The estimated class of a line of light."""
 
     accessible_mw: float
     """Power through a pupil of 7 mm at 100 mm from the line's origin."""
