@@ -1,4 +1,4 @@
-"""A node that cannot run as it is started ends with exit code 1 and one line."""
+"""A node that cannot run as it is started, or beside one of its name, ends with one line."""
 
 import os
 import signal
@@ -10,11 +10,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from ros_process import NodeProcess, domain_environment, wait_until
+from ros_process import NodeProcess, Observer, domain_environment, wait_until
 
 from eschorty_ros.hardware.base.launcher import VARIABLE
 from eschorty_ros.nodes.ros.domain import free_domain
 
+LASER, SCANNER = "eschorty_ros.nodes.laser.node", "eschorty_ros.nodes.scanner.node"
+IDLE = {"auto_start": False}
 NODES = ("camera", "laser", "stage", "reconstruction", "scanner", "replay")
 # Starts a node and reports its process; the node is to end with it.
 LAUNCHER = f"""
@@ -51,7 +53,7 @@ def test_a_value_that_is_refused_is_one_line(name: str, value: object, words: st
 
 @pytest.mark.parametrize("early", [True, False])
 def test_a_node_ends_when_its_launcher_is_killed(tmp_path: Path, early: bool) -> None:
-    node = [sys.executable, "-m", "eschorty_ros.nodes.scanner.node"]
+    node = [sys.executable, "-m", SCANNER]
     log = tmp_path / "log"
     with log.open("wb") as stream:
         launcher = subprocess.Popen(
@@ -68,3 +70,62 @@ def test_a_node_ends_when_its_launcher_is_killed(tmp_path: Path, early: bool) ->
         launcher.communicate()
         wait_until(lambda: not Path(f"/proc/{pid}").exists(), "the end of the node")
     assert log.read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "words"),
+    [
+        (("--params-file", "/none.yaml"), {}, "/none.yaml"),
+        (("--params-file", "{broken}"), {}, "broken.yaml"),
+        (("-r", "bad::="), {}, "bad::="),
+        ((), {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}, "KEYSTORE"),
+    ],
+)
+def test_ros_that_does_not_start_is_one_line(tmp_path: Path, arguments, environment, words) -> None:
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("a: [1")
+    ended = subprocess.run(
+        [sys.executable, "-m", SCANNER, "--ros-args",
+         *(argument.format(broken=broken) for argument in arguments)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+    )  # fmt: skip
+    assert ended.returncode == 1
+    (line,) = (ended.stdout + ended.stderr).strip().splitlines()
+    assert words in line, line
+    assert len(line) <= 300
+
+
+def assert_refused(second: NodeProcess, name: str) -> None:
+    assert second.wait() == 1, second.output
+    [line] = [line for line in second.output.splitlines() if line.strip()]
+    assert line.startswith(f"error: another node /eschorty/{name} runs")
+    assert len(line) <= 300
+
+
+def test_the_second_refuses_and_after_a_kill_the_next_starts(observer: Observer) -> None:
+    with NodeProcess(LASER, IDLE, domain=observer.domain) as first:
+        observer.wait_for_state("laser", "unconfigured")
+        with NodeProcess(LASER, IDLE, domain=observer.domain) as second:
+            assert_refused(second, "laser")
+        assert first.running()
+        first.send(signal.SIGKILL)
+        first.wait()
+    # The killed node is still in the graph of the others.
+    with NodeProcess(LASER, IDLE, domain=observer.domain) as third:
+        observer.wait_for_state("laser", "unconfigured")
+        assert third.running()
+
+
+def test_of_two_started_together_one_runs(observer: Observer) -> None:
+    with (
+        NodeProcess(SCANNER, {}, domain=observer.domain) as one,
+        NodeProcess(SCANNER, {}, domain=observer.domain) as other,
+    ):
+        wait_until(lambda: not (one.running() and other.running()), "the end of one")
+        ended, alive = (one, other) if other.running() else (other, one)
+        assert_refused(ended, "scanner")
+        observer.wait_for_answers("scanner")
+        assert alive.running()
