@@ -8,7 +8,7 @@ from collections import deque
 from eschorty_ros.control.scan_sequence import ScanFailure
 
 _WINDOW_S = 1.0
-# A message may come late, and on a busy computer all of a second's do; none comes before its stamp.
+# On a busy computer every message of a second may come late; none comes before its stamp.
 _AHEAD_MAX_S, _BEHIND_MAX_S = 0.1, 0.5
 
 
