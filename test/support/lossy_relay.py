@@ -22,11 +22,9 @@ DRIVER, EVENTS = "event_camera", "/event_camera/events"
 class LossyRelay(Node):
     """``near/NAME`` to ``far/NAME`` for heartbeats; ``near/events`` as metavision_driver's.
 
-    Attributes
-    ----------
-    lost : dict of str to float
-        Share of each type's messages that are lost, by name of the type: of each run of
-        ``1 / share`` messages a random one.
+    Public attributes:
+    - ``lost``: Share of each type's messages that are lost, by name of the type: of each run of ``1
+      / share`` messages a random one.
     """
 
     def __init__(self, context: rclpy.Context, heartbeats: tuple[str, ...]) -> None:

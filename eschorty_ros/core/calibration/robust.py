@@ -37,12 +37,10 @@ _PAIRED_MAX = 40
 def inliers(
     observed: Observed, design: RangeModel, names: tuple[str, ...], priors: Mapping[str, float]
 ) -> tuple[Mask, Array]:
-    """Find the targets that follow one curve.
+    """Return a mask of the targets that follow one curve, and the residuals of all against it.
 
+    Residuals are in standard deviations; those of the others include the uncertainty of the curve.
     Raises ``FitError`` when no curve fits more than half of the targets.
-
-    The second array holds the residuals against the curve of the kept targets in standard
-    deviations; those of the others include the uncertainty of that curve.
     """
     values = _least_median(observed, design)
     refuse_singular(Problem(observed, design, names, priors, values), values)
