@@ -72,9 +72,9 @@ class Publishers:
 
 
 class LatchedState:
-    """A latched topic whose state ends with its publisher.
+    """Receives a latched topic whose state ends with its publisher.
 
-    Then those that are left give theirs again.
+    The states of the publishers that are left are then received again.
 
     - ``take``: Receives each message.
     - ``forget``: Called when the publisher of the newest message has ended.
