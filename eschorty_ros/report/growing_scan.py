@@ -66,7 +66,7 @@ def write_growing_scan(points: NDArray[np.void], path: str | os.PathLike[str]) -
 def _surface(points: NDArray[np.void]) -> _Surface:
     from matplotlib import colormaps
 
-    stage_mm, range_mm = stage_and_range_mm(points, (0.0, 1.0, 0.0))
+    stage_mm, range_mm = stage_and_range_mm(points)
     grid = grid_of(points, stage_mm)
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float64) * 1e3
     low, high = central(range_mm)

@@ -23,8 +23,8 @@ class LossyRelay(Node):
     """``near/NAME`` to ``far/NAME`` for heartbeats; ``near/events`` as metavision_driver's.
 
     Public attributes:
-    - ``lost``: Share of each type's messages that are lost, by name of the type: of each run of ``1
-      / share`` messages a random one.
+    - ``lost``: Share of each type's messages that are lost, by name of the type: of each
+      ``1 / share`` messages a random one.
     """
 
     def __init__(self, context: rclpy.Context, heartbeats: tuple[str, ...]) -> None:

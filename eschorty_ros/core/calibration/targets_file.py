@@ -53,7 +53,7 @@ def read_targets(
       lines that begin with ``#`` are comments.
     - ``sigma_row_px``, ``sigma_range_mm``: Standard deviations where the file gives none.
 
-    Raises ``FormatError``: names file, line, column and value.
+    Raises ``FormatError``, which names file, line, column and value.
     Targets are labelled ``line N`` where the file has no label.
     """
     table = _read(file_path("path", path), TARGET_COLUMNS, ("row", "range_mm"))
@@ -96,7 +96,7 @@ def read_distances(
       ``column`` and ``row`` (where the post is expected), ``label``.
     - ``sigma_range_mm``: Standard deviation where the file gives none.
 
-    Raises ``FormatError``: names file, line, column and value.
+    Raises ``FormatError``, which names file, line, column and value.
     """
     return [
         KnownTarget(

@@ -197,7 +197,7 @@ def load_named_calibration(folder: str | os.PathLike[str], name: str) -> Calibra
 
     - ``name``: As `save_named_calibration` takes it; with or without ``.yaml``.
 
-    Raises ``CalibrationError``: one line naming file, key, value and remedy.
+    Raises ``CalibrationError`` in one line with file, key, value and remedy.
     """
     path = _named_path(folder, name)
     if os.path.lexists(path):
@@ -278,7 +278,7 @@ def refuse_other_instrument(candidate: Calibration, active: Calibration) -> None
 
     - ``candidate``, ``active``: The one that is to replace, and the one that is in use.
 
-    Raises ``CalibrationError``: names the first key that differs and both values.
+    Raises ``CalibrationError``, which names the first key that differs and both values.
     """
     for key, meaning in _OF_THE_INSTRUMENT.items():
         theirs, ours = getattr(candidate, key), getattr(active, key)

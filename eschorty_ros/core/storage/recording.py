@@ -174,7 +174,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
 def read_scan_yaml(path: str | os.PathLike[str]) -> ScanLog:
     """Read ``scan.yaml``.
 
-    Raises ``FormatError``: one line naming the file, the key, the value and the remedy.
+    Raises ``FormatError`` in one line with the file, the key, the value and the remedy.
     """
     return validate(ScanLog, read_yaml(path, FormatError), FormatError)
 
@@ -203,7 +203,7 @@ def read_marks_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
 def read_laser_yaml(path: str | os.PathLike[str]) -> Modulation:
     """Read ``laser.yaml``.
 
-    Raises ``FormatError``: one line naming the file, the key, the value and the remedy.
+    Raises ``FormatError`` in one line with the file, the key, the value and the remedy.
     """
     laser = validate(_LaserFile, read_yaml(path, FormatError), FormatError)
     try:
@@ -313,7 +313,7 @@ def csv_lines(table: NDArray[np.void]) -> bytes:
 def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
     """Read ``stage.csv``: STAGE_DTYPE, shape (n,), at least one sample, in time order.
 
-    Raises ``FormatError``: one line naming the file, the line and the remedy.
+    Raises ``FormatError`` in one line with the file, the line and the remedy.
     """
     path = file_path("path", path)
     samples = _read_csv(path, STAGE_DTYPE)
@@ -333,7 +333,7 @@ def read_stage_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
 def read_truth_csv(path: str | os.PathLike[str]) -> NDArray[np.void]:
     """Read ``truth.csv``: TRUTH_DTYPE, shape (n,).
 
-    Raises ``FormatError``: one line naming the file, the line and the remedy.
+    Raises ``FormatError`` in one line with the file, the line and the remedy.
     """
     return _read_csv(file_path("path", path), TRUTH_DTYPE)
 

@@ -144,8 +144,8 @@ class _InPipe:
 class EmulatedUsbDevice:
     """Base of the models, which override ``control``, ``bulk_out`` and ``bulk_in`` as needed.
 
-    - ``wait``: Waits for data: ``wait(condition, seconds)``, False on a time-out. With ``lambda *_:
-      False`` every wait times out at once, for tests without sleeps.
+    - ``wait``: Waits for data: ``wait(condition, seconds)``, False on a time-out. One that
+      returns False makes every wait time out at once, for tests without sleeps.
 
     Public attributes:
     - ``gone``: Unplugged: every transfer fails with ENODEV, the bus does not list it.

@@ -98,7 +98,7 @@ class ChunkQueue:
     def get(self, timeout_s: float) -> EventChunk | None:
         """Return the oldest chunk, ``None`` after ``timeout_s`` without one or after ``close``.
 
-        Raises ``DeviceError``: the error that was given to ``fail``.
+        Raises the ``DeviceError`` that was given to ``fail``.
         """
         end_s = time.monotonic() + timeout_s
         with self._changed:
