@@ -61,12 +61,12 @@ class LaserSupervisor:
 
     @property
     def unknown(self) -> str:
-        """Why the state of the output is unknown, empty when it is known."""
+        """Return why the state of the output is unknown, empty when it is known."""
         return self._record.unknown
 
     @property
     def device(self) -> str:
-        """Model of the generator, empty while none is open."""
+        """Return the generator's model, empty while none is open."""
         laser = self._laser
         return laser.identity.model if laser is not None else ""
 

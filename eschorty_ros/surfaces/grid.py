@@ -40,7 +40,7 @@ class CloudGrid(NamedTuple):
 
 
 class Links(NamedTuple):
-    """Where neighbours are on one surface: along, (lines - 1, columns); across, one column less."""
+    """Neighbours that are on one surface: along, (lines - 1, columns); across, one column less."""
 
     along: NDArray[np.bool_]
     across: NDArray[np.bool_]

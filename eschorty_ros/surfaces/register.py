@@ -28,7 +28,7 @@ _WITHOUT_PERIOD_S = 1.0
 
 
 class Pose(NamedTuple):
-    """Where a cloud is in the frame of the first one."""
+    """Pose of a cloud in the frame of the first one, with its covariance."""
 
     transform: Array
     """Shape (4, 4). Takes points of the cloud, in m, into the frame of the first one."""

@@ -36,7 +36,7 @@ class ScanValues(NamedTuple):
 
 @dataclass(frozen=True)
 class Conditions:
-    """What is known of the instrument; the defaults are those before anything has been received."""
+    """State of the instrument as received; the defaults are those before the first message."""
 
     scanner: bool = False
     scanning: bool = False

@@ -9,7 +9,7 @@ _OUTPUTS = ("off", "ON", "unknown")
 
 @dataclass
 class Status:
-    """What the instrument reports; a value that is not known is NaN or empty."""
+    """State that the instrument reports; a value that is not known is NaN or empty."""
 
     laser: str = "no report"
     reason: str = ""

@@ -105,7 +105,7 @@ class SlowDecoder:
         self.base += bits
 
     def continuation(self, kind: int, q: int) -> bool:
-        """Whether the word belonged to the pending OTHERS."""
+        """Return whether the word belonged to the pending OTHERS."""
         subtype, parts = self.other
         if kind == 15 and len(parts) < 2:
             parts.append(q)

@@ -25,7 +25,7 @@ _TUNSETIFF, _IFF_TAP_NO_PI = 0x400454CA, 0x1002
 
 
 def missing() -> str:
-    """Why such a link cannot be made here, ``""`` when it can."""
+    """Return why such a link cannot be made here, ``""`` when it can."""
     if shutil.which("ip") is None:
         return "the command ip is missing; install iproute2"
     if not os.access("/dev/net/tun", os.W_OK):

@@ -183,7 +183,7 @@ class Bench:
         return sum(math.ceil(pause_s * FREQUENCY_HZ) + 1 for pause_s in pauses_s)
 
     def _last_light_ns(self) -> list[int]:
-        """When the output went on, off, on, ..., off in the last light."""
+        """Return the times at which the output went on, off, on, ..., off in the last light."""
         times_ns = [t_ns for t_ns, _ in read_output_log(self.laser_log)]
         on = len(times_ns) - 2
         while on >= 2 and times_ns[on] - times_ns[on - 1] < PAUSE_NS:

@@ -102,7 +102,7 @@ REPLAY = (
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a launch file starts."""
+    """The nodes, bench and view that a launch file starts."""
 
     nodes: Tables
     """Parameters by node; those of ``file`` override them."""
