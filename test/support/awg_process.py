@@ -31,7 +31,7 @@ class AwgProcess(CommandProcess):
         return self.outputs()[-1] == "ON"
 
     def off_after_s(self, since_ns: int) -> float:
-        """Return the seconds from ``since_ns`` (CLOCK_MONOTONIC) until the output was switched off."""
+        """Return the time from ``since_ns`` (CLOCK_MONOTONIC) until the output was off, s."""
         wait_until(lambda: not self.lit(), "the output off", 60.0, 0.005)
         return (read_output_log(self.log)[-1][0] - since_ns) * 1e-9
 

@@ -107,11 +107,6 @@ class Design:
         depth = (self.baseline_mm * math.tan(theta) - self.focal_length_mm) / math.sin(theta)
         return depth - self.model.b_mm
 
-    @property
-    def axis_row(self) -> float:
-        """Row that looks along the optical axis, px; usually just off the sensor."""
-        return float(self.model.row(self.axis_range_mm))
-
     def calibration(self, name: str) -> Calibration:
         """Return the build as a calibration of a bare name, which is not fitted to anything."""
         model = self.model
