@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -236,7 +235,7 @@ def assert_accurate(points: np.ndarray, positions_mm: np.ndarray, completeness: 
     assert p95_mm <= 2.5, found
 
 
-def _positions_mm() -> np.ndarray:
+def positions_mm() -> np.ndarray:
     """Positions of a full scan's periods."""
     return 1e3 * (START_M + (STOP_M - START_M) * (np.arange(PERIODS) + 0.5) / PERIODS)
 
@@ -253,7 +252,7 @@ def full_scan(bench: Bench) -> None:
     assert len(points) >= 0.99 * result.points
     assert result.packets_lost == 0
     assert abs(int(_profile_of(points)[-1]) + 1 - PERIODS) <= 2
-    assert_accurate(points, _positions_mm(), completeness)
+    assert_accurate(points, positions_mm(), completeness)
     sweep_s = (
         result.sweep_stop.sec - result.sweep_start.sec
         + 1e-9 * (result.sweep_stop.nanosec - result.sweep_start.nanosec)
@@ -262,18 +261,6 @@ def full_scan(bench: Bench) -> None:
     assert math.isclose(sweep_s, (STOP_M - START_M) / SPEED_M_S, rel_tol=0.25)
     assert "sweeping" in [f.phase for f in bench.scans.feedback]
     assert 0.0 < result.sigma_median < 2e-3
-    bench.assert_off_and_at_rest()
-
-
-def lossy_scan(bench: Bench) -> None:
-    """A scan in which packets are lost: each costs at most the points of its period."""
-    before = len(bench.clouds)
-    status, result = bench.scan()
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    assert result.packets_lost > 0
-    points, _ = bench.lit_part(bench.cloud_after(before, result.points))
-    print(f"{result.packets_lost} packets lost")
-    assert_accurate(points, _positions_mm(), BUT_ONE - result.packets_lost / PERIODS)
     bench.assert_off_and_at_rest()
 
 
@@ -307,37 +294,6 @@ def cut_off(bench: Bench, cut: Callable[[], Any], join: Callable[[], Any]) -> No
     full_scan(bench)
 
 
-def cancel_scan(bench: Bench) -> None:
-    """Cancel in the middle: light off, stage stopped, what there is published."""
-    before = len(bench.clouds)
-    handle = bench.start(**SLOW)
-    bench.wait_for_sweep()
-    canceled = handle.cancel_goal_async()
-    wait_until(canceled.done, "an answer to the cancel request")
-    status, result = bench.scans.end()
-    assert status == GoalStatus.STATUS_CANCELED, result.message
-    assert not result.success
-    bench.assert_off_and_at_rest()
-    assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
-    _assert_partial(bench, before, result, to_the_end=True)
-
-
-def bad_goals(bench: Bench) -> None:
-    """Each bad value is refused, its name and the remedy in the message; no light."""
-    cases = (
-        ({"start": -0.01}, ("start", "-0.01", "travel")),
-        ({"stop": 0.5}, ("stop", "0.5", "travel")),
-        ({"stop": START_M}, ("start and stop",)),
-        ({"speed": 0.0}, ("speed", "m/s")),
-        ({"speed": 9.0}, ("speed", "9")),
-        ({"frequency": 5.0}, ("frequency", "5 Hz", "16")),
-        ({"frequency": 1e6}, ("frequency", "20000")),
-        ({"duty": 1.5}, ("duty", "1.5")),
-        ({"start": math.nan}, ("start", "nan")),
-    )
-    assert_refused(bench, bench.scan, cases)
-
-
 def assert_refused(bench: Bench, order: Callable[..., tuple[int, Any]], cases: Iterable) -> None:
     """Each goal of ``cases`` is aborted with these words, without any light."""
     lines = len(bench.output_lines())
@@ -348,78 +304,6 @@ def assert_refused(bench: Bench, order: Callable[..., tuple[int, Any]], cases: I
         for word in words:
             assert word in result.message, (goal, result.message)
     assert len(bench.output_lines()) == lines
-
-
-def bad_parameters(bench: Bench) -> None:
-    """A bad value is refused with a reason, and the old one stays."""
-    for node, name, value, word in (
-        ("reconstruction", "centroid", "magic", "mode_mean"),
-        ("reconstruction", "events_min", 0, "range"),
-        ("reconstruction", "line_width_px", -1.0, "range"),
-        ("reconstruction", "stage_gap", "soon", "type"),
-        ("reconstruction", "frequency", 5.0, "16"),
-        ("reconstruction", "calibration", "config_1", "read"),
-        ("scanner", "speed_max", 1.0, "read"),
-        ("laser", "frequency", 1.0, "range"),
-    ):
-        accepted, reason = bench.observer.set_parameter(node, name, value)
-        assert not accepted, (node, name)
-        assert word in reason.lower(), (node, name, reason)
-    for value in (5, 4):
-        accepted, reason = bench.observer.set_parameter("reconstruction", "events_min", value)
-        assert accepted, reason
-
-
-def burst_of_goals(bench: Bench, count: int) -> None:
-    """So many bad goals at once, around a good one: none is left behind."""
-    bad = Scan.Goal(start=START_M, stop=math.nan, speed=SPEED_M_S)
-    sent = [bench.scans.client.send_goal_async(bad) for _ in range(count)]
-    handle = bench.start(**SLOW)
-    sent += [bench.scans.client.send_goal_async(bad) for _ in range(count)]
-    bench.wait_for_sweep()
-    wait_until(handle.cancel_goal_async().done, "an answer to the cancel request")
-    status, result = bench.scans.end()
-    assert status == GoalStatus.STATUS_CANCELED, result.message
-    bench.assert_off_and_at_rest()
-
-
-def reconstruction_killed(bench: Bench, kill: Callable[[], Any]) -> None:
-    """The reconstruction dies mid-scan: light off at once, the goal ends with the reason."""
-    bench.start(**SLOW)
-    bench.wait_for_sweep()
-    kill()
-    killed_ns = time.monotonic_ns()
-    status, result = bench.scans.end()
-    ended_s = (time.monotonic_ns() - killed_ns) * 1e-9
-    bench.assert_off_and_at_rest()
-    dark_s = (read_output_log(bench.laser_log)[-1][0] - killed_ns) * 1e-9
-    print(f"dark {dark_s:.3f} s, goal ended {ended_s:.1f} s after the reconstruction")
-    assert status == GoalStatus.STATUS_ABORTED
-    assert re.search(r"reconstruction: process \d+ is (gone|dead)", result.message), result.message
-    assert dark_s <= 0.25
-
-
-def scanner_killed(bench: Bench, kill: Callable[[], Any]) -> None:
-    """The scanner dies mid-scan: the reconstruction publishes the points so far."""
-    before = len(bench.clouds)
-    # Near, as the stage goes on to its target, in the dark.
-    bench.start(**{**SLOW, "stop": 0.5 * FAR_M})
-    bench.wait_for_sweep()
-    kill()
-    wait_until(lambda: len(bench.clouds) > before, "the cloud so far")
-    assert bench.clouds[-1].width > KEPT_POINTS
-    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")
-    wait_until(lambda: bench.laser[-1].output == LaserState.OUTPUT_OFF, "the state off")
-
-
-def scanner_interrupted(bench: Bench, interrupt: Callable[[], Any]) -> None:
-    """The scanner ends mid-scan: without its heartbeat the laser switches off."""
-    bench.start(**SLOW)
-    bench.wait_for_sweep()
-    # A renewal that comes late pauses the light.
-    wait_until(lambda: bench.output_lines()[-1] == "ON", "the light")
-    interrupt()
-    wait_until(lambda: bench.output_lines()[-1] == "OFF", "OFF in the emulator's log")
 
 
 def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
@@ -436,10 +320,10 @@ def camera_killed(bench: Bench, kill: Callable[[], Any]) -> None:
     assert "camera" in result.message, result.message
     bench.assert_off_and_at_rest()
     assert bench.odometry[-1].pose.pose.position.y < FAR_M - 0.005
-    _assert_partial(bench, before, result, to_the_end=False)
+    assert_partial(bench, before, result, to_the_end=False)
 
 
-def _assert_partial(bench: Bench, before: int, result: Any, *, to_the_end: bool) -> None:
+def assert_partial(bench: Bench, before: int, result: Any, *, to_the_end: bool) -> None:
     """The cloud reaches ``to_the_end`` of the light, or of the events that a camera had sent."""
     points, light_after_s = bench.lit_part(bench.cloud_after(before, result.points))
     assert len(points) > KEPT_POINTS

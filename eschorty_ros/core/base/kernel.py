@@ -81,7 +81,7 @@ def _names(code: CodeType) -> Iterator[str]:
 def with_names(function: Any, suffix: str, **names: Any) -> Any:
     """Return the kernel of ``function`` with other global ``names``, such as kernels it calls.
 
-    It makes and returns no arrays. ``suffix`` tells it from others of the same function.
+    It makes and returns no arrays. ``suffix`` distinguishes it from others of the same function.
     """
     clone = FunctionType(function.__code__, {**function.__globals__, **names})
     clone.__module__, clone.__qualname__ = function.__module__, f"{function.__qualname__}_{suffix}"

@@ -167,10 +167,7 @@ class RangeModel:
         With ``L = f (cot(theta) + cot|theta'|)`` from the lens to the Scheimpflug line these are
         ``L cos(theta) - k - b`` and ``L sin(theta)``; the lens is on the sheet's -y side.
 
-        Raises
-        ------
-        ArgumentError
-            When no sensor tilt gives this ``k'`` with this lens.
+        Raises ``ArgumentError`` when no sensor tilt gives this ``k'`` with this lens.
         """
         if not self.tilt_sine < 1.0:
             raise ArgumentError(

@@ -142,7 +142,7 @@ def height_map(points: Points, profile: NDArray[np.integer[Any]], columns: int) 
 
     - ``points``: POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,). At most one point in each
       column of a profile.
-    - ``profile``: Shape (n,). What tells a point's profile from others, increasing with time.
+    - ``profile``: Shape (n,). A number of its own for each profile, increasing with time.
     - ``columns``: Columns of the sensor.
 
     Where nothing is, all numbers with a fraction are NaN and ``flags`` 0.
