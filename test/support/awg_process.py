@@ -15,6 +15,7 @@ from waiting import wait_until
 
 from eschorty_ros.emulation.awg.model import AwgModel, read_output_log
 from eschorty_ros.emulation.bus import UsbServer
+from eschorty_ros.hardware.base.priority import DEVICE_NICE, raise_priority
 
 
 class AwgProcess(CommandProcess):
@@ -44,6 +45,7 @@ def awg_process(folder: Path) -> Iterator[AwgProcess]:
 
 
 def serve(path: str, log: str) -> None:
+    raise_priority(DEVICE_NICE)
     model = AwgModel(time.monotonic_ns, log)
 
     def do(line: str) -> None:

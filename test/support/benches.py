@@ -12,6 +12,7 @@ from short_folder import short_folder
 
 from eschorty_ros.emulation.bench.devices import Bench, BenchSettings
 from eschorty_ros.emulation.bench.server import serving
+from eschorty_ros.hardware.base.priority import DEVICE_NICE, raise_priority
 
 
 @contextlib.contextmanager
@@ -33,6 +34,7 @@ def remote_bench(**settings: Any) -> Iterator[tuple[CommandProcess, Path]]:
 
 
 def serve(folder: str, settings: str) -> None:
+    raise_priority(DEVICE_NICE)
     bench = Bench(BenchSettings(**json.loads(settings)))
     with serving(bench, Path(folder)):
         run_commands(bench.set_scene)

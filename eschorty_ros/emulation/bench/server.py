@@ -26,6 +26,7 @@ from eschorty_ros.emulation.bench.folder import (
 from eschorty_ros.emulation.bench.physics import TRIGGERS, Imperfections
 from eschorty_ros.emulation.bus import PtyPort, UsbServer
 from eschorty_ros.hardware.base.launcher import end_with_launcher
+from eschorty_ros.hardware.base.priority import DEVICE_NICE, raise_priority
 from eschorty_ros.simulation.pixels import PRESETS
 from eschorty_ros.simulation.world import BACKGROUND_HZ
 
@@ -99,6 +100,7 @@ def serve(folder: Path, settings: BenchSettings) -> None:
     are refused.
     """
     termination = _Termination()
+    raise_priority(DEVICE_NICE)
     with _locked(folder):
         bench = Bench(settings)
         with serving(bench, folder) as usb:

@@ -24,6 +24,7 @@ from typing import Any
 
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.base.priority import GUARD_NICE, raise_priority
 from eschorty_ros.hardware.base.protocols import LaserOutput, RenewedLaser
 from eschorty_ros.hardware.base.stalls import StallMeter, process_fault
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
@@ -285,8 +286,7 @@ def _protect() -> None:
     """Keep this process from the kernel's out-of-memory killer and in time, where permitted."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("-1000", encoding="ascii")
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, -20)
+    raise_priority(GUARD_NICE)
     # Where Linux shares the cores by sessions, a process's own priority counts within its session.
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text("-20", encoding="ascii")

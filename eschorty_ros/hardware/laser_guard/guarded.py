@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import itertools
-import os
 import queue
 import select
 import threading
@@ -21,6 +20,7 @@ from eschorty_ros.core.base.errors import (
     EschortyError,
 )
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.base.priority import GUARD_NICE, raise_priority
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserReadback
 from eschorty_ros.hardware.base.stalls import process_fault
 from eschorty_ros.hardware.laser_guard.messages import (
@@ -193,8 +193,7 @@ class GuardedLaser:
 
     def _watch(self) -> None:
         """Wait for the end or the stop of the guard's process, and replace it then."""
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), -20)
+        raise_priority(GUARD_NICE)
         self._guard.wait_until_lost()
         self._guard.kill()
         if not self._dismissed:
