@@ -516,7 +516,7 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
     return appended.next
 
 
-@kernel
+@kernel(inline="always")
 def _begin_period(edges, edge, memory, state, counters):
     """Close the open period and begin the next at an edge."""
     if state.status == _FILLED:
@@ -528,7 +528,7 @@ def _begin_period(edges, edge, memory, state, counters):
     state.period = edges.period[edge]
 
 
-@kernel
+@kernel(inline="always")
 def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
     """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
     columns, rows = memory.columns, memory.estimator.rows
