@@ -108,6 +108,8 @@ class TimedProfiles:
 
     def select(self, mask: NDArray[np.bool_]) -> TimedProfiles:
         """Return the points where ``mask`` is set."""
+        if mask.all():
+            return self
         sensor = None if self.sensor is None else self.sensor.select(mask)
         return TimedProfiles(
             self.profiles.select(mask), self.t_ns[mask], self.edge_ns[mask], sensor

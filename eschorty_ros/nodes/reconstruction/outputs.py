@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
@@ -76,20 +77,26 @@ class Outputs:
         """Publish each profile, or as many as the maximum rate allows."""
         if self._profile.get_subscription_count() == 0:
             return
-        for timed in fresh:
-            edges_ns, starts = np.unique(timed.edge_ns, return_index=True)
-            for edge_ns, start, stop in zip(
-                edges_ns.tolist(), starts, [*starts[1:], len(timed.edge_ns)], strict=True
-            ):
-                if abs(edge_ns - self._last_profile_ns) < self._profile_spacing_ns:
-                    continue
+        for timed in map(self._spaced, fresh):
+            starts = _starts(timed.edge_ns)
+            if not starts.size:
+                continue
+            stamps_ns = np.minimum.reduceat(timed.t_ns, starts)
+            counts = np.diff(starts, append=len(timed.t_ns))
+            points = place_link(timed.profiles, self._model)
+            live = live_points(points, timed.t_ns, np.repeat(stamps_ns, counts))
+            for part, stamp_ns in zip(np.split(live, starts[1:]), stamps_ns.tolist(), strict=True):
+                self._profile.publish(cloud_message(part, stamp_ns, LINK))
+
+    def _spaced(self, timed: TimedProfiles) -> TimedProfiles:
+        """Return the profiles that the maximum rate allows."""
+        starts = _starts(timed.edge_ns)
+        chosen = np.zeros(starts.size, np.bool_)
+        for index, edge_ns in enumerate(timed.edge_ns[starts].tolist()):
+            if abs(edge_ns - self._last_profile_ns) >= self._profile_spacing_ns:
                 self._last_profile_ns = edge_ns
-                t_ns = timed.t_ns[start:stop]
-                stamp_ns = int(t_ns.min())
-                points = place_link(timed.profiles.select(np.arange(start, stop)), self._model)
-                self._profile.publish(
-                    cloud_message(live_points(points, t_ns, stamp_ns), stamp_ns, LINK)
-                )
+                chosen[index] = True
+        return timed.select(np.repeat(chosen, np.diff(starts, append=len(timed.t_ns))))
 
     def points(self, placed: list[PlacedPoints]) -> None:
         """Collect points and publish them as one cloud at most every 50 ms."""
@@ -104,12 +111,13 @@ class Outputs:
         points = join_points([part.points for part in self._batch])
         t_ns = np.concatenate([part.t_ns for part in self._batch])
         self._batch.clear()
-        piece = (t_ns - t_ns.min()) // LIVE_SPAN_NS
-        for index in np.unique(piece):
-            inside = piece == index
-            stamp_ns = int(t_ns[inside].min())
-            live = live_points(points[inside], t_ns[inside], stamp_ns)
+        while len(points):
+            stamp_ns = int(t_ns.min())
+            later = t_ns >= stamp_ns + LIVE_SPAN_NS
+            now = slice(None) if not later.any() else ~later
+            live = live_points(points[now], t_ns[now], stamp_ns)
             self._points.publish(cloud_message(live, stamp_ns, BASE))
+            points, t_ns = points[later], t_ns[later]
 
     def scan(self, scan: AssembledScan, fallback_stamp_ns: int, organized: bool) -> None:
         """Publish an assembled scan, also an empty one; ``organized``: as a height map."""
@@ -120,3 +128,8 @@ class Outputs:
             with contextlib.suppress(ArgumentError):
                 points = height_map(points, scan.edge_ns, self._model.columns)
         self._scan.publish(cloud_message(points, stamp_ns, BASE))
+
+
+def _starts(edge_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Return the index of the first point of each profile."""
+    return np.flatnonzero(np.diff(edge_ns, prepend=edge_ns[:1] - 1))

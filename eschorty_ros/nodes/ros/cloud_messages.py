@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -55,17 +56,7 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
     message.header.frame_id = frame_id
     message.height, message.width = (1, *points.shape)[-2:]
     dtype = points.dtype
-    assert dtype.names is not None
-    assert dtype.fields is not None
-    message.fields = [
-        PointField(
-            name=name,
-            offset=dtype.fields[name][1],
-            datatype=_POINT_FIELD_TYPES[dtype.fields[name][0].str[1:]],
-            count=1,
-        )
-        for name in dtype.names
-    ]
+    message.fields = _point_fields(dtype)
     message.is_bigendian = False
     message.point_step = dtype.itemsize
     message.row_step = dtype.itemsize * message.width
@@ -73,6 +64,14 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
     if points.size:
         message.data = _bytes_field(points)
     return message
+
+
+@cache
+def _point_fields(dtype: np.dtype[Any]) -> list[PointField]:
+    return [
+        PointField(name=name, offset=offset, datatype=_POINT_FIELD_TYPES[kind.str[1:]], count=1)
+        for name, (kind, offset, *_) in (dtype.fields or {}).items()
+    ]
 
 
 def points_from_message(message: PointCloud2, *, organized: bool = False) -> NDArray[Any]:
@@ -95,10 +94,12 @@ def points_from_message(message: PointCloud2, *, organized: bool = False) -> NDA
     return points if message.is_dense else points[np.isfinite(points["x"])]
 
 
-def live_points(scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
+def live_points(
+    scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int | NDArray[np.int64]
+) -> NDArray[Any]:
     """Return an assembled scan's points in the layout of a live cloud, ``t`` from ``stamp_ns``.
 
-    All of ``t_ns`` must be within ``LIVE_SPAN_NS`` after ``stamp_ns``.
+    All of ``t_ns`` must be within ``LIVE_SPAN_NS`` after the stamp, or the stamp of each.
     """
     live = np.empty(len(scan_points), live_dtype(scan_points.dtype))
     for name in scan_points.dtype.names or ():

@@ -1,0 +1,94 @@
+"""Live clouds: one message a profile, a bounded rate, spans that fit their times."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Profiles, place
+from eschorty_ros.live.scan_buffer import PlacedPoints
+from eschorty_ros.live.sensor_epoch import TimedProfiles
+from eschorty_ros.nodes.reconstruction.outputs import Outputs
+from eschorty_ros.nodes.ros.cloud_messages import points_from_message
+from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+
+CALIBRATION = load_calibration("config_3")
+ZERO_NS = 1_800_000_000_000_000_000
+COLUMNS = 3
+
+
+class Publisher(list):
+    publish = list.append
+
+    def get_subscription_count(self):
+        return 1
+
+
+class Node:
+    """Makes publishers that keep their messages, by topic."""
+
+    def __init__(self):
+        self.topics = {}
+
+    def create_publisher(self, _type, topic, _qos, **_override):
+        return self.topics.setdefault(topic, Publisher())
+
+
+def timed(edges_us):
+    """Return profiles of three columns, each event 10 us after the one before."""
+    edge_us = np.repeat(np.array(edges_us, np.int64), COLUMNS)
+    count = edge_us.size
+    column = np.tile(np.arange(COLUMNS, dtype=np.uint16), len(edges_us))
+    t_us = edge_us + 100 - 10 * column.astype(np.int64)
+    profiles = Profiles(
+        period=edge_us, edge_us=edge_us, t_us=t_us, column=column, row=np.full(count, 300.0),
+        sigma_row=np.full(count, 0.1), events=np.full(count, 30, np.uint32),
+        width_px=np.full(count, 5.0), return_index=np.zeros(count, np.uint8),
+        flags=np.zeros(count, np.uint16), range_mm=1000.0 + np.arange(count),
+        sigma_mm=np.ones(count),
+    )  # fmt: skip
+    return TimedProfiles(profiles, ZERO_NS + t_us * 1000, ZERO_NS + edge_us * 1000)
+
+
+def times_ns(message):
+    since_ns = points_from_message(message)["t"].astype(np.int64)
+    return (ns_from_stamp(message.header.stamp) + since_ns).tolist()
+
+
+def test_every_profile_is_a_message_stamped_with_its_first_point():
+    node = Node()
+    outputs = Outputs(node, CALIBRATION, 1000.0)
+    fresh = timed([0, 1000, 2000]), timed([3000])
+    outputs.profiles(list(fresh))
+    messages = node.topics["profile"]
+    assert len(messages) == 4
+    for number, message in enumerate(messages):
+        edge_ns = ZERO_NS + number * 1_000_000
+        assert ns_from_stamp(message.header.stamp) == edge_ns + 80_000
+        assert times_ns(message) == [edge_ns + 100_000, edge_ns + 90_000, edge_ns + 80_000]
+        assert points_from_message(message)["column"].tolist() == [0, 1, 2]
+    ranges_m = np.concatenate([points_from_message(message)["x"] for message in messages[:3]])
+    np.testing.assert_allclose(ranges_m, fresh[0].profiles.range_mm * 1e-3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pieces", [1, 4])
+def test_the_rate_of_profiles_is_bounded(pieces):
+    node = Node()
+    outputs = Outputs(node, CALIBRATION, 250.0)
+    for edges_us in np.split(np.arange(12) * 1000, pieces):
+        outputs.profiles([timed(edges_us)])
+    begins_ns = [ns_from_stamp(message.header.stamp) for message in node.topics["profile"]]
+    assert np.diff(begins_ns).tolist() == [4_000_000, 4_000_000]
+
+
+def test_points_further_apart_than_a_message_can_hold_are_in_two():
+    node = Node()
+    far = timed([0, 1000, 4_100_000, 8_300_000])
+    points = place(far.profiles, CALIBRATION.model(), 0.0, CALIBRATION.stage_direction)
+    Outputs(node, CALIBRATION, 1000.0).points(
+        [PlacedPoints(points, far.t_ns, far.edge_ns, np.zeros(len(points)))]
+    )
+    messages = node.topics["points"]
+    assert [message.width for message in messages] == [6, 3, 3]
+    assert [t for message in messages for t in times_ns(message)] == far.t_ns.tolist()
