@@ -1,6 +1,10 @@
-"""What the tests of the nodes share."""
+"""Tests of the nodes: without rclpy they are skipped, with it they share an observer."""
 
 import pytest
+
+
+def pytest_pycollect_makemodule() -> None:
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 
 @pytest.fixture

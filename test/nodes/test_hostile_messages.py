@@ -7,9 +7,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 import scan_scenarios as scenarios
 from benches import remote_bench
 from contact import Contact

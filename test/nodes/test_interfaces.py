@@ -2,12 +2,9 @@
 
 from collections.abc import Iterator
 
-import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 import interfaces as tables
 import policies
+import pytest
 from rclpy.node import Node
 
 from eschorty_ros.nodes.ros.instrument_client import InstrumentClient

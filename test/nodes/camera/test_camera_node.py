@@ -5,9 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from benches import bench_here
 from event_camera_msgs.msg import EventPacket
 from rclpy.qos import ReliabilityPolicy

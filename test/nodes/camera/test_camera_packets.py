@@ -1,9 +1,5 @@
 """Numbers of the packets, from which subscribers notice gaps and restarts."""
 
-import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.hardware.base.protocols import EventChunk
 from eschorty_ros.nodes.camera.packet_publisher import PacketPublisher
 

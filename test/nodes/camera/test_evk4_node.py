@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from camera_on_bench import StillBench
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState

@@ -5,9 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from event_camera_msgs.msg import EventPacket
 from evk4_bench import OnDemand
 from ros_process import NodeProcess, Observer, processes, wait_until

@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
 from event_camera_msgs.msg import EventPacket

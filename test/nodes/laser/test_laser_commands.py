@@ -4,9 +4,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from delayed_laser import DelayedLaser
 from eschorty_ros.msg import LaserState
 from ros_process import Observer, nodes_here, wait_until

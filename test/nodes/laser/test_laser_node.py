@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.msg import LaserState
 from laser_bench import OFF_LIMIT_S, LaserBench
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, stamped_after, wait_until

@@ -10,9 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from diagnostic_msgs.msg import DiagnosticStatus
 from eschorty_ros.msg import LaserState
 from rclpy.node import Node

@@ -8,8 +8,6 @@ import pytest
 import yaml
 from mutation import mutations
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.nodes.one_process.hardware_file import TABLES, read_hardware
 

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.core.base.errors import EschortyError
 from eschorty_ros.nodes.one_process import launch_arguments
 from eschorty_ros.nodes.one_process.launch_arguments import CALIBRATE, REPLAY, SCAN

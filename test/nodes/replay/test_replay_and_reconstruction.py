@@ -4,9 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan

@@ -4,9 +4,6 @@ from array import array
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.msg import LaserState
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -9,12 +9,8 @@ import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import pytest
-import yaml
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 import scan_scenarios as scenarios
+import yaml
 from benches import remote_bench
 from ros_process import NAMESPACE, NodeProcess, Observer, node_name, processes
 from std_msgs.msg import Header

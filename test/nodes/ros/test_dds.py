@@ -3,9 +3,6 @@
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from ros_process import NodeProcess, Observer
 
 from eschorty_ros.nodes.ros.dds import RANGE, VARIABLES

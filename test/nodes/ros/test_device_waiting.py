@@ -6,9 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_process import Observer, nodes_here, wait_until
 

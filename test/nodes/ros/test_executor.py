@@ -6,9 +6,6 @@ import time
 from collections.abc import Iterator
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node

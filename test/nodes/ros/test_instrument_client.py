@@ -4,8 +4,6 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.control.instrument_monitor import InstrumentMonitor
 from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanCanceled, ScanRequest

@@ -7,9 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from ros_process import NodeProcess, Observer, domain_environment, wait_until
 
 from eschorty_ros.hardware.base.launcher import VARIABLE

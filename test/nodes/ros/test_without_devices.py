@@ -5,9 +5,6 @@ import time
 from collections.abc import Iterator
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ros_process import NodeProcess, Observer, processes, wait_until
 

@@ -10,9 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from action_msgs.msg import GoalStatus
 from benches import remote_bench
 from command_process import CommandProcess

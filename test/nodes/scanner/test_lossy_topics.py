@@ -4,9 +4,6 @@ import signal
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 import scan_scenarios as scenarios
 from action_msgs.msg import GoalStatus
 from benches import remote_bench

@@ -9,9 +9,6 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 import scan_scenarios as scenarios
 from benches import remote_bench
 from lossy_link import TwoHosts, missing

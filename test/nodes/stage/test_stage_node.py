@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from action_msgs.msg import GoalStatus
 from benches import bench_here
 from eschorty_ros.action import MoveStage
