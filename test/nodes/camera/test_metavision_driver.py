@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_process import NodeProcess, Observer, Remap, wait_until
 from sensor_msgs.msg import PointCloud2
+from tf2_msgs.msg import TFMessage
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
@@ -47,12 +48,16 @@ def recording(tmp_path_factory):
 def publish(driver: Driver, observer: Observer, recording, states) -> None:
     """Publish stage and packets; stay a bounded number ahead, as best effort loses a burst."""
     odometry = observer.publisher(Odometry, "/my_stage/odom", qos.stream(2000))
+    placed = observer.collect(TFMessage, "/tf", qos.stream())
     zero_ns = observer.node.get_clock().now().nanoseconds
     for t_us, position_mm in recording.stage_samples.tolist():
         message = Odometry()
         message.header.stamp = stamp_from_ns(zero_ns + 1000 * t_us)
         message.pose.pose.position.y = 1e-3 * position_mm
         odometry.publish(message)
+    # Before the scan begins: a sweep shorter than the scan is reported as incomplete.
+    stamp = message.header.stamp
+    wait_until(lambda: placed and placed[-1].transforms[-1].header.stamp == stamp, "the stage")
     camera = Node(driver.node, context=observer.node.context)
     reliability = ReliabilityPolicy[driver.reliability.upper()]
     events = camera.create_publisher(
