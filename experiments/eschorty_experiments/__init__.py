@@ -14,6 +14,8 @@ NAMES: tuple[str, ...] = (
     "reflectance_step",
     "scans",
     "estimators",
+    "static_light",
+    "effects",
     "calibration",
     "calibrated_scan",
     "tradeoff",

@@ -30,7 +30,7 @@ class Curve:
     """Shift of the centroid towards the brighter side, px, with the step at the line's centre.
 
     ``raw`` and ``compensated`` have one entry per contrast; ``scatter`` is the standard deviation
-    of single points of ``raw``.
+    of single points of ``raw``, ``intensity`` the shift of the irradiance's own centroid.
     """
 
     frequency_hz: float
@@ -38,6 +38,7 @@ class Curve:
     raw: Array
     scatter: Array
     compensated: Array
+    intensity: Array
     fits: Fits
 
 
@@ -100,6 +101,7 @@ def _contrast(axes: Axes, curve: Curve) -> None:
     axes.plot(x, np.polyval(curve.fits.linear, x), "--", color="0.5", lw=1,
               label=f"linear, R² {curve.fits.r2_linear:.2f}")  # fmt: skip
     axes.plot(curve.contrast, curve.compensated, "s", ms=4, color="tab:green", label="compensated")
+    axes.plot(curve.contrast, curve.intensity, "k:", label="centroid of the irradiance")
     axes.axhline(0.0, color="0.6", lw=0.8)
     axes.set(
         xlabel="contrast from black",

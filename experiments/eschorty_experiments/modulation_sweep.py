@@ -123,7 +123,11 @@ def _remarks(sweeps: dict[str, list[Point]], parameters: dict[str, PixelParamete
         "both ends counted, in each column alone; the lines are anywhere between two rows.",
         f"Counts peak at {_peak_hz(paper):g} Hz (paper) and {_peak_hz(narrow):g} Hz (narrow). The "
         "paper has them fall from about 1 kHz on; preset paper stays flat over some kHz and dips "
-        "near 1 kHz, where pixels still in their refractory time skip every other edge.",
+        "near 1 kHz: from 714 Hz on, half a period is shorter than the refractory time of 700 us, "
+        "so that a pixel misses every other edge until at 1.4 kHz a whole period fits. All "
+        "simulated pixels have the same time: a spread of 10 % halves the dip and one of 30 % "
+        "removes it, so the paper's camera, whose times are unknown and surely differ, need not "
+        "show it.",
         "Preset paper ends at "
         f"{paper[-1].width_px:g} rows at 20 kHz where the paper has 2: with noise on the swing "
         "rows beyond the edge fire occasionally. Preset narrow reaches "

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 SPEED_MM_S = 300.0
 TRAVEL_MM = (0.0, 200.0)
-STRIP_MM = (75.0, 120.0)
+HALF_MM, STRIP_MM = (50.0, 150.0), (75.0, 120.0)
 
 FREQUENCIES_HZ = (70.0, 1000.0)
 NEAR_FACE_MM, FAR_FACE_MM = 1000.0, 2430.0
@@ -72,7 +72,7 @@ class Scanned:
 
 
 def cases(effort: Effort) -> list[Case]:
-    """Return the scans; of those at 1 kHz a fast run has a strip of the leaves alone."""
+    """Return the scans; a fast run has half of the leaves, and at 1 kHz only a strip of them."""
     made = []
     for name, title, scene, build in (
         ("leaves", "leaves at 1.32 m", Leaves(), "config_3"),
@@ -82,7 +82,8 @@ def cases(effort: Effort) -> list[Case]:
         for hz in FREQUENCIES_HZ:
             costly = effort.fast and hz > 100.0
             if not costly:
-                made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, TRAVEL_MM))
+                travel = HALF_MM if effort.fast and isinstance(scene, Leaves) else TRAVEL_MM
+                made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, travel))
             elif isinstance(scene, Leaves):
                 made.append(Case(f"{name}_{hz:g}hz", title, scene, build, hz, STRIP_MM))
     return made
