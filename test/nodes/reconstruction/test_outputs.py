@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is not installed")
-
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, place
 from eschorty_ros.live.scan_buffer import PlacedPoints
