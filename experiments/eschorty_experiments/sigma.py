@@ -132,7 +132,7 @@ def _scene_findings(sweep: tuple[float, float, float], measured: list[Ratios]) -
         shares = [one.within(1.0, mixed) for one in mine]
         name = f"{frequency_hz:g} Hz, {speed_mm_s:g} mm/s: share within 1 sigma{words}"
         if frequency_hz > SATURATED_HZ:
-            low, high = 0.0, 1.0
+            low, high = -math.inf, math.inf
         findings.append(Finding(f"{name}, lowest of the scenes", min(shares), low=low))
         findings.append(Finding(f"{name}, highest", max(shares), high=high))
     return findings
