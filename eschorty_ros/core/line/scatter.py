@@ -23,8 +23,9 @@ _APART = 5
 _BLOCK = 16
 _KEPT = 0.5
 _DIFFERENCES_MIN = 8.0
-# A larger second difference is an edge of the surface.
+# A larger second difference is an edge of the surface, but where most are as large.
 _DIFFERENCE_MAX_PX = 4.0
+_DEVIATIONS_MAX = 3.0
 FACTOR_MAX = 64.0
 _LOCKING = 1.0 / 24.0
 
@@ -52,6 +53,8 @@ def _add_differences(rows, scatter):
     """Add the second differences of a profile to the sums, but for lines that an edge cuts."""
     row, sigma2, cut = rows.row[0], rows.sigma2[0], rows.truncated[0]
     columns = row.size
+    usual = np.sqrt(scatter.squares.sum() / max(scatter.number.sum(), 1.0))
+    largest = max(_DIFFERENCE_MAX_PX, _DEVIATIONS_MAX * usual)
     for block in range(1, scatter.number.size - 1):
         first = max((block - 1) * _BLOCK, _APART)
         last = min(block * _BLOCK, columns - _APART)
@@ -60,7 +63,7 @@ def _add_differences(rows, scatter):
             before, after = c - _APART, c + _APART
             difference = row[before] - 2.0 * row[c] + row[after]
             whole = not (cut[before] or cut[c] or cut[after])
-            if whole and abs(difference) <= _DIFFERENCE_MAX_PX:
+            if whole and abs(difference) <= largest:
                 squares += difference * difference
                 expected += sigma2[before] + 4.0 * sigma2[c] + sigma2[after]
                 number += 1.0
@@ -70,8 +73,8 @@ def _add_differences(rows, scatter):
 
 
 @kernel(_nrt=False)
-def _scale(rows, scatter):
-    """Scale the variances of a profile by the scatter.
+def _scale(rows, scatter, smoothing):
+    """Scale the variances of a profile by the scatter, and widen the smoothing gates by it.
 
     With a ``factor_max`` of 0, for means over full columns, they are as expected.
     """
@@ -79,15 +82,19 @@ def _scale(rows, scatter):
     _add_differences(rows, scatter)
     for block in range(1, scatter.number.size - 1):
         near = slice(block - 1, block + 2)
-        if scatter.number[near].sum() < _DIFFERENCES_MIN or scatter.factor_max == 0.0:
-            continue
-        ratio = scatter.squares[near].sum() / scatter.expected[near].sum()
+        measured = scatter.number[near].sum() >= _DIFFERENCES_MIN and scatter.factor_max > 0.0
+        ratio = scatter.squares[near].sum() / scatter.expected[near].sum() if measured else 1.0
+        ratio = min(ratio, FACTOR_MAX)
         factor = min(ratio, scatter.factor_max)
         for k in range(returns):
             for c in range((block - 1) * _BLOCK, min(block * _BLOCK, columns)):
+                smoothing.gates_px[k, c] = smoothing.gate_px
                 if rows.truncated[k, c]:
                     continue
-                own2 = factor * rows.sigma2[k, c]
-                rows.sigma2[k, c] = own2
-                if own2 < _LOCKING:
-                    rows.common2[k, c] += _LOCKING - own2
+                scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * rows.sigma2[k, c])
+                smoothing.gates_px[k, c] = max(smoothing.gate_px, scattered)
+                if measured:
+                    own2 = factor * rows.sigma2[k, c]
+                    rows.sigma2[k, c] = own2
+                    if own2 < _LOCKING:
+                        rows.common2[k, c] += _LOCKING - own2

@@ -18,7 +18,10 @@ _ISOLATION_REACH = 2
 
 
 class Smoothing(NamedTuple):
-    """Settings of smoothing and isolation, and the smoothed rows with their variance and width."""
+    """Settings of smoothing and isolation, and the smoothed rows with their variance and width.
+
+    ``gates_px`` are the gates of a profile's points: ``gate_px``, or more where rows scatter more.
+    """
 
     half_width: int
     gate_px: float
@@ -27,6 +30,7 @@ class Smoothing(NamedTuple):
     isolated: NDArray[np.bool_]
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
+    gates_px: NDArray[np.float64]
     widths: Widths
 
 
@@ -54,7 +58,7 @@ def _partner(row, k, c, other):
 
 
 @kernel(_nrt=False)
-def _add_pairs(rows, k, j, gate, sums):
+def _add_pairs(rows, k, j, gates, sums):
     """Add the neighbours ``j`` columns away to those points of return ``k`` that have all nearer.
 
     ``sums`` are those of the rows' differences, the variances, the spreads and the points.
@@ -65,7 +69,7 @@ def _add_pairs(rows, k, j, gate, sums):
         if used[k, c] == 2 * j - 1 and not np.isnan(row[k, c]):
             left, before = _partner(row, k, c, c - np.uintp(j))
             right, after = _partner(row, k, c, c + np.uintp(j))
-            if abs(left) <= gate and abs(right) <= gate:
+            if abs(left) <= gates[k, c] and abs(right) <= gates[k, c]:
                 difference[k, c] += left + right
                 variance[k, c] += rows.sigma2[before, c - j] + rows.sigma2[after, c + j]
                 spread2[k, c] += rows.variance[before, c - j] + rows.variance[after, c + j]
@@ -83,7 +87,7 @@ def _add_values(values, total, used, j):
 
 
 @kernel(_nrt=False)
-def _add_only_pairs(rows, j, gate, sums):
+def _add_only_pairs(rows, j, gates, sums):
     """Add the neighbours as `_add_pairs` does, where a column has one return: in vectors."""
     row = rows.row
     difference, variance, spread2, used = sums
@@ -91,6 +95,7 @@ def _add_only_pairs(rows, j, gate, sums):
     j, columns = np.uintp(j), np.uintp(row.shape[1])
     for c in range(j, columns - j):
         left, right = row[0, c - j] - row[0, c], row[0, c + j] - row[0, c]
+        gate = gates[0, c]
         near = (used[0, c] == number) & (abs(left) <= gate) & (abs(right) <= gate)
         difference[0, c] += left + right if near else 0.0
         used[0, c] += 2.0 if near else 0.0
@@ -121,10 +126,10 @@ def _smooth(rows, smoothing):
     sums = out_row, out_sigma2, out_width, used
     for j in range(1, min(smoothing.half_width, (columns - 1) // 2) + 1):
         if returns == 1:
-            _add_only_pairs(rows, j, smoothing.gate_px, sums)
+            _add_only_pairs(rows, j, smoothing.gates_px, sums)
         else:
             for k in range(returns):
-                _add_pairs(rows, k, j, smoothing.gate_px, sums)
+                _add_pairs(rows, k, j, smoothing.gates_px, sums)
     smoothed = 0
     for k in range(returns):
         for c in range(columns):

@@ -371,6 +371,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             isolated=np.zeros(shape, np.bool_),
             row=np.zeros(shape),
             sigma2=np.zeros(shape),
+            gates_px=np.zeros(shape),
             widths=empty_widths(*shape),
         ),
         light=Light(),
@@ -474,7 +475,7 @@ def _close(memory, state, counters):
     counters.columns_unmodulated += sums.unmodulated
     counters.events_unmodulated += sums.events_unmodulated
     counters.columns_isolated += _reject_isolated(rows, smoothing)
-    _scale(rows, scatter)
+    _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _mark_unusual(rows, smoothing, light.lit_share)
     if estimator.method == _LEARNED or footprint.state[3] > 0:

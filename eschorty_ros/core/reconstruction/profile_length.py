@@ -12,9 +12,10 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HeldEvents
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 from eschorty_ros.core.modulation.phase_lock import BLOCK_PERIODS, BLOCK_US
-from eschorty_ros.core.reconstruction.settings import Settings
 
 PERIODS_MAX = 1000
+EVENTS_WANTED = 16
+"""Events per column and profile that a point should have."""
 _HELD_EVENTS_MAX = 1 << 22
 # Events of a window that are looked at, evenly spread.
 _SAMPLE = 4096
@@ -35,9 +36,10 @@ class ProfileLength:
     modulated, or has a line where pixels are too slow to follow: the choice does not depend on how
     the stream is split, nor on the background before the laser is on. Of their columns, weighted
     by events, one has ``sum n^2 / sum n - 1`` events, with ``n`` the events of each column. One
-    period is a profile where it has 4 of them, the default of ``events_min``. Else a profile gets
-    twice as many, by the events of the next block, since pixels give more when the laser is
-    switched on. Of Poisson counts with a mean of 8, one in 24 is less than 4.
+    period is a profile where it has half of `EVENTS_WANTED`: of Poisson counts with a mean of 8,
+    one in 24 is less than 4, the default of ``events_min``. Else a profile gets as many periods as
+    give `EVENTS_WANTED`, by the events of the next block, since pixels give more when the laser is
+    switched on.
 
     Parameters
     ----------
@@ -77,10 +79,10 @@ class ProfileLength:
             end = int(np.searchsorted(t, end_us))
             if begin < end:
                 events = self._events(t[begin:end], x[begin:end])
-            if events >= Settings().events_min:
+            if 2.0 * events >= EVENTS_WANTED:
                 return 1
             begin = end
-        wanted = math.ceil(2.0 * Settings().events_min / max(events, 1e-9))
+        wanted = math.ceil(EVENTS_WANTED / max(events, 1e-9))
         return min(wanted, periods_max(self._modulation))
 
     def _is_lit(

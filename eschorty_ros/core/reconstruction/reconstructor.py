@@ -20,7 +20,7 @@ from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
-from eschorty_ros.core.reconstruction.profile_length import periods_max
+from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, periods_max
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.region import within_ranges
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -30,8 +30,6 @@ from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 _PIECE_WORDS = 1 << 16
 # Few words more than a block of the phase lock needs events.
 _BLOCK_WORDS = 1 << 13
-_EVENTS_WANTED = 16
-"""Events per column and profile that a point should have."""
 _STAGE_EDGES_MAX = 1024
 """Most pieces with edges that are kept until ``take_stage_edges`` is called."""
 
@@ -367,8 +365,8 @@ class Reconstructor:
             )
         per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
         few = counts["columns_too_few_events"]
-        if few > 10 * counts["points"] and per_column < _EVENTS_WANTED:
-            wanted = min(math.ceil(every * _EVENTS_WANTED / max(per_column, 1e-3)), 1000)
+        if few > 10 * counts["points"] and per_column < EVENTS_WANTED:
+            wanted = min(math.ceil(every * EVENTS_WANTED / max(per_column, 1e-3)), 1000)
             found.append(
                 f"{few} columns have too few events for a point, {per_column:.2g} per column and "
                 f"profile on average; set periods_per_profile to about {wanted}"

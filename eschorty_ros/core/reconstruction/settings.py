@@ -57,9 +57,8 @@ class Settings:
     The compensation of reflectance steps is off by default, since it needs the stage's speed and
     delays profiles by the time that a step takes to cross the line.
 
-    At high frequencies (above about 5 kHz) a column gives fewer than ``events_min`` events per
-    period: ``periods_per_profile`` 0 then takes more periods for a profile, as `profile_length`
-    describes.
+    At high frequencies (above about 2 kHz) a column gives too few events for a point per period:
+    ``periods_per_profile`` 0 then takes more periods for a profile, as `profile_length` describes.
 
     Columns and ranges are the region of interest. Events elsewhere are counted and not used.
 
@@ -113,8 +112,9 @@ class Settings:
         2, 0, 20, "columns", "neighbours averaged on either side; 0 is off"
     )
     smoothing_gate_px: float = _number(
-        2.0, 0.0, 100.0, "px", "neighbours further off in rows are not averaged"
-    )
+        2.0, 0.0, 100.0, "px",
+        "neighbours further off in rows are not averaged, unless rows scatter as much",
+    )  # fmt: skip
     isolation_gate_px: float = _number(
         12.0, 0.0, 720.0, "px", "a weak point needs a neighbouring column this near in rows"
     )

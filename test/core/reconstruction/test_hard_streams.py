@@ -188,6 +188,17 @@ def _kept(camera: Camera, share: float) -> Events:
     return t[kept], x[kept], y[kept], p[kept]
 
 
+@pytest.mark.parametrize(("share", "error_max_mm"), [(0.22, 1.0), (0.5, 0.5)])
+def test_rows_that_scatter_more_are_averaged_and_have_an_honest_sigma(share, error_max_mm):
+    camera = Camera(periods=16)
+    found, _ = points(camera, _kept(camera, share))
+    found = found.select(found.period >= 4)
+    error = np.abs(error_mm(found))
+    assert np.quantile(error, 0.6827) < error_max_mm, f"seed {camera.seed}"
+    assert 0.6 < np.mean(error < found.sigma_mm) < 0.73
+    assert 0.89 < np.mean(error < 2.0 * found.sigma_mm) < 0.97
+
+
 def _swapped(camera: Camera) -> Events:
     t, x, y, p = camera.line(wavy)
     return t, x, y, 1 - p

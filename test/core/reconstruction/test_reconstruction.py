@@ -361,7 +361,7 @@ def test_a_profile_has_as_many_periods_as_give_points(phase):
     modulation = Modulation(20_000.0, on_edge_us=None if phase == "estimated" else 50_000)
     found, whole = reconstruct(stream, modulation)
     every = whole.periods_per_profile
-    assert every in (5, 6), f"seed {SEED}"
+    assert every in (10, 11), f"seed {SEED}"
     lit = found.select(found.edge_us >= 50_000)
     assert len(lit) > 0.9 * 300 * 3000 / every
     assert np.median(np.abs(lit.row - 350)) < 1.0
