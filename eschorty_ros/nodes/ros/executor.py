@@ -130,19 +130,21 @@ class _Redirecting:
         callback, profile = subscription.callback, subscription.qos_profile
         bounded = profile.history == HistoryPolicy.KEEP_LAST and profile.depth > 0
         waiting: deque[tuple[Any, ...]] = deque(maxlen=profile.depth if bounded else None)
+        lock = threading.Lock()
 
         def take_first() -> None:
-            # A newer message may have taken its place.
-            with contextlib.suppress(IndexError):
+            with lock:
                 message = waiting.popleft()
-                callback(*message)
+            callback(*message)
 
         run = self._guarded(node, subscription, take_first)
 
         def receive(*message: Any) -> None:
-            full = len(waiting) == waiting.maxlen
-            # rclpy 9.1's EventsExecutor gives message and information as one tuple.
-            waiting.append(message[0] if isinstance(message[0], tuple) else message)
+            # Each message that waits has one run, which a newer one inherits that takes its place.
+            with lock:
+                full = len(waiting) == waiting.maxlen
+                # rclpy 9.1's EventsExecutor gives message and information as one tuple.
+                waiting.append(message[0] if isinstance(message[0], tuple) else message)
             if not full:
                 self._submit(subscription.callback_group, run)
 

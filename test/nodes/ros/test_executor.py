@@ -3,7 +3,9 @@
 import functools
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import rclpy
@@ -88,6 +90,28 @@ def test_of_the_messages_of_a_busy_callback_the_newest_are_kept(spun):
     # One was in the callback; a wait set takes one more when that ends.
     assert received == sorted(received)
     assert len(received) <= DEPTH + 2
+
+
+class _SlowQueue(deque[Any]):
+    def append(self, item: Any) -> None:
+        time.sleep(1e-3)
+        super().append(item)
+
+
+def test_the_last_of_many_messages_is_always_received(spun, monkeypatch):
+    """While a message takes its place in the queue, the one before leaves it for the callback."""
+    node, _, _ = spun
+    monkeypatch.setattr(executor, "deque", _SlowQueue)
+    received: list[int] = []
+
+    def slow(message: Int32) -> None:
+        time.sleep(3e-3)
+        received.append(message.data)
+
+    subscription = node.create_subscription(Int32, "last", slow, 1)
+    for number in range(100):
+        subscription.callback(Int32(data=number))
+    wait_until(lambda: received[-1:] == [99], "the last message")
 
 
 def test_errors_are_counted_and_the_node_goes_on(spun):
