@@ -39,7 +39,7 @@ class ProfileLength:
     period is a profile where it has half of `EVENTS_WANTED`: of Poisson counts with a mean of 8,
     one in 24 is less than 4, the default of ``events_min``. Else a profile gets as many periods as
     give `EVENTS_WANTED`, by the events of the next block, since pixels give more when the laser is
-    switched on.
+    switched on. Blocks without light do not count.
 
     Parameters
     ----------
@@ -50,53 +50,57 @@ class ProfileLength:
         self._modulation = modulation
         self._span_us = max(BLOCK_US, round(BLOCK_PERIODS * modulation.period_us))
         self._seen = 0
-        self._end_us: int | None = None
+        self._window: tuple[int, int] | None = None
 
     def choose(self, held: HeldEvents, watermark_us: int, last: bool = False) -> int:
         """Return the periods of a profile, 0 while the held events do not give them.
 
         1 where too many events do not follow the laser, or none do and these are the ``last``.
         """
-        t, x, y, p = held.arrays
-        while self._end_us is None:
-            begin = self._seen
-            window = estimation_window(t[begin:], watermark_us, self._modulation)
-            if window is None and not last:
-                return 0
-            end = t.size if window is None else begin + window.size
-            sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
-            found = begin < end and self._is_lit(t[sample], x[sample], y[sample], p[sample])
-            if not found and (window is None or end > _HELD_EVENTS_MAX):
-                return 1
-            if found:
-                self._end_us = int(t[end - 1]) + self._span_us
-            # The first window may begin before the laser is on. Behind a short stream is nothing.
-            self._seen = begin if found and end == t.size else end
-        begin, events = self._seen, 0.0
-        for end_us in (self._end_us, self._end_us + self._span_us):
-            if watermark_us <= end_us and not last:
-                return 0
-            end = int(np.searchsorted(t, end_us))
-            if begin < end:
-                events = self._events(t[begin:end], x[begin:end])
-            if 2.0 * events >= EVENTS_WANTED:
-                return 1
-            begin = end
+        t = held.arrays[0]
+        while True:
+            while self._window is None:
+                begin = self._seen
+                window = estimation_window(t[begin:], watermark_us, self._modulation)
+                if window is None and not last:
+                    return 0
+                self._seen = end = t.size if window is None else begin + window.size
+                if self._is_lit(held, begin, end):
+                    self._window = begin, end
+                elif window is None or end > _HELD_EVENTS_MAX:
+                    return 1
+            first, begin = self._window
+            end_us, events = int(t[begin - 1]) + self._span_us, 0.0
+            if last and t[-1] < end_us:
+                # A short stream has no complete block.
+                begin = first
+            for block_us in (end_us, end_us + self._span_us):
+                if watermark_us <= block_us and not last:
+                    return 0
+                end = int(np.searchsorted(t, block_us))
+                if self._is_lit(held, begin, end):
+                    events = self._events(held, begin, end)
+                if 2.0 * events >= EVENTS_WANTED:
+                    return 1
+                begin = end
+            if events > 0.0 or last:
+                break
+            # The light was on for less than a window.
+            self._seen, self._window = begin, None
         wanted = math.ceil(EVENTS_WANTED / max(events, 1e-9))
-        return min(wanted, periods_max(self._modulation))
+        return min(wanted, periods_max(self._modulation)) if events > 0.0 else 1
 
-    def _is_lit(
-        self,
-        t_us: NDArray[np.int64],
-        columns: NDArray[np.uint16],
-        rows: NDArray[np.uint16],
-        polarity: NDArray[np.uint8],
-    ) -> bool:
-        """Return true when events follow the laser or are on a line."""
-        return estimate_phase(t_us, polarity, self._modulation).found or _is_line(columns, rows)
+    def _is_lit(self, held: HeldEvents, begin: int, end: int) -> bool:
+        """Return true when held events follow the laser or are on a line."""
+        if begin == end:
+            return False
+        sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
+        t, x, y, p = (values[sample] for values in held.arrays)
+        return estimate_phase(t, p, self._modulation).found or _is_line(x, y)
 
-    def _events(self, t_us: NDArray[np.int64], columns: NDArray[np.uint16]) -> float:
+    def _events(self, held: HeldEvents, begin: int, end: int) -> float:
         """Return the events of a lit column in a period."""
+        t_us, columns = (values[begin:end] for values in held.arrays[:2])
         turns = ((t_us - t_us[0]) / self._modulation.period_us).astype(np.int64)
         counts = np.bincount(columns).astype(np.float64)
         return (float(counts @ counts) / t_us.size - 1.0) / _participating(np.bincount(turns))

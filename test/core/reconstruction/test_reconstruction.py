@@ -372,6 +372,20 @@ def test_a_profile_has_as_many_periods_as_give_points(phase):
     assert_same(found, reconstruct(stream, modulation, Settings(periods_per_profile=every))[0])
 
 
+def test_a_flash_before_the_laser_does_not_choose_the_periods_of_a_profile():
+    flash = lines(periods=2, columns=200, events=20.0, background=0.0)
+    laser = lines(periods=40, columns=200, events=20.0, background=0.0, edge_us=3_000_000)
+    rng = np.random.default_rng(SEED)
+    t_us = np.sort(rng.integers(0, 3_500_000, 150_000))
+    noise = t_us, rng.integers(0, 200, t_us.size), rng.integers(0, 720, t_us.size), t_us % 2
+    stream = encoded(
+        sort_readout(*(np.concatenate(v) for v in zip(flash, laser, noise, strict=True)))
+    )
+    found, whole = reconstruct(stream, KNOWN)
+    assert whole.periods_per_profile == 1, f"seed {SEED}"
+    assert len(found.select(found.edge_us >= 3_000_000)) > 0.95 * 200 * 40
+
+
 def test_the_region_of_interest_keeps_the_points_inside_and_counts_the_events_outside():
     slope = lines(lambda k, c: 100 + 0.4 * c, events=60.0, fwhm_px=6.0, background=0.05)
     near_mm, far_mm = MODEL.range_mm([250.0, 450.0])
