@@ -26,7 +26,7 @@ class PhaseEstimate:
     ----------
     edge_us : int
         Sensor time of a rising edge within the window's first period, from the earliest events
-        after it: late by the pixels' shortest latency.
+        after it: late by the pixels' shortest latency. The first event's where none is ``found``.
     strength : float
         Vector strength of all events, 0 to 1 (ON events against the rising edge, OFF events
         against the falling one).
@@ -83,14 +83,13 @@ def estimate_phase(
     period_us = modulation.period_us
     origin = int(t_us[0])
     phase = (t_us - origin) / period_us
-    phase -= np.where(polarity == 1, 0.0, modulation.duty)
+    phase -= modulation.duty * (polarity == 0)
     phase -= np.floor(phase)
     strength = float(abs(np.exp(2j * np.pi * phase).mean()))
     rayleigh = strength * strength * t_us.size
-    begin = _burst_begin(phase)
-    return PhaseEstimate(
-        origin + round(begin * period_us), strength, rayleigh, rayleigh > _RAYLEIGH_MIN
-    )
+    found = rayleigh > _RAYLEIGH_MIN
+    begin = _burst_begin(phase) if found else 0.0
+    return PhaseEstimate(origin + round(begin * period_us), strength, rayleigh, found)
 
 
 def _burst_begin(phase: NDArray[np.float64]) -> float:
