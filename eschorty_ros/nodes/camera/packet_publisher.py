@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 from collections.abc import Iterable
 from typing import Any
 
@@ -88,8 +87,8 @@ class PacketPublisher:
                 seq=self.seq,
                 encoding="evt3",
                 is_bigendian=False,
-                events=array.array("B", payload),
             )
+            message.events.frombytes(payload)
             message.header.stamp = stamp_from_ns(stamp_ns)
             message.header.frame_id = self._frame_id
             self._publisher.publish(message)

@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 import traceback
-from array import array
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -200,8 +199,8 @@ class ReplayNode(Node):
                 width=self._reader.header.width,
                 seq=seq,
                 encoding="evt3",
-                events=array("B", packet.data),
             )
+            message.events.frombytes(packet.data)
             message.header.stamp = stamp_from_ns(self._ns(packet.from_us))
             message.header.frame_id = OPTICAL
             self._events.publish(message)

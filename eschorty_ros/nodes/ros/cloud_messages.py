@@ -39,11 +39,9 @@ _POINT_FIELD_TYPES = {
 }
 
 
-def _bytes_field(values: NDArray[Any]) -> array[int]:
-    """Copy an array's bytes into the type that a message field accepts without a loop."""
-    data = array("B")
-    data.frombytes(np.ascontiguousarray(values).data.cast("B"))
-    return data
+def _fill(field: array[int], values: NDArray[Any]) -> None:
+    """Copy an array's bytes into a message's field, once: to set it would copy them again."""
+    field.frombytes(np.ascontiguousarray(values).data.cast("B"))
 
 
 def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
@@ -62,7 +60,7 @@ def cloud_message(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCl
     message.row_step = dtype.itemsize * message.width
     message.is_dense = points.ndim == 1
     if points.size:
-        message.data = _bytes_field(points)
+        _fill(message.data, points)
     return message
 
 
@@ -118,5 +116,5 @@ def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Im
     message.encoding = "mono8"
     message.is_bigendian = 0
     message.step = message.width
-    message.data = _bytes_field(pixels)
+    _fill(message.data, pixels)
     return message

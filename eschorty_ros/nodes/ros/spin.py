@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import re
 import select
@@ -142,6 +143,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
             spinning.executor.add_node(node)
         second = SecondNodes(nodes)
         second.wait()
+        # What lives as long as the process need not be searched, which halts all threads.
+        gc.freeze()
         spinning.start()
         with _signal_pipe() as signals:
             while rclpy.ok() and not ending.requested:
