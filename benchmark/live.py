@@ -233,7 +233,7 @@ def main() -> None:
     parser.add_argument("--frequency", type=float, nargs="+", default=[70.0, 1000.0])
     parser.add_argument("--packet-ms", type=float, nargs="+", default=[1.024, 4.096])
     parser.add_argument("--rate", type=float, nargs="+", default=[0.5, 1.0, 2.0])
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--reliable", action="store_true")
     parser.add_argument("--soak", type=float, metavar="MINUTES", default=0.0)
     parser.add_argument("--publish", action="store_true", help=argparse.SUPPRESS)

@@ -1,6 +1,7 @@
 """Write docs/performance.md: the speed of decoding and reconstruction on this computer.
 
-Usage: python benchmark/performance.py [--seconds S] [--repeats N] [--out FILE]
+Usage: PYTHONPATH=benchmark:test/support:$PYTHONPATH python benchmark/performance.py [--seconds S]
+           [--repeats N] [--out FILE]
 """
 
 from __future__ import annotations
@@ -74,6 +75,16 @@ THREADS = (
     "laser", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s", "times one thread",
     "same points", "memory, MB", "before, MB", "points, MB",
 )  # fmt: skip
+LIVE_TEXT = """
+## Through ROS 2
+
+`benchmark/live.py`: another process publishes event packets of 1 or 4 ms and the stage's odometry
+at a multiple of real time, a reconstruction node publishes every profile and the points of each
+50 ms, and a third process receives both. *per CPU s* counts all of the node's process, *offline* is
+the same code without ROS. *MB* is the node's memory at the start and at the end. Latency is from
+the end of a period to the arrival of its profile; at half of real time a packet takes twice its
+time to fill.
+"""
 
 
 def header(names: tuple[str, ...]) -> str:
@@ -230,6 +241,8 @@ def main() -> None:
                 recording = write_recording(Path(made) / name, modulation, data, number)
                 text += threads(recording, frequency_hz, repeats)
                 (recording / EVENTS_FILE).unlink()
+    command = [sys.executable, str(Path(__file__).with_name("live.py")), "--rate", "0.5", "1"]
+    text += f"{LIVE_TEXT}\n```text\n{subprocess.check_output(command, text=True)}```\n"
     arguments.out.write_text(text)
     print(text)
 
