@@ -9,6 +9,7 @@ import re
 import select
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -24,9 +25,11 @@ from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
+from eschorty_ros.nodes.ros.dds_deadlock import DdsDeadlock, DdsDeadlockError
 from eschorty_ros.nodes.ros.executor import Spinning
 
 _TURN_S = 0.1
+_CLOSE_S = 3.0
 _SIGNALS_MAX = 64
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ending: WeakSet[Node] = WeakSet()
@@ -125,11 +128,13 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     - ``args``: Command line; that of the process when omitted.
 
     Returns 0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built, another of its
-    name runs, or a callback failed (one line for an ``EschortyError``).
+    name runs, or a callback failed (one line for an ``EschortyError``). The process ends with 1
+    where DDS does not answer any more.
     """
     nodes: list[Node] = []
     spinning: Spinning | None = None
     code = 0
+    deadlocked = False
     use_profile()
     end_with_launcher()
     try:
@@ -146,17 +151,19 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         # What lives as long as the process need not be searched, which halts all threads.
         gc.freeze()
         spinning.start()
+        dds = DdsDeadlock()
         with _signal_pipe() as signals:
             while rclpy.ok() and not ending.requested:
                 spinning.raise_error()
                 second.look()
+                dds.look()
                 if select.select([signals], [], [], _TURN_S)[0]:
                     os.read(signals, _SIGNALS_MAX)
     except KeyboardInterrupt:
         pass
     except EschortyError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
-        code = 1
+        code, deadlocked = 1, isinstance(error, DdsDeadlockError)
     except Exception:
         # A callback that publishes while a node ends the context fails.
         if rclpy.ok():
@@ -168,6 +175,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         if spinning is not None:
             spinning.stop_callbacks()
         make_safe(nodes)
+        if deadlocked:
+            _exit_without_dds(nodes)
         _tear_down(nodes, spinning)
     return code
 
@@ -187,6 +196,19 @@ def _initialise(args: Sequence[str] | None) -> None:
         remedy = "ROS_SECURITY_KEYSTORE" if secured else "--ros-args"
         raise ArgumentError(f"ROS does not start: {reason}; look at {remedy}") from error
     rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.UNSET)
+
+
+def _exit_without_dds(nodes: Sequence[Node]) -> None:
+    """Close the devices, for as long as DDS lets it, and end the process."""
+
+    def close() -> None:
+        for node in nodes:
+            node.destroy_node()
+
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
+    closing.join(_CLOSE_S)
+    os._exit(1)
 
 
 def _tear_down(nodes: Sequence[Node], spinning: Spinning | None) -> None:
