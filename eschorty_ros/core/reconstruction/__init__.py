@@ -14,6 +14,7 @@ from eschorty_ros.core.reconstruction.profiles import (
     stage_offset_m,
 )
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
+from eschorty_ros.core.reconstruction.region import region_window
 from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
 from eschorty_ros.core.reconstruction.warm_up import warm_up
 
@@ -28,6 +29,7 @@ __all__ = [
     "place_link",
     "reconstruct_recording",
     "recorded_settings",
+    "region_window",
     "stage_offset_m",
     "stage_speed_mm_s",
     "warm_up",

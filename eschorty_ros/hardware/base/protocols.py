@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
@@ -81,6 +81,12 @@ class EventSource(Protocol):
 
         Raises ``ArgumentError`` for an unknown bias or an offset outside its range,
         ``DeviceError`` when the camera is not open or reads back another value.
+        """
+
+    def set_windows(self, windows: Sequence[tuple[int, int, int, int]]) -> None:
+        """Set the regions of interest: first column, first row, width, height; none is all.
+
+        Raises ``DeviceError`` when the camera is not open or does not answer.
         """
 
     def filters_out(self, frequency_hz: float) -> bool:

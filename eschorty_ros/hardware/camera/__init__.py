@@ -7,7 +7,7 @@ from eschorty_ros.hardware.camera.event_trail import TRAIL_THRESHOLD_US, TRAIL_T
 from eschorty_ros.hardware.camera.evk4 import Evk4
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
 from eschorty_ros.hardware.camera.monitors import PACKET_PERIOD_US
-from eschorty_ros.hardware.camera.pixel_selection import windows_of
+from eschorty_ros.hardware.camera.pixel_selection import Window, windows_of
 from eschorty_ros.hardware.camera.settings import LEAVE, CameraSettings
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "AntiFlicker",
     "CameraSettings",
     "Evk4",
+    "Window",
     "load_bias_file",
     "save_bias_file",
     "windows_of",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import usb.backend
 
@@ -20,6 +20,7 @@ from eschorty_ros.hardware.camera.chunk_queue import BYTES_MAX, ChunkQueue
 from eschorty_ros.hardware.camera.connection import Connection, EndedError
 from eschorty_ros.hardware.camera.health import HealthMonitor
 from eschorty_ros.hardware.camera.imx636 import HEIGHT, WIDTH
+from eschorty_ros.hardware.camera.pixel_selection import Window
 from eschorty_ros.hardware.camera.registers import Sleep
 from eschorty_ros.hardware.camera.session import Session
 from eschorty_ros.hardware.camera.settings import CameraSettings
@@ -196,6 +197,14 @@ class Evk4:
         kept = self._connection.require(name).set_bias(name, offset)
         self._connection.settings = settings
         return kept
+
+    def set_windows(self, windows: Sequence[Window]) -> None:
+        """Set the regions of interest: first column, first row, width, height; none is all.
+
+        Raises ``DeviceError`` when the camera is not open or does not answer.
+        """
+        self._connection.require("roi").set_windows(windows)
+        self._connection.settings = self._connection.settings.with_windows(windows)
 
     def filters_out(self, frequency_hz: float) -> bool:
         """Return whether the anti-flicker filter removes light modulated at ``frequency_hz``."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 
 import usb.backend
@@ -17,6 +18,7 @@ from eschorty_ros.hardware.camera import event_rate, imx636, monitors, treuzell
 from eschorty_ros.hardware.camera.biases import BiasBank
 from eschorty_ros.hardware.camera.bulk_reader import BulkReader, ClockNs, make_reader
 from eschorty_ros.hardware.camera.camera_usb import NAME, open_camera, read_serial
+from eschorty_ros.hardware.camera.pixel_selection import Window, set_windows
 from eschorty_ros.hardware.camera.registers import Sleep, run_sequence
 from eschorty_ros.hardware.camera.settings import CameraSettings, apply_settings
 
@@ -104,6 +106,11 @@ class Session:
             kept = self._biases.write(name, offset)
         self.applied[name] = kept
         return kept
+
+    def set_windows(self, windows: Sequence[Window]) -> None:
+        """Set the regions of interest."""
+        with self._sequence:
+            set_windows(self.control, windows)
 
     def read_biases(self) -> dict[str, int]:
         """Return the offsets in the camera."""

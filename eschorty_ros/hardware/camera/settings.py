@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from eschorty_ros.hardware.camera.anti_flicker import AntiFlicker, set_anti_flicker
@@ -48,6 +48,10 @@ class CameraSettings:
     def with_bias(self, name: str, offset: int) -> CameraSettings:
         """Return these settings with one bias changed."""
         return replace(self, biases={**self.biases, name: offset})
+
+    def with_windows(self, windows: Sequence[Window]) -> CameraSettings:
+        """Return these settings with other regions of interest."""
+        return replace(self, windows=tuple(windows))
 
 
 def apply_settings(

@@ -19,7 +19,12 @@ from eschorty_ros.hardware.camera import BIASES, save_bias_file
 from eschorty_ros.live.packet_cutting import SIZE_MAX_BYTES
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.camera.packet_publisher import PacketPublisher
-from eschorty_ros.nodes.camera.parameters import EVK4_TABLE, make_camera, missing_bias_file
+from eschorty_ros.nodes.camera.parameters import (
+    EVK4_TABLE,
+    make_camera,
+    missing_bias_file,
+    windows_given,
+)
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
@@ -179,10 +184,12 @@ class CameraNode(DeviceNode):
             self._diagnostics.publish()
 
     def _on_change(self, proposed: dict[str, Any]) -> None:
-        """Set changed biases; the offset read back becomes the parameter."""
-        source = self._source
+        """Set changed biases and windows; the offset read back becomes the parameter."""
+        source, windows = self._source, windows_given(proposed)
         if source is None:
             return
+        if windows != windows_given(self.parameters):
+            source.set_windows(windows)
         for name in BIASES:
             offset = proposed[name]
             if offset != self._biases.get(name):

@@ -22,6 +22,7 @@ from eschorty_ros.hardware.camera import (
     AntiFlicker,
     CameraSettings,
     Evk4,
+    Window,
     load_bias_file,
     windows_of,
 )
@@ -77,6 +78,7 @@ EVK4_TABLE = (
         _FULL_FRAME,
         "x, y, width, height per window; windows act as the product of their columns and rows",
         "px",
+        dynamic=True,
     ),
     Param("hot_pixels", "", "pixels to mask, at most 64: 'x,y x,y'"),
     Param("trail_filter", False, "filter of trailing events" + _IGNORED),
@@ -107,7 +109,6 @@ def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
     Raises ``ArgumentError`` for a value outside its range. Raises ``FormatError`` for a malformed
     bias file.
     """
-    roi = tuple(parameters["roi"])
     enabled = parameters["erc_mode"] == "enabled"
     return CameraSettings(
         biases=_biases(parameters),
@@ -117,10 +118,19 @@ def camera_settings(parameters: Mapping[str, Any]) -> CameraSettings:
         anti_flicker=_anti_flicker(parameters),
         trail_filter=parameters["trail_filter_type"] if parameters["trail_filter"] else "",
         trail_threshold_us=parameters["trail_filter_threshold"],
-        windows=() if roi == _FULL_FRAME else windows_of(roi),
+        windows=windows_given(parameters),
         hot_pixels=_pixels(parameters["hot_pixels"]),
         trigger_input=parameters["trigger_in_mode"] == "external",
     )
+
+
+def windows_given(parameters: Mapping[str, Any]) -> tuple[Window, ...]:
+    """Return the regions of interest, none for the full frame.
+
+    Raises ``ArgumentError`` when one is outside the sensor.
+    """
+    roi = tuple(parameters["roi"])
+    return () if roi == _FULL_FRAME else windows_of(roi)
 
 
 def _anti_flicker(parameters: Mapping[str, Any]) -> AntiFlicker | None:

@@ -24,6 +24,7 @@ from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.core.storage import ScanLog
+from eschorty_ros.live.calibration_capture import Capture
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline
@@ -33,6 +34,7 @@ from eschorty_ros.msg import LaserState, PositionTrigger
 from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibration
 from eschorty_ros.nodes.reconstruction.auto_calibration import AutoCalibration
 from eschorty_ros.nodes.reconstruction.calibrator import Calibrator
+from eschorty_ros.nodes.reconstruction.camera_roi import CameraRoi
 from eschorty_ros.nodes.reconstruction.inputs import (
     laser_settings,
     packet_from_message,
@@ -97,6 +99,8 @@ class ReconstructionNode(Node):
         self._outputs = Outputs(self, self.calibration, self.parameters["profile_rate_max"])
         self._jobs = JobQueue(self.parameters["packets_max"])
         self._reports = Reports(self, self._pipeline, self._jobs)
+        self._camera_roi = CameraRoi(self, self.parameters["camera_roi"] == "follow")
+        self._camera_roi.follow(self.parameters.settings(Settings), self.calibration.model())
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
         if self.parameters["auto_calibrate"]:
@@ -117,7 +121,7 @@ class ReconstructionNode(Node):
                 self._use_calibration,
             ),
             self._in_worker,
-            self._pipeline.set_capture,
+            self._set_capture,
             lambda: float(values["line_width_px"]),
             (values["node_timeout"], values["service_timeout"], values["events_timeout"]),
         )
@@ -228,10 +232,16 @@ class ReconstructionNode(Node):
             self._pipeline.set_calibration(calibration)
             self._outputs.set_calibration(calibration)
             self.calibration = calibration
+            self._camera_roi.follow(self.parameters.settings(Settings), calibration.model())
 
         done, reason = self._in_worker(use)
         if not done:
             raise ArgumentError(f"calibration not exchanged: {reason}")
+
+    def _set_capture(self, capture: Capture | None) -> None:
+        if capture is not None:
+            self._camera_roi.check_full()
+        self._pipeline.set_capture(capture)
 
     def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
         self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")
@@ -296,6 +306,7 @@ class ReconstructionNode(Node):
         names = Settings.__dataclass_fields__
         settings = Settings(**{name: values[name] for name in names if name in values})
         override = modulation_override(values)
+        self._camera_roi.follow(settings, self.calibration.model())
         self._post(partial(self._pipeline.stream.set_settings, settings))
         self._jobs.post(partial(self._pipeline.placer.set_gap, values["stage_gap"]))
         self._override = override

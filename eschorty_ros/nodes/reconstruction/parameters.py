@@ -25,6 +25,9 @@ TABLE = (
           "s", 0.0, 1e6, dynamic=True),
     # Longer than the 3 s after which DDS repeats what got lost at the end of a burst.
     Param("stage_timeout", 6.0, "longest wait of a point for its stage position", "s", 0.1, 60.0),
+    Param("camera_roi", "leave", "the camera's own region of interest: leave it as it is, or let "
+          "it follow columns and ranges, so that it sends nothing else",
+          choices=("leave", "follow")),
     Param("packets_max", 2000, "packets that may wait for reconstruction", "packets", 10, 100_000),
     Param("profile_rate_max", 200.0, "most live profiles per second", "Hz", 0.1, 20_000.0),
     Param("record", "", "folder into which every scan is recorded, one folder each; empty: no "

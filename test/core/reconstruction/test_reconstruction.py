@@ -18,6 +18,7 @@ from eschorty_ros.core.reconstruction import (
     place,
     place_link,
     profile_assembler,
+    region_window,
     windows,
 )
 
@@ -401,6 +402,25 @@ def test_the_region_of_interest_keeps_the_points_inside_and_counts_the_events_ou
     assert error.mean() <= 1.01 * before.mean(), f"seed {SEED}"
     assert b.counters["events_outside_roi"] > 0.5 * b.counters["events"]
     assert a.counters["events_outside_roi"] == 0
+
+
+def test_a_camera_that_sends_the_regions_window_gives_the_same_points():
+    t, x, y, p = lines(lambda k, c: 100 + 0.4 * c, events=60.0, fwhm_px=6.0, background=0.05)
+    near_mm, far_mm = MODEL.range_mm([250.0, 450.0])
+    settings = replace(RAW, column_first=300, column_last=800, range_min=near_mm * 1e-3,
+                       range_max=far_mm * 1e-3)  # fmt: skip
+    left, top, width, height = region_window(settings, MODEL)
+    assert (left, width) == (300, 501)
+    assert height < 300
+    seen = (left <= x) & (x < left + width) & (top <= y) & (y < top + height)
+    whole, _ = reconstruct(encoded((t, x, y, p)), KNOWN, settings)
+    part, counted = reconstruct(encoded((t[seen], x[seen], y[seen], p[seen])), KNOWN, settings)
+    np.testing.assert_array_equal(part.row, whole.row)
+    assert len(part) > 1000, f"seed {SEED}"
+    assert counted.counters["events"] < 0.5 * x.size
+    assert region_window(RAW, MODEL) == (0, 0, MODEL.columns, MODEL.rows)
+    beside = replace(RAW, column_first=2000)
+    assert region_window(beside, MODEL) == (0, 0, MODEL.columns, MODEL.rows)
 
 
 def test_twenty_kilohertz_periods_are_closed_without_loss():

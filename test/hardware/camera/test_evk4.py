@@ -129,6 +129,18 @@ def test_default_settings_leave_the_pixels_alone() -> None:
         assert seen.packet_period_us == 4000
 
 
+def test_windows_are_set_while_streaming(bench: CameraBench) -> None:
+    bench.camera.set_windows([(10, 100, 1200, 50)])
+    seen = bench.model.settings
+    assert seen.rows_off == frozenset(range(720)) - frozenset(range(100, 150))
+    assert frozenset(range(1280)) - seen.columns_off == frozenset(range(10, 1210))
+    bench.camera.set_windows([])
+    seen = bench.model.settings
+    assert seen.rows_off | seen.columns_off == frozenset()
+    bench.exchange()
+    assert bench.model.watch.violations == []
+
+
 def test_bias_is_set_and_read_back_while_streaming(bench: CameraBench) -> None:
     assert bench.camera.set_bias("bias_refr", 30) == 30
     assert dict(bench.model.settings.biases)["bias_refr"] == 30

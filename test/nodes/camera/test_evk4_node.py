@@ -192,6 +192,22 @@ def test_settings_of_the_sensor_are_parameters(start: Start) -> None:
     assert "erases the laser's 70 Hz; switch it off" in status.message
 
 
+def test_the_region_of_interest_changes_while_the_camera_streams(start: Start) -> None:
+    run = start().active()
+    accepted, reason = run.observer.set_parameter("camera", "roi", [0, 200, 1280, 300])
+    assert accepted, reason
+    rows = frozenset(range(720))
+    assert run.model.settings.rows_off == rows - frozenset(range(200, 500))
+    accepted, reason = run.observer.set_parameter("camera", "roi", [0, 700, 1280, 300])
+    assert not accepted
+    assert "leaves the sensor" in reason
+    assert run.model.settings.rows_off == rows - frozenset(range(200, 500))
+    accepted, reason = run.observer.set_parameter("camera", "roi", [0, 0, 1280, 720])
+    assert accepted, reason
+    assert not run.model.settings.rows_off
+    assert len(run.packets_from(2)) >= 2
+
+
 def test_events_dropped_by_the_rate_control_are_reported(start: Start, tmp_path: Path) -> None:
     still = StillBench(tmp_path)
     run = start(model=still.bench.camera, erc_mode="enabled", erc_rate=300_000).active()
