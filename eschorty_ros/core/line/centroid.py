@@ -76,6 +76,9 @@ _VOTE = 0.45
 _BACKGROUND_FREE = 1.5
 # Half the width of a line in standard deviations: 1.7 for a flat one, about 3 for a Gaussian.
 _HALF_SPAN = 2.5
+# Standard errors of a window's mean. A learned row further from it belongs to a line that has moved
+# while it was lit, or that a rim cuts: the footprint does not describe it.
+_LEARNED_OFF = 2.0
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
 _HALF_BIAS2 = 1.7519
 
@@ -596,7 +599,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             row = _mean(window)
             cut = windowed and (window.first == 0 or window.last >= estimator.rows - 1.0)
             near_edge |= cut
-            learned = -1.0
+            best, learned = row, -1.0
             if learning:
                 _sample(packed, column, c, row, estimator.rows, footprint, scratch.row_counts)
             if cut or estimator.method == _LEARNED:
@@ -607,7 +610,8 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
                 row = _row_in_window(packed, column, window, other, half, estimator, scratch)
             used = window.sums.events
             estimate = _row_estimate(row, variance, line_variance, used, estimator)
-            if learned >= 0.0:
+            near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
+            if learned >= 0.0 and (cut or near):
                 best = min(max(best, -0.5), estimator.rows - 0.5)
                 bias2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
                 estimate = RowEstimate(best, learned + bias2, estimate.truncated)

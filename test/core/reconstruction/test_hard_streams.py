@@ -89,6 +89,19 @@ def test_good_points_of_a_face_that_is_swept_fast_have_no_flag(tmp_path):
     assert np.mean(found.flags[np.abs(error_mm) < 1.0] != 0) < 0.015
 
 
+def test_a_learned_footprint_does_not_pull_lines_that_move_while_they_are_lit(tmp_path):
+    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
+    recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep)
+    p95_mm = {}
+    for method in ("mode_mean", "learned"):
+        found = reconstruct_recording(recording, Settings(centroid=method)).profiles
+        stage_mm = recording.stage.position_mm(found.t_us)
+        truth_mm = true_range_mm(scene, narrow.model(), stage_mm, found.column)
+        p95_mm[method] = np.nanquantile(np.abs(found.range_mm - truth_mm), 0.95)
+    assert p95_mm["learned"] < 1.2 * p95_mm["mode_mean"]
+
+
 @dataclass(frozen=True)
 class Dim(Plane):
     reflects: float = 1.0
