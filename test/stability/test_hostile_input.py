@@ -492,7 +492,8 @@ NOT_FOR_USERS = {
     "calibration.moving_target", "calibration.recorded_moving_target",
     "calibration.recorded_posts", "optics.photons_per_column", "optics.refuse_other_instrument",
     "reconstruction.add_stage", "reconstruction.reconstruct_recording",
-    "reconstruction.recorded_settings", "storage.finite_points", "storage.height_map",
+    "reconstruction.recorded_settings", "reconstruction.region_window",
+    "storage.finite_points", "storage.height_map",
     "reconstruction.stage_offset_m", "reconstruction.stage_speed_mm_s", "reconstruction.warm_up",
     # Parts of the streaming pipeline.
     "clocks.ClockLine", "clocks.EdgeClock", "clocks.LowerEnvelope", "clocks.MotionPlan",
