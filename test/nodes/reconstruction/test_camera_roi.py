@@ -1,5 +1,6 @@
 """The camera's region of interest follows the one that is reconstructed."""
 
+import time
 from typing import Any
 
 import pytest
@@ -69,6 +70,8 @@ def test_a_camera_that_is_to_be_left_alone_is(observer):
         camera = start(Camera)
         roi = followed(start, False)
         assert observer.set_parameter("camera", "roi", [0, 0, 8, 8])[0]
+        # Time for some requests, if there were any.
+        time.sleep(1.0)
         assert camera.roi() == [0, 0, 8, 8]
         roi.check_full()
 
