@@ -41,7 +41,10 @@ class MemoryPort:
 
 
 class AptBench:
-    """Driver, ``AptModel`` with these arguments, and the clock of both."""
+    """Driver, ``AptModel`` with these arguments, and the clock of both.
+
+    The controller handles nothing and sends nothing until ``halted_until_ns``.
+    """
 
     def __init__(
         self, settings: AptSettings | None = None, *, home: bool = True, **model: Any
@@ -49,6 +52,7 @@ class AptBench:
         self.settings = settings or AptSettings()
         self.now_ns = 0
         self.clock_set_ns = 0
+        self.halted_until_ns = 0
         self.model = AptModel(
             self.clock_ns, controller=self.settings.controller, bay=self.settings.bay, **model
         )
@@ -86,7 +90,7 @@ class AptBench:
         self.now_ns += max(idle_ns // TICK_NS, 1) * TICK_NS
         self.on_tick()
         if self.link is not None:
-            self.link.receive(self.model.step())
+            self.link.receive(b"" if self.now_ns < self.halted_until_ns else self.model.step())
             self._due_ns = self.now_ns + round(self.link.service() * 1e9)
 
     def _idle_ns(self) -> int:

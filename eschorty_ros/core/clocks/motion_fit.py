@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections import deque
 from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +26,10 @@ from eschorty_ros.core.clocks.stage_track import POSITION_LIMIT_MM
 _LEGS_MAX = 64
 _READINGS_MAX = 10_000
 _LEG_READINGS_MAX = 512
+# Readings whose usual spread between request and receipt is that of a host that keeps up.
+_USUAL_READINGS = 32
+# A motion whose start is bounded less well than by two usual readings is not yet known.
+_USUAL_SPREADS = 2
 _REST_MM = 1e-4
 # A move is kept while this share of its readings agrees with it, and its speed and acceleration
 # are fitted when fewer than _AGREEING_SHARE agree, each time with 1.2 times the readings.
@@ -55,13 +61,19 @@ class MotionFit:
         self.late_readings = 0
         self._at_ns: list[int] = []
         self._positions: list[float] = []
+        self._until_ns: int | None = None
+        self._spreads_ns: deque[int] = deque(maxlen=_USUAL_READINGS)
         self._legs = [_Leg(-TIME_LIMIT)]
         self._delays = _Delays()
 
     @property
     def until_ns(self) -> int | None:
-        """Time up to which positions are known; ``None`` before the first reading."""
-        return self._at_ns[-1] if self._at_ns else None
+        """Time up to which positions are known; ``None`` before the first reading.
+
+        After a stall of host or controller it stays where the motion under way can have begun
+        until a reading of usual delay, or the motion's end, shows when it did.
+        """
+        return self._until_ns
 
     @property
     def residual_mm(self) -> float:
@@ -103,9 +115,20 @@ class MotionFit:
             return
         self._at_ns.append(reading.middle_ns)
         self._positions.append(reading.position_mm)
+        if earliest_ns is not None:
+            self._spreads_ns.append(latest_ns - earliest_ns)
         if len(self._at_ns) > 2 * _READINGS_MAX:
             del self._at_ns[:_READINGS_MAX], self._positions[:_READINGS_MAX]
         self._legs[-1].add(reading)
+        self._until_ns = self._known_until_ns()
+
+    def _known_until_ns(self) -> int:
+        """Return the time up to which positions are known now, not before the last one returned."""
+        until_ns = self._at_ns[-1]
+        if self._spreads_ns:
+            spread_ns = _USUAL_SPREADS * median(self._spreads_ns)
+            until_ns = min(until_ns, self._legs[-1].known_until_ns(spread_ns))
+        return until_ns if self._until_ns is None else max(until_ns, self._until_ns)
 
     def expect_move(self, plan: MotionPlan) -> None:
         """Expect ``plan``, from rest to rest, to begin at its ``start_ns`` or soon after."""
@@ -229,6 +252,10 @@ class _Leg:
     def add(self, reading: _Reading) -> None:
         """Use one reading."""
 
+    def known_until_ns(self, spread_ns: float) -> int:
+        """Return the time up to which it is known when its start has to be within ``spread_ns``."""
+        return TIME_LIMIT
+
     def expected_mm(self, earliest_ns: int, latest_ns: int) -> tuple[float, float] | None:
         """Return the lowest and highest position between two times; ``None`` if unknown."""
         return None
@@ -283,6 +310,16 @@ class _Move(_Leg):
         self._readings.append(reading)
         self._append_passings([reading])
         self._fit()
+
+    def known_until_ns(self, spread_ns: float) -> int:
+        if not self._fits or math.isfinite(self._not_after_s):
+            return TIME_LIMIT
+        begin_s = self._not_before_s
+        if self._timing is not None:
+            begin_s = max(begin_s, self._timing.begin_s)
+            if (self._timing.end_s - begin_s) * 1e9 <= spread_ns:
+                return TIME_LIMIT
+        return self.from_ns + round(begin_s * 1e9)
 
     @property
     def delays(self) -> _Delays:
@@ -358,7 +395,9 @@ class _Move(_Leg):
             speed[passed],
             self._usual,
         )
-        start_s = max(min(timing.start_s, self._not_after_s), self._not_before_s)
+        # The slow readings, which are not averaged, bound it all the same.
+        start_s = min(max(timing.start_s, timing.begin_s), timing.end_s)
+        start_s = max(min(start_s, self._not_after_s), self._not_before_s)
         self._timing = replace(timing, start_s=start_s)
         self.sigma_mm = timing.sigma_s * float(speed[passed].max())
         agreeing = int(np.count_nonzero(timing.agreeing))
@@ -443,10 +482,15 @@ class _Delays:
 
 @dataclass(frozen=True, slots=True)
 class _Timing:
-    """Start of a motion (s), its standard deviation (s), and which readings agree with it."""
+    """Start of a motion (s), its standard deviation (s), and which readings agree with it.
+
+    It is between ``begin_s`` and ``end_s``; ``begin_s`` is -inf where no request is known.
+    """
 
     start_s: float
     sigma_s: float
+    begin_s: float
+    end_s: float
     agreeing: NDArray[np.bool_]
     delays: _Delays
     bounded_below: bool = False
@@ -472,19 +516,20 @@ def _start_of(
     agreeing = (earliest_s - slack_s <= middle) & (latest_s + slack_s >= middle)
     use = agreeing & (speed >= _FAST_SHARE * speed[agreeing].max(initial=0.0))
     if not use.any():
-        return _Timing(middle, float(end - begin), agreeing, usual)
+        return _Timing(middle, float(end - begin), begin, end, agreeing, usual)
     floor_s = float(slack_s[use].min()) + 1e-9
     after, late_s, after_s = _lower_end(latest_s[use], usual.after_s, floor_s)
     known = use & np.isfinite(earliest_s)
     if not known.any():
-        return _Timing(after, late_s, agreeing, _Delays(usual.before_s, after_s))
+        return _Timing(after, late_s, begin, end, agreeing, _Delays(usual.before_s, after_s))
     before, early_s, before_s = _lower_end(-earliest_s[known], usual.before_s, floor_s)
     weights = np.array([late_s**-2, early_s**-2])
     joined = float(weights @ np.array([after, -before]) / weights.sum())
     low, high = sorted((float(latest_s[use].min()), float(earliest_s[known].max())))
     sigma_s = float(weights.sum() ** -0.5)
     start_s = min(max(joined, low), high)
-    return _Timing(start_s, sigma_s, agreeing, _Delays(before_s, after_s), bounded_below=True)
+    delays = _Delays(before_s, after_s)
+    return _Timing(start_s, sigma_s, begin, end, agreeing, delays, bounded_below=True)
 
 
 def _widest_agreement(low: Array, high: Array) -> tuple[float, float]:

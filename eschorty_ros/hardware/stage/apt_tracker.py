@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -92,8 +93,9 @@ class Tracker:
         self._now_ns, self._clock_ns = now_ns, clock_ns
         self._status_ns: int | None = None
         self._offset_ns: int | None = None
-        self._poll: tuple[int, int] | None = None
-        self._unmatched_until_ns = 0
+        self._requests_ns: deque[int] = deque()
+        self._requested_ns: int | None = None
+        self._answers_late_until_ns = 0
         self._rest_ns = 0
         self._known_from_ns = 0
         self._age_checks = 0
@@ -131,14 +133,17 @@ class Tracker:
 
     def begin_poll(self) -> bool:
         """Return whether to request a status; if so, the request must be sent at once."""
-        now_ns, poll = self._now_ns(), self._poll
+        now_ns = self._now_ns()
         # One at a time, so that an answer belongs to its request.
-        if poll is not None:
-            if now_ns - poll[1] < _POLL_LOST_NS:
+        if self._requested_ns is not None:
+            if now_ns - self._requested_ns < _POLL_LOST_NS:
                 return False
             # Its answer may still come, and must not count as the next one's.
-            self._unmatched_until_ns = now_ns + LATE_NS
-        self._poll = self._clock_ns(), now_ns
+            self._answers_late_until_ns = now_ns + LATE_NS
+        elif now_ns >= self._answers_late_until_ns:
+            self._requests_ns.clear()
+        self._requests_ns.append(self._clock_ns())
+        self._requested_ns = now_ns
         return True
 
     def state(self, t_ns: int | None, lag_ns: int) -> StageState:
@@ -172,10 +177,12 @@ class Tracker:
         latest_ns = clock_ns - ANSWER_NS
         position_mm = self.scale.mm(frame.integer("position"))
         self._follow_clock(position_mm, latest_ns, clock_ns - received_ns)
+        # Answers keep the order of their requests. One that is lost leaves a request too early for
+        # the answer after it, which is a bound all the same.
         earliest_ns = None
-        if self._poll is not None and received_ns >= self._unmatched_until_ns:
-            earliest_ns = min(self._poll[0] + REQUEST_NS, latest_ns)
-        self._poll = None
+        if self._requests_ns:
+            earliest_ns = min(self._requests_ns.popleft() + REQUEST_NS, latest_ns)
+        self._requested_ns = None
         status = Status(position_mm, frame.integer("bits"), earliest_ns, latest_ns)
         self._status_ns, self._age_checks = received_ns, 0
         motion = self.motion
@@ -206,7 +213,8 @@ class Tracker:
         if before_ns is None or abs(offset_ns - before_ns) < _CLOCK_SET_NS:
             return
         self.clock_sets += 1
-        self._poll = None
+        self._requests_ns.clear()
+        self._requested_ns = None
         self._rest_ns += offset_ns - before_ns
         self._restart_fit(position_mm, latest_ns, None)
         self.checks.reset()

@@ -72,6 +72,31 @@ def test_odometry_within_20_um_at_300_mm_s(rate_hz: float) -> None:
     assert bench.stage.statistics()["fit_residual_um"] < 5.0
 
 
+@pytest.mark.parametrize("halt_ms", [0, 60, 150, 280])
+@pytest.mark.parametrize("late_ms", [0.0, 10.0])
+def test_odometry_waits_for_a_motion_that_begins_late(halt_ms: int, late_ms: float) -> None:
+    """No position is reported that the next reading contradicts, and none waits for the end."""
+    bench = AptBench(late_ns=lambda: round(late_ms * 1e6))
+    bench.move(19.3)
+    bench.stage.move_to(60.0, 50.0)
+    begun_ns = bench.now_ns
+    bench.halted_until_ns = begun_ns + halt_ms * 1_000_000
+    found: dict[int, float] = {}
+    behind_ms = 0.0
+    while bench.stage.state().moving:
+        bench.advance(0.01)
+        state = bench.stage.state()
+        found[state.t_ns] = state.position_mm
+        if bench.now_ns > bench.halted_until_ns + 50_000_000:
+            behind_ms = max(behind_ms, (bench.clock_ns() - state.t_ns) * 1e-6)
+    true = np.array([bench.model.axis.position_mm(t_ns) for t_ns in found])
+    worst_mm = np.abs(np.array(list(found.values())) - true).max()
+    print(f"{halt_ms} ms, answers {late_ms:g} ms late: off by {worst_mm:.3f} mm at most, "
+          f"{behind_ms:.0f} ms behind after the halt")  # fmt: skip
+    assert worst_mm < 0.3
+    assert behind_ms < 130.0
+
+
 def test_moves_are_refused_with_a_reason() -> None:
     bench = AptBench(home=False)
     with pytest.raises(DeviceError, match="not homed"):
