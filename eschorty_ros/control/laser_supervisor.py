@@ -235,9 +235,12 @@ class LaserSupervisor:
                 self.disable(str(error))
 
     def _receive(self, readback: LaserReadback) -> None:
+        self._store(readback)
+        self.report()
+
+    def _store(self, readback: LaserReadback) -> None:
         for text in self._record.receive(readback):
             self._log(text)
-        self.report()
 
     def _check_interlock(self) -> None:
         stall_s = self._stalls.measure()
@@ -272,10 +275,13 @@ class LaserSupervisor:
         with self._lock:
             if self._in_flight.is_void(ticket):
                 return
-            self._receive(readback)
+            self._store(readback)
             reason = self._record.must_disable(readback)
+            # The state that is published names why the light ended.
             if reason:
                 self.trip(reason)
+            else:
+                self.report()
 
     def _fail(self, error: Exception) -> None:
         self.trip(f"watching it failed: {error!r}")

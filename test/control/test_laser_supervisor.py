@@ -10,9 +10,11 @@ from stall_clock import StallClock
 from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT, LaserInterlock
+from eschorty_ros.control.laser_readback import LaserStatus
 from eschorty_ros.control.laser_supervisor import LaserSupervisor
 from eschorty_ros.core.base.errors import DeviceError
 from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.hardware.base.protocols import LaserOutput
 
 
 @pytest.fixture
@@ -22,9 +24,13 @@ def laser() -> Iterator[DelayedLaser]:
     made.go.set()
 
 
-def opened(laser: DelayedLaser, interlock: LaserInterlock) -> LaserSupervisor:
+def opened(
+    laser: DelayedLaser,
+    interlock: LaserInterlock,
+    publish: Callable[[LaserStatus], None] = lambda status: None,
+) -> LaserSupervisor:
     made = LaserSupervisor(
-        interlock, running=lambda: True, publish=lambda status: None, alarm=print, log=print,
+        interlock, running=lambda: True, publish=publish, alarm=print, log=print,
         readback_period_s=0.02,
     )  # fmt: skip
     interlock.receive_heartbeat()
@@ -73,6 +79,21 @@ def test_enabled_twice_it_stays_on(supervisor, laser):
     supervisor.enable()
     assert laser.lit
     assert laser.enablings == 1
+
+
+def test_light_that_ends_by_itself_is_reported_with_why_it_is_off(laser):
+    seen: list[LaserStatus] = []
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
+    supervisor = opened(laser, interlock, seen.append)
+    supervisor.arm()
+    supervisor.enable()
+    laser.lit = False
+    wait_until(lambda: seen[-1].requested is LaserOutput.OFF, "the request to be taken back")
+    supervisor.close()
+    lit = [status for status in seen if status.reason == "switched on by request"]
+    assert lit
+    assert all(status.readback.output is LaserOutput.ON for status in lit)
+    assert "reads back OFF, requested ON" in seen[-1].reason
 
 
 def test_arming_does_not_outlive_disabling(supervisor, laser):
