@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
@@ -61,6 +61,7 @@ class LaserInterlock:
         self._now_s = now_s
         # Time of the last report of closed by source, ``None`` after one of open.
         self._closed_s: dict[str, float | None] = {}
+        self._nameless: set[str] = set()
         self._opened_by = ""
         self._armed_s: float | None = None
         self._on_s: float | None = None
@@ -98,16 +99,25 @@ class LaserInterlock:
         """
         if unnamed and unnamed != source:
             self._closed_s.pop(unnamed, None)
+            self._nameless.discard(unnamed)
+        elif unnamed and len(self._nameless) < _KEPT:
+            self._nameless.add(unnamed)
         if is_open:
             self._opened_by = source or "laser/interlock"
         if source in self._closed_s or len(self._closed_s) < _KEPT:
             self._closed_s[source] = None if is_open else self._now_s()
 
-    def reset_contact(self) -> str:
+    def reset_contact(self, living: Collection[str] | None = None) -> str:
         """Undo the latch of an opened contact; return why that is refused, ``""`` when it is not.
 
-        It is while a source reports it open, or its report of closed has expired.
+        It is while a source reports it open, or its report of closed has expired. A source whose
+        name never became known, and that is not among the ``living`` any more, cannot report
+        closed: it is dropped.
         """
+        if living is not None:
+            for source in self._nameless.difference(living):
+                self._closed_s.pop(source, None)
+                self._nameless.discard(source)
         fault = self._source_fault()
         if not fault:
             self._opened_by = ""

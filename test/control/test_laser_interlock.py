@@ -91,6 +91,21 @@ def test_a_source_whose_name_is_discovered_later_is_one_source(clock):
     assert not interlock.contact_open
 
 
+def test_an_ended_source_that_never_had_a_name_does_not_stay_open_for_ever(clock):
+    interlock = LaserInterlock(5.0, 600.0, {}, now_s=lambda: clock.now_s)
+    interlock.receive_contact(True, "0a1b", unnamed="0a1b")
+    interlock.receive_contact(True, "/door")
+    interlock.receive_contact(False, "/door")
+    assert "interlock open (0a1b)" in interlock.reset_contact({"0a1b", "2c3d"})
+    assert interlock.contact_open
+    interlock.receive_contact(True, "/door")
+    assert "interlock open (/door)" in interlock.reset_contact({"2c3d"})
+    interlock.receive_contact(False, "/door")
+    assert interlock.contact_open
+    assert interlock.reset_contact({"2c3d"}) == ""
+    assert not interlock.contact_open
+
+
 def test_every_source_must_be_closed_and_fresh_and_an_opened_one_reset(clock):
     interlock = LaserInterlock(10.0, 60.0, {}, now_s=clock)
     assert not interlock.contact_open

@@ -47,7 +47,8 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
                 bench.observer.wait_for_answers(name, scenarios.SCAN_DEADLINE_S)
             yield bench, running, Contact(bench.observer)
             for name, process in running.items():
-                print(f"--- {name}\n{process.output[-3000:]}")
+                crash = process.output.rfind("Fatal Python error")
+                print(f"--- {name}\n{process.output[crash if crash >= 0 else -3000:]}")
 
 
 def test_nodes_without_devices_outlast_everything(instrument):

@@ -178,7 +178,7 @@ class LaserNode(DeviceNode):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        refusal = self._supervisor.interlock.reset_contact()
+        refusal = self._supervisor.interlock.reset_contact(self._contacts.living())
         response.success = not refusal
         response.message = f"laser refused: {refusal}" if refusal else "interlock closed"
         self._supervisor.report()

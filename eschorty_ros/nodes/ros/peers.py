@@ -57,6 +57,11 @@ class Publishers:
         """Return the identity of a message's publisher as text."""
         return _publisher(info).hex()
 
+    def living(self) -> set[str]:
+        """Return the identities of those that are there."""
+        ends = self._node.get_publishers_info_by_topic(self._topic)
+        return {bytes(end.endpoint_gid).hex() for end in ends}
+
     def name(self, info: Mapping[str, Any]) -> str:
         """Return the full name of the node that published a message, ``""`` while it is unknown."""
         publisher = _publisher(info)
