@@ -18,7 +18,7 @@ from eschorty_ros.hardware.stage.apt_link import AptLink
 from eschorty_ros.hardware.stage.apt_port import find_port, open_port
 from eschorty_ros.hardware.stage.apt_setup import AptSettings, AptSetup
 from eschorty_ros.hardware.stage.apt_status import Status
-from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, WARN_AGE_NS, Kind, Tracker
+from eschorty_ros.hardware.stage.apt_tracker import BYTE_NS, Kind, Tracker
 
 _MOVE_NS = 12 * BYTE_NS
 _KEEP_ALIVE_S = 0.5
@@ -180,11 +180,7 @@ class AptStage:
     @property
     def healthy(self) -> bool:
         """True while status messages come and nothing has failed."""
-        return (
-            self._tracker.failure is None
-            and not self._closed
-            and self._tracker.age_ns < WARN_AGE_NS
-        )
+        return self._tracker.failure is None and not self._closed and not self._tracker.late
 
     def statistics(self) -> dict[str, float]:
         """Return counters for diagnostics."""

@@ -29,6 +29,7 @@ _POLL_LOST_NS = 250_000_000
 # Larger than any drift between two messages and any step of a simulated clock.
 _CLOCK_SET_NS = 500_000_000
 # After a stall of the host, statuses may still wait to be read: so many checks come first.
+_LATE_CHECKS_MIN = 5
 _AGE_CHECKS_MIN = 20
 
 
@@ -106,6 +107,13 @@ class Tracker:
         return 0 if self._status_ns is None else self._now_ns() - self._status_ns
 
     @property
+    def late(self) -> bool:
+        """True when status messages do not come although this process runs."""
+        age_ns = self.age_ns
+        checked = self._age_checks >= _LATE_CHECKS_MIN or age_ns > FAULT_AGE_NS
+        return age_ns > WARN_AGE_NS and checked
+
+    @property
     def homing(self) -> bool:
         """True while the axis moves to its reference."""
         return self.motion is not None and self.motion.kind is Kind.HOME
@@ -155,7 +163,7 @@ class Tracker:
         t_ns = min(max(requested_ns, self._known_from_ns), until_ns)
         position, velocity = (float(value) for value in self.fit.state(t_ns))
         flags = apt.decode_bits(status.bits)
-        if self.age_ns > WARN_AGE_NS:
+        if self.late:
             flags = (*flags, "status_late")
         moving = self.motion is not None or t_ns < self._rest_ns
         homed = bool(status.bits & apt.HOMED) and not self.homing
