@@ -102,6 +102,7 @@ class _Redirecting:
                 (node.subscriptions, self._redirect_subscription),
                 (node.timers, self._redirect_timer),
                 (node.services, self._redirect_service),
+                (node.waitables, self._redirect_waitable),
             ):
                 for entity in entities:
                     if not hasattr(entity, "redirected"):
@@ -195,6 +196,20 @@ class _Redirecting:
         service.callback, service.send_response = request, respond
 
 
+    def _redirect_waitable(self, node: Node, waitable: Any) -> None:
+        execute = waitable.execute
+
+        async def executed(data: Any) -> None:
+            # Such as an action whose client does not take the answer.
+            try:
+                await execute(data)
+            except Exception as error:
+                if not self.ending:
+                    note_error(node, waitable, error)
+
+        waitable.execute = executed
+
+
 class EventExecutor(_Redirecting, _Events):
     """rclpy's ``EventsExecutor`` with the callback groups of ``MultiThreadedExecutor``.
 
@@ -212,7 +227,16 @@ class EventExecutor(_Redirecting, _Events):
         """Run a coroutine, which may wait, in a thread; anything else in the executor's."""
         if inspect.iscoroutinefunction(callback):
             return self._pool.submit(lambda: asyncio.run(callback(*args, **kwargs)))
-        return super().create_task(callback, *args, **kwargs)
+
+        def called() -> Any:
+            # An exception would end the process: rclpy 9.1 looks for a logger at a null pointer.
+            try:
+                return callback(*args, **kwargs)
+            except Exception as error:
+                for node in self._members[: not self.ending]:
+                    note_error(node, callback, error)
+
+        return super().create_task(called)
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop; callbacks that still wait do not run."""

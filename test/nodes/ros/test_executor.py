@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 import rclpy
+from eschorty_ros.action import MoveStage
+from rclpy.action import ActionServer
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from ros_process import Observer
@@ -138,6 +140,35 @@ def test_errors_are_counted_and_the_node_goes_on(spun):
     assert (answer.result().success, answer.result().message) == (False, "a request")
     wait_until(lambda: refusals(node).counts == {"bad": 3, "bad_request": 1}, "the counts")
     spinning.raise_error()
+
+
+def test_an_error_of_an_action_or_a_task_does_not_end_the_process(spun):
+    node, spinning, observer = spun
+    failed, done = [], threading.Event()
+
+    class FailingOnce(ActionServer):
+        async def execute(self, data: Any) -> None:
+            if not failed:
+                failed.append(data)
+                raise RuntimeError("the client is gone")
+            await super().execute(data)
+
+    def move(goal: Any) -> MoveStage.Result:
+        goal.succeed()
+        return MoveStage.Result()
+
+    FailingOnce(node, MoveStage, "move", move)
+    client = observer.action_client(MoveStage, "move")
+    wait_until(client.server_is_ready, "the action")
+    client.send_goal_async(MoveStage.Goal())
+    wait_until(lambda: failed, "the goal that fails")
+    spinning.executor.create_task(lambda: 1 // 0)
+    spinning.executor.create_task(done.set)
+    wait_until(done.is_set, "the task behind it")
+    sent = client.send_goal_async(MoveStage.Goal())
+    wait_until(sent.done, "the answer to the next goal")
+    assert sent.result().accepted
+    assert refusals(node).counts["FailingOnce"] == 1
 
 
 def test_an_error_of_a_timer_ends_the_node(spun):
