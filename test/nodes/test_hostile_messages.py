@@ -48,7 +48,7 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             yield bench, running, Contact(bench.observer)
             for name, process in running.items():
                 crash = process.output.rfind("Fatal Python error")
-                print(f"--- {name}\n{process.output[crash if crash >= 0 else -3000:]}")
+                print(f"--- {name}\n{process.output[crash if crash >= 0 else -3000 :]}")
 
 
 def test_nodes_without_devices_outlast_everything(instrument):

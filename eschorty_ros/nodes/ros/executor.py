@@ -195,7 +195,6 @@ class _Redirecting:
 
         service.callback, service.send_response = request, respond
 
-
     def _redirect_waitable(self, node: Node, waitable: Any) -> None:
         execute = waitable.execute
 
