@@ -78,7 +78,11 @@ class AptBench:
     def _make_link(
         self, on_frame: Callable[[Frame, int], None], on_lost: Callable[[DeviceError], None]
     ) -> AptLink:
-        self.link = AptLink(self.port, on_frame, on_lost, lambda: self.now_ns, self._wait)
+        def on_status(frame: Frame, received_ns: int) -> None:
+            self.last_status = frame
+            on_frame(frame, received_ns)
+
+        self.link = AptLink(self.port, on_status, on_lost, lambda: self.now_ns, self._wait)
         return self.link
 
     def _wait(self, condition: threading.Condition, seconds: float) -> None:

@@ -26,6 +26,9 @@ _HEALTH_S = 0.05
 _ENABLE_S = 10.0
 _FIRST_STATUS_S = 1.5
 _CLOSE_S = 1.2
+# Two clocks are read together; a thread that is suspended between them reads again.
+_READ_NS = 100_000
+_READS_MAX = 10
 _PROFILED, _IMMEDIATE = 2, 1
 _ON, _OFF = 1, 2
 
@@ -284,7 +287,7 @@ class AptStage:
     # Frames, in the reader's thread
 
     def _on_frame(self, frame: apt.Frame, received_ns: int) -> None:
-        clock_ns = self._clock_ns()
+        clock_ns = received_ns + self._clock_offset_ns()
         if frame.source != self._settings.address and not frame.name.startswith("error"):
             return
         with self._lock:
@@ -306,6 +309,16 @@ class AptStage:
                             "clear its cause, then configure again"
                         )
                     )
+
+    def _clock_offset_ns(self) -> int:
+        """Return the lead of the stamping clock over the link's, read while nothing intervenes."""
+        for _ in range(_READS_MAX):
+            before_ns = self._link.now_ns()
+            clock_ns = self._clock_ns()
+            after_ns = self._link.now_ns()
+            if after_ns - before_ns < _READ_NS:
+                break
+        return clock_ns - (before_ns + after_ns) // 2
 
     # Failure
 

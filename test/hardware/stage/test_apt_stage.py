@@ -97,6 +97,30 @@ def test_odometry_waits_for_a_motion_that_begins_late(halt_ms: int, late_ms: flo
     assert behind_ms < 130.0
 
 
+def test_a_suspended_reader_does_not_look_like_a_clock_that_was_set() -> None:
+    """The thread may stop for long between the receipt of a status and the reading of a clock."""
+    bench = AptBench()
+    bench.stage.move_to(100.0, 100.0)
+    bench.advance(0.3)
+    read, suspended = bench.stage._clock_ns, []
+
+    def suspended_once() -> int:
+        if not suspended:
+            suspended.append(bench.now_ns)
+            bench.now_ns += 700_000_000
+        return read()
+
+    bench.stage._clock_ns = suspended_once
+    bench.stage._on_frame(bench.last_status, bench.now_ns)
+    bench.advance(0.3)
+    assert suspended
+    assert bench.stage.statistics()["clock_sets"] == 0
+    t_ns = EPOCH_NS + suspended[0] + 300_000_000
+    state = bench.stage.state(t_ns)
+    assert state.t_ns == t_ns
+    assert state.position_mm == pytest.approx(bench.model.axis.position_mm(t_ns), abs=0.05)
+
+
 def test_moves_are_refused_with_a_reason() -> None:
     bench = AptBench(home=False)
     with pytest.raises(DeviceError, match="not homed"):
