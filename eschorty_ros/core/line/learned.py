@@ -39,13 +39,17 @@ _MOVES_MAX = 24
 # Where every line is cut, a computation from rows that are off leaves this part of their bias.
 _BIAS_KEPT = 0.85
 _OFF_LINE_PX = 1.0
+# Shares of the posterior by the logarithm below the best, in steps of 1/64; less counts as none.
+_STEP_BITS = 4
+_SHARES = np.exp(-(np.arange(8 << 6) + 0.5) / 64.0)
 
 
 class Footprint(NamedTuple):
     """Counts of pixels by their events and distance, and the logarithms of their shares.
 
     ``log[k]`` is relative to that of no event but for ``log[0]``; ``empty`` is the sum of
-    ``log[0]`` over all rows, by the line's place in its row. ``rows_seen`` holds the events of
+    ``log[0]`` over all rows, by the line's place in its row and on over as many as there are
+    candidates. ``rows_seen`` holds the events of
     the sampled columns' rows from ``first_row`` on, which is -1 where there is none. ``state`` is
     the number of profiles, of computations and of the columns counted since; 1 while the sensor's
     edge cuts a line, which other estimators need a footprint for; and the number of computations
@@ -69,7 +73,7 @@ def make_footprint(half_max: int, columns: int) -> Footprint:
     return Footprint(
         pixels=np.zeros((_COUNTS, size)),
         log=np.zeros((_COUNTS, size), np.int32),
-        empty=np.zeros(_PLACES, np.int32),
+        empty=np.zeros(_PLACES + 2 * _SIDE + 1, np.int32),
         likelihood=np.zeros(2 * _SIDE + 1, np.int32),
         rows_seen=np.zeros((columns // _STRIDE + 1, 2 * reach + 1), np.uint8),
         first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
@@ -131,8 +135,9 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
     likelihood, log, reach = footprint.likelihood, footprint.log, footprint.reach
     middle = log.shape[1] // 2
     if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (rows - 1 - reach):
+        first = (place - _SIDE) % _PLACES
         for m in range(2 * _SIDE + 1):
-            likelihood[m] = footprint.empty[(place - _SIDE + m) % _PLACES]
+            likelihood[m] = footprint.empty[first + m]
     else:
         for m in range(2 * _SIDE + 1):
             at = place - _SIDE + m
@@ -147,12 +152,12 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
             first = middle + place - _SIDE - _PLACES * row
             for m in range(2 * _SIDE + 1):
                 likelihood[m] += log[k, first + m]
+    peak = likelihood[0]
+    for m in range(1, 2 * _SIDE + 1):
+        peak = max(peak, likelihood[m])
     best = 0
-    for m in range(1, _SIDE + 1):
-        if likelihood[_SIDE + m] > likelihood[_SIDE + best]:
-            best = m
-        if likelihood[_SIDE - m] > likelihood[_SIDE + best]:
-            best = -m
+    while likelihood[_SIDE + best] < peak:
+        best = -best if best > 0 else 1 - best
     return best
 
 
@@ -177,14 +182,16 @@ def _learned_row(packed, column, row, rows, footprint, counts):
         if abs(best) <= _SIDE - 2:
             break
         place = np.int64(min(max(place + best, -_PLACES), _PLACES * rows))
-    peak = footprint.likelihood[_SIDE + best]
+    likelihood = footprint.likelihood
+    peak = likelihood[_SIDE + best]
     total, first, second = 0.0, 0.0, 0.0
-    for m in range(_SIDE + 1):
-        above = np.exp((footprint.likelihood[_SIDE + m] - peak) / _LOG_ONE)
-        below = np.exp((footprint.likelihood[_SIDE - m] - peak) / _LOG_ONE) if m else 0.0
-        total += above + below
-        first += m * (above - below)
-        second += m * m * (above + below)
+    for m in range(-_SIDE, _SIDE + 1):
+        below = np.int64(peak - likelihood[_SIDE + m]) >> _STEP_BITS
+        if below < _SHARES.size:
+            share = _SHARES[below]
+            total += share
+            first += m * share
+            second += m * m * share
     offset = first / total
     mean = (place + offset) / _PLACES
     variance = max(second / total - offset * offset, 0.0) / (_PLACES * _PLACES)
@@ -252,10 +259,11 @@ def _compute(footprint):
             log[k, b] = np.int32(np.rint(_LOG_ONE * ratio))
         log[:, size - 1 - b] = log[:, b]
     reach, middle = footprint.reach, size // 2
-    for place in range(_PLACES):
+    for place in range(footprint.empty.size):
         total = np.int32(0)
         for row in range(-reach - 1, reach + 2):
-            if abs(place - _PLACES * row) <= _PLACES * reach:
-                total += log[0, middle + place - _PLACES * row]
+            at = place % _PLACES - _PLACES * row
+            if abs(at) <= _PLACES * reach:
+                total += log[0, middle + at]
         footprint.empty[place] = total
     footprint.state[1] += 1
