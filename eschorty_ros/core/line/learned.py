@@ -73,8 +73,8 @@ def make_footprint(half_max: int, columns: int) -> Footprint:
     return Footprint(
         pixels=np.zeros((_COUNTS, size)),
         log=np.zeros((_COUNTS, size), np.int32),
-        empty=np.zeros(_PLACES + 2 * _SIDE + 1, np.int32),
-        likelihood=np.zeros(2 * _SIDE + 1, np.int32),
+        empty=np.zeros(_PLACES + 2 * _SIDE, np.int32),
+        likelihood=np.zeros(2 * _SIDE, np.int32),
         rows_seen=np.zeros((columns // _STRIDE + 1, 2 * reach + 1), np.uint8),
         first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
         state=np.zeros(5, np.int64),
@@ -103,11 +103,14 @@ def _bias_left(footprint):
 
 @kernel(_nrt=False)
 def _count_rows(packed, column, low, high, counts):
-    """Count the events of rows low..high into ``counts``."""
-    for i in range(column.start, column.start + column.events):
+    """Count the events of rows low..high into ``counts``; return the first and last row of any."""
+    first, last = high + 1, low - 1
+    for i in range(np.uintp(column.start), np.uintp(column.start + column.events)):
         row = np.int64(packed[i] & ROW_MASK)
         if low <= row <= high:
-            counts[row] += 1
+            counts[np.uintp(row)] += 1
+            first, last = min(first, row), max(last, row)
+    return first, last
 
 
 @kernel(_nrt=False)
@@ -133,13 +136,14 @@ def _sample(packed, column, c, row, rows, footprint, counts):
 def _log_likelihoods(footprint, place, low, high, counts, rows):
     """Fill the log-likelihoods of the places around ``place``; return the best one's offset."""
     likelihood, log, reach = footprint.likelihood, footprint.log, footprint.reach
-    middle = log.shape[1] // 2
+    # A number that the compiler does not know: it adds in vectors, in place of one after the other.
+    middle, candidates = log.shape[1] // 2, np.uintp(likelihood.size)
     if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (rows - 1 - reach):
-        first = (place - _SIDE) % _PLACES
-        for m in range(2 * _SIDE + 1):
-            likelihood[m] = footprint.empty[first + m]
+        begin = np.uintp((place - _SIDE) % _PLACES)
+        for m in range(candidates):
+            likelihood[m] = footprint.empty[begin + m]
     else:
-        for m in range(2 * _SIDE + 1):
+        for m in range(2 * _SIDE):
             at = place - _SIDE + m
             total = np.int32(0)
             for row in range(max(at // _PLACES - reach, 0), min(at // _PLACES + reach + 2, rows)):
@@ -147,18 +151,20 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
                     total += log[0, middle + at - _PLACES * row]
             likelihood[m] = total
     for row in range(low, high + 1):
-        k = min(counts[row], _COUNTS - 1)
+        k = np.uintp(min(counts[row], _COUNTS - 1))
         if k > 0:
-            first = middle + place - _SIDE - _PLACES * row
-            for m in range(2 * _SIDE + 1):
-                likelihood[m] += log[k, first + m]
-    peak = likelihood[0]
-    for m in range(1, 2 * _SIDE + 1):
+            begin = np.uintp(middle + place - _SIDE - _PLACES * row)
+            for m in range(candidates):
+                likelihood[m] += log[k, begin + m]
+    peak = likelihood[np.uintp(0)]
+    for m in range(candidates):
         peak = max(peak, likelihood[m])
-    best = 0
-    while likelihood[_SIDE + best] < peak:
-        best = -best if best > 0 else 1 - best
-    return best
+    for m in range(_SIDE):
+        if likelihood[_SIDE + m] == peak:
+            return m
+        if likelihood[_SIDE - m] == peak:
+            return -m
+    return -_SIDE
 
 
 @kernel(_nrt=False)
@@ -174,7 +180,7 @@ def _learned_row(packed, column, row, rows, footprint, counts):
     centre = np.int64(np.rint(row))
     margin = reach + _MOVES_MAX
     all_low, all_high = max(centre - margin, 0), min(centre + margin, rows - 1)
-    _count_rows(packed, column, all_low, all_high, counts)
+    all_low, all_high = _count_rows(packed, column, all_low, all_high, counts)
     for _ in range(_MOVES_MAX):
         low = max(-((_PLACES * reach - place) // _PLACES), all_low)
         high = min((place + _PLACES * reach) // _PLACES, all_high)
@@ -185,13 +191,17 @@ def _learned_row(packed, column, row, rows, footprint, counts):
     likelihood = footprint.likelihood
     peak = likelihood[_SIDE + best]
     total, first, second = 0.0, 0.0, 0.0
-    for m in range(-_SIDE, _SIDE + 1):
-        below = np.int64(peak - likelihood[_SIDE + m]) >> _STEP_BITS
-        if below < _SHARES.size:
+    for way in (1, -1):
+        m = best if way > 0 else best - 1
+        while -_SIDE <= m < _SIDE:
+            below = np.int64(peak - likelihood[_SIDE + m]) >> _STEP_BITS
+            if below >= _SHARES.size:
+                break
             share = _SHARES[below]
             total += share
             first += m * share
             second += m * m * share
+            m += way
     offset = first / total
     mean = (place + offset) / _PLACES
     variance = max(second / total - offset * offset, 0.0) / (_PLACES * _PLACES)
@@ -217,10 +227,11 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
             continue
         last = min(first + 2 * footprint.reach, rows - 1)
-        for at in range(first, last + 1):
-            place = np.int64(np.rint(_PLACES * (at - smoothed[c])))
-            if abs(place) <= middle:
-                pixels[footprint.rows_seen[slot, at - first], middle + place] += 1.0
+        begin = middle + np.int64(np.rint(_PLACES * (first - smoothed[c])))
+        for at in range(np.uintp(last + 1 - first)):
+            place = begin + np.int64(_PLACES * at)
+            if 0 <= place <= 2 * middle:
+                pixels[footprint.rows_seen[slot, at], np.uintp(place)] += 1.0
         footprint.state[2] += 1
     footprint.state[0] += 1
     doublings = min(max(footprint.state[1] - _ROUNDS, 0), _DOUBLINGS)
