@@ -229,7 +229,7 @@ def main() -> None:
         cores=cores,
     )
     text += header(ONE_THREAD)
-    for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.1)):
+    for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.4)):
         text += one_thread(frequency_hz, 1.5 * share, arguments.repeats)
     text += THREADS_TEXT + header(THREADS)
     with tempfile.TemporaryDirectory() as made:

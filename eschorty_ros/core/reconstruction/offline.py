@@ -26,7 +26,7 @@ from eschorty_ros.core.storage.recording import SETTINGS_FILE, TRUTH_FILE
 
 # Bytes of the file that are mapped at a time, in one thread and in several.
 _PASS_BYTES = 1 << 20
-_WINDOWS_BYTES = 1 << 25
+_WINDOWS_BYTES = 1 << 27
 _SPEED_SAMPLES = 256
 _MOVING_SHARE = 0.8
 

@@ -82,7 +82,7 @@ class WindowAssembler:
         self._jobs = jobs
         self._pool = ThreadPoolExecutor(jobs, "window")
         self._open = ProfileAssembler(settings, model)
-        self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs + 1))
+        self._idle = deque(ProfileAssembler(settings, model) for _ in range(2 * jobs))
         self._counts: Counter[str] = Counter()
         self._at = Cut(0, 0)
 
@@ -129,7 +129,7 @@ class WindowAssembler:
             if found is None:
                 break
             cut, left = found, profile_assembler.WINDOW_EVENTS
-            if len(running) > self._jobs:
+            if len(running) >= 2 * self._jobs:
                 going = self._accept(running.popleft(), going)
             assembler = self._idle.popleft()
             assembler.begin_window(edges, cut.edge - 1, self._open)
