@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -80,12 +80,16 @@ def best(task: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     return shortest, result
 
 
-def ours(data: bytes, modulation: Modulation, settings: Settings) -> Profiles:
+def parts(data: bytes, modulation: Modulation, settings: Settings) -> Iterator[Profiles]:
+    """Yield the profiles chunk by chunk, as a recording or a stream is reconstructed."""
     reconstructor = Reconstructor(CALIBRATION, modulation, settings)
-    parts = [
-        reconstructor.push(data[k : k + CHUNK_BYTES]) for k in range(0, len(data), CHUNK_BYTES)
-    ]
-    return Profiles.concatenate([*parts, reconstructor.flush()])
+    for k in range(0, len(data), CHUNK_BYTES):
+        yield reconstructor.push(data[k : k + CHUNK_BYTES])
+    yield reconstructor.flush()
+
+
+def ours(data: bytes, modulation: Modulation, settings: Settings) -> Profiles:
+    return Profiles.concatenate(list(parts(data, modulation, settings)))
 
 
 def plain(data: bytes, modulation: Modulation) -> Profiles:
