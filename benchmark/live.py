@@ -64,7 +64,7 @@ def later(packet: bytes, loops: int) -> bytes:
     words = np.frombuffer(packet, "<u2").copy()
     high = words >> 12 == 8
     steps = loops * (LOOP_US >> 12)
-    words[high] = 0x8000 | ((words[high] & 0xFFF) + steps & 0xFFF)
+    words[high] = 0x8000 | ((words[high] & 0xFFF) + steps % 0x1000 & 0xFFF)
     return words.tobytes()
 
 

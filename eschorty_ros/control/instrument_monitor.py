@@ -55,12 +55,13 @@ class InstrumentMonitor:
     - ``camera_present``: Returns whether a node publishes events.
 
     Public attributes:
-    - ``samples``: ROS time (ns) and stage position (mm) since the last ``samples.clear()``.
+    - ``samples``: ROS time (ns) and stage position (mm) since ``restart_samples``.
     """
 
     def __init__(self, camera_present: Callable[[], bool]) -> None:
         self._camera_present = camera_present
         self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
+        self._samples_from_ns = 0
         self.laser: LaserStatus | None = None
         self.reconstruction: ReconstructionStatus | None = None
         self.position_mm = float("nan")
@@ -100,7 +101,14 @@ class InstrumentMonitor:
         self._stage_s = now_s
         self._ages["stage"].add(age_s)
         self.at_rest = abs(velocity_mm_s) < _REST_MM_S
-        self.samples.append((t_ns, position_mm))
+        # Those of the motion before may still come.
+        if t_ns >= self._samples_from_ns:
+            self.samples.append((t_ns, position_mm))
+
+    def restart_samples(self, from_ns: int) -> None:
+        """Keep the stage's samples from this ROS time on."""
+        self._samples_from_ns = from_ns
+        self.samples.clear()
 
     def reconstructed_mm(self) -> float:
         """Return where the stage was at the newest event reconstructed, NaN when not known."""

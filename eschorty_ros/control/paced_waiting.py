@@ -55,7 +55,7 @@ class PacedWaiting:
         self._canceled, self._feedback = canceled, feedback
         self._watching = self._shielded = False
         self._phase = "preparing"
-        self.monitor.samples.clear()
+        self.monitor.restart_samples(self._now_ns())
 
     def end(self) -> None:
         """Make every wait fail from now on."""

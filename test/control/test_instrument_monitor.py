@@ -66,7 +66,10 @@ def test_a_drain_ends_although_there_is_progress():
 
 def test_the_progress_is_where_the_stage_was_at_the_newest_event():
     subject = monitor()
-    subject.samples.clear()
+    subject.restart_samples(100)
+    # Of the approach, which ended elsewhere, and late.
+    subject.update_stage(50, 7.0, 10.0, 0.0)
+    assert not subject.samples
     assert np.isnan(subject.reconstructed_mm())
     for t_ns, at_mm in ((100, 1.0), (200, 2.0), (300, 3.0)):
         subject.update_stage(t_ns, at_mm, 10.0, 0.0)

@@ -338,7 +338,7 @@ class ScanClient(InstrumentClient):
             stop=m_from_mm(request.stop_mm),
             passes=request.passes,
         )
-        self.monitor.samples.clear()
+        self.monitor.restart_samples(self._now_ns())
         # A cancel before the answer would leave a scan that is never ended.
         with self.shielded():
             answer = self._call("reconstruction/begin_scan", begin, within_s=_BEGIN_S)
