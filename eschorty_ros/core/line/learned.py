@@ -48,12 +48,11 @@ class Footprint(NamedTuple):
     """Counts of pixels by their events and distance, and the logarithms of their shares.
 
     ``log[k]`` is relative to that of no event but for ``log[0]``; ``empty`` is the sum of
-    ``log[0]`` over all rows, by the line's place in its row and on over as many as there are
-    candidates. ``rows_seen`` holds the events of
-    the sampled columns' rows from ``first_row`` on, which is -1 where there is none. ``state`` is
-    the number of profiles, of computations and of the columns counted since; 1 while the sensor's
-    edge cuts a line, which other estimators need a footprint for; and the number of computations
-    from lines that are all cut.
+    ``log[0]`` over all rows, by the line's place in its row and on over all candidates.
+    ``rows_seen`` holds the events of the sampled columns' rows from ``first_row`` on, which is -1
+    where there is none. ``state`` is the number of profiles, of computations and of the columns
+    counted since; 1 while the sensor's edge cuts a line, which other estimators need a footprint
+    for; and the number of computations from lines that are all cut.
     """
 
     pixels: NDArray[np.float64]
@@ -179,8 +178,8 @@ def _learned_row(packed, column, row, rows, footprint, counts):
     reach = footprint.reach
     centre = np.int64(np.rint(row))
     margin = reach + _MOVES_MAX
-    all_low, all_high = max(centre - margin, 0), min(centre + margin, rows - 1)
-    all_low, all_high = _count_rows(packed, column, all_low, all_high, counts)
+    span = max(centre - margin, 0), min(centre + margin, rows - 1)
+    all_low, all_high = _count_rows(packed, column, span[0], span[1], counts)
     for _ in range(_MOVES_MAX):
         low = max(-((_PLACES * reach - place) // _PLACES), all_low)
         high = min((place + _PLACES * reach) // _PLACES, all_high)
