@@ -63,8 +63,8 @@ def later(packet: bytes, loops: int) -> bytes:
     """Return a packet as it is so many loops later."""
     words = np.frombuffer(packet, "<u2").copy()
     high = words >> 12 == 8
-    steps = loops * (LOOP_US >> 12)
-    words[high] = 0x8000 | ((words[high] & 0xFFF) + steps % 0x1000 & 0xFFF)
+    steps = loops * (LOOP_US >> 12) % 0x1000
+    words[high] = 0x8000 | ((words[high] & 0xFFF) + steps & 0xFFF)
     return words.tobytes()
 
 

@@ -38,6 +38,7 @@ CASES = {
     "ours (mode_mean)": Settings(),
     "mean": Settings(centroid="mean"),
     "median": Settings(centroid="median"),
+    "learned": Settings(centroid="learned"),
     "gauss_ml": Settings(centroid="gauss_ml"),
     "edge_mid": Settings(centroid="edge_mid"),
     "ours, all returns": Settings(returns="all"),

@@ -92,7 +92,7 @@ def test_a_source_whose_name_is_discovered_later_is_one_source(clock):
 
 
 def test_an_ended_source_that_never_had_a_name_does_not_stay_open_for_ever(clock):
-    interlock = LaserInterlock(5.0, 600.0, {}, now_s=lambda: clock.now_s)
+    interlock = LaserInterlock(10.0, 60.0, {}, now_s=clock)
     interlock.receive_contact(True, "0a1b", unnamed="0a1b")
     interlock.receive_contact(True, "/door")
     interlock.receive_contact(False, "/door")

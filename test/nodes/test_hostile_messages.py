@@ -47,8 +47,7 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
                 bench.observer.wait_for_answers(name, scenarios.SCAN_DEADLINE_S)
             yield bench, running, Contact(bench.observer)
             for name, process in running.items():
-                crash = process.output.rfind("Fatal Python error")
-                print(f"--- {name}\n{process.output[crash if crash >= 0 else -3000 :]}")
+                print(f"--- {name}\n{process.end_of_output}")
 
 
 def test_nodes_without_devices_outlast_everything(instrument):

@@ -16,6 +16,7 @@ from eschorty_ros.hardware.stage.apt_stage import AptStage
 
 EPOCH_NS = 1_700_000_000_000_000_000
 TICK_NS = 200_000
+SUSPENSION_NS = 600_000_000
 
 
 class MemoryPort:
@@ -43,7 +44,8 @@ class MemoryPort:
 class AptBench:
     """Driver, ``AptModel`` with these arguments, and the clock of both.
 
-    The controller handles nothing and sends nothing until ``halted_until_ns``.
+    The controller handles nothing and sends nothing until ``halted_until_ns``. The host is
+    suspended at each of the next ``suspensions`` times at which it reads its clock.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class AptBench:
         self.now_ns = 0
         self.clock_set_ns = 0
         self.halted_until_ns = 0
+        self.suspensions = 0
         self.model = AptModel(
             self.clock_ns, controller=self.settings.controller, bay=self.settings.bay, **model
         )
@@ -70,6 +73,9 @@ class AptBench:
 
     def host_clock_ns(self) -> int:
         """The clock by which the driver stamps, set by ``clock_set_ns``."""
+        if self.suspensions:
+            self.suspensions -= 1
+            self.now_ns += SUSPENSION_NS
         return self.clock_ns() + self.clock_set_ns
 
     def open(self) -> AptStage:
@@ -78,11 +84,7 @@ class AptBench:
     def _make_link(
         self, on_frame: Callable[[Frame, int], None], on_lost: Callable[[DeviceError], None]
     ) -> AptLink:
-        def on_status(frame: Frame, received_ns: int) -> None:
-            self.last_status = frame
-            on_frame(frame, received_ns)
-
-        self.link = AptLink(self.port, on_status, on_lost, lambda: self.now_ns, self._wait)
+        self.link = AptLink(self.port, on_frame, on_lost, lambda: self.now_ns, self._wait)
         return self.link
 
     def _wait(self, condition: threading.Condition, seconds: float) -> None:

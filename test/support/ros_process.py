@@ -98,6 +98,13 @@ class NodeProcess:
         """Everything the process has printed."""
         return Path(self._log.name).read_text(errors="replace")
 
+    @property
+    def end_of_output(self) -> str:
+        """The last it has printed; after a crash all from the crash on."""
+        output = self.output
+        crash = output.rfind("Fatal Python error")
+        return output[crash if crash >= 0 else -3000 :]
+
     def send(self, number: int) -> None:
         self._process.send_signal(number)
 

@@ -39,9 +39,10 @@ _MOVES_MAX = 24
 # Where every line is cut, a computation from rows that are off leaves this part of their bias.
 _BIAS_KEPT = 0.85
 _OFF_LINE_PX = 1.0
-# Shares of the posterior by the logarithm below the best, in steps of 1/64; less counts as none.
+# Shares of the posterior by the logarithm below the best, in steps; less counts as none.
 _STEP_BITS = 4
-_SHARES = np.exp(-(np.arange(8 << 6) + 0.5) / 64.0)
+_STEPS_PER_ONE = _LOG_ONE >> _STEP_BITS
+_SHARES = np.exp(-(np.arange(8 * _STEPS_PER_ONE) + 0.5) / _STEPS_PER_ONE)
 
 
 class Footprint(NamedTuple):

@@ -21,6 +21,8 @@ from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings
 
 JOBS_MAX = 256
+# Windows that wait for a thread, so that none waits for the rows before to be handed on.
+_WAITING = 2
 
 
 class _Assembled(NamedTuple):
@@ -82,7 +84,7 @@ class WindowAssembler:
         self._jobs = jobs
         self._pool = ThreadPoolExecutor(jobs, "window")
         self._open = ProfileAssembler(settings, model)
-        self._idle = deque(ProfileAssembler(settings, model) for _ in range(2 * jobs))
+        self._idle = deque(ProfileAssembler(settings, model) for _ in range(jobs + _WAITING))
         self._counts: Counter[str] = Counter()
         self._at = Cut(0, 0)
 
@@ -129,7 +131,7 @@ class WindowAssembler:
             if found is None:
                 break
             cut, left = found, profile_assembler.WINDOW_EVENTS
-            if len(running) >= 2 * self._jobs:
+            if len(running) >= self._jobs + _WAITING:
                 going = self._accept(running.popleft(), going)
             assembler = self._idle.popleft()
             assembler.begin_window(edges, cut.edge - 1, self._open)

@@ -59,8 +59,7 @@ class Publishers:
 
     def living(self) -> set[str]:
         """Return the identities of those that are there."""
-        ends = self._node.get_publishers_info_by_topic(self._topic)
-        return {bytes(end.endpoint_gid).hex() for end in ends}
+        return {publisher.hex() for publisher in _living(self._node, self._topic)}
 
     def name(self, info: Mapping[str, Any]) -> str:
         """Return the full name of the node that published a message, ``""`` while it is unknown."""
@@ -103,9 +102,9 @@ class LatchedState:
 
     def check(self) -> None:
         """Forget the state if its publisher has ended."""
-        name = self.subscription.topic_name
-        living = {bytes(end.endpoint_gid) for end in self._node.get_publishers_info_by_topic(name)}
-        if not self._publisher or self._publisher in living:
+        if not self._publisher:
+            return
+        if self._publisher in _living(self._node, self.subscription.topic_name):
             return
         self._publisher = b""
         self._forget()
@@ -139,6 +138,11 @@ def publishers_fault(node: Node, topic: str) -> str:
     if not names:
         return f"no publisher of {full}"
     return f"{full} has {len(names)} publishers ({', '.join(names)[:100]}); stop all but one"
+
+
+def _living(node: Node, topic: str) -> set[bytes]:
+    """Return the identities of a topic's publishers."""
+    return {bytes(end.endpoint_gid) for end in node.get_publishers_info_by_topic(topic)}
 
 
 def _publisher(info: Mapping[str, Any]) -> bytes:

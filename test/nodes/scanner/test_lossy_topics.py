@@ -46,7 +46,7 @@ def instrument(tmp_path_factory):
     ):
         yield bench, running, relay
         for name, process in running.items():
-            print(f"--- {name}\n{process.output[-3000:]}")
+            print(f"--- {name}\n{process.end_of_output}")
 
 
 def test_a_scan_with_metavision_driver_and_five_percent_of_the_heartbeats_lost(instrument):

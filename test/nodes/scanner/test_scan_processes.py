@@ -34,7 +34,7 @@ def instrument(tmp_path_factory):
     ):
         yield bench, running, scenarios.node_parameters(folder)
         for name, process in running.items():
-            print(f"--- {name}\n{process.output[-3000:]}")
+            print(f"--- {name}\n{process.end_of_output}")
 
 
 def started(module, instrument):

@@ -43,7 +43,7 @@ def instrument(tmp_path_factory):
             bench = ending.enter_context(scenarios.bench(DOMAIN, log))
         yield bench, hosts
         for name, process in (devices | others).items():
-            print(f"--- {name}\n{process.output[-3000:]}")
+            print(f"--- {name}\n{process.end_of_output}")
 
 
 @pytest.mark.parametrize("lost", [0.01, 0.05])
