@@ -135,7 +135,9 @@ def setting(name: str) -> tuple[Any, Kind]:
         return value, text()
     if name == "stage_speed_mm_s":
         return value, number(-10_000.1, 10_000.1)
-    return value, integer(-1) if isinstance(value, int) else number(-1e-9)
+    if isinstance(value, int):
+        return value, integer(-2 if name == "phase_gate_us" else -1)
+    return value, number(-1e-9)
 
 
 CALLS: dict[str, Call] = {

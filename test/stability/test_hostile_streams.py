@@ -33,16 +33,17 @@ def scrambled(seed: int) -> bytes:
     return np.choose(rng.choice(len(kinds), WORDS, p=shares), kinds).astype("<u2").tobytes()
 
 
-whole_columns = st.tuples(st.sampled_from(METHODS), st.just("strongest"))
+gates_us = 0, 500, 100_000
+whole_columns = st.tuples(st.sampled_from(METHODS), st.just("strongest"), st.sampled_from(gates_us))
 windows = st.tuples(
     st.sampled_from([name for name in METHODS if name not in FULL_COLUMN_METHODS]),
     st.sampled_from(RETURNS),
+    st.sampled_from([-1, *gates_us]),
 )
 hostile_settings = st.builds(
-    lambda method, **others: Settings(centroid=method[0], returns=method[1], **others),
+    lambda method, **others: Settings(*method[:2], phase_gate_us=method[2], **others),
     method=st.one_of(whole_columns, windows),
     noise_filter=st.sampled_from(["none", "activity"]),
-    phase_gate_us=st.sampled_from([0, 500, 100_000]),
     line_width_px=st.sampled_from([1.0, 7.3, 200.0]),
     events_min=st.sampled_from([1, 4]),
     column_limit=st.sampled_from([16, 128]),

@@ -544,9 +544,9 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     if estimator.method == _GAUSS_ML:
         size = _fill_likelihood(scratch.likelihood, half)
         scratch = Scratch(scratch.row_counts, scratch.likelihood[:size])
-    for c in range(columns.counts.size):
-        n = np.int64(columns.counts[c])
-        columns.counts[c] = 0
+    for c in range(columns.seeds.size):
+        n = np.int64(columns.counts[c, 0])
+        columns.counts[c, 0] = 0
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0

@@ -9,20 +9,21 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US, TIME_SHIFT
-from eschorty_ros.core.modulation.phase_gate import PhaseGate, _outside
+from eschorty_ros.core.modulation.phase_gate import _gate_part
 
 _ROOM = 128
 _ALL_ROWS = np.empty(0, np.uint32)
 
 
 class Columns(NamedTuple):
-    """Packed events by column: ``counts`` of them from ``starts`` on, with room for padding.
+    """Packed events by column: ``counts[c, 0]`` of them from ``starts[c]`` on.
 
-    The ``room`` for events grows up to ``limit``. ``seeds`` are the rows of the lines in the last
-    period, fixed point; -1 for none. ``rivals`` are those of second lines that are nearly as
-    strong, and ``evidence`` the events by which the first ones have been stronger. In a region of
-    interest column ``c`` takes ``row_first[c]`` and the ``row_span[c]`` rows behind it; without one
-    both are empty. ``refused`` counts the events that `_bin` did not append, by reason.
+    The ``counts[c, 1]`` late ones of a `PhaseGate` that keeps them follow where the ``room`` for
+    the others ends, with its padding. It grows up to ``limit``. ``seeds`` are the rows of the lines
+    in the last period, fixed point; -1 for none. ``rivals`` are those of second lines that are
+    nearly as strong, and ``evidence`` the events by which the first ones have been stronger. In a
+    region of interest column ``c`` takes ``row_first[c]`` and the ``row_span[c]`` rows behind it;
+    without one both are empty. ``refused`` counts the events that `_bin` did not append, by reason.
     """
 
     packed: NDArray[np.uint32]
@@ -39,9 +40,10 @@ class Columns(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Where `_bin` puts the events of a period, which begins at ``edge_us``.
+    """Where `_bin` puts the events of a part of the period, which begins at ``edge_us``.
 
-    Events before ``floor_us`` count as at that time.
+    Events before ``floor_us`` count as at that time. ``late_on`` and ``late_off`` are 1 where a
+    gate has ON and OFF events as late, which it keeps apart or drops.
     """
 
     packed: NDArray[np.uint32]
@@ -50,7 +52,9 @@ class Bins(NamedTuple):
     row_first: NDArray[np.uint32]
     row_span: NDArray[np.uint32]
     refused: Any
-    gate: PhaseGate
+    late_on: np.uintp
+    late_off: np.uintp
+    keeps_late: bool
     edge_us: np.int64
     floor_us: np.int64
 
@@ -69,11 +73,11 @@ class Appended(NamedTuple):
 def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
     """Return ``columns`` empty columns with ``room`` for events each, and ``limit`` at most."""
     room = min(room, limit)
-    stride = room + BLOCK
+    size = 2 * (room + BLOCK)
     return Columns(
-        packed=np.empty(columns * stride, np.uint32),
-        starts=np.arange(columns) * stride,
-        counts=np.zeros(columns, np.uint32),
+        packed=np.empty(columns * size, np.uint32),
+        starts=np.arange(columns) * size,
+        counts=np.zeros((columns, 2), np.uint32),
         seeds=np.full(columns, -1, np.int64),
         rivals=np.full(columns, -1, np.int64),
         evidence=np.zeros(columns),
@@ -89,7 +93,7 @@ def wider_columns(columns: Columns) -> Columns:
     """Return the same columns with twice the room, or all that the limit allows."""
     size = columns.counts.size
     packed = columns.packed.reshape(size, -1)
-    wider = empty_columns(size, columns.limit, 2 * columns.room)
+    wider = empty_columns(len(columns.counts), columns.limit, 2 * columns.room)
     wider.packed.reshape(size, -1)[:, : packed.shape[1]] = packed
     return columns._replace(packed=wider.packed, starts=wider.starts, room=wider.room)
 
@@ -102,7 +106,9 @@ def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Col
     packed = np.empty(int(sizes.sum()), np.uint32)
     packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
     return empty_columns(counts.size, 0, 0)._replace(
-        packed=packed, starts=starts, counts=counts.astype(np.uint32)
+        packed=packed,
+        starts=starts,
+        counts=np.stack((counts, np.zeros_like(counts)), 1).astype(np.uint32),
     )
 
 
@@ -119,19 +125,21 @@ def _bin(bins, n, t_us, column, row, polarity):
     # An array that is bound to a name here is counted as used for every event.
     c, r = np.uintp(column), np.uint32(row)
     dt = max(t_us, bins.floor_us) - bins.edge_us
+    late = bins.late_on if polarity else bins.late_off
     if bins.row_first.size > 0 and np.uint32(r - bins.row_first[c]) > bins.row_span[c]:
         bins.refused.outside_region += 1
-    elif bins.gate.length_us > 0.0 and _outside(dt, polarity, bins.gate):
+    elif late and not bins.keeps_late:
         bins.refused.gated += 1
     else:
-        events = bins.counts[c]
+        events = bins.counts[c, late]
         if events < bins.room:
-            bins.packed[c * np.uintp(bins.room + np.uint32(BLOCK)) + np.uintp(events)] = np.uint32(
+            at = (np.uintp(2) * c + late) * np.uintp(bins.room + np.uint32(BLOCK))
+            bins.packed[at + np.uintp(events)] = np.uint32(
                 (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
                 | (np.uint32(polarity) << np.uint32(ROW_BITS))
                 | r
             )
-            bins.counts[c] = events + np.uint32(1)
+            bins.counts[c, late] = events + np.uint32(1)
         else:
             bins.refused.over_limit += 1
     return n + np.uint64(1)
@@ -143,27 +151,37 @@ def _needs_room(columns):
     return columns.refused.over_limit > 0 and columns.room < columns.limit
 
 
+@kernel(inline="always")
+def _bins(columns, part, keeps_late, edge_us, floor_us):
+    """Return the bins of a part of the period."""
+    return Bins(
+        columns.packed, columns.counts, np.uint32(columns.room), columns.row_first,
+        columns.row_span, columns.refused, np.uintp(part.late_on), np.uintp(part.late_off),
+        keeps_late, edge_us, floor_us,
+    )  # fmt: skip
+
+
 @kernel
 def _append(events, first, limit_us, edge_us, columns, rows, gate):
-    """Append the events before ``limit_us`` that pass the gate to `empty_columns`."""
+    """Append the events before ``limit_us`` to `empty_columns`, or count why not."""
     t, x, y, p = events
     before = columns.counts.copy()
     _forget_refused(columns.refused)
-    bins = Bins(
-        columns.packed, columns.counts, np.uint32(columns.room), columns.row_first,
-        columns.row_span, columns.refused, gate, edge_us, edge_us,
-    )  # fmt: skip
-    size = np.uintp(columns.counts.size)
+    size = np.uintp(columns.counts.shape[0])
     rows_end = np.uint32(rows)
     i = np.uintp(first)
     end = np.uintp(t.size)
     outside = 0
     while i < end and t[i] < limit_us:
-        if np.uintp(x[i]) < size and np.uint32(y[i]) < rows_end:
-            _bin(bins, np.uint64(0), t[i], x[i], y[i], p[i])
-        else:
-            outside += 1
-        i += np.uintp(1)
+        part = _gate_part(max(t[i], edge_us), edge_us, gate)
+        bins = _bins(columns, part, gate.keeps_late > 0, edge_us, edge_us)
+        end_us = min(part.end_us, limit_us)
+        while i < end and t[i] < end_us:
+            if np.uintp(x[i]) < size and np.uint32(y[i]) < rows_end:
+                _bin(bins, np.uint64(0), t[i], x[i], y[i], p[i])
+            else:
+                outside += 1
+            i += np.uintp(1)
     if _needs_room(columns):
         columns.counts[:] = before
         return Appended(np.int64(first), True, 0)

@@ -1,8 +1,8 @@
-"""Phase gate: an event is kept only soon after the laser edge that can cause it.
+"""Phase gate: an event is kept only in the part of the period in which its polarity follows light.
 
-ON events follow rising edges and OFF events falling ones; background is spread evenly. The gate
-keeps a share of (LEAD_US + gate) / period of the background of both polarities, 8 % at 70 Hz with
-1 ms.
+ON events follow rising edges of the laser and OFF events falling ones; background is spread evenly.
+The gate keeps a share of (LEAD_US + gate) / period of the background of both polarities, 8 % at
+70 Hz with 1 ms.
 """
 
 from __future__ import annotations
@@ -19,31 +19,34 @@ LEAD_US = 200
 """Time from opening to edge: an estimated edge is later than the first events."""
 
 GATE_MAX_US = 100_000
+GATE_LEARNED = -1
+"""In place of a time: the gate is learned from the stream."""
+TURN = 1 << 32
 
 
 class PhaseGate(NamedTuple):
-    """Windows behind the laser's edges in which events are kept.
+    """Parts of the period in which ON and OFF events are kept, 2**32 per turn, as uint32.
 
     Attributes
     ----------
-    period_us, frequency_mhz : float
-        Length of the period and its reciprocal.
-    on_lead_us, off_lead_us : float
-        Time since the opening of the window of ON and of OFF events minus that since the rising
-        edge.
-    length_us : float
-        Length of a window; 0 is no gate.
+    step : int
+        Turns per microsecond; 0 is no gate.
+    on_begin, on_span, off_begin, off_span : int
+        Phase behind the rising edge at which events are kept from, and for how long.
+    keeps_late : int
+        1 where other events are kept apart, 0 where they are dropped.
     """
 
-    period_us: float = 1.0
-    frequency_mhz: float = 1.0
-    on_lead_us: float = 0.0
-    off_lead_us: float = 0.0
-    length_us: float = 0.0
+    step: int = 0
+    on_begin: int = 0
+    on_span: int = TURN - 1
+    off_begin: int = 0
+    off_span: int = TURN - 1
+    keeps_late: int = 0
 
 
 def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
-    """Return the windows behind the edges of ``modulation``.
+    """Return the gate behind the edges of ``modulation``.
 
     Parameters
     ----------
@@ -63,17 +66,49 @@ def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
         When ``gate_us`` is outside its range.
     """
     integer("gate_us", gate_us, 0, GATE_MAX_US)
-    period_us, length_us = modulation.period_us, float(LEAD_US + gate_us)
+    period_us, length_us = modulation.period_us, LEAD_US + gate_us
     if gate_us == 0 or modulation.waveform == "sine" or length_us >= period_us:
         return PhaseGate()
-    on_lead_us = float(LEAD_US)
-    off_lead_us = on_lead_us - modulation.duty * period_us
-    return PhaseGate(period_us, 1.0 / period_us, on_lead_us, off_lead_us, length_us)
+    step = TURN / period_us
+    lead, span = round(step * LEAD_US), round(step * length_us) - 1
+    off_begin = round(TURN * modulation.duty) - lead
+    return PhaseGate(round(step), TURN - lead, span, off_begin % TURN, span)
 
 
-@kernel
-def _outside(dt_us, polarity, gate):
-    """Return true when ``dt_us`` after a rising edge is outside the window of its polarity."""
-    late_us = dt_us + (gate.on_lead_us if polarity else gate.off_lead_us)
-    late_us -= gate.period_us * np.floor(late_us * gate.frequency_mhz)
-    return late_us >= gate.length_us
+class GatePart(NamedTuple):
+    """A part of the period: 1 where its ON or OFF events are late, and the time of its end."""
+
+    late_on: int
+    late_off: int
+    end_us: int
+
+
+@kernel(_nrt=False)
+def _is_late(dt_us, polarity, gate):
+    """Return true when an event ``dt_us`` after a rising edge is outside the gate."""
+    if gate.step == 0:
+        return False
+    phase = np.uint32(np.uint32(dt_us) * np.uint32(gate.step))
+    if polarity:
+        return np.uint32(phase - np.uint32(gate.on_begin)) > np.uint32(gate.on_span)
+    return np.uint32(phase - np.uint32(gate.off_begin)) > np.uint32(gate.off_span)
+
+
+@kernel(_nrt=False)
+def _steps_left(phase, begin, span, step):
+    """Return 1 if a phase is outside a span, and the steps after which that is no longer so."""
+    behind = np.uint32(phase - np.uint32(begin))
+    if behind <= np.uint32(span):
+        return 0, np.int64(np.uint32(span) - behind) // step + 1
+    return 1, -(-np.int64(np.uint32(np.uint32(begin) - phase)) // step)
+
+
+@kernel(_nrt=False)
+def _gate_part(t_us, edge_us, gate):
+    """Return the part of a gate that a time is in, which is behind the rising edge."""
+    if gate.step == 0:
+        return GatePart(0, 0, 1 << 62)
+    phase = np.uint32((t_us - edge_us) * gate.step)
+    late_on, on_us = _steps_left(phase, gate.on_begin, gate.on_span, gate.step)
+    late_off, off_us = _steps_left(phase, gate.off_begin, gate.off_span, gate.step)
+    return GatePart(late_on, late_off, t_us + min(on_us, off_us))

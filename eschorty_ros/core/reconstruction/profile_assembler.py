@@ -27,10 +27,10 @@ from eschorty_ros.core.line.centroid import (
     make_scratch,
 )
 from eschorty_ros.core.line.columns import (
-    Bins,
     Columns,
     _append,
     _bin,
+    _bins,
     _forget_refused,
     _needs_room,
     empty_columns,
@@ -39,6 +39,14 @@ from eschorty_ros.core.line.columns import (
 from eschorty_ros.core.line.delay import Light, _delay_us, light
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import Footprint, _forget, _learn, make_footprint
+from eschorty_ros.core.line.learned_gate import (
+    LearnedGate,
+    _forget_gate,
+    _learn_gate,
+    _use_late,
+    make_gate,
+    same_gate,
+)
 from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
 from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
@@ -46,7 +54,7 @@ from eschorty_ros.core.line.unusual import _mark_unusual, _restart_widths, empty
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
-from eschorty_ros.core.modulation.phase_gate import phase_gate
+from eschorty_ros.core.modulation.phase_gate import _gate_part
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.region import region
@@ -87,15 +95,18 @@ _COUNTERS = np.dtype(
         )
     ]
 )
-# ``status`` is one of the three below, ``half`` the half width of a window for the open period in
-# fixed point, ``rows`` the number of rows in the output, ``full`` 1 while a column needs more room,
-# ``window`` the number of events since the estimate started, ``over`` 1 where a pass ended with it.
+# ``part_us`` is where the part of the gate begins, ``status`` one of the three below, ``half`` the
+# half width of a window for the open period in fixed point, ``rows`` the number of rows in the
+# output, ``full`` 1 while a column needs more room, ``window`` the number of events since the
+# estimate started, ``over`` 1 where a pass ended with it.
 _STATE = np.dtype(
     [
         (name, np.int64)
-        for name in ("period", "edge_us", "status", "half", "rows", "full", "window", "over")
+        for name in (
+            "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "over",
+        )
     ]
-)
+)  # fmt: skip
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
 
@@ -126,6 +137,7 @@ class _Memory(NamedTuple):
 
     columns: Columns
     estimator: Estimator
+    gate: LearnedGate
     blink: Blink
     footprint: Footprint
     scatter: Scatter
@@ -188,12 +200,13 @@ class ProfileAssembler:
 
         ``every`` is the number of periods in a profile.
         """
-        self._gate = phase_gate(modulation, self._gate_us)
         lit = light(modulation, every)
         if CENTROIDS[self._memory.estimator.method] in FULL_COLUMN_METHODS:
             # They hold background, which comes at any time.
             lit = lit._replace(delay_max_us=Light().delay_max_us)
-        self._memory = self._memory._replace(blink=blink(modulation, every), light=lit)
+        self._memory = self._memory._replace(
+            gate=make_gate(modulation, self._gate_us), blink=blink(modulation, every), light=lit
+        )
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
         _begin_window(self._memory, self._state)
@@ -203,8 +216,10 @@ class ProfileAssembler:
 
         Nothing is counted, and no footprint learned.
         """
-        self._gate = before._gate
-        self._memory = self._memory._replace(blink=before._memory.blink, light=before._memory.light)
+        memory = before._memory
+        self._memory = self._memory._replace(
+            gate=same_gate(memory.gate), blink=memory.blink, light=memory.light
+        )
         self._memory.columns.counts[:] = 0
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state["rows"] = 0
@@ -212,7 +227,8 @@ class ProfileAssembler:
         _forget(self._memory.footprint)
         _begin_window(self._memory, self._state)
         self._state["status"] = _EMPTY
-        self._state["edge_us"], self._state["period"] = edges.t_us[edge], edges.period[edge]
+        self._state["edge_us"] = self._state["part_us"] = edges.t_us[edge]
+        self._state["period"] = edges.period[edge]
 
     def exchange_footprints(self, other: ProfileAssembler) -> None:
         """Go on with the footprint of ``other``, which gets that of this one."""
@@ -259,9 +275,7 @@ class ProfileAssembler:
         size = held[0].size + new[0].size
         progress = _Progress(0, 0)
         while True:
-            progress = _merge(
-                *parts, edges, progress, self._gate, self._memory, self._state, self._counters
-            )
+            progress = _merge(*parts, edges, progress, self._memory, self._state, self._counters)
             self._widen()
             if progress.event == size and progress.edge == edges.t_us.size:
                 return
@@ -296,8 +310,8 @@ class ProfileAssembler:
         rows_max = self._memory.output.row.size - self._memory.rows.row.size
         while True:
             progress = _merge_words(
-                words, progress, decoder.memory, span, edges, self._gate, self._memory,
-                self._state, self._counters,
+                words, progress, decoder.memory, span, edges, self._memory, self._state,
+                self._counters,
             )  # fmt: skip
             full, crowded = self._widen(), self._state["rows"] > rows_max
             if crowded:
@@ -375,6 +389,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             widths=empty_widths(*shape),
         ),
         light=Light(),
+        gate=make_gate(Modulation(70.0), 0),
         delay=np.zeros(2),
         rows=empty_rows(*shape),
         scratch=make_scratch(_WIDER * estimator.half_max),
@@ -402,6 +417,7 @@ def _begin_window(memory, state):
     memory.scatter.expected[:] = 0.0
     memory.scatter.number[:] = 0.0
     memory.delay[:] = 0.0
+    _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths)
 
 
@@ -463,8 +479,13 @@ def _write(rows, smoothing, few, delay_us, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, blink, footprint, scatter, smoothing = memory[:6]
+    columns, estimator, gate, blink, footprint, scatter, smoothing = memory[:7]
     light, rows, scratch = memory.light, memory.rows, memory.scratch
+    if gate.choices.size > 0:
+        _learn_gate(columns, state.half, gate)
+        gated = _use_late(columns, gate)
+        counters.events_binned -= gated
+        counters.events_gated += gated
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > estimator.half_max
@@ -484,8 +505,12 @@ def _close(memory, state, counters):
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, light)
     _write(rows, smoothing, few, delay_us, state, memory.output)
-    if state.window >= memory.window_events and estimator.method != _LEARNED:
-        _begin_window(memory, state)
+    if state.window >= memory.window_events:
+        if estimator.method == _LEARNED:
+            state.window = 0
+            _forget_gate(gate)
+        else:
+            _begin_window(memory, state)
 
 
 @kernel
@@ -501,7 +526,7 @@ def _count(events, outside, refused, state, counters):
 
 
 @kernel
-def _fill(events, first, limit_us, columns, rows, gate, state, counters):
+def _fill(events, first, limit_us, memory, state, counters):
     """Sort the events before ``limit_us`` into the open period; return the index of the next."""
     if state.status == _CLOSED:
         i = first
@@ -510,6 +535,7 @@ def _fill(events, first, limit_us, columns, rows, gate, state, counters):
         counters.events_before_first_edge += i - first
         return i
     state.status = _FILLED
+    columns, rows, gate = memory.columns, memory.estimator.rows, memory.gate.state
     appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
     state.full = appended.full
     if not appended.full:
@@ -525,21 +551,20 @@ def _begin_period(edges, edge, memory, state, counters):
     elif state.status == _EMPTY:
         counters.periods_empty += 1
     state.status = _EMPTY
-    state.edge_us = edges.t_us[edge]
+    state.edge_us = state.part_us = edges.t_us[edge]
     state.period = edges.period[edge]
 
 
 @kernel(inline="always")
-def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
+def _merge_part(events, edges, i, edge, drain, memory, state, counters):
     """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
-    columns, rows = memory.columns, memory.estimator.rows
     rows_max = memory.output.row.size - memory.rows.row.size
     t = events.t
     far = np.int64(1 << 62)
     while True:
         limit_us = edges.t_us[edge] if edge < edges.t_us.size else far
         if i < t.size and t[i] < limit_us:
-            i = _fill(events, i, limit_us, columns, rows, gate, state, counters)
+            i = _fill(events, i, limit_us, memory, state, counters)
             if state.full:
                 return i, edge
         if edge == edges.t_us.size or (i == t.size and not drain):
@@ -551,7 +576,7 @@ def _merge_part(events, edges, i, edge, drain, gate, memory, state, counters):
 
 
 @kernel
-def _merge(held, new, edges, progress, gate, memory, state, counters):
+def _merge(held, new, edges, progress, memory, state, counters):
     """Merge events, first those of ``held``, with edges from ``progress`` on.
 
     A period is closed when an event reaches its end or after the last event. Events and edges
@@ -560,10 +585,10 @@ def _merge(held, new, edges, progress, gate, memory, state, counters):
     size = held.t.size
     i, edge = progress
     if i < size:
-        i, edge = _merge_part(held, edges, i, edge, False, gate, memory, state, counters)
+        i, edge = _merge_part(held, edges, i, edge, False, memory, state, counters)
         if i < size:
             return _Progress(i, edge)
-    i, edge = _merge_part(new, edges, i - size, edge, True, gate, memory, state, counters)
+    i, edge = _merge_part(new, edges, i - size, edge, True, memory, state, counters)
     return _Progress(size + i, edge)
 
 
@@ -571,36 +596,39 @@ _decode_into_bins = decode_into(_bin, "bins")
 
 
 @kernel
-def _merge_words(words, progress, decoder, span, edges, gate, memory, state, counters):
+def _merge_words(words, progress, decoder, span, edges, memory, state, counters):
     """Decode words into the open period and those that begin at the edges.
 
     It ends before the first event at the end of ``span`` or later, and before a trigger. Words
     and edges remain when a column or the output has no room.
     """
-    columns = memory.columns
+    columns, gate = memory.columns, memory.gate.state
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge
     state.over = 0
     while True:
-        limit_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
-        counts, numbers = columns.counts.copy(), decoder.numbers.copy()
+        end_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
+        before = columns.counts.copy(), decoder.numbers.copy()
         _forget_refused(columns.refused)
-        bins = Bins(
-            columns.packed, columns.counts, np.uint32(columns.room), columns.row_first,
-            columns.row_span, columns.refused, gate, state.edge_us,
-            max(state.edge_us, span.floor_us),
-        )  # fmt: skip
+        floor_us = max(state.edge_us, span.floor_us)
+        part = _gate_part(max(state.part_us, floor_us), state.edge_us, gate)
+        bins = _bins(columns, part, gate.keeps_late > 0, state.edge_us, floor_us)
+        limit_us = min(end_us, part.end_us)
         end, events, _ = _decode_into_bins(words, i, limit_us, False, decoder, bins)
         if _needs_room(columns):
-            columns.counts[:], decoder.numbers[:] = counts, numbers
+            columns.counts[:], decoder.numbers[:] = before
             state.full = 1
             break
         i = end
         if events > 0:
             state.status = _FILLED
             _count(np.int64(events), 0, columns.refused, state, counters)
-        late = i < np.uint64(words.size) and words[i] >> 12 != EXT_TRIGGER
-        if not late or edge == edges.t_us.size:
+        if i == np.uint64(words.size) or words[i] >> 12 == EXT_TRIGGER:
+            break
+        if limit_us < end_us:
+            state.part_us = limit_us
+            continue
+        if edge == edges.t_us.size:
             break
         if state.status == _FILLED and state.rows > rows_max:
             break

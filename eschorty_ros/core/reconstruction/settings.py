@@ -9,13 +9,14 @@ from eschorty_ros.core.base.arrays import short
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.line import (
     CENTROIDS,
+    FULL_COLUMN_METHODS,
     RETURNS,
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
     check_method,
 )
-from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US
+from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, GATE_MAX_US
 
 NOISE_FILTERS = ("none", "activity")
 SWITCH = ("off", "on")
@@ -50,9 +51,9 @@ class Settings:
     plane the median error is the same with and without), and the filter costs more than a third of
     the speed.
 
-    The phase gate is off by default, too: the delay of a real sensor's events depends on its
-    biases. 1000 us at 70 Hz and 600 us at 300 Hz keep the simulated sensor's events. Windows that
-    cover the period, above about 1 kHz, remove nothing.
+    The phase gate is off by default, too: at edges of a surface it makes large errors larger. -1
+    learns it from the stream; 1000 us at 70 Hz and 600 us at 300 Hz keep the simulated sensor's
+    events. Windows that cover the period, above about 1 kHz, remove nothing.
 
     The compensation of reflectance steps is off by default, since it needs the stage's speed and
     delays profiles by the time that a step takes to cross the line.
@@ -80,8 +81,10 @@ class Settings:
     keep: str = _choice("all", KEEP, "points to keep; good ones have no flag")
     noise_filter: str = _choice("none", NOISE_FILTERS, "filter before the events are binned")
     phase_gate_us: int = _number(
-        0, 0, GATE_MAX_US, "us", "keep only events this soon after their laser edge; 0 is off"
-    )
+        0, GATE_LEARNED, GATE_MAX_US, "us",
+        "keep only events this soon after their laser edge; 0 is off, -1 takes the time with which "
+        "rows scatter least",
+    )  # fmt: skip
     trigger_source: str = _choice(
         "laser", TRIGGER_SOURCES,
         "device wired to the camera's trigger input: the laser cuts the periods, the stage's "
@@ -175,6 +178,11 @@ class Settings:
             raise ArgumentError(
                 f"range_max is {self.range_max:g} m and range_min {self.range_min:g} m; choose a "
                 "larger range_max"
+            )
+        if self.phase_gate_us == GATE_LEARNED and self.centroid in FULL_COLUMN_METHODS:
+            raise ArgumentError(
+                f"phase_gate_us is -1, which follows the line, and centroid {self.centroid!r} uses "
+                "full columns; choose a time, or mode_mean"
             )
         if self.returns == "all" and self.organized == "on":
             raise ArgumentError(

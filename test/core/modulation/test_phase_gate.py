@@ -1,19 +1,27 @@
 """Phase gate: what it keeps of a simulated line, what it leaves of the background, its counts."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from line_events import encoded
 from reconstructing import reconstruct
 
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase_gate import GATE_MAX_US, LEAD_US, phase_gate
+from eschorty_ros.core.modulation.phase_gate import (
+    GATE_LEARNED,
+    GATE_MAX_US,
+    LEAD_US,
+    phase_gate,
+)
 from eschorty_ros.core.optics import load_calibration
-from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.core.reconstruction import Settings, reconstruct_recording
+from eschorty_ros.report.accuracy import true_range_mm
+from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane
-from eschorty_ros.simulation.world import World
+from eschorty_ros.simulation.world import World, simulate_recording
 
 SEED = 20261121
 COLUMNS = 128
@@ -98,7 +106,7 @@ def test_gate_off_or_as_long_as_the_period_removes_nothing():
 
 
 def test_a_sine_has_no_edges_to_gate_by():
-    assert phase_gate(Modulation(70.0, waveform="sine"), 1000).length_us == 0.0
+    assert phase_gate(Modulation(70.0, waveform="sine"), 1000).step == 0
 
 
 def test_several_periods_per_profile_are_gated_each():
@@ -113,7 +121,78 @@ def test_few_gross_errors_are_left_in_strong_background():
     modulation = Modulation(70.0, on_edge_us=EDGE_US)
     true_row = CALIBRATION.model().row(1320.0)
     spread = {}
-    for gate_us in (0, 1000):
+    for gate_us in (0, 1000, GATE_LEARNED):
         found, _ = run(data, modulation, gate_us)
         spread[gate_us] = float(np.quantile(np.abs(found.row - true_row), 0.95))
     assert spread[1000] < 0.6 * spread[0], f"seed {SEED}: {spread}"
+    assert spread[GATE_LEARNED] < 0.7 * spread[0], f"seed {SEED}: {spread}"
+
+
+@dataclass(frozen=True)
+class HalfDark(Plane):
+    """The second half of the travel is dark, where pixels are slow."""
+
+    def reflectance(self, stage_mm, columns, model):
+        dark = np.asarray(stage_mm) > 20.0
+        return np.where(dark[:, None], 0.05, 1.0) + np.zeros(np.size(columns))
+
+
+def recorded(folder, scene, columns=320, speed_mm_s=50.0, travel_mm=(10.0, 30.0), pixels="paper"):
+    narrow = replace(CALIBRATION, columns=columns, principal_column=(columns - 1) / 2)
+    return simulate_recording(
+        folder, scene, narrow, Modulation(70.0), *travel_mm, speed_mm_s, SEED,
+        parameters=preset(pixels),
+    )  # fmt: skip
+
+
+def both(recording) -> list:
+    """Return what comes of a recording without a gate and with one that is learned."""
+    return [
+        reconstruct_recording(recording, Settings(phase_gate_us=gate_us))
+        for gate_us in (0, GATE_LEARNED)
+    ]
+
+
+@pytest.mark.parametrize(("pixels", "share"), [("paper", 0.95), ("noisy", 0.7)])
+def test_a_learned_gate_reduces_the_error(tmp_path, pixels, share):
+    plane = Plane(1320.0, slope_column=0.2)
+    recording = recorded(tmp_path, plane, pixels=pixels)
+    error_mm = []
+    for found in both(recording):
+        stage_mm = recording.stage.position_mm(found.profiles.t_us)
+        truth_mm = true_range_mm(
+            plane, recording.calibration.model(), stage_mm, found.profiles.column
+        )
+        error_mm.append(np.quantile(np.abs(found.profiles.range_mm - truth_mm), 0.68))
+    assert error_mm[1] < share * error_mm[0], f"seed {SEED}"
+    assert found.counters["events_gated"] > 0
+
+
+def test_slow_pixels_of_a_surface_that_becomes_dark_keep_their_points(tmp_path):
+    without, learned = both(recorded(tmp_path, HalfDark(1320.0)))
+    assert learned.counters["events_gated"] > 0
+    assert len(learned.profiles) > 0.999 * len(without.profiles), f"seed {SEED}"
+
+
+def test_a_learned_gate_does_not_move_a_line_that_moves_while_it_is_lit(tmp_path):
+    plane = Plane(1100.0, slope_stage=1.2, pivot_mm=40.0)
+    recording = recorded(tmp_path, plane, speed_mm_s=300.0, travel_mm=(10.0, 70.0))
+    without, learned = both(recording)
+    moved_px = learned.profiles.row - without.profiles.row
+    print(f"rows moved by {moved_px.mean():.3f} px on average")
+    assert abs(moved_px.mean()) < 0.03, f"seed {SEED}"
+
+
+@pytest.mark.parametrize("case", ["swapped polarity", "wrong frequency"])
+def test_a_learned_gate_that_does_not_help_takes_no_points(case):
+    t, x, y, p = line(70.0)
+    data = stream([(t, x, y, 1 - p if case == "swapped polarity" else p)])
+    modulation = Modulation(83.0 if case == "wrong frequency" else 70.0, on_edge_us=EDGE_US)
+    found, _ = run(data, modulation, GATE_LEARNED)
+    assert len(found) >= 0.99 * len(run(data, modulation, 0)[0])
+
+
+@pytest.mark.parametrize("method", ["mean", "median"])
+def test_methods_of_full_columns_refuse_a_learned_gate(method):
+    with pytest.raises(ArgumentError, match=r"phase_gate_us is -1.*choose a time"):
+        Settings(centroid=method, phase_gate_us=GATE_LEARNED)

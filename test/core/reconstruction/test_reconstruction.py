@@ -78,6 +78,7 @@ def _split_cases():
         "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
         "filter": (data, known, Settings(noise_filter="activity")),
         "gate": (data, known, Settings(phase_gate_us=500)),
+        "learned gate": (data, known, Settings(phase_gate_us=-1)),
         "learned": (data, known, Settings(centroid="learned")),
         "cut": (encoded(cut), known, Settings()),
     }

@@ -1,0 +1,191 @@
+"""The phase gate with which the rows of a stream scatter least.
+
+Pixels answer an edge of the laser with a burst of events. Later ones, which they give by themselves
+or long after the edge, say less about where the line is. How long the burst is depends on the
+camera, so gates of several lengths are compared on a profile: by the scatter of the rows of near
+columns, and by whether the rows of near columns move together. They do where the line moves while
+it is lit, since what it passes on its way counts, too; then no gate is used.
+
+Events outside the gate are kept apart, and used in columns that have many of them: a surface that
+is darker or moves more than those of that profile.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.window import BLOCK, FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.modulation.phase_gate import (
+    GATE_LEARNED,
+    PhaseGate,
+    _is_late,
+    phase_gate,
+)
+
+# The longest gate is half of the period, each further one half as long.
+_LENGTHS = 5
+# Distance of the columns of a second difference, and differences without which nothing is known.
+_APART = 5
+_DIFFERENCES_MIN = 64
+# Columns that are tested for moving together, and the mean square of their sum over the sum of
+# their squares, which is 1 by chance.
+_TOGETHER = 16
+_TOGETHER_MAX = 2.0
+# Standard deviations by which a column's number of late events exceeds the usual one.
+_DEVIATIONS = 3.0
+# Events for a row, and the share of the rows that must not get less.
+_EVENTS_MIN = 4
+_FOUND_MIN = 0.995
+
+
+class LearnedGate(NamedTuple):
+    """The gate in use, and the choices for one to be learned.
+
+    Both have the fields of a `PhaseGate`. The state is ``known`` once a choice or none is in use,
+    and its ``late`` is the usual number of late events of a column.
+    """
+
+    state: Any
+    choices: NDArray[np.void]
+
+
+def make_gate(modulation: Modulation, gate_us: int) -> LearnedGate:
+    """Return a gate of fixed length, or one to be learned."""
+    if gate_us != GATE_LEARNED:
+        return _gate(phase_gate(modulation, gate_us), [])
+    lengths_us = [round(modulation.period_us / (2 << k)) for k in range(_LENGTHS)]
+    choices = [phase_gate(modulation, length_us) for length_us in lengths_us]
+    return _gate(PhaseGate(keeps_late=1), [gate for gate in choices if gate.step > 0])
+
+
+def same_gate(gate: LearnedGate) -> LearnedGate:
+    """Return a gate of its own with the same state."""
+    return gate._replace(state=gate.state.copy())
+
+
+def _gate(gate: PhaseGate, choices: list[PhaseGate]) -> LearnedGate:
+    states = [_state(one) for one in (gate, *choices)]
+    return LearnedGate(states[0], np.array([*states[1:]], states[0].dtype))
+
+
+def _state(gate: PhaseGate) -> Any:
+    state = record(*PhaseGate._fields, "known", "late")
+    for name, value in gate._asdict().items():
+        state[name] = value
+    return state
+
+
+@kernel
+def _forget_gate(gate):
+    """Begin to learn again, where the gate is to be learned."""
+    if gate.choices.size > 0:
+        gate.state.step = gate.state.known = 0
+
+
+@kernel(_nrt=False)
+def _fill_rows(columns, half, gate, row):
+    """Fill the mean row of each column's events within ``half`` of its last line and in the gate.
+
+    It is NaN where there are too few. Returns their number.
+    """
+    found = 0
+    for c in range(row.size):
+        row[c] = np.nan
+        seed = columns.seeds[c]
+        if seed < 0:
+            continue
+        begin = np.uintp(columns.starts[c])
+        events, total = np.int64(0), np.int64(0)
+        for i in range(begin, begin + np.uintp(columns.counts[c, 0])):
+            v = columns.packed[i]
+            offset = np.int64(v & ROW_MASK) * FRACTION - seed
+            if abs(offset) <= half and not _is_late(v >> TIME_SHIFT, v & POLARITY, gate):
+                events += 1
+                total += offset
+        if events >= _EVENTS_MIN:
+            row[c] = (seed + total / events) / FRACTION
+            found += 1
+    return found
+
+
+@kernel
+def _scatter(row):
+    """Return the median size of the second differences of rows, infinite where few are known."""
+    differences = np.abs(row[: -2 * _APART] - 2.0 * row[_APART:-_APART] + row[2 * _APART :])
+    known = differences[~np.isnan(differences)]
+    return np.median(known) if known.size >= _DIFFERENCES_MIN else np.inf
+
+
+@kernel
+def _move_together(row, others):
+    """Return true when the differences of rows of near columns are alike."""
+    ratios, blocks = 0.0, 0
+    for first in range(0, row.size, _TOGETHER):
+        difference = row[first : first + _TOGETHER] - others[first : first + _TOGETHER]
+        squares = np.nansum(difference * difference)
+        if squares > 0.0:
+            ratios += np.nansum(difference) ** 2 / squares
+            blocks += 1
+    return ratios > _TOGETHER_MAX * blocks
+
+
+@kernel
+def _usual_late(columns, gate):
+    """Return the median number of a column's events outside the gate."""
+    late = np.zeros(columns.seeds.size, np.int64)
+    for c in range(late.size):
+        begin = np.uintp(columns.starts[c])
+        for i in range(begin, begin + np.uintp(columns.counts[c, 0])):
+            v = columns.packed[i]
+            late[c] += _is_late(v >> TIME_SHIFT, v & POLARITY, gate)
+    return np.int64(np.median(late[columns.seeds >= 0]))
+
+
+@kernel
+def _learn_gate(columns, half, gate):
+    """Choose the gate from the events of a profile and the lines of the last one."""
+    state = gate.state
+    if state.known > 0:
+        return
+    row, gated = np.empty(columns.seeds.size), np.empty(columns.seeds.size)
+    found = _fill_rows(columns, half, state, row)
+    least = _scatter(row)
+    if least == np.inf:
+        return
+    state.known = 1
+    for k in range(gate.choices.size):
+        choice = gate.choices[k]
+        if _fill_rows(columns, half, choice, gated) < _FOUND_MIN * found:
+            continue
+        scatter = _scatter(gated)
+        if scatter < least and not _move_together(gated, row):
+            least = scatter
+            state.step, state.late = choice.step, _usual_late(columns, choice)
+            state.on_begin, state.on_span = choice.on_begin, choice.on_span
+            state.off_begin, state.off_span = choice.off_begin, choice.off_span
+
+
+@kernel
+def _use_late(columns, gate):
+    """Append late events to the others of columns with many; return the number left out."""
+    most = gate.state.late + _DEVIATIONS * np.sqrt(gate.state.late)
+    left = np.int64(0)
+    packed, counts = columns.packed, columns.counts
+    for c in range(columns.seeds.size):
+        late = np.uintp(counts[c, 1])
+        counts[c, 1] = 0
+        if late <= most:
+            left += np.int64(late)
+            continue
+        begin = np.uintp(columns.starts[c])
+        end = begin + np.uintp(counts[c, 0])
+        begin += np.uintp(columns.room + BLOCK)
+        for i in range(late):
+            packed[end + i] = packed[begin + i]
+        counts[c, 0] += np.uint32(late)
+    return left
