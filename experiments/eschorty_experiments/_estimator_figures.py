@@ -49,7 +49,7 @@ def bounds_figure(cases: list[Case]) -> Figure:
     for axes, (field, label, chosen), title in zip(
         figure.subplots(1, 3, sharey=True), panels, titles, strict=True
     ):
-        for method, marker in zip(METHODS, "os^xd", strict=True):
+        for method, marker in zip(METHODS, "os^", strict=True):
             line = [case for case in cases if case.method == method and chosen(case)]
             values = [getattr(case, field) for case in line]
             axes.plot(values, [case.over_bound for case in line], marker + "-", label=method)
@@ -70,7 +70,7 @@ def returns_figure(cases: list[Case], seconds: list[Second]) -> Figure:
     """Draw the shares of gross errors and of reported second lines."""
     figure = new_figure(11.0, 4.4)
     gross, strength, apart = figure.subplots(1, 3)
-    for method, marker in zip(METHODS, "os^xd", strict=True):
+    for method, marker in zip(METHODS, "os^", strict=True):
         kind = (method, 20.0, 0.3)
         line = [case for case in cases if (case.method, case.fwhm_px, case.background) == kind]
         shares = [100.0 * case.gross for case in line]

@@ -10,7 +10,7 @@ import numpy as np
 from eschorty_experiments._scan_errors import ScanErrors
 from eschorty_experiments._tradeoff_runs import BACKGROUND_SHARES, SMOOTHING, Variant
 from eschorty_experiments._tradeoff_tables import Summary, pareto_front
-from eschorty_ros.core.line import METHODS
+from eschorty_ros.core.line import CENTROIDS
 from eschorty_ros.report.figures import new_figure
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _mark(
     if variant.settings is None:
         axes.plot(*where, "k*", markersize=13)
         return
-    colour = f"C{METHODS.index(variant.estimator)}"
+    colour = f"C{CENTROIDS.index(variant.estimator)}"
     axes.plot(
         *where,
         _MARKERS[filters.index(variant.filters) % len(_MARKERS)],
@@ -93,7 +93,7 @@ def _legend(figure: Figure, filters: Sequence[str]) -> None:
         )  # fmt: skip
 
     handles = [handle("*", "numpy baseline", "k", 12.0), handle("o", "default", "red", 14.0)]
-    handles += [handle("o", method, f"C{k}") for k, method in enumerate(METHODS)]
+    handles += [handle("o", method, f"C{k}") for k, method in enumerate(CENTROIDS)]
     handles += [
         handle(_MARKERS[k % len(_MARKERS)], f"filter {name}") for k, name in enumerate(filters)
     ]

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from eschorty_experiments._scan_errors import ScanErrors, scan_errors
-from eschorty_ros.core.line import METHODS
+from eschorty_ros.core.line import CENTROIDS
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import NOISE_FILTERS, Profiles, Reconstructor, Settings
@@ -100,7 +100,7 @@ def variants() -> list[Variant]:
             )
         )
         for method, noise_filter, gate_us, half_width in product(
-            METHODS, NOISE_FILTERS, (0, GATE_US), SMOOTHING
+            CENTROIDS, NOISE_FILTERS, (0, GATE_US), SMOOTHING
         )
     ]
 

@@ -17,7 +17,7 @@ from eschorty_experiments._tradeoff_runs import (
 from eschorty_experiments._tradeoff_tables import pareto_front
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.line import METHODS
+from eschorty_ros.core.line import CENTROIDS
 from eschorty_ros.core.reconstruction import NOISE_FILTERS, Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,8 +26,10 @@ SEED = 3
 
 def test_every_estimator_filter_and_smoothing_is_compared_once():
     made = variants()
-    assert len(set(made)) == len(made) == 1 + len(METHODS) * len(NOISE_FILTERS) * 2 * len(SMOOTHING)
-    assert {one.estimator for one in made} == {BASELINE, *METHODS}
+    assert (
+        len(set(made)) == len(made) == 1 + len(CENTROIDS) * len(NOISE_FILTERS) * 2 * len(SMOOTHING)
+    )
+    assert {one.estimator for one in made} == {BASELINE, *CENTROIDS}
     assert sum(one.is_default for one in made) == 1
     assert {one.filters for one in made} >= {*NOISE_FILTERS, "gate"}
     assert len({one.label for one in made}) == len(made)
@@ -37,7 +39,7 @@ def test_one_change_at_a_time_starts_with_baseline_and_default():
     made = one_change()
     assert made[0] == Variant(None)
     assert made[1] == Variant(Settings())
-    assert {one.estimator for one in made[1:]} == set(METHODS)
+    assert {one.estimator for one in made[1:]} == set(CENTROIDS)
     assert {one.half_width for one in made[1:]} == set(SMOOTHING)
 
 

@@ -118,16 +118,6 @@ def test_rows_without_events_inside_a_line(method):
     assert np.abs(found.row - 300.0).max() < 8.0
 
 
-@pytest.mark.hard_case(22)
-def test_gauss_ml_without_background_is_the_mean(measured):
-    """Closed form: without noise events the likelihood of a Gaussian peaks at their mean."""
-    rng = np.random.default_rng(SEED)
-    rows = np.rint(rng.normal(350.0, 4.0, (300, 40))).astype(np.int64)
-    found = estimate(rows.ravel(), np.arange(301) * 40, "gauss_ml", line_width_px=9.4)
-    error = np.quantile(np.abs(found.row - rows.mean(axis=1)), 0.95)
-    measured("gauss_ml against the mean, no background, px (95 %)", error, 0.05)
-
-
 TIED = {
     "two equal groups": [100, 100, 100, 600, 600, 600],
     "two overlapping groups": [300, 300, 300, 309, 309, 309],

@@ -22,13 +22,9 @@ from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import (
     HALF_PER_SIGMA,
     HALF_WIDTH_PER_FWHM,
-    _edge_midpoint,
-    _fill_likelihood,
-    _gauss_ml,
     _mean,
     _median,
     _variance,
-    likelihood_size,
 )
 from eschorty_ros.core.line.learned import _bias_left, _learned_row, _sample, make_footprint
 from eschorty_ros.core.line.sigma import (
@@ -54,18 +50,17 @@ from eschorty_ros.core.line.window import (
     _full_column,
     _mean_shift,
     _padded,
-    _rows_nearer,
     _second_return,
 )
 
-METHODS = ("mode_mean", "mean", "median", "gauss_ml", "edge_mid")
+METHODS = ("mode_mean", "mean", "median")
 CENTROIDS = (*METHODS, "learned")
 """The methods, and the one that follows a stream."""
 FULL_COLUMN_METHODS = ("mean", "median")
 RETURNS = ("strongest", "first", "last", "all")
 
-# Codes are indices of the tuples above. The methods up to _MEAN are a window's mean.
-_MODE_MEAN, _MEAN, _MEDIAN, _GAUSS_ML, _EDGE_MID, _LEARNED = range(6)
+# Codes are indices of the tuples above.
+_MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = range(4)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 # Windows of a column that are tested for the laser's modulation.
 _WINDOWS_MAX = 4
@@ -160,13 +155,6 @@ class RowEstimate(NamedTuple):
     truncated: bool
 
 
-class Scratch(NamedTuple):
-    """Zeroed counts per row, and room for the table of the likelihood."""
-
-    row_counts: NDArray[np.int64]
-    likelihood: NDArray[np.float64]
-
-
 class PeriodSums(NamedTuple):
     """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns.
 
@@ -209,9 +197,9 @@ def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
     return CENTROIDS.index(method), RETURNS.index(returns)
 
 
-def make_scratch(half_max: int) -> Scratch:
-    """Return the scratch memory for windows of the half width ``half_max`` and narrower."""
-    return Scratch(np.zeros(1 << ROW_BITS, np.int64), np.empty(likelihood_size(half_max)))
+def make_row_counts() -> NDArray[np.int64]:
+    """Return zeroed counts, one per row."""
+    return np.zeros(1 << ROW_BITS, np.int64)
 
 
 def empty_rows(returns: int, columns: int) -> Rows:
@@ -245,12 +233,10 @@ def estimate(
         Rows of the events, 0 to ``height`` - 1, grouped by column in any order.
     offsets : array of int64, shape (columns + 1,)
         Column ``c`` has the events ``rows[offsets[c]:offsets[c + 1]]``.
-    method : {"mode_mean", "mean", "median", "gauss_ml", "edge_mid"}
+    method : {"mode_mean", "mean", "median"}
         ``mode_mean`` averages the densest window (half width 1.3 x ``line_width_px``, at most 5
-        mean-shift steps) and ignores background elsewhere. ``gauss_ml`` maximises from there the
-        likelihood of a Gaussian of ``line_width_px`` on uniform background; ``edge_mid`` is the
-        middle between the window's quantiles 1/8 and 7/8, the edges of the line. ``mean`` and
-        ``median`` use the full column (``mean`` is the method of the paper).
+        mean-shift steps) and ignores background elsewhere. ``mean`` and ``median`` use the full
+        column (``mean`` is the method of the paper).
     returns : {"strongest", "first", "last", "all"}
         Returns to report where a column has a second one: another window at least
         2 x ``line_width_px`` away whose inner half has at least half as many events, and more than
@@ -312,9 +298,9 @@ def estimate(
         error_model=error_model(method, sigma_factor, sigma_floor_px, sigma_common_px),
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
-    columns, scratch = grouped_columns(row_array, offset_array), make_scratch(estimator.half_max)
+    columns, row_counts = grouped_columns(row_array, offset_array), make_row_counts()
     footprint = make_footprint(estimator.half_max, columns=0)
-    _estimate_columns(columns, estimator.half_max, estimator, Blink(), footprint, found, scratch)
+    _estimate_columns(columns, estimator.half_max, estimator, Blink(), footprint, found, row_counts)
     by_column = slice(None) if returns == "all" else 0
     row, sigma, width, events, truncated = (
         np.ascontiguousarray(values.T[:, by_column])
@@ -394,7 +380,7 @@ def _find(packed, column, half, estimator, seed):
 
 
 @kernel(_nrt=False)
-def _modulated(packed, column, found, half, estimator, blink, scratch):
+def _modulated(packed, column, found, half, estimator, blink, row_counts):
     """Return the window of events that follow the laser, and the column without other windows.
 
     The last value is true when the window may be background all the same. The status is
@@ -404,9 +390,7 @@ def _modulated(packed, column, found, half, estimator, blink, scratch):
     for _ in range(_WINDOWS_MAX):
         window = found.window
         follows, sure = _follows(packed, column, window.first, window.last, blink)
-        left = _without_hot_pixels(
-            packed, column, window.first, window.last, blink, scratch.row_counts
-        )
+        left = _without_hot_pixels(packed, column, window.first, window.last, blink, row_counts)
         if left.events == column.events:
             # A second window is a second chance for background.
             if follows and (sure or column.events == events):
@@ -482,23 +466,6 @@ def _stronger(packed, column, c, half, columns, estimator, blink, found):
     return Returns(FOUND, False, a, a)
 
 
-@kernel(_nrt=False)
-def _row_in_window(packed, column, window, other, half, estimator, scratch):
-    """Return the row of the return in ``window`` by a method that reads its events again.
-
-    ``other`` is the column's second return, or ``window`` itself when there is none.
-    """
-    method = estimator.method
-    if method == _MEDIAN:
-        return _median(packed, column, scratch.row_counts)
-    if method == _EDGE_MID:
-        return _edge_midpoint(packed, column, window.first, window.last, scratch.row_counts)
-    first, last = np.int64(0), np.int64(ROW_LAST)
-    if other.centre != window.centre:
-        first, last = _rows_nearer(window.centre, other.centre)
-    return _gauss_ml(packed, column, window, first, last, half, estimator.rows, scratch.likelihood)
-
-
 @kernel
 def _row_estimate(row, variance, line_variance, events, estimator):
     """Return a row with its own variance, which covers its bias where the sensor cuts the line."""
@@ -522,7 +489,7 @@ def _reported(returns, found):
 
 
 @kernel(_nrt=False)
-def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
+def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
     """Estimate the rows of every column into ``out`` and empty the columns.
 
     Events that do not follow the laser are left out, unless ``blink`` is no test.
@@ -541,9 +508,6 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
     line_variance = (half / HALF_PER_SIGMA) ** 2
     if half <= estimator.half_max:
         line_variance = min(line_variance, estimator.line_variance)
-    if estimator.method == _GAUSS_ML:
-        size = _fill_likelihood(scratch.likelihood, half)
-        scratch = Scratch(scratch.row_counts, scratch.likelihood[:size])
     for c in range(columns.seeds.size):
         n = np.int64(columns.counts[c, 0])
         columns.counts[c, 0] = 0
@@ -566,7 +530,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             )
         ):
             found, column, doubtful = _modulated(
-                packed, column, found, half, estimator, blink, scratch
+                packed, column, found, half, estimator, blink, row_counts
             )
             events_unmodulated += n - column.events
             if found.status == UNMODULATED:
@@ -601,13 +565,13 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, scratch):
             near_edge |= cut
             best, learned = row, -1.0
             if learning:
-                _sample(packed, column, c, row, estimator.rows, footprint, scratch.row_counts)
+                _sample(packed, column, c, row, estimator.rows, footprint, row_counts)
             if cut or estimator.method == _LEARNED:
                 best, learned = _learned_row(
-                    packed, column, row, estimator.rows, footprint, scratch.row_counts
+                    packed, column, row, estimator.rows, footprint, row_counts
                 )
-            if learned < 0.0 and _MEAN < estimator.method < _LEARNED:
-                row = _row_in_window(packed, column, window, other, half, estimator, scratch)
+            if estimator.method == _MEDIAN:
+                row = _median(packed, column, row_counts)
             used = window.sums.events
             estimate = _row_estimate(row, variance, line_variance, used, estimator)
             near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance

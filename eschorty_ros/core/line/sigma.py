@@ -48,8 +48,6 @@ METHOD_ERRORS = {
     "mode_mean": ErrorModel(0.2, 0.89, 0.4),
     "mean": ErrorModel(0.4, 0.82, 1.35),
     "median": ErrorModel(0.2, 1.06, 1.6, median=True),
-    "gauss_ml": ErrorModel(0.2, 0.91, 0.4),
-    "edge_mid": ErrorModel(0.243, 0.885, 0.42),
     # Before a footprint is learned.
     "learned": ErrorModel(0.2, 0.89, 0.4),
 }

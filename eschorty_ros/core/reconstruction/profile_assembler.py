@@ -19,12 +19,11 @@ from eschorty_ros.core.line.centroid import (
     FULL_COLUMN_METHODS,
     Estimator,
     Rows,
-    Scratch,
     _estimate_columns,
     check_method,
     empty_rows,
     half_width_fixed,
-    make_scratch,
+    make_row_counts,
 )
 from eschorty_ros.core.line.columns import (
     Columns,
@@ -145,7 +144,7 @@ class _Memory(NamedTuple):
     light: Light
     delay: NDArray[np.float64]
     rows: Rows
-    scratch: Scratch
+    row_counts: NDArray[np.int64]
     output: _Output
     window_events: int
 
@@ -392,7 +391,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         gate=make_gate(Modulation(70.0), 0),
         delay=np.zeros(2),
         rows=empty_rows(*shape),
-        scratch=make_scratch(_WIDER * estimator.half_max),
+        row_counts=make_row_counts(),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
         window_events=WINDOW_EVENTS,
     )
@@ -480,13 +479,13 @@ def _write(rows, smoothing, few, delay_us, state, output):
 def _close(memory, state, counters):
     """Turn the open period into rows."""
     columns, estimator, gate, blink, footprint, scatter, smoothing = memory[:7]
-    light, rows, scratch = memory.light, memory.rows, memory.scratch
+    light, rows, row_counts = memory.light, memory.rows, memory.row_counts
     if gate.choices.size > 0:
         _learn_gate(columns, state.half, gate)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated
-    sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, scratch)
+    sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, row_counts)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > estimator.half_max
     counters.periods_closed += 1

@@ -13,7 +13,7 @@ from eschorty_ros.core.reconstruction import Settings, place_link
 
 SEED = 31
 CALIBRATION = load_calibration("config_3")
-WINDOWED = ("mode_mean", "gauss_ml", "edge_mid")
+WINDOWED = ("mode_mean", "learned")
 NEAR, FAR = 250.0, 420.0
 PERIODS, COLUMNS = 8, 200
 
