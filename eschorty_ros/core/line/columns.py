@@ -12,6 +12,9 @@ from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US, TIME_S
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 
 _ROOM = 128
+# Room for padding. With it a column is an odd number of cache lines, so that the places to which
+# events are appended are in all sets of the cache.
+PADDING = BLOCK + 8
 _ALL_ROWS = np.empty(0, np.uint32)
 
 
@@ -73,7 +76,7 @@ class Appended(NamedTuple):
 def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
     """Return ``columns`` empty columns with ``room`` for events each, and ``limit`` at most."""
     room = min(room, limit)
-    size = 2 * (room + BLOCK)
+    size = 2 * (room + PADDING)
     return Columns(
         packed=np.empty(columns * size, np.uint32),
         starts=np.arange(columns) * size,
@@ -133,7 +136,7 @@ def _bin(bins, n, t_us, column, row, polarity):
     else:
         events = bins.counts[c, late]
         if events < bins.room:
-            at = (np.uintp(2) * c + late) * np.uintp(bins.room + np.uint32(BLOCK))
+            at = (np.uintp(2) * c + late) * np.uintp(bins.room + np.uint32(PADDING))
             bins.packed[at + np.uintp(events)] = np.uint32(
                 (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
                 | (np.uint32(polarity) << np.uint32(ROW_BITS))

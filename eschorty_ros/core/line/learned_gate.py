@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.window import BLOCK, FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
+from eschorty_ros.core.line.columns import PADDING
+from eschorty_ros.core.line.window import FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import (
     GATE_LEARNED,
@@ -184,7 +185,7 @@ def _use_late(columns, gate):
             continue
         begin = np.uintp(columns.starts[c])
         end = begin + np.uintp(counts[c, 0])
-        begin += np.uintp(columns.room + BLOCK)
+        begin += np.uintp(columns.room + PADDING)
         for i in range(late):
             packed[end + i] = packed[begin + i]
         counts[c, 0] += np.uint32(late)
