@@ -40,7 +40,7 @@ TOPICS = {
     "camera/events": "raw EVT3; stamp: arrival of the first byte; `seq` without gaps",
     "camera/clock": "ROS time (`header.stamp`) of a sensor time (`time_ref`); optional",
     "camera/heartbeat": "10 Hz while events can come",
-    "laser/state": "requested and read-back output, modulation, and the reason; 2 Hz at least",
+    "laser/state": "read-back and requested output, modulation, reason; changes, 2 Hz at least",
     "laser/heartbeat": "10 Hz while the sender wants light; the reconstruction when it calibrates",
     "laser/interlock": "true: open, laser off until closed by all that publish it and reset",
     "stage/odom": "position along the stage in `pose.pose.position.y`, speed in `twist`",
