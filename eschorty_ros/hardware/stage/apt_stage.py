@@ -29,7 +29,7 @@ _CLOSE_S = 1.2
 # Two clocks are read together; a thread that is suspended between them reads again.
 _READ_NS = 100_000
 _READS_MAX = 10
-# At rest two readings are half of the least lag apart, so that a state is between two of them.
+# At rest a reading comes twice in the least lag, so that a state is between two of them.
 _REST_POLL_NS = 50_000_000
 _PROFILED, _IMMEDIATE = 2, 1
 _ON, _OFF = 1, 2
