@@ -30,9 +30,8 @@ Pulses = Callable[[int, int], list[tuple[int, bool]]]
 _PACKET_US = 4_000
 # Shorter packets leave together.
 _PACKET_MIN_US = 1_000
+# Those of a dark scene always do.
 _AT_ONCE_US = 16_000
-# So do those of a dark scene, with the time at which the first one would have come.
-_DARK_US = 32_000
 _SLEEP_MIN_S = 1e-4
 _PULSE_MAX_NS = 1_000_000_000
 _PPB = 1_000_000_000
@@ -104,8 +103,7 @@ class Physics:
 
     Public attributes:
     - ``packet_us``: Sensor time after which a packet of bytes leaves, at least a millisecond.
-    - ``late_ns``: Bench time between the time at which the first of the packets simulated last
-      would have come and their simulation.
+    - ``late_ns``: Bench time between the end of the bytes simulated last and their simulation.
     - ``late_changes``: Changes set after the world had passed their time.
     - ``edges``, ``edges_missed``: Trigger edges on the wire, and those of them that the camera
       misses.
@@ -247,7 +245,7 @@ class Physics:
 
     @property
     def _step_us(self) -> int:
-        return max(self.packet_us, _PACKET_MIN_US if self._light.on else _DARK_US)
+        return max(self.packet_us, _PACKET_MIN_US if self._light.on else _AT_ONCE_US)
 
     def _simulate(self) -> bool:
         """Advance the world by some packets at most; returns whether it advanced."""
@@ -269,9 +267,8 @@ class Physics:
         packets = (self._sensor_us(horizon_ns) - world.now_us) // step_us
         if packets < 1:
             return False
-        first_us = world.now_us + min(step_us, self.packet_us)
         data = world.advance(world.now_us + min(packets, max(_AT_ONCE_US // step_us, 1)) * step_us)
-        self.late_ns = horizon_ns - self._zero_ns - self._bench_ns(first_us)
+        self.late_ns = horizon_ns - self._zero_ns - self._bench_ns(world.now_us)
         if data:
             late_ns = round(self._usb_chance.uniform(0.0, self._imperfections.usb_jitter_ms) * 1e6)
             self._in_transit.append((horizon_ns + late_ns, data))
