@@ -17,13 +17,14 @@ from eschorty_ros.hardware.base.stalls import process_fault
 _STOPPED = "stopped"
 # Any program may publish a heartbeat; a text of another form or length is not read.
 _TEXT = re.compile(rf"(\S{{1,200}}) ([0-9]{{1,10}})( {_STOPPED})?", re.ASCII)
-CHECK_S = 0.02
+# Each check wakes the process, which costs more than what is checked.
+CHECK_S = 0.05
 PERIOD_S = 0.1
 LAST_HEARTBEATS = 3
 # Shorter than the time after which a driver reports a device without answers; a running device is
 # read again within this many checks.
 STALL_S = 0.3
-RECOVERY_CHECKS = 10
+RECOVERY_CHECKS = 4
 
 
 @cache

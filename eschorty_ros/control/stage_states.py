@@ -6,7 +6,7 @@ from eschorty_ros.hardware.base.protocols import LinearStage, StageState
 
 # A stall of up to this many periods is filled.
 FILL_MAX = 200
-REST_NS = 100_000_000
+REST_NS = 200_000_000
 """Distance of the states of a stage at rest."""
 # A newest time further back than this is that of a clock that was set back.
 _CLOCK_BACK_NS = 100_000_000

@@ -122,11 +122,11 @@ class TimedProfiles:
         t_ns, edge_ns = self.sensor.to_ns()
         return replace(self, t_ns=t_ns, edge_ns=edge_ns)
 
-    def earliest_ns(self) -> int:
-        """Return the ROS time of the first point by the clock as it is now."""
+    def latest_ns(self) -> int:
+        """Return the ROS time of the last point by the clock as it is now."""
         if self.sensor is None:
-            return int(self.t_ns.min())
-        return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.min()))
+            return int(self.t_ns.max())
+        return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.max()))
 
     def covered(self) -> NDArray[np.bool_]:
         """Return a mask of the points whose times are covered by edges, all without edges."""

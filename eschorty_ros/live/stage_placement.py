@@ -91,7 +91,8 @@ class StagePlacer:
             self._sampled = last_us, now_s
         for arrived_s, waiting in self._waiting:
             expired = now_s - arrived_s > self.timeout_s
-            if not expired and (last_us is None or waiting.earliest_ns() // NS_PER_US > last_us):
+            # All of a part together: to copy those that are known costs more than they gain.
+            if not expired and (last_us is None or waiting.latest_ns() // NS_PER_US > last_us):
                 left.append((arrived_s, waiting))
                 continue
             timed = waiting.retimed()
@@ -99,15 +100,12 @@ class StagePlacer:
             early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
             if now_s - arrived_s <= min(_EDGE_WAIT_S, self.timeout_s):
                 early |= ~timed.covered()
-            if expired:
-                self.points_without_stage += int(np.count_nonzero(early))
-            elif early.any():
-                left.append((arrived_s, timed.select(early)))
-            if early.all():
+            if early.any() and not expired:
+                left.append((arrived_s, waiting))
                 continue
             position_mm = self.track.position_mm(t_us)
             known = ~early & ~np.isnan(position_mm)
-            self.points_without_stage += int(np.count_nonzero(~early & ~known))
+            self.points_without_stage += int(np.count_nonzero(~known))
             if known.any():
                 placed.append((timed.select(known), position_mm[known]))
         self._waiting = left

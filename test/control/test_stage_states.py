@@ -33,20 +33,20 @@ def test_a_clock_set_back_does_not_end_the_odometry(back_s):
     bench.advance(0.1)
     (last_ns,) = times_since(bench, last_ns)
     assert abs(last_ns - bench.host_clock_ns()) < 200_000_000
-    bench.advance(0.1)
+    bench.advance(0.2)
     assert len(times_since(bench, last_ns)) > 5
 
 
-def test_a_stage_at_rest_has_ten_states_per_second_and_none_is_missing_when_it_moves():
+def test_a_stage_at_rest_has_five_states_per_second_and_none_is_missing_when_it_moves():
     bench = AptBench()
     bench.advance(0.5)
     (last,) = states_since(bench.stage, 0, PERIOD_NS)
     assert not last.moving
     bench.advance(0.05)
     assert states_since(bench.stage, last.t_ns, PERIOD_NS, rested=True) == []
-    bench.advance(0.1)
+    bench.advance(0.2)
     (rest,) = states_since(bench.stage, last.t_ns, PERIOD_NS, rested=True)
-    bench.advance(0.3)
+    bench.advance(0.5)
     assert len(states_since(bench.stage, rest.t_ns, PERIOD_NS, rested=True)) > 20
     bench.stage.move_to(10.0, 50.0)
     bench.advance(0.2)

@@ -106,12 +106,13 @@ def test_points_wait_for_the_stage_and_are_never_extrapolated():
     assert placer.ready(0.1) == []
     placer.add_stage(T0_NS, 10.0)
     placer.add_stage(T0_NS + 1_000_000, 11.0)
-    ((part, position_mm),) = placer.ready(0.2)
+    # Those that came together wait for the last of them.
+    assert placer.ready(0.2) == []
+    assert (placer.points_without_stage, placer.waiting) == (0, 3)
+    ((part, position_mm),) = placer.ready(1.5)
     assert part.t_ns.tolist() == [T0_NS + 500_000]
     np.testing.assert_allclose(position_mm, [10.5])
-    # The first was before the stage's first sample, the last still waits.
-    assert (placer.points_without_stage, placer.waiting) == (1, 1)
-    assert placer.ready(1.5) == []
+    # The first was before the stage's first sample, the last after its newest.
     assert (placer.points_without_stage, placer.waiting) == (2, 0)
 
 

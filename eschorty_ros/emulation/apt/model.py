@@ -94,6 +94,11 @@ class AptModel:
         self.axis.encoder_offset_mm = self.axis.position_mm(now_ns)
         self.axis.pattern = self._memory.pattern
 
+    @property
+    def resting(self) -> bool:
+        """Return whether no motion is under way, and no byte."""
+        return not (self._in or self._out or self._ending)
+
     def trigger_pulses(self, from_ns: int, until_ns: int) -> list[tuple[int, bool]]:
         """Return the trigger edges from ``from_ns`` to before ``until_ns``: time, rising."""
         return self.axis.pulses(from_ns, until_ns)

@@ -22,6 +22,9 @@ class Wire:
         self._delivered_ns = 0
         self._sent: deque[tuple[int, bytes]] = deque()
 
+    def __bool__(self) -> bool:
+        return bool(self._sent)
+
     def send(self, data: bytes, at_ns: int) -> None:
         """Begin to send ``data`` at ``at_ns`` or when the line is free."""
         self._free_ns = max(self._free_ns, at_ns) + len(data) * BYTE_NS

@@ -16,6 +16,8 @@ from typing import Protocol
 from eschorty_ros.core.base.errors import DeviceError
 
 _TICK_S = 0.002
+# A device at rest does nothing by itself.
+_REST_TICK_S = 0.05
 _READ_BYTES = 4096
 
 
@@ -23,6 +25,10 @@ class SerialModel(Protocol):
     """A device on a serial line, with a clock of its own."""
 
     gone: bool
+
+    @property
+    def resting(self) -> bool:
+        """Return whether nothing is under way, on the line or in the device."""
 
     def feed(self, data: bytes) -> None:
         """Receive bytes from the host."""
@@ -111,7 +117,9 @@ class PtyPort:
     def _exchange(self, host: int) -> None:
         """Exchange bytes for one tick; the device end stays open, which prevents a hang-up."""
         data = b""
-        if select.select([host], [], [], _TICK_S)[0]:
+        with self._lock:
+            tick_s = _REST_TICK_S if self._model.resting else _TICK_S
+        if select.select([host], [], [], tick_s)[0]:
             data = os.read(host, _READ_BYTES)
         with self._lock:
             if data:

@@ -29,6 +29,8 @@ _CLOSE_S = 1.2
 # Two clocks are read together; a thread that is suspended between them reads again.
 _READ_NS = 100_000
 _READS_MAX = 10
+# At rest a reading comes twice in the least lag, so that a state is between two of them.
+_REST_POLL_NS = 50_000_000
 _PROFILED, _IMMEDIATE = 2, 1
 _ON, _OFF = 1, 2
 
@@ -73,6 +75,7 @@ class AptStage:
         self._lock = threading.RLock()
         self._stopping: list[tuple[int, bytes]] = []
         self._closed = False
+        self._polled_ns = 0
         # Both counters show a stop and an order that cross, on either side.
         self._stops = self._orders = 0
         # Frames that come at once wait for the tracker.
@@ -102,7 +105,7 @@ class AptStage:
         self._setup.send("set_enabled", state=_ON)
         self._tracker.begin_motion(Kind.STOP, 0.0, 0.0, self.speed_max_mm_s, _ENABLE_S)
         self._link.call_every(_KEEP_ALIVE_S, self._keep_alive)
-        self._link.call_every(1.0 / self._settings.poll_hz, self.request_status)
+        self._link.call_every(1.0 / self._settings.poll_hz, self._poll)
         self._link.call_every(_HEALTH_S, self._check_health)
         if not self._link.wait_until(lambda: self._tracker.status is not None, _FIRST_STATUS_S):
             raise DeviceTimeoutError(
@@ -264,6 +267,12 @@ class AptStage:
 
     def _keep_alive(self) -> None:
         self._link.write(apt.pack("keep_alive", self._settings.address))
+
+    def _poll(self) -> None:
+        now_ns = self._link.now_ns()
+        if self._tracker.motion is not None or now_ns - self._polled_ns >= _REST_POLL_NS:
+            self._polled_ns = now_ns
+            self.request_status()
 
     def request_status(self) -> None:
         """Request a status unless one is on its way; see ``Actions``."""

@@ -52,9 +52,18 @@ class PacketPublisher:
             "erc_events_dropped": max(words.erc_events_in - words.erc_events_out, 0),
         }
 
+    @property
+    def dark(self) -> bool:
+        """Return whether packets wait longer, since the laser is known to be off."""
+        return self._packetizer.dark
+
+    @dark.setter
+    def dark(self, value: bool) -> None:
+        self._packetizer.dark = value
+
     def set_thresholds(self, age_ns: int, size_bytes: int) -> None:
         """Publish packets at this age or size."""
-        self._packetizer = Packetizer(age_ns, size_bytes)
+        self._packetizer = Packetizer(age_ns, size_bytes, self.dark)
 
     def push(self, chunk: EventChunk | None, now_ns: int) -> None:
         """Publish the packets that are due; ``None`` is a wait without data."""

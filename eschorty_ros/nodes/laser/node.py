@@ -30,7 +30,8 @@ from eschorty_ros.nodes.ros.parameters import Param, from_settings
 from eschorty_ros.nodes.ros.peers import Publishers
 from eschorty_ros.nodes.ros.spin import run
 
-STATE_RATE_HZ = 20.0
+# Every change and every read-back is published, too.
+STATE_RATE_HZ = 2.0
 THREADS = 4
 WATCHED = ("camera", "stage")
 

@@ -40,7 +40,7 @@ from eschorty_ros.nodes.reconstruction.inputs import (
     packet_from_message,
     pulse_train,
 )
-from eschorty_ros.nodes.reconstruction.outputs import Outputs
+from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
 from eschorty_ros.nodes.reconstruction.parameters import TABLE, modulation_override
 from eschorty_ros.nodes.reconstruction.reports import Reports
 from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
@@ -54,7 +54,9 @@ from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
 from eschorty_ros.nodes.ros.spin import run
 
 _STAGE_DEPTH = 2000
-_IDLE_S = 0.02
+_STATE_S = 0.2
+# The points of a stream that has ended leave with the step after it, at their own interval.
+_IDLE_S = POINTS_INTERVAL_S
 # Fewer than the packets that a stream holds.
 _JOBS_PER_STEP = 256
 # A step costs as much as the events of some packets of 1 ms; they wait for each other this long.
@@ -168,7 +170,7 @@ class ReconstructionNode(Node):
             now_ns = self.get_clock().now().nanoseconds
             self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(0.1, self._reports.publish_state, clock=steady)
+        self.create_timer(_STATE_S, self._reports.publish_state, clock=steady)
         self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
 
     def safe_state(self) -> None:

@@ -27,7 +27,7 @@ from eschorty_ros.nodes.ros.cloud_messages import (
 )
 from eschorty_ros.nodes.ros.transforms import BASE, LINK, OPTICAL
 
-_POINTS_INTERVAL_S = 0.05
+POINTS_INTERVAL_S = 0.05
 _FRAME_INTERVAL_S = 0.1
 
 
@@ -105,7 +105,7 @@ class Outputs:
             return
         self._batch.extend(placed)
         now_s = time.monotonic()
-        if not self._batch or now_s - self._points_at_s < _POINTS_INTERVAL_S:
+        if not self._batch or now_s - self._points_at_s < POINTS_INTERVAL_S:
             return
         self._points_at_s = now_s
         points = join_points([part.points for part in self._batch])

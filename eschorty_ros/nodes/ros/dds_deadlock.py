@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from eschorty_ros.core.base.errors import DeviceError
@@ -30,7 +29,8 @@ class DdsDeadlock:
 
     def __init__(self) -> None:
         self._looked_s = time.monotonic()
-        self._switches = -1
+        self._switches: dict[Path, int] = {}
+        self._ran: Path | None = None
         self._looks = 0
 
     def look(self) -> None:
@@ -43,26 +43,45 @@ class DdsDeadlock:
         if now_s - self._looked_s < _PERIOD_S:
             return
         self._looked_s = now_s
-        before, self._switches = self._switches, sum(_switches())
-        blocked = self._switches == before and self._switches > 0 and _messages_wait()
-        self._looks = self._looks + 1 if blocked else 0
+        self._looks = 0 if self._threads_run() or not _messages_wait() else self._looks + 1
         if self._looks >= _LOOKS_MAX:
             raise DdsDeadlockError(
                 "DDS takes no messages any more, its threads wait for each other (a defect of "
                 "Fast DDS 3, upstream issue 6502); start the node again"
             )
 
+    def _threads_run(self) -> bool:
+        """Return whether a thread of DDS has run since the look before, or none is known."""
+        # First the one that ran the last time: to look at all threads costs 5 ms.
+        ran = self._ran
+        if ran is not None and (switches := _switches(ran)) != self._switches[ran]:
+            self._switches[ran] = switches
+            return True
+        before = self._switches
+        self._switches = {task: _switches(task) for task in _dds_threads()}
+        changed = [task for task, count in self._switches.items() if before.get(task) != count]
+        self._ran = next(iter(changed), None)
+        return bool(changed) or not self._switches
 
-def _switches() -> Iterator[int]:
-    """Give the context switches of the threads of DDS in this process."""
+
+def _dds_threads() -> list[Path]:
+    """Return the folders of the threads of DDS in this process."""
+    tasks = []
     for task in (_SELF / "task").glob("*"):
         # A thread may end in between.
         with contextlib.suppress(OSError):
             if task.joinpath("comm").read_text().startswith("dds."):
-                for line in task.joinpath("status").read_text().splitlines():
-                    name, _, value = line.partition(":")
-                    if name.endswith("ctxt_switches"):
-                        yield int(value)
+                tasks.append(task)
+    return tasks
+
+
+def _switches(task: Path) -> int:
+    """Return the context switches of a thread, 0 after its end."""
+    try:
+        lines = task.joinpath("status").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) for line in lines if "ctxt_switches" in line)
 
 
 def _messages_wait() -> bool:

@@ -38,9 +38,11 @@ class Heartbeat:
         return self._schedule.healthy
 
     def _run(self) -> None:
-        pause = threading.Event()
         stalls = StallMeter(CHECK_S)
-        while not pause.wait(CHECK_S) and self._node.context.ok():
+        while True:
+            time.sleep(CHECK_S)
+            if not self._node.context.ok():
+                return
             healthy, now_s = self._checked_health(), time.monotonic()
             text = self._schedule.check(healthy, stalls.measure(), now_s)
             if text is not None and not self._publish(text):

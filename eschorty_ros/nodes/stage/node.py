@@ -36,7 +36,7 @@ _ODOM_DEPTH = 2000
 TABLE = (
     *drivers.DRIVER,
     *DRIVER_TABLE,
-    Param("odom_rate", 100.0, "rate of stage/odom in motion; 10 Hz at rest", "Hz", 1.0, 500.0),
+    Param("odom_rate", 100.0, "rate of stage/odom in motion; 5 Hz at rest", "Hz", 1.0, 500.0),
     Param("position_sigma", 1e-6, "standard deviation of the position", "m", 0.0, 1.0),
     Param("velocity_sigma", 1e-3, "standard deviation of the velocity", "m/s", 0.0, 10.0),
     Param("home_timeout", 60.0, "longest time for homing", "s", 1.0, 600.0),

@@ -205,7 +205,8 @@ def test_bytes_that_come_late_know_by_how_much() -> None:
         late_ns.append(physics.late_ns)
     assert late_ns == sorted(late_ns, reverse=True)
     assert late_ns[0] > 400 * MS
-    assert 0 <= late_ns[-1] < 2 * MS
+    # The packets of a dark scene come together.
+    assert 0 <= late_ns[-1] < 16 * MS
 
 
 def test_late_changes_are_counted() -> None:

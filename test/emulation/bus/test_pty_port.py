@@ -17,6 +17,7 @@ class Echo:
 
     def __init__(self) -> None:
         self.gone = False
+        self.resting = False
         self.received = b""
         self._answer = b""
 

@@ -148,9 +148,9 @@ def test_a_controller_that_sends_nothing_fails(bench: AptBench) -> None:
     assert bench.stage.healthy
     bench.advance(0.1)
     bench.model.mute = True
-    bench.advance(0.48)
+    bench.advance(0.44)
     assert bench.stage.healthy
-    bench.advance(0.12)
+    bench.advance(0.16)
     assert "status_late" in bench.stage.state().flags
     assert not bench.stage.healthy
     assert "sent no status for 1.5 s" in bench.failure()

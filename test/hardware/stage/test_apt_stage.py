@@ -277,3 +277,18 @@ def test_the_odometry_continues_after_the_host_clock_is_set(
     bench.move(40.0)
     assert bench.stage.state().position_mm == pytest.approx(40.0, abs=5e-5)
     assert bench.stage.healthy
+
+
+def test_a_stage_at_rest_is_polled_less_and_its_states_are_no_older():
+    bench = AptBench()
+    bench.advance(0.5)
+
+    def readings_in(seconds: float) -> float:
+        before = bench.stage.statistics()["frames"]
+        bench.advance(seconds)
+        return bench.stage.statistics()["frames"] - before
+
+    assert 15 <= readings_in(1.0) <= 20
+    assert bench.host_clock_ns() - bench.stage.state().t_ns <= bench.stage.lag_s * 1e9
+    bench.stage.move_to(100.0, 50.0)
+    assert readings_in(1.0) >= 45

@@ -98,6 +98,22 @@ def test_events_stream_with_arrival_stamps(start: Start) -> None:
     wait_until(lambda: run.beats, "a beat")
 
 
+def test_packets_collect_events_for_longer_while_the_laser_is_off_and_not_armed(
+    start: Start,
+) -> None:
+    run = start().active()
+    publisher = run.observer.node.create_publisher(LaserState, "laser/state", qos.latched())
+
+    def last_gap_ns() -> int:
+        before, last = run.packets_from(2)[-2:]
+        return ns_from_stamp(last.header.stamp) - ns_from_stamp(before.header.stamp)
+
+    publisher.publish(LaserState(frequency=70.0))
+    wait_until(lambda: last_gap_ns() >= 100_000_000, "packets of 0.1 s")
+    publisher.publish(LaserState(frequency=70.0, armed=True))
+    wait_until(lambda: last_gap_ns() < 100_000_000, "shorter packets")
+
+
 def test_an_unplugged_camera_is_reported_at_once_and_the_stream_restarts_at_zero(
     start: Start,
 ) -> None:

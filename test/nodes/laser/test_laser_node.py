@@ -97,6 +97,12 @@ def test_laser_is_off_at_start(bench: Bench) -> None:
     assert bench.states[-1].output == LaserState.OUTPUT_OFF
 
 
+def test_state_of_a_laser_that_is_seldom_read_back_still_comes(tmp_path: Path) -> None:
+    with running(tmp_path, readback_rate=0.1) as bench:
+        before = len(bench.states)
+        wait_until(lambda: len(bench.states) >= before + 3, "states without a change")
+
+
 def test_enable_is_refused_with_the_reason(bench: Bench) -> None:
     assert "not armed" in bench.enable().message
     bench.arm()
