@@ -357,6 +357,13 @@ class Reconstructor:
                 f"{self.modulation.frequency_hz:g} Hz and gave no points; check the frequency and "
                 "that the laser is on"
             )
+        if counts["sensor_drop_words"]:
+            found.append(
+                f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
+                "events, which moves rows where one side of the line is lost; limit the camera's "
+                "region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
+                "bias_diff_off)"
+            )
         if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
             found.append(
                 f"the line is wider than line_width_px = {self.settings.line_width_px:g} in "

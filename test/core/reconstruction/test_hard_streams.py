@@ -246,6 +246,15 @@ def test_a_stream_without_points_has_a_reason(case):
     assert len(warning) < 300
 
 
+def test_a_readout_that_reports_lost_events_has_a_warning():
+    camera = Camera(periods=4)
+    data = stream(camera.line(wavy)) + np.array([0xEEDA], "<u2").tobytes()
+    _, reconstructor = reconstruct(data, Modulation(70.0, on_edge_us=FIRST_EDGE_US))
+    (warning,) = reconstructor.warnings
+    assert "reports 1 times that its readout lost events" in warning
+    assert len(warning) < 300
+
+
 def _sloping(towards: float):
     return lambda k, c: np.abs(towards - 3.0 - 0.06 * c) + 0.0 * k
 
