@@ -26,7 +26,7 @@ DRIVER_TABLE = (
     Param("travel_low", 0.0, "lower end of the travel to use", "m", -1.0, 1.0),
     Param("travel_high", 0.22, "upper end of the travel to use", "m", -1.0, 1.0),
     Param("homing_speed", 0.025, "speed of homing", "m/s", 0.001, 0.1),
-    Param("poll_rate", 50.0, "rate of status requests", "Hz", 5.0, 200.0),
+    Param("poll_rate", 50.0, "rate of status requests; 20 Hz at most at rest", "Hz", 5.0, 200.0),
     Param("trigger_interval", 0.002, "distance of pulses for the camera; 0 = none", "m", 0.0, 0.1),
     Param("trigger_port", 1, "output of the controller for the pulses", "", 1, 3),
 )
