@@ -94,16 +94,16 @@ def _file_digest(path: str) -> str:
 
 
 def record(*names: str, value: int = 0, numbers: NDArray[np.int64] | None = None) -> Any:
-    """Return a record of int64 fields, all ``value``, that Python and kernels change by name.
+    """Return a record of int64 fields, all ``value``, that kernels change as attributes.
 
     It is a view of ``numbers`` where they are given.
 
     >>> state = record("row", "column")
-    >>> state.row += 3
+    >>> state["row"] += 3
     >>> print(state)
     (3, 0)
     """
     dtype = np.dtype([(name, np.int64) for name in names])
     if numbers is None:
         numbers = np.full(len(names), value, np.int64)
-    return numbers.view(dtype).view(np.recarray)[0]
+    return numbers.view(dtype)[0]

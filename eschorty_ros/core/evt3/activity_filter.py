@@ -72,8 +72,8 @@ class ActivityFilter:
         self._cells = np.full(self._size, _NEVER, dtype=np.int32)
         self._state = record(*_STATE)
         state = self._state
-        state.window_us, state.pitch = self.window_us, self._pitch
-        state.width, state.height = self.width, self.height
+        state["window_us"], state["pitch"] = self.window_us, self._pitch
+        state["width"], state["height"] = self.width, self.height
         self._counts = [0, 0, 0]
         self._newest_us = -TIME_LIMIT
 
@@ -97,8 +97,8 @@ class ActivityFilter:
             raise ArgumentError(f"t[{fall}] is {t_us[fall]} us; sort the events by time")
         if len(self._buffers[0]) < size + 1:
             self._buffers = event_arrays(size + 1)
-        if size and not self._state.started:
-            self._state.origin_us, self._state.started = t_us[0], 1
+        if size and not self._state["started"]:
+            self._state["origin_us"], self._state["started"] = t_us[0], 1
         if size:
             self._newest_us = int(t_us[-1])
         kept, outside = _filter(

@@ -196,20 +196,20 @@ class Decoder:
 
         The first TIME_HIGH that follows is accepted at once; what comes before it is dropped.
         """
-        if self._state.run == _RUNNING:
-            self._state.run = _AFTER_GAP
+        if self._state["run"] == _RUNNING:
+            self._state["run"] = _AFTER_GAP
         self._drop_context()
         self._odd = b""
-        self._counts.gaps += 1
+        self._counts["gaps"] += 1
 
     def _drop_context(self) -> None:
         state = self._state
-        state.held_high = -1
-        state.row = _NO_ROW
-        state.limit = 0
-        state.base = _NO_BASE
-        state.triple = 0
-        state.others_parts = 0
+        state["held_high"] = -1
+        state["row"] = _NO_ROW
+        state["limit"] = 0
+        state["base"] = _NO_BASE
+        state["triple"] = 0
+        state["others_parts"] = 0
 
     @property
     def counters(self) -> Counters:
@@ -221,14 +221,14 @@ class Decoder:
     @property
     def time_us(self) -> int | None:
         """Newest sensor time, also without events; ``None`` before the first TIME_HIGH."""
-        if self._state.run == _NO_TIME:
+        if self._state["run"] == _NO_TIME:
             return None
-        return int(self._state.t_us)
+        return int(self._state["t_us"])
 
     @property
     def newest_us(self) -> int:
         """Time of the newest event or trigger."""
-        return int(self._state.floor_us)
+        return int(self._state["floor_us"])
 
     @property
     def settled_us(self) -> int | None:
@@ -236,9 +236,9 @@ class Decoder:
 
         Earlier than ``time_us`` as long as the sensor may still take a TIME_LOW back.
         """
-        if self._state.run == _NO_TIME:
+        if self._state["run"] == _NO_TIME:
             return None
-        return int(max(self._state.floor_us, self._state.epoch_us))
+        return int(max(self._state["floor_us"], self._state["epoch_us"]))
 
     def decode(self, data: Bytes) -> Events:
         """Return events and triggers of the next bytes of the stream.
@@ -281,7 +281,7 @@ class Decoder:
 
     def is_at(self, other: Decoder) -> bool:
         """Return whether the state is that of ``other``, as far as it matters for what follows."""
-        size = len(_STATE) if self._state.others_parts else _STATE.index("others_type")
+        size = len(_STATE) if self._state["others_parts"] else _STATE.index("others_type")
         return bool(np.array_equal(self._numbers[:size], other._numbers[:size]))
 
     @property

@@ -47,13 +47,13 @@ class Encoder:
         self.width = int(width)
         self.height = int(height)
         self._state = record(*_STATE, value=_NONE)
-        self._state.width = self.width
+        self._state["width"] = self.width
         self._words = np.empty(0, dtype="<u2")
 
     @property
     def time_us(self) -> int | None:
         """Time the stream has reached (us); ``None`` before the first word."""
-        return None if self._state.t_us == _NONE else int(self._state.t_us)
+        return None if self._state["t_us"] == _NONE else int(self._state["t_us"])
 
     def encode(
         self,
@@ -139,16 +139,16 @@ class Encoder:
         return words[:n].tobytes()
 
     def _refuse_fall(self, name: str, times: NDArray[np.int64]) -> None:
-        fall = _first_fall(times, self._state.t_us)
+        fall = _first_fall(times, self._state["t_us"])
         if fall >= 0:
-            before = times[fall - 1] if fall else self._state.t_us
+            before = times[fall - 1] if fall else self._state["t_us"]
             raise ArgumentError(
                 f"{name}[{fall}] is {times[fall]} us, after {before} us; sort the events by time"
             )
 
     def _high_words(self, start_us: int, end_us: int) -> int:
         """Return number of TIME_HIGH words up to ``end_us``."""
-        begun_us = start_us if self._state.t_us == _NONE else int(self._state.t_us)
+        begun_us = start_us if self._state["t_us"] == _NONE else int(self._state["t_us"])
         if end_us - begun_us > _IDLE_MAX_US:
             raise ArgumentError(
                 f"time runs from {begun_us} to {end_us} us in one call; "

@@ -40,12 +40,12 @@ class WordCounter:
     def __init__(self) -> None:
         self._counts = record(*_COUNTS)
 
-    off = property(lambda self: int(self._counts.off))
-    on = property(lambda self: int(self._counts.on))
-    triggers = property(lambda self: int(self._counts.triggers))
-    drop_words = property(lambda self: int(self._counts.drop_words))
-    erc_events_in = property(lambda self: int(self._counts.erc_events_in))
-    erc_events_out = property(lambda self: int(self._counts.erc_events_out))
+    off = property(lambda self: int(self._counts["off"]))
+    on = property(lambda self: int(self._counts["on"]))
+    triggers = property(lambda self: int(self._counts["triggers"]))
+    drop_words = property(lambda self: int(self._counts["drop_words"]))
+    erc_events_in = property(lambda self: int(self._counts["erc_events_in"]))
+    erc_events_out = property(lambda self: int(self._counts["erc_events_out"]))
 
     def add(self, data: bytes | bytearray | memoryview) -> None:
         """Count complete 16-bit words; a single last byte is left out.

@@ -184,9 +184,9 @@ class Reconstructor:
     def _add_words(self, words: NDArray[np.uint16]) -> int:
         """Decode words into periods without storing the events; return the number read."""
         counts = self._decoder.memory.counts
-        before = int(counts.events)
+        before = int(counts["events"])
         read = self._periods.add_words(words, self._decoder, self._watermark_us)
-        events = int(counts.events) - before
+        events = int(counts["events"]) - before
         if events:
             self.newest_t_us = max(self._decoder.newest_us, self._watermark_us)
             self._counts["events"] += events

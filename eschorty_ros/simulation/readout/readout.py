@@ -144,8 +144,8 @@ class Readout:
         self.merged = 0
         self._cut_short = np.empty((0, 3), dtype=np.int64)
         self._state = record(*_STATE)
-        self._state.row_ns = round(p.row_time_us * 1000)
-        self._state.noted = self._state.period = -1
+        self._state["row_ns"] = round(p.row_time_us * 1000)
+        self._state["noted"] = self._state["period"] = -1
         self._queue = _Queue(
             rows=np.empty((rows, 2), dtype=np.int64),
             heads=np.append(np.full(rows, -1), 0),
@@ -156,12 +156,12 @@ class Readout:
     @property
     def dropped(self) -> int:
         """Events lost so far because too many waited."""
-        return int(self._state.dropped)
+        return int(self._state["dropped"])
 
     @property
     def rate_dropped(self) -> int:
         """Events the rate control has dropped so far."""
-        return int(self._state.cut)
+        return int(self._state["cut"])
 
     def limit(self, t_us: int, rate: EventRate | None) -> None:
         """Limit the rate from ``t_us`` on, up to which everything has been read out.
@@ -169,13 +169,12 @@ class Readout:
         ``None`` lets everything through. The period under way ends.
         """
         state = self._state
-        if state.limit_period_us and state.came:
-            ended = np.array([[t_us, state.came, state.passed]])
+        if state["limit_period_us"] and state["came"]:
+            ended = np.array([[t_us, state["came"], state["passed"]]])
             self._cut_short = np.concatenate((self._cut_short, ended))
-        state.came, state.passed, state.period = 0, 0, -1
-        state.limit_period_us, state.limit_events = (
-            (rate.period_us, rate.events) if rate else (0, 0)
-        )
+        state["came"], state["passed"], state["period"] = 0, 0, -1
+        state["limit_period_us"] = rate.period_us if rate else 0
+        state["limit_events"] = rate.events if rate else 0
 
     def read_out(self, requests: NDArray[np.int64], until_us: int) -> ReadOut:
         """Pass on events as they are read out before ``until_us``.
@@ -186,15 +185,16 @@ class Readout:
             All event keys of :meth:`PixelArray.take` up to ``until_us`` not given before, sorted.
         until_us : int
         """
-        events_max = requests.size + int(self._state.waiting)
+        events_max = requests.size + int(self._state["waiting"])
+        periods_max = events_max + 1 if self._state["limit_period_us"] else 0
         out = _Out(
             keys=np.empty(events_max, dtype=np.int64),
             drops_us=np.empty(requests.size, dtype=np.int64),
-            periods=np.empty((events_max + 1 if self._state.limit_period_us else 0, 3), np.int64),
+            periods=np.empty((periods_max, 3), np.int64),
             counts=record("keys", "drops", "periods"),
         )
         _read_out(requests, until_us, self._state, self._queue, out)
-        n = int(out.counts.keys)
+        n = int(out.counts["keys"])
         keys = out.keys[:n]
         keys.sort()
         # np.unique hashes and is ten times slower here.
@@ -202,11 +202,11 @@ class Readout:
         if not fresh.all():
             keys = keys[fresh]
             self.merged += n - keys.size
-        periods = out.periods[: out.counts.periods]
+        periods = out.periods[: out.counts["periods"]]
         if self._cut_short.size:
             periods = np.concatenate((self._cut_short, periods))
             self._cut_short = self._cut_short[:0]
-        return ReadOut(keys, out.drops_us[: out.counts.drops], periods)
+        return ReadOut(keys, out.drops_us[: out.counts["drops"]], periods)
 
 
 @kernel
