@@ -50,11 +50,14 @@ def _delay_us(rows, sums, light):
     ``sums`` are the points' mean times since their edge, us, and their number.
     """
     returns, columns = rows.row.shape
+    total_us, points = np.int64(0), np.int64(0)
     for k in range(returns):
-        for c in range(columns):
-            if not np.isnan(rows.row[k, c]):
-                sums[0] += rows.mean_dt_us[k, c]
-                sums[1] += 1.0
+        for c in range(np.uintp(columns)):
+            found = not np.isnan(rows.row[k, c])
+            total_us += rows.mean_dt_us[k, c] if found else np.int64(0)
+            points += np.int64(found)
+    sums[0] += total_us
+    sums[1] += points
     late_us = sums[0] / max(sums[1], 1.0) - light.middle_us
     known = sums[1] >= _POINTS_MIN and abs(late_us) <= light.delay_max_us
     return np.int64(np.rint(late_us)) if known else np.int64(0)

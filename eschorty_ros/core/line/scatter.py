@@ -59,11 +59,11 @@ def _add_differences(rows, scatter):
         first = max((block - 1) * _BLOCK, _APART)
         last = min(block * _BLOCK, columns - _APART)
         squares, expected, number = 0.0, 0.0, 0.0
-        for c in range(first, last):
-            before, after = c - _APART, c + _APART
+        for c in range(np.uintp(first), np.uintp(max(first, last))):
+            before, after = c - np.uintp(_APART), c + np.uintp(_APART)
             difference = row[before] - 2.0 * row[c] + row[after]
-            whole = not (cut[before] or cut[c] or cut[after])
-            if whole and abs(difference) <= largest:
+            whole = not (cut[before] | cut[c] | cut[after])
+            if whole & (abs(difference) <= largest):
                 squares += difference * difference
                 expected += sigma2[before] + 4.0 * sigma2[c] + sigma2[after]
                 number += 1.0
@@ -85,16 +85,13 @@ def _scale(rows, scatter, smoothing):
         measured = scatter.number[near].sum() >= _DIFFERENCES_MIN and scatter.factor_max > 0.0
         ratio = scatter.squares[near].sum() / scatter.expected[near].sum() if measured else 1.0
         ratio = min(ratio, FACTOR_MAX)
-        factor = min(ratio, scatter.factor_max)
+        factor = min(ratio, scatter.factor_max) if measured else 1.0
         for k in range(returns):
-            for c in range((block - 1) * _BLOCK, min(block * _BLOCK, columns)):
-                smoothing.gates_px[k, c] = smoothing.gate_px
-                if rows.truncated[k, c]:
-                    continue
-                scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * rows.sigma2[k, c])
-                smoothing.gates_px[k, c] = max(smoothing.gate_px, scattered)
-                if measured:
-                    own2 = factor * rows.sigma2[k, c]
-                    rows.sigma2[k, c] = own2
-                    if own2 < _LOCKING:
-                        rows.common2[k, c] += _LOCKING - own2
+            for c in range(np.uintp((block - 1) * _BLOCK), np.uintp(min(block * _BLOCK, columns))):
+                sigma2, cut = rows.sigma2[k, c], rows.truncated[k, c]
+                scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
+                gate_px = max(smoothing.gate_px, scattered)
+                smoothing.gates_px[k, c] = smoothing.gate_px if cut else gate_px
+                own2 = sigma2 if cut else factor * sigma2
+                rows.sigma2[k, c] = own2
+                rows.common2[k, c] += max(_LOCKING - own2, 0.0) if measured and not cut else 0.0

@@ -136,7 +136,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     returns, columns = row.shape
     smoothed, before, state = widths.smoothed, widths.before, widths.state
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual, sigma = state[0], _SIGMA_PER_MEDIAN * state[1]
+    usual, median, sigma = state[0], state[1], _SIGMA_PER_MEDIAN * state[1]
     pairs = widths.below[_BINS] + 1.0
     for k in range(returns):
         for c in range(columns):
@@ -161,9 +161,10 @@ def _mark_unusual(rows, smoothing, lit_share):
                 widths.number[_bin(width)] += weight
             if c >= _APART and not np.isnan(smoothed[k, c - _APART]):
                 difference = abs(smoothed[k, c] - smoothed[k, c - _APART])
-                if state[1] == 0.0:
-                    state[1] = difference
+                if median == 0.0:
+                    median = difference
                 pairs += 1.0
                 step = max(1.0 / pairs, _STEP)
-                state[1] *= 1.0 + (step if difference > state[1] else -step)
+                median *= 1.0 + (step if difference > median else -step)
+    state[1] = median
     _update(widths, columns)
