@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_CAPACITY = 4096
+_CAPACITY = 1 << 19
 _DTYPES = (np.int64, np.uint16, np.uint16, np.uint8)
 
 EventArrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]

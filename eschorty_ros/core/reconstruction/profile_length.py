@@ -11,11 +11,12 @@ from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HeldEvents
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
-from eschorty_ros.core.modulation.phase_lock import BLOCK_PERIODS, BLOCK_US
+from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
 PERIODS_MAX = 1000
 EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
+_BLOCK_PERIODS = 2
 _HELD_EVENTS_MAX = 1 << 22
 # Events of a window that are looked at, evenly spread.
 _SAMPLE = 4096
@@ -32,7 +33,7 @@ def periods_max(modulation: Modulation) -> int:
 class ProfileLength:
     """Chooses the periods of a profile from the first events that follow the laser.
 
-    They are those of `BLOCK_US`, or of `BLOCK_PERIODS`, behind the first estimation window that is
+    They are those of `BLOCK_US`, or of two periods, behind the first estimation window that is
     modulated, or has a line where pixels are too slow to follow: the choice does not depend on how
     the stream is split, nor on the background before the laser is on. Of their columns, weighted
     by events, one has ``sum n^2 / sum n - 1`` events, with ``n`` the events of each column. One
@@ -48,7 +49,7 @@ class ProfileLength:
 
     def __init__(self, modulation: Modulation) -> None:
         self._modulation = modulation
-        self._span_us = max(BLOCK_US, round(BLOCK_PERIODS * modulation.period_us))
+        self._span_us = max(BLOCK_US, round(_BLOCK_PERIODS * modulation.period_us))
         self._seen = 0
         self._window: tuple[int, int] | None = None
 
