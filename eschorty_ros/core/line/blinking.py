@@ -17,11 +17,11 @@ from eschorty_ros.core.line.window import (
     BLOCK,
     CHUNK,
     POLARITY,
-    POLARITY_SHIFT,
     ROW_BITS,
     ROW_MASK,
     TIME_SHIFT,
-    _padded,
+    _column,
+    _pad,
 )
 from eschorty_ros.core.modulation import Modulation
 
@@ -44,13 +44,13 @@ _UNIT = 4096.0
 class Blink(NamedTuple):
     """Turns per microsecond and the turn from rising to falling edge, both of 2**32 per turn.
 
-    A ``step`` of 0 is no test. ``low_us`` is the time from rising to falling edge, 0 where a
+    A ``step`` of 0 is no test. ``lit_us`` is the time from rising to falling edge, 0 where a
     profile has more periods than one.
     """
 
     step: np.uint32 = np.uint32(0)
     duty: np.uint32 = np.uint32(0)
-    low_us: np.uint32 = np.uint32(0)
+    lit_us: np.uint32 = np.uint32(0)
 
 
 class Vector(NamedTuple):
@@ -114,28 +114,13 @@ def _vector(packed, column, first, last, blink):
     return Vector(events, x, y)
 
 
-@kernel(_nrt=False)
-def _is_concentrated(packed, column, first, last, blink):
-    """Return true when 9 of 10 events of rows first..last are between their edge and the other one.
+@kernel
+def _is_in_phase(sums):
+    """Return true when 9 of 10 events of a window are between their edge and the other one.
 
     Only from 16 events on, which background reaches less often than a vector strength of a half.
-    The numbers of all events and of the others share one register lane.
     """
-    base = np.uint32(first)
-    span = np.uint32(last - first)
-    low_us = blink.low_us
-    none, one, high = np.uint32(0), np.uint32(1), np.uint32(1 << 16)
-    begin = np.uintp(column.start)
-    sums = none
-    for i in range(begin, begin + np.uintp(column.blocks) * np.uintp(BLOCK)):
-        v = packed[i]
-        inside = np.uint32((v & ROW_MASK) - base) <= span
-        on = np.uint32((v >> POLARITY_SHIFT) & one)
-        bright = one if np.uint32(v >> TIME_SHIFT) < low_us else none
-        both = np.uint32(np.uint32(np.uint32(on ^ bright) * high) + one)
-        sums = np.uint32(sums + (both if inside else none))
-    events = np.int64(sums & np.uint32(0xFFFF))
-    return events >= 16 and 10 * np.int64(sums >> np.uint32(16)) <= events
+    return sums.events >= 16 and 10 * sums.out_of_phase <= sums.events
 
 
 @kernel(_nrt=False)
@@ -185,7 +170,8 @@ def _without(packed, column, first, last):
         if not first <= row <= last:
             packed[column.start + n] = packed[i]
             n += 1
-    return _padded(packed, column.start, n)
+    _pad(packed, column.start + n)
+    return _column(column.start, n, column.lit_us)
 
 
 @kernel(_nrt=True)

@@ -14,7 +14,7 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blinking import (
     Blink,
     _follows,
-    _is_concentrated,
+    _is_in_phase,
     _without,
     _without_hot_pixels,
 )
@@ -45,11 +45,14 @@ from eschorty_ros.core.line.window import (
     TOO_FEW,
     UNMODULATED,
     Returns,
+    Sums,
+    Window,
+    _column,
     _densest_window,
     _exceeds_background,
     _full_column,
     _mean_shift,
-    _padded,
+    _pad,
     _second_return,
 )
 
@@ -74,6 +77,8 @@ _HALF_SPAN = 2.5
 # Standard errors of a window's mean. A learned row further from it belongs to a line that has moved
 # while it was lit, or that a rim cuts: the footprint does not describe it.
 _LEARNED_OFF = 2.0
+_NONE = np.int64(0)
+_NO_WINDOW = Window(_NONE, _NONE, Sums(_NONE, _NONE, _NONE, _NONE, _NONE), np.int64(-1))
 # Bias of the mean of half a Gaussian, squared, over the variance of that half.
 _HALF_BIAS2 = 1.7519
 
@@ -153,6 +158,14 @@ class RowEstimate(NamedTuple):
     row: float
     sigma2: float
     truncated: bool
+
+
+class _Seen(NamedTuple):
+    """Returns of a column and its events that follow the laser; ``doubtful`` ones may not."""
+
+    found: Returns
+    events: np.int64
+    doubtful: bool
 
 
 class PeriodSums(NamedTuple):
@@ -367,18 +380,6 @@ def _search(packed, column, half, estimator):
     return found
 
 
-@kernel(_nrt=False, forceinline=True)
-def _find(packed, column, half, estimator, seed):
-    """Find the window of a column's line, from the row ``seed`` on if it is 0 or more."""
-    if seed >= 0:
-        window = _mean_shift(packed, column, seed, half, 0, ROW_LAST)
-        events = window.sums.events
-        # Otherwise a window elsewhere may have more.
-        if events >= estimator.events_min and 2 * events > column.events:
-            return Returns(FOUND, False, window, window)
-    return _search(packed, column, half, estimator)
-
-
 @kernel(_nrt=False)
 def _modulated(packed, column, found, half, estimator, blink, row_counts):
     """Return the window of events that follow the laser, and the column without other windows.
@@ -488,6 +489,96 @@ def _reported(returns, found):
     return (far, near) if returns == _LAST else (near, far)
 
 
+@kernel
+def _is_cut(window, rows):
+    """Return true when a window reaches the first or last row of the sensor."""
+    return window.first == 0 or window.last >= rows - 1.0
+
+
+@kernel
+def _is_clear(window, column, estimator, blink):
+    """Return true when a window needs no search for others and no further test of its events."""
+    events = window.sums.events
+    return (
+        events >= estimator.events_min
+        and 3 * events > 2 * column.events
+        and not _is_cut(window, estimator.rows)
+        and estimator.returns == _STRONGEST
+        and (blink.step == 0 or _is_in_phase(window.sums))
+    )
+
+
+@kernel(_nrt=False)
+def _seen(packed, column, c, half, columns, estimator, blink, window, row_counts):
+    """Search a column for its returns; ``window`` is that around its last row, if it has one."""
+    testing = _is_windowed(estimator.method) and blink.step > 0
+    doubtful = False
+    found = Returns(FOUND, False, window, window)
+    if window.sums.events < estimator.events_min or 2 * window.sums.events <= column.events:
+        found = _search(packed, column, half, estimator)
+    if testing and not (
+        found.status == TOO_FEW or (found.status == FOUND and _is_in_phase(found.window.sums))
+    ):
+        found, column, doubtful = _modulated(
+            packed, column, found, half, estimator, blink, row_counts
+        )
+        if found.status == UNMODULATED:
+            return _Seen(found, column.events, True)
+    if estimator.returns != _STRONGEST:
+        found = _all_returns(packed, column, half, estimator, found)
+        if testing and found.second:
+            other = found.other
+            if not _follows(packed, column, other.first, other.last, blink)[0]:
+                found = Returns(FOUND, False, found.window, found.window)
+    elif _is_windowed(estimator.method):
+        used = found.window.sums.events
+        if found.status == AMBIGUOUS or (
+            found.status == FOUND and 2 * (column.events - used) >= used
+        ):
+            found = _stronger(packed, column, c, half, columns, estimator, blink, found)
+        else:
+            columns.rivals[c] = -1
+    return _Seen(found, column.events, doubtful)
+
+
+@kernel(_nrt=False)
+def _refined(packed, column, c, window, line_variance, estimator, footprint, row_counts):
+    """Return the row of a window's line that a learned footprint or the median gives."""
+    rows, method = estimator.rows, estimator.method
+    row, variance = _mean(window), _variance(window.sums)
+    cut = _is_windowed(method) and _is_cut(window, rows)
+    best, learned = row, -1.0
+    if method == _LEARNED or footprint.state[3] > 0:
+        _sample(packed, column, c, row, rows, footprint, row_counts)
+    if cut or method == _LEARNED:
+        best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
+    if method == _MEDIAN:
+        row = _median(packed, column, row_counts)
+    used = window.sums.events
+    estimate = _row_estimate(row, variance, line_variance, used, estimator)
+    near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
+    if learned >= 0.0 and (cut or near):
+        best = min(max(best, -0.5), rows - 0.5)
+        bias2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
+        estimate = RowEstimate(best, learned + bias2, estimate.truncated)
+    return estimate
+
+
+@kernel(_nrt=False, forceinline=True)
+def _put(k, c, window, estimate, variance, doubtful, estimator, out):
+    """Write a return of a column; return whether its width is that of a line."""
+    out.row[k, c] = estimate.row
+    out.sigma2[k, c] = estimate.sigma2
+    out.common2[k, c] = estimator.error_model.common**2
+    out.variance[k, c] = variance
+    out.events[k, c] = window.sums.events
+    out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / window.sums.events))
+    out.doubtful[k, c] = doubtful
+    out.truncated[k, c] = estimate.truncated
+    narrow = variance <= _BACKGROUND_FREE * estimator.line_variance
+    return not estimate.truncated and (_is_windowed(estimator.method) or narrow)
+
+
 @kernel(_nrt=False)
 def _estimate_columns(columns, half, estimator, blink, footprint, out, row_counts):
     """Estimate the rows of every column into ``out`` and empty the columns.
@@ -501,13 +592,14 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
     unmodulated, events_unmodulated = np.int64(0), np.int64(0)
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
-    testing = windowed and blink.step > 0
-    learning = estimator.method == _LEARNED or footprint.state[3] > 0
+    plain = estimator.method == _MODE_MEAN and footprint.state[3] == 0
     near_edge = False
-    packed, model = columns.packed, estimator.error_model
+    packed = columns.packed
     line_variance = (half / HALF_PER_SIGMA) ** 2
     if half <= estimator.half_max:
         line_variance = min(line_variance, estimator.line_variance)
+    for c in range(columns.seeds.size):
+        _pad(packed, columns.starts[c] + np.int64(columns.counts[c, 0]))
     for c in range(columns.seeds.size):
         n = np.int64(columns.counts[c, 0])
         columns.counts[c, 0] = 0
@@ -515,41 +607,26 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         if n < estimator.events_min:
             few += n > 0
             continue
-        column = _padded(packed, columns.starts[c], n)
-        last = columns.seeds[c]
-        seed = np.int64(-1)
-        if windowed and estimator.seeded:
-            seed = last if last >= 0 else neighbour
-        found = _find(packed, column, half, estimator, seed)
-        doubtful = False
-        if testing and not (
-            found.status == TOO_FEW
-            or (
-                found.status == FOUND
-                and _is_concentrated(packed, column, found.window.first, found.window.last, blink)
-            )
-        ):
-            found, column, doubtful = _modulated(
-                packed, column, found, half, estimator, blink, row_counts
-            )
-            events_unmodulated += n - column.events
-            if found.status == UNMODULATED:
-                unmodulated += 1
-                continue
-        if windowed and estimator.returns == _STRONGEST:
-            used = found.window.sums.events
-            if found.status == AMBIGUOUS or (
-                found.status == FOUND and 2 * (column.events - used) >= used
-            ):
-                found = _stronger(packed, column, c, half, columns, estimator, blink, found)
-            else:
+        column = _column(columns.starts[c], n, blink.lit_us)
+        seed = columns.seeds[c] if columns.seeds[c] >= 0 else neighbour
+        window = _NO_WINDOW
+        if windowed and estimator.seeded and seed >= 0:
+            window = _mean_shift(packed, column, seed, half, 0, ROW_LAST)
+            if plain and _is_clear(window, column, estimator, blink):
                 columns.rivals[c] = -1
-        if estimator.returns != _STRONGEST:
-            found = _all_returns(packed, column, half, estimator, found)
-            if testing and found.second:
-                other = found.other
-                if not _follows(packed, column, other.first, other.last, blink)[0]:
-                    found = Returns(FOUND, False, found.window, found.window)
+                columns.seeds[c] = neighbour = window.centre
+                row, variance, used = _mean(window), _variance(window.sums), window.sums.events
+                estimate = _row_estimate(row, variance, line_variance, used, estimator)
+                if _put(0, c, window, estimate, variance, False, estimator, out):
+                    events += n
+                    squares += variance * (used - 1)
+                    freedom += used - 1
+                continue
+        seen = _seen(packed, column, c, half, columns, estimator, blink, window, row_counts)
+        found = seen.found
+        if found.status == UNMODULATED:
+            unmodulated += 1
+        events_unmodulated += n - seen.events
         if found.status != FOUND:
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
@@ -558,39 +635,16 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         columns.seeds[c] = neighbour = found.window.centre
         two += found.second
         window, other = _reported(estimator.returns, found)
+        left = _column(columns.starts[c], seen.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
-            variance = _variance(window.sums)
-            row = _mean(window)
-            cut = windowed and (window.first == 0 or window.last >= estimator.rows - 1.0)
-            near_edge |= cut
-            best, learned = row, -1.0
-            if learning:
-                _sample(packed, column, c, row, estimator.rows, footprint, row_counts)
-            if cut or estimator.method == _LEARNED:
-                best, learned = _learned_row(
-                    packed, column, row, estimator.rows, footprint, row_counts
-                )
-            if estimator.method == _MEDIAN:
-                row = _median(packed, column, row_counts)
-            used = window.sums.events
-            estimate = _row_estimate(row, variance, line_variance, used, estimator)
-            near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
-            if learned >= 0.0 and (cut or near):
-                best = min(max(best, -0.5), estimator.rows - 0.5)
-                bias2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
-                estimate = RowEstimate(best, learned + bias2, estimate.truncated)
+            estimate = _refined(
+                packed, left, c, window, line_variance, estimator, footprint, row_counts
+            )
+            variance, used = _variance(window.sums), window.sums.events
+            near_edge |= windowed and _is_cut(window, estimator.rows)
             if not windowed:
-                columns.seeds[c] = np.int64(np.rint(FRACTION * row))
-            out.row[k, c] = estimate.row
-            out.sigma2[k, c] = estimate.sigma2
-            out.common2[k, c] = model.common**2
-            out.variance[k, c] = variance
-            out.events[k, c] = used
-            out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / used))
-            out.doubtful[k, c] = doubtful
-            out.truncated[k, c] = estimate.truncated
-            narrow = variance <= _BACKGROUND_FREE * estimator.line_variance
-            if not estimate.truncated and (windowed or narrow):
+                columns.seeds[c] = np.int64(np.rint(FRACTION * estimate.row))
+            if _put(k, c, window, estimate, variance, seen.doubtful, estimator, out):
                 events += n if k == 0 else 0
                 squares += variance * (used - 1)
                 freedom += used - 1

@@ -46,7 +46,8 @@ class Bins(NamedTuple):
     """Where `_bin` puts the events of a part of the period, which begins at ``edge_us``.
 
     Events before ``floor_us`` count as at that time. ``late_on`` and ``late_off`` are 1 where a
-    gate has ON and OFF events as late, which it keeps apart or drops.
+    gate has ON and OFF events as late, which it keeps apart or drops. ``counts`` are those of
+    `Columns`, in one dimension. It ``selects`` where region or gate refuse events.
     """
 
     packed: NDArray[np.uint32]
@@ -58,6 +59,7 @@ class Bins(NamedTuple):
     late_on: np.uintp
     late_off: np.uintp
     keeps_late: bool
+    selects: bool
     edge_us: np.int64
     floor_us: np.int64
 
@@ -104,7 +106,7 @@ def wider_columns(columns: Columns) -> Columns:
 def grouped_columns(rows: NDArray[np.uint32], offsets: NDArray[np.int64]) -> Columns:
     """Return columns of which ``c`` has the events ``rows[offsets[c]:offsets[c + 1]]``."""
     counts = np.diff(offsets)
-    sizes = -(-counts // BLOCK) * BLOCK
+    sizes = counts + BLOCK
     starts = np.cumsum(sizes) - sizes
     packed = np.empty(int(sizes.sum()), np.uint32)
     packed[np.arange(rows.size) + np.repeat(starts - offsets[:-1], counts)] = rows
@@ -129,23 +131,33 @@ def _bin(bins, n, t_us, column, row, polarity):
     c, r = np.uintp(column), np.uint32(row)
     dt = max(t_us, bins.floor_us) - bins.edge_us
     late = bins.late_on if polarity else bins.late_off
+    place = np.uintp(2) * c + late
+    events = bins.counts[place]
+    if bins.selects and not _is_selected(bins, c, r, late):
+        return n + np.uint64(1)
+    if events < bins.room:
+        at = place * np.uintp(bins.room + np.uint32(PADDING))
+        bins.packed[at + np.uintp(events)] = np.uint32(
+            (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
+            | (np.uint32(polarity) << np.uint32(ROW_BITS))
+            | r
+        )
+        bins.counts[place] = events + np.uint32(1)
+    else:
+        bins.refused.over_limit += 1
+    return n + np.uint64(1)
+
+
+@kernel(_nrt=False)
+def _is_selected(bins, c, r, late):
+    """Return true when region and gate take an event, or count why not."""
     if bins.row_first.size > 0 and np.uint32(r - bins.row_first[c]) > bins.row_span[c]:
         bins.refused.outside_region += 1
-    elif late and not bins.keeps_late:
+        return False
+    if late and not bins.keeps_late:
         bins.refused.gated += 1
-    else:
-        events = bins.counts[c, late]
-        if events < bins.room:
-            at = (np.uintp(2) * c + late) * np.uintp(bins.room + np.uint32(PADDING))
-            bins.packed[at + np.uintp(events)] = np.uint32(
-                (np.uint32(min(dt, TIME_LIMIT_US - 1)) << TIME_SHIFT)
-                | (np.uint32(polarity) << np.uint32(ROW_BITS))
-                | r
-            )
-            bins.counts[c, late] = events + np.uint32(1)
-        else:
-            bins.refused.over_limit += 1
-    return n + np.uint64(1)
+        return False
+    return True
 
 
 @kernel(_nrt=False)
@@ -157,10 +169,12 @@ def _needs_room(columns):
 @kernel(inline="always")
 def _bins(columns, part, keeps_late, edge_us, floor_us):
     """Return the bins of a part of the period."""
+    drops = (part.late_on > 0 or part.late_off > 0) and not keeps_late
+    selects = drops or columns.row_first.size > 0
     return Bins(
-        columns.packed, columns.counts, np.uint32(columns.room), columns.row_first,
+        columns.packed, columns.counts.reshape(-1), np.uint32(columns.room), columns.row_first,
         columns.row_span, columns.refused, np.uintp(part.late_on), np.uintp(part.late_off),
-        keeps_late, edge_us, floor_us,
+        keeps_late, selects, edge_us, floor_us,
     )  # fmt: skip
 
 

@@ -45,20 +45,28 @@ _FALSE_SECOND = 1000.0
 
 
 class Column(NamedTuple):
-    """Place of one column in the packed events: ``events`` from ``start`` on, padded to blocks."""
+    """Place of one column in the packed events: ``events`` from ``start`` on, padded to blocks.
+
+    The laser is on for the first ``lit_us`` of the period.
+    """
 
     start: np.int64
     events: np.int64
     blocks: np.int64
+    lit_us: np.uint32
 
 
 class Sums(NamedTuple):
-    """Sums over the events of a range of rows; d is the row minus the first row of the range."""
+    """Sums over the events of a range of rows; d is the row minus the first row of the range.
+
+    ``out_of_phase`` counts ON events of the dark and OFF events of the light.
+    """
 
     events: np.int64
     d: np.int64
     d2: np.int64
     time_us: np.int64
+    out_of_phase: np.int64
 
 
 class Window(NamedTuple):
@@ -91,12 +99,16 @@ class _Densest(NamedTuple):
 
 
 @kernel(_nrt=False)
-def _padded(packed, start, events):
-    """Fill the last block behind the column's events and return its place."""
-    blocks = (events + BLOCK - 1) // BLOCK
-    for i in range(events, blocks * BLOCK):
-        packed[start + i] = PAD
-    return Column(start, events, blocks)
+def _pad(packed, end):
+    """Fill a block behind a column's events."""
+    for i in range(np.uintp(BLOCK)):
+        packed[np.uintp(end) + i] = PAD
+
+
+@kernel
+def _column(start, events, lit_us):
+    """Return the place of a column, which has been padded."""
+    return Column(start, events, (events + BLOCK - 1) // BLOCK, lit_us)
 
 
 @kernel(_nrt=False, forceinline=True)
@@ -112,26 +124,32 @@ def _window_sums(packed, column, first, last):
     sum_d = np.int64(0)
     sum_d2 = np.int64(0)
     sum_time = np.int64(0)
+    out_of_phase = np.int64(0)
+    none, one = np.uint32(0), np.uint32(1)
     begin = np.uintp(column.start)
     padded = begin + np.uintp(column.blocks) * np.uintp(BLOCK)
     while begin < padded:
         end = min(begin + CHUNK, padded)
-        both = np.uint32(0)
-        d2 = np.uint32(0)
-        ts = np.uint32(0)
+        both, d2, ts, opposite = none, none, none, none
         for i in range(begin, end):
             v = packed[i]
             d = np.uint32((v & ROW_MASK) - base)
+            t = v >> TIME_SHIFT
             inside = d <= span
-            both = np.uint32(both + (np.uint32(d + _ONE) if inside else np.uint32(0)))
-            d2 = np.uint32(d2 + (np.uint32(d * d) if inside else np.uint32(0)))
-            ts = np.uint32(ts + ((v >> TIME_SHIFT) if inside else np.uint32(0)))
+            both = np.uint32(both + (np.uint32(d + _ONE) if inside else none))
+            d2 = np.uint32(d2 + (np.uint32(d * d) if inside else none))
+            ts = np.uint32(ts + (t if inside else none))
+            # The sign of the time until the light ends is 1 where it is on.
+            lit = np.uint32(t - column.lit_us) >> np.uint32(31)
+            other = np.uint32(((v >> POLARITY_SHIFT) ^ lit) & one)
+            opposite = np.uint32(opposite + (other if inside else none))
         events += np.int64(both >> _ONE_BITS)
         sum_d += np.int64(both & (_ONE - np.uint32(1)))
         sum_d2 += np.int64(d2)
         sum_time += np.int64(ts)
+        out_of_phase += np.int64(opposite)
         begin = end
-    return Sums(events, sum_d, sum_d2, sum_time)
+    return Sums(events, sum_d, sum_d2, sum_time, out_of_phase)
 
 
 @kernel(_nrt=False)
