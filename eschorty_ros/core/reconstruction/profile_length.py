@@ -17,6 +17,7 @@ PERIODS_MAX = 1000
 EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
 _BLOCK_PERIODS = 2
+_BLOCK_EVENTS = 1 << 16
 _HELD_EVENTS_MAX = 1 << 22
 # Events of a window that are looked at, evenly spread.
 _SAMPLE = 4096
@@ -33,14 +34,15 @@ def periods_max(modulation: Modulation) -> int:
 class ProfileLength:
     """Chooses the periods of a profile from the first events that follow the laser.
 
-    They are those of `BLOCK_US`, or of two periods, behind the first estimation window that is
-    modulated, or has a line where pixels are too slow to follow: the choice does not depend on how
-    the stream is split, nor on the background before the laser is on. Of their columns, weighted
-    by events, one has ``sum n^2 / sum n - 1`` events, with ``n`` the events of each column. One
-    period is a profile where it has half of `EVENTS_WANTED`: of Poisson counts with a mean of 8,
-    one in 24 is less than 4, the default of ``events_min``. Else a profile gets as many periods as
-    give `EVENTS_WANTED`, by the events of the next block, since pixels give more when the laser is
-    switched on. Blocks without light do not count.
+    They are a block behind the first estimation window that is modulated, or has a line where
+    pixels are too slow to follow: the choice does not depend on how the stream is split, nor on the
+    background before the laser is on. Of their columns, weighted by events, one has ``sum n^2 / sum
+    n - 1`` events, with ``n`` the events of each column. One period is a profile where it has half
+    of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the default of
+    ``events_min``. Else a profile gets as many periods as give `EVENTS_WANTED`, by the events of
+    the next block, since pixels give more when the laser is switched on. Blocks without light do
+    not count. A block has `BLOCK_US`, or whole periods with enough events, but two periods at
+    least.
 
     Parameters
     ----------
@@ -71,14 +73,15 @@ class ProfileLength:
                 elif window is None or end > _HELD_EVENTS_MAX:
                     return 1
             first, begin = self._window
-            end_us, events = int(t[begin - 1]) + self._span_us, 0.0
-            if last and t[-1] < end_us:
+            end_us, events = int(t[begin - 1]), 0.0
+            if last and t[-1] < end_us + self._span_us:
                 # A short stream has no complete block.
                 begin = first
-            for block_us in (end_us, end_us + self._span_us):
-                if watermark_us <= block_us and not last:
+            for _ in range(2):
+                end_us = self._block_end_us(t, begin, end_us)
+                if watermark_us <= end_us and not last:
                     return 0
-                end = int(np.searchsorted(t, block_us))
+                end = int(np.searchsorted(t, end_us))
                 if self._is_lit(held, begin, end):
                     events = self._events(held, begin, end)
                 if 2.0 * events >= EVENTS_WANTED:
@@ -90,6 +93,15 @@ class ProfileLength:
             self._seen, self._window = begin, None
         wanted = math.ceil(EVENTS_WANTED / max(events, 1e-9))
         return min(wanted, periods_max(self._modulation)) if events > 0.0 else 1
+
+    def _block_end_us(self, t_us: NDArray[np.int64], begin: int, begin_us: int) -> int:
+        """Return the end of the block that begins with an event and at a time."""
+        end_us = begin_us + self._span_us
+        if t_us.size > begin + _BLOCK_EVENTS:
+            period_us = self._modulation.period_us
+            periods = math.ceil((int(t_us[begin + _BLOCK_EVENTS]) - begin_us) / period_us)
+            end_us = min(end_us, begin_us + round(max(periods, _BLOCK_PERIODS) * period_us))
+        return end_us
 
     def _is_lit(self, held: HeldEvents, begin: int, end: int) -> bool:
         """Return true when held events follow the laser or are on a line."""
