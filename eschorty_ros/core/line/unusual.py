@@ -138,6 +138,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     known = widths.below[_BINS] >= _POINTS_MIN
     usual, median, sigma = state[0], state[1], _SIGMA_PER_MEDIAN * state[1]
     pairs = widths.below[_BINS] + 1.0
+    used, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
             width, last_width, last_row = smoothed[k, c], before[0, k, c], before[1, k, c]
@@ -149,8 +150,10 @@ def _mark_unusual(rows, smoothing, lit_share):
             if np.isnan(width) or rows.truncated[k, c] or rows.events[k, c] < events_min:
                 continue
             weight = 1.0
-            reach = sigma * np.sqrt(5.0 / widths.used[k, c]) * _PER_ROW
-            if known and not _is_usual(widths, width, max(np.int64(np.rint(reach)), 1)):
+            if widths.used[k, c] != used:
+                used = widths.used[k, c]
+                reach = max(np.int64(np.rint(sigma * np.sqrt(5.0 / used) * _PER_ROW)), 1)
+            if known and not _is_usual(widths, width, reach):
                 own2 = sigma2[k, c] - rows.common2[k, c]
                 steady = not way * way > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
