@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import kernel, record, with_names
 from eschorty_ros.core.line.window import BLOCK, ROW_BITS, TIME_LIMIT_US, TIME_SHIFT
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 
@@ -47,7 +47,7 @@ class Bins(NamedTuple):
 
     Events before ``floor_us`` count as at that time. ``late_on`` and ``late_off`` are 1 where a
     gate has ON and OFF events as late, which it keeps apart or drops. ``counts`` are those of
-    `Columns`, in one dimension. It ``selects`` where region or gate refuse events.
+    `Columns`, in one dimension.
     """
 
     packed: NDArray[np.uint32]
@@ -59,7 +59,6 @@ class Bins(NamedTuple):
     late_on: np.uintp
     late_off: np.uintp
     keeps_late: bool
-    selects: bool
     edge_us: np.int64
     floor_us: np.int64
 
@@ -125,15 +124,31 @@ def _forget_refused(refused):
 
 
 @kernel(_nrt=False)
-def _bin(bins, n, t_us, column, row, polarity):
+def _late(bins, polarity):
+    return bins.late_on if polarity else bins.late_off
+
+
+@kernel(_nrt=False)
+def _is_selected(bins, c, r, late):
+    """Return true when region and gate take an event, or count why not."""
+    if bins.row_first.size > 0 and np.uint32(r - bins.row_first[c]) > bins.row_span[c]:
+        bins.refused.outside_region += 1
+        return False
+    if late and not bins.keeps_late:
+        bins.refused.gated += 1
+        return False
+    return True
+
+
+def _append_event(bins, n, t_us, column, row, polarity):
     """Append an event to its column, or count why not: a decoder's ``emit``."""
     # An array that is bound to a name here is counted as used for every event.
     c, r = np.uintp(column), np.uint32(row)
     dt = max(t_us, bins.floor_us) - bins.edge_us
-    late = bins.late_on if polarity else bins.late_off
+    late = _late(bins, polarity)
     place = np.uintp(2) * c + late
     events = bins.counts[place]
-    if bins.selects and not _is_selected(bins, c, r, late):
+    if not _is_selected(bins, c, r, late):
         return n + np.uint64(1)
     if events < bins.room:
         at = place * np.uintp(bins.room + np.uint32(PADDING))
@@ -149,15 +164,17 @@ def _bin(bins, n, t_us, column, row, polarity):
 
 
 @kernel(_nrt=False)
-def _is_selected(bins, c, r, late):
-    """Return true when region and gate take an event, or count why not."""
-    if bins.row_first.size > 0 and np.uint32(r - bins.row_first[c]) > bins.row_span[c]:
-        bins.refused.outside_region += 1
-        return False
-    if late and not bins.keeps_late:
-        bins.refused.gated += 1
-        return False
+def _never_late(bins, polarity):
+    return np.uintp(0)
+
+
+@kernel(_nrt=False)
+def _selects_all(bins, c, r, late):
     return True
+
+
+_bin = with_names(_append_event, "some")
+_bin_all = with_names(_append_event, "all", _late=_never_late, _is_selected=_selects_all)
 
 
 @kernel(_nrt=False)
@@ -169,12 +186,10 @@ def _needs_room(columns):
 @kernel(inline="always")
 def _bins(columns, part, keeps_late, edge_us, floor_us):
     """Return the bins of a part of the period."""
-    drops = (part.late_on > 0 or part.late_off > 0) and not keeps_late
-    selects = drops or columns.row_first.size > 0
     return Bins(
         columns.packed, columns.counts.reshape(-1), np.uint32(columns.room), columns.row_first,
         columns.row_span, columns.refused, np.uintp(part.late_on), np.uintp(part.late_off),
-        keeps_late, selects, edge_us, floor_us,
+        keeps_late, edge_us, floor_us,
     )  # fmt: skip
 
 

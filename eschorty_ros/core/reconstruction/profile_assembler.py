@@ -29,6 +29,7 @@ from eschorty_ros.core.line.columns import (
     Columns,
     _append,
     _bin,
+    _bin_all,
     _bins,
     _forget_refused,
     _needs_room,
@@ -592,6 +593,7 @@ def _merge(held, new, edges, progress, memory, state, counters):
 
 
 _decode_into_bins = decode_into(_bin, "bins")
+_decode_all_into_bins = decode_into(_bin_all, "all_bins")
 
 
 @kernel
@@ -604,6 +606,7 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
     columns, gate = memory.columns, memory.gate.state
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge
+    takes_all = gate.step == 0 and columns.row_first.size == 0
     state.over = 0
     while True:
         end_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
@@ -613,7 +616,10 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
         part = _gate_part(max(state.part_us, floor_us), state.edge_us, gate)
         bins = _bins(columns, part, gate.keeps_late > 0, state.edge_us, floor_us)
         limit_us = min(end_us, part.end_us)
-        end, events, _ = _decode_into_bins(words, i, limit_us, False, decoder, bins)
+        if takes_all:
+            end, events, _ = _decode_all_into_bins(words, i, limit_us, False, decoder, bins)
+        else:
+            end, events, _ = _decode_into_bins(words, i, limit_us, False, decoder, bins)
         if _needs_room(columns):
             columns.counts[:], decoder.numbers[:] = before
             state.full = 1
