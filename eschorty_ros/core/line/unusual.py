@@ -152,7 +152,7 @@ def _mark_unusual(rows, smoothing, lit_share):
             weight = 1.0
             if widths.used[k, c] != used:
                 used = widths.used[k, c]
-                reach = max(np.int64(np.rint(sigma * np.sqrt(5.0 / used) * _PER_ROW)), 1)
+                reach = np.int64(max(np.rint(sigma * np.sqrt(5.0 / used) * _PER_ROW), 1.0))
             if known and not _is_usual(widths, width, reach):
                 own2 = sigma2[k, c] - rows.common2[k, c]
                 steady = not way * way > _STEADY**2 * own2
