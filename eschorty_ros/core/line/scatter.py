@@ -3,11 +3,12 @@
 The second difference of the rows of three columns is zero on a smooth surface, so its mean square
 is six variances of a single row, less what all of them share. Its ratio to what the estimator
 expects scales the expected variance: that of the columns' own rows, which sets the gates of
-smoothing, and again that of the smoothed rows, whose columns share more than is expected.
+smoothing, and again that of the smoothed rows, since columns share some of what smoothing should
+remove.
 
 What neighbours share over more columns no difference of rows shows, but the line does: its ends are
-whole pixels. Each is off by a twelfth of a squared row, and half of the scatter of the length
-between them is what the two do not share; the middle has the rest. Scatter of the ends dithers it.
+whole pixels, each off by a twelfth of a squared row. The middle of two is off by that less a
+quarter of the variance of the length between them. Scatter of the ends dithers it.
 """
 
 from __future__ import annotations
