@@ -1,11 +1,14 @@
 """Sigma from the scatter at hand: how much rows of near columns differ, in this stream.
 
-The second difference of the rows of three columns, five apart, is zero on a smooth surface, so its
-mean square is six variances of a single row, less what all of them share. Its ratio to what the
-estimator expects scales the expected variance.
+The second difference of the rows of three columns is zero on a smooth surface, so its mean square
+is six variances of a single row, less what all of them share. Its ratio to what the estimator
+expects scales the expected variance: that of the columns' own rows, which sets the gates of
+smoothing, and again that of the smoothed rows, since columns share some of what smoothing should
+remove.
 
-Where rows hardly scatter, neighbours share an error instead: the two ends of the line are whole
-pixels, a twelfth of a squared row each, and their middle has half of that. Scatter dithers it.
+What neighbours share over more columns no difference of rows shows, but the line does: its ends are
+whole pixels, each off by a twelfth of a squared row. The middle of two is off by that less a
+quarter of the variance of the length between them. Scatter of the ends dithers it.
 """
 
 from __future__ import annotations
@@ -24,52 +27,110 @@ _BLOCK = 16
 _KEPT = 0.5
 _DIFFERENCES_MIN = 8.0
 # A larger second difference is an edge of the surface, but where most are as large.
-_DIFFERENCE_MAX_PX = 4.0
+_EDGE_PX = 4.0
 _DEVIATIONS_MAX = 3.0
 FACTOR_MAX = 64.0
-_LOCKING = 1.0 / 24.0
+# Variance of a whole pixel. Of lengths that are one of two numbers of them, the largest second
+# difference, squared.
+_WHOLE = 1.0 / 12.0
+_LENGTH2_MAX = 4.0
+# Mean square of a normal distribution over that of its mean size.
+_SQUARE_PER_SIZE2 = 0.5 * np.pi
 
 
-class Scatter(NamedTuple):
-    """Sums over profiles, by block: squared differences, what is expected, their number.
+class Differences(NamedTuple):
+    """Sums over profiles, by block: squared differences, what is expected, their sizes and number.
 
-    Variances are scaled by ``factor_max`` at most.
+    ``lengths2`` are variances of the length of a line by the differences of lengths.
     """
 
     squares: NDArray[np.float64]
     expected: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    lengths2: NDArray[np.float64]
     number: NDArray[np.float64]
+
+
+class Scatter(NamedTuple):
+    """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most."""
+
+    own: Differences
+    smoothed: Differences
     factor_max: float
 
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
-    squares, expected, number = np.zeros((3, -(-columns // _BLOCK) + 2))
-    return Scatter(squares, expected, number, factor_max)
+    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // _BLOCK) + 2))
+    return Scatter(Differences(*own), Differences(*smoothed), factor_max)
+
+
+@kernel
+def _forget_scatter(scatter):
+    """Forget all differences."""
+    for sums in (scatter.own, scatter.smoothed):
+        sums.squares[:] = 0.0
+        sums.expected[:] = 0.0
+        sums.sizes[:] = 0.0
+        sums.lengths2[:] = 0.0
+        sums.number[:] = 0.0
 
 
 @kernel(_nrt=False)
-def _add_differences(rows, scatter):
-    """Add the second differences of a profile to the sums, but for lines that an edge cuts."""
-    row, sigma2, cut = rows.row[0], rows.sigma2[0], rows.truncated[0]
-    columns = row.size
-    usual = np.sqrt(scatter.squares.sum() / max(scatter.number.sum(), 1.0))
-    largest = max(_DIFFERENCE_MAX_PX, _DEVIATIONS_MAX * usual)
-    for block in range(1, scatter.number.size - 1):
-        first = max((block - 1) * _BLOCK, _APART)
-        last = min(block * _BLOCK, columns - _APART)
-        squares, expected, number = 0.0, 0.0, 0.0
+def _add_differences(row, sigma2, rows, apart, edge_px, sums):
+    """Add a profile's differences of ``row``, columns ``apart``, to the sums.
+
+    Lines that the sensor's edge cuts are left out, and differences above ``edge_px``: edges of the
+    surface, but where most are as large.
+    """
+    variance, cut, columns = rows.variance[0], rows.truncated[0], row.size
+    usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
+    largest = max(edge_px, _DEVIATIONS_MAX * usual)
+    for block in range(1, sums.number.size - 1):
+        first = max((block - 1) * _BLOCK, apart)
+        last = min(block * _BLOCK, columns - apart)
+        squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
-            before, after = c - np.uintp(_APART), c + np.uintp(_APART)
+            before, after = c - np.uintp(apart), c + np.uintp(apart)
             difference = row[before] - 2.0 * row[c] + row[after]
             whole = not (cut[before] | cut[c] | cut[after])
             if whole & (abs(difference) <= largest):
                 squares += difference * difference
                 expected += sigma2[before] + 4.0 * sigma2[c] + sigma2[after]
+                sizes += abs(difference)
+                # The square of a length is 12 variances of evenly lit rows.
+                wider = variance[before] - 2.0 * variance[c] + variance[after]
+                length2 = 3.0 * wider * wider / max(variance[c], _WHOLE)
+                lengths2 += min(length2, _LENGTH2_MAX) / 6.0
                 number += 1.0
-        scatter.squares[block] = _KEPT * scatter.squares[block] + squares
-        scatter.expected[block] = _KEPT * scatter.expected[block] + expected
-        scatter.number[block] = _KEPT * scatter.number[block] + number
+        sums.squares[block] = _KEPT * sums.squares[block] + squares
+        sums.expected[block] = _KEPT * sums.expected[block] + expected
+        sums.sizes[block] = _KEPT * sums.sizes[block] + sizes
+        sums.lengths2[block] = _KEPT * sums.lengths2[block] + lengths2
+        sums.number[block] = _KEPT * sums.number[block] + number
+
+
+@kernel(_nrt=False)
+def _ratio(sums, block, factor_max):
+    """Return the ratio of the squares near a block to those expected; -1 where it is not known."""
+    near = slice(block - 1, block + 2)
+    if factor_max == 0.0 or sums.number[near].sum() < _DIFFERENCES_MIN:
+        return -1.0
+    return min(sums.squares[near].sum() / sums.expected[near].sum(), FACTOR_MAX)
+
+
+@kernel(_nrt=False)
+def _locking2(sums, block):
+    """Return the variance that rows near a block share as the line's ends are whole pixels.
+
+    A row is the mean of two ends, so that an end scatters by two of its variances. These follow
+    from the mean size of differences: rows that leap to the next pixel are no scatter.
+    """
+    near = slice(block - 1, block + 2)
+    number = sums.number[near].sum()
+    size = sums.sizes[near].sum() / number
+    end2 = 2.0 * _SQUARE_PER_SIZE2 * size * size / 6.0
+    return max(_WHOLE - 0.25 * sums.lengths2[near].sum() / number - end2, 0.0)
 
 
 @kernel(_nrt=False)
@@ -79,12 +140,13 @@ def _scale(rows, scatter, smoothing):
     With a ``factor_max`` of 0, for means over full columns, they are as expected.
     """
     returns, columns = rows.row.shape
-    _add_differences(rows, scatter)
-    for block in range(1, scatter.number.size - 1):
-        near = slice(block - 1, block + 2)
-        measured = scatter.number[near].sum() >= _DIFFERENCES_MIN and scatter.factor_max > 0.0
-        ratio = scatter.squares[near].sum() / scatter.expected[near].sum() if measured else 1.0
-        ratio = min(ratio, FACTOR_MAX)
+    sums = scatter.own
+    _add_differences(rows.row[0], rows.sigma2[0], rows, _APART, _EDGE_PX, sums)
+    for block in range(1, sums.number.size - 1):
+        ratio = _ratio(sums, block, scatter.factor_max)
+        measured = ratio >= 0.0
+        locking2 = _locking2(sums, block) if measured else 0.0
+        ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         for k in range(returns):
             for c in range(np.uintp((block - 1) * _BLOCK), np.uintp(min(block * _BLOCK, columns))):
@@ -92,6 +154,22 @@ def _scale(rows, scatter, smoothing):
                 scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
                 gate_px = max(smoothing.gate_px, scattered)
                 smoothing.gates_px[k, c] = smoothing.gate_px if cut else gate_px
-                own2 = sigma2 if cut else factor * sigma2
-                rows.sigma2[k, c] = own2
-                rows.common2[k, c] += max(_LOCKING - own2, 0.0) if measured and not cut else 0.0
+                rows.sigma2[k, c] = sigma2 if cut else factor * sigma2
+                rows.common2[k, c] += 0.0 if cut else locking2
+
+
+@kernel(_nrt=False)
+def _scale_smoothed(rows, scatter, smoothing):
+    """Scale the smoothed variances of a profile by the scatter left; add what neighbours share."""
+    returns, columns = rows.row.shape
+    sums, sigma2 = scatter.smoothed, smoothing.sigma2
+    averaged = 2 * smoothing.half_width + 1
+    edge_px = _EDGE_PX / np.sqrt(averaged)
+    _add_differences(smoothing.row[0], sigma2[0], rows, max(_APART, averaged), edge_px, sums)
+    for block in range(1, sums.number.size - 1):
+        ratio = _ratio(sums, block, scatter.factor_max)
+        factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
+        for k in range(returns):
+            for c in range(np.uintp((block - 1) * _BLOCK), np.uintp(min(block * _BLOCK, columns))):
+                own2 = sigma2[k, c] * (1.0 if rows.truncated[k, c] else factor)
+                sigma2[k, c] = rows.common2[k, c] + own2

@@ -110,8 +110,7 @@ def _smooth(rows, smoothing):
     The pairs are added outwards up to the first one that is incomplete or beyond the gate: a slope
     is preserved, no average crosses a larger step, no empty column is filled. The columns' own
     variances ``sigma2`` are independent, so that of the mean of n is their sum over n squared. The
-    variance ``common2`` is shared by neighbours, whose lines cross the pixel rows at the same
-    place, and is not reduced.
+    variance ``common2``, which neighbours share, is not reduced and not included yet.
     """
     out_row, out_sigma2 = smoothing.row, smoothing.sigma2
     out_width, used = smoothing.widths.smoothed, smoothing.widths.used
@@ -138,7 +137,7 @@ def _smooth(rows, smoothing):
             smoothed += n > 1.0
         for c in range(columns):
             n = used[k, c]
-            out_sigma2[k, c] = rows.common2[k, c] + out_sigma2[k, c] / (n * n)
+            out_sigma2[k, c] /= n * n
         for c in range(columns):
             width = np.sqrt(out_width[k, c] / used[k, c])
             out_width[k, c] = np.nan if np.isnan(rows.row[k, c]) else width

@@ -47,7 +47,14 @@ from eschorty_ros.core.line.learned_gate import (
     make_gate,
     same_gate,
 )
-from eschorty_ros.core.line.scatter import FACTOR_MAX, Scatter, _scale, empty_scatter
+from eschorty_ros.core.line.scatter import (
+    FACTOR_MAX,
+    Scatter,
+    _forget_scatter,
+    _scale,
+    _scale_smoothed,
+    empty_scatter,
+)
 from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
 from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
 from eschorty_ros.core.line.unusual import _mark_unusual, _restart_widths, empty_widths
@@ -413,9 +420,7 @@ def _begin_window(memory, state):
     state.half = memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:] = -1
-    memory.scatter.squares[:] = 0.0
-    memory.scatter.expected[:] = 0.0
-    memory.scatter.number[:] = 0.0
+    _forget_scatter(memory.scatter)
     memory.delay[:] = 0.0
     _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths)
@@ -498,6 +503,7 @@ def _close(memory, state, counters):
     counters.columns_isolated += _reject_isolated(rows, smoothing)
     _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
+    _scale_smoothed(rows, scatter, smoothing)
     _mark_unusual(rows, smoothing, light.lit_share)
     if estimator.method == _LEARNED or footprint.state[3] > 0:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]

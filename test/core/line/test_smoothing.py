@@ -74,6 +74,28 @@ def test_sigma_is_the_scatter_of_the_columns(scatter_px):
     assert np.sqrt(np.mean(inner**2)) == pytest.approx(row.std(), rel=0.1)
 
 
+def test_sigma_has_what_near_columns_share():
+    rng = np.random.default_rng(8)
+    row = 300 + 0.25 * np.repeat(np.rint(rng.normal(0.0, 1.2, 426)), 3)
+    out, sigma = smoothed(row)
+    inner = slice(100, -100)
+    scatter_px = np.sqrt(np.mean((out[inner] - 300.0) ** 2))
+    sigma_px = np.sqrt(np.mean(sigma[inner] ** 2 - COMMON_PX**2))
+    assert sigma_px == pytest.approx(scatter_px, rel=0.1), "seed 8"
+
+
 def test_rows_that_do_not_scatter_have_the_sigma_of_whole_pixels():
     _, sigma = smoothed(np.full(200, 300.0))
-    np.testing.assert_allclose(sigma[20:-20] ** 2, COMMON_PX**2 + 1 / 24, rtol=1e-12)
+    np.testing.assert_allclose(sigma[20:-20] ** 2, COMMON_PX**2 + 1 / 12, rtol=1e-12)
+
+
+@pytest.mark.parametrize("slope", [0.004, 0.02, 0.05])
+def test_sigma_of_evenly_lit_rows_is_that_of_their_two_ends(slope):
+    """Both ends of 20 rows go to the next pixel at once: neighbours have the same error."""
+    true = 300.0 + slope * np.arange(1280)
+    lit = np.abs(np.arange(400)[:, None] - true) < 10.0
+    y, x = np.nonzero(lit)
+    events = sort_readout(np.full(x.size, 2000), x, y, np.ones(x.size, np.uint8))
+    found, _ = reconstruct(encoded(events), settings=Settings(isolation_events=0))
+    error_px = np.sqrt(np.mean((found.row - true[found.column]) ** 2))
+    assert np.sqrt(np.mean(found.sigma_row**2)) == pytest.approx(error_px, rel=0.15)

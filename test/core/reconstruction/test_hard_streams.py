@@ -17,6 +17,7 @@ from eschorty_ros.core.reconstruction import (
     reconstruct_recording,
 )
 from eschorty_ros.report.accuracy import true_range_mm
+from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane, named
 from eschorty_ros.simulation.world import World, simulate_recording
 
@@ -210,6 +211,21 @@ def test_rows_that_scatter_more_are_averaged_and_have_an_honest_sigma(share, err
     assert np.quantile(error, 0.6827) < error_max_mm, f"seed {camera.seed}"
     assert 0.6 < np.mean(error < found.sigma_mm) < 0.73
     assert 0.89 < np.mean(error < 2.0 * found.sigma_mm) < 0.97
+
+
+def test_sigma_covers_what_pixels_without_noise_hide(tmp_path):
+    """All of them fire in the same rows, up to half a row off."""
+    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
+    scene, sweep = Plane(slope_column=0.1), (10.0, 25.0, 50.0)
+    ideal = {"seed": 3, "parameters": preset("ideal")}
+    recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep, **ideal)
+    found = reconstruct_recording(recording).profiles
+    stage_mm = recording.stage.position_mm(found.t_us)
+    truth_mm = true_range_mm(scene, narrow.model(), stage_mm, found.column)
+    error = np.abs(found.range_mm - truth_mm)[found.flags == 0]
+    sigma_mm = found.sigma_mm[found.flags == 0]
+    assert np.mean(error < 2.0 * sigma_mm) > 0.87, "seed 3"
+    assert np.median(sigma_mm) < 1.2 * np.sqrt(np.mean(error**2))
 
 
 def _swapped(camera: Camera) -> Events:
