@@ -456,29 +456,31 @@ def _few_events(rows, most):
 def _write(rows, smoothing, few, delay_us, state, output):
     """Write the period's rows behind ``state.rows``, by column, nearest return first."""
     returns, columns = rows.row.shape
-    i = state.rows
-    for c in range(columns):
+    period, edge_us = state.period, state.edge_us
+    first = end = np.uintp(state.rows)
+    for c in range(np.uintp(columns)):
         index = 0
-        for k in range(returns):
-            if np.isnan(rows.row[k, c]):
-                continue
-            output.period[i] = state.period
-            output.edge_us[i] = state.edge_us
-            output.t_us[i] = state.edge_us + rows.mean_dt_us[k, c] - delay_us
-            output.column[i] = c
-            output.row[i] = smoothing.row[k, c]
-            output.sigma_row[i] = np.sqrt(smoothing.sigma2[k, c])
-            output.width_px[i] = np.sqrt(rows.variance[k, c])
-            output.events[i] = rows.events[k, c]
-            output.return_index[i] = index
-            output.flags[i] = (
-                (MIXED if rows.mixed[k, c] else 0)
-                | (SENSOR_EDGE if rows.truncated[k, c] else 0)
-                | (FEW_EVENTS if rows.events[k, c] < few else 0)
-            )
-            index += 1
-            i += 1
-    state.rows = i
+        for k in range(np.uintp(returns)):
+            # Overwritten by the next point where there is none here.
+            output.column[end], output.flags[end], output.return_index[end] = c, k, index
+            found = not np.isnan(rows.row[k, c])
+            index += found
+            end += np.uintp(found)
+    for i in range(first, end):
+        k, c = np.uintp(output.flags[i]), np.uintp(output.column[i])
+        output.period[i] = period
+        output.edge_us[i] = edge_us
+        output.t_us[i] = edge_us + rows.mean_dt_us[k, c] - delay_us
+        output.row[i] = smoothing.row[k, c]
+        output.sigma_row[i] = np.sqrt(smoothing.sigma2[k, c])
+        output.width_px[i] = np.sqrt(rows.variance[k, c])
+        output.events[i] = rows.events[k, c]
+        output.flags[i] = (
+            (MIXED if rows.mixed[k, c] else 0)
+            | (SENSOR_EDGE if rows.truncated[k, c] else 0)
+            | (FEW_EVENTS if rows.events[k, c] < few else 0)
+        )
+    state.rows = end
 
 
 @kernel
