@@ -95,16 +95,16 @@ def _own_variance(variance, line_variance, count, row, rows, model):
     """
     floor2 = model.floor**2
     sigma2 = model.factor**2 * min(variance, line_variance) / count + floor2
-    excess = variance - line_variance
-    if excess > 0.0:
-        events, shared = _background(excess, count, row, rows)
-        coherent = 1.0 + max(events - 1.0, 0.0) * shared
-        if model.median:
-            # A background event moves the median by half the distance of two of the line's events.
-            step2 = 3.0 * line_variance / (count * count)
-            sigma2 += model.background**2 * events * coherent * step2
-        else:
-            sigma2 += model.background**2 * excess / count * coherent
+    # No branch: whether a line is wider than expected is a matter of chance.
+    excess = max(variance - line_variance, 0.0)
+    events, shared = _background(excess, count, row, rows)
+    coherent = 1.0 + max(events - 1.0, 0.0) * shared
+    if model.median:
+        # A background event moves the median by half the distance of two of the line's events.
+        step2 = 3.0 * line_variance / (count * count)
+        sigma2 += model.background**2 * events * coherent * step2
+    else:
+        sigma2 += model.background**2 * excess / count * coherent
     if count < 2 or variance == 0.0:
         sigma2 = max(sigma2, 1.0 / 12.0 + floor2)
     return sigma2
