@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, times
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
 
 NM_PER_MM = 1_000_000
 POSITION_LIMIT_MM = 1e9
@@ -111,11 +110,25 @@ class StageTrack:
             mm; NaN outside the samples and inside a gap longer than ``max_gap_us``.
         """
         query = times("t_us", t_us)
-        held_us, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
-        position_mm = np.full(query.size, np.nan)
-        _interpolate(held_us, nm, self.max_gap_us or 0, np.ascontiguousarray(query).ravel(),
-                     position_mm)  # fmt: skip
-        return position_mm.reshape(query.shape)
+        held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
+        if held.size == 0 or query.size == 0:
+            return np.full(query.shape, np.nan)
+        left = np.searchsorted(held, [query.min(), query.max()], side="right") - 1
+        # The times of a few profiles are between the same two samples.
+        if left[0] == left[1]:
+            left = left[0]
+        else:
+            left = np.searchsorted(held, query, side="right") - 1
+        left = np.clip(left, 0, held.size - 1)
+        right = np.minimum(left + 1, held.size - 1)
+        since = query - held[left]
+        gap = held[right] - held[left]
+        step_nm = (nm[right] - nm[left]).astype(np.float64)
+        position = (nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM
+        unknown = (query < held[left]) | (query > held[right])
+        if self.max_gap_us is not None:
+            unknown |= (gap > self.max_gap_us) & (since > 0)
+        return np.where(unknown, np.nan, position)
 
     def samples_from(self, t_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return times and positions (mm) of the samples kept, those before ``t_us`` left out."""
@@ -144,24 +157,3 @@ class StageTrack:
             grown[: len(self)] = getattr(self, name)[self._begin : self._end]
             setattr(self, name, grown)
         self._begin, self._end = 0, len(self)
-
-
-@kernel("(i8[::1], i8[::1], i8, i8[::1], f8[::1])")
-def _interpolate(held_us, nm, gap_max_us, query_us, position_mm):
-    """Write the positions at the times of a query within the samples held."""
-    if held_us.size == 0:
-        return
-    left = 0
-    for i in range(query_us.size):
-        t_us = query_us[i]
-        if t_us < held_us[0] or t_us > held_us[-1]:
-            continue
-        # Queries are of one profile after the other: most are between the same two samples.
-        if t_us < held_us[left] or (left + 1 < held_us.size and t_us >= held_us[left + 1]):
-            left = np.searchsorted(held_us, t_us, side="right") - 1
-        right = min(left + 1, held_us.size - 1)
-        since_us, gap_us = t_us - held_us[left], held_us[right] - held_us[left]
-        if gap_max_us > 0 and gap_us > gap_max_us and since_us > 0:
-            continue
-        step_nm = float(nm[right] - nm[left])
-        position_mm[i] = (nm[left] + step_nm * (since_us / max(gap_us, 1))) / NM_PER_MM
