@@ -113,12 +113,10 @@ class StageTrack:
         held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
         if held.size == 0 or query.size == 0:
             return np.full(query.shape, np.nan)
-        left = np.searchsorted(held, [query.min(), query.max()], side="right") - 1
+        ends = np.searchsorted(held, [query.min(), query.max()], side="right") - 1
         # The times of a few profiles are between the same two samples.
-        if left[0] == left[1]:
-            left = left[0]
-        else:
-            left = np.searchsorted(held, query, side="right") - 1
+        one = ends[0] == ends[1]
+        left = ends[0] if one else np.searchsorted(held, query, side="right") - 1
         left = np.clip(left, 0, held.size - 1)
         right = np.minimum(left + 1, held.size - 1)
         since = query - held[left]
