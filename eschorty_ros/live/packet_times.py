@@ -11,8 +11,8 @@ from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.evt3 import words as w3
 
 WRAP_US = 1 << 24
-# A stream repeats its time far more often than this.
-_WORDS_SEARCHED = 8192
+# A stream repeats its time far more often than the latter, mostly within the first.
+_WORDS_SEARCHED = 256, 8192
 # A stream without losses skips less of its own time than this between two packets.
 _STEP_US = 100_000
 # A packet at most this many numbers back that is stamped no later was overtaken in transit.
@@ -84,8 +84,11 @@ def skips_time(data: Any, before_us: int | None) -> bool:
 
 
 def _first_word_us(data: Any, before_us: int | None) -> int | None:
-    words = _words(data)[:_WORDS_SEARCHED]
-    low = np.flatnonzero(words >> 12 == w3.TIME_LOW)
+    for count in _WORDS_SEARCHED:
+        words = _words(data)[:count]
+        low = np.flatnonzero(words >> 12 == w3.TIME_LOW)
+        if low.size:
+            break
     high = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
     if high.size and (low.size == 0 or high[0] < low[0]):
         until = low[0] if low.size else words.size

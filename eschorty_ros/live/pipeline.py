@@ -148,21 +148,25 @@ class Pipeline:
         if self._recorder is not None:
             self._recorder.stage(t_ns, position_mm)
 
-    def step(self, now_s: float) -> tuple[list[TimedProfiles], list[PlacedPoints]]:
-        """Return the profiles completed and the points placed since the last call."""
+    def complete(self, now_s: float) -> list[TimedProfiles]:
+        """Return the profiles completed since the last call."""
         self.process(now_s)
+        fresh, self._fresh = self._fresh, []
+        return fresh
+
+    def place(self, now_s: float) -> list[PlacedPoints]:
+        """Return the points whose stage position has become known."""
         self.stream.fit_edges(self.placer.track)
         ready = self.placer.ready(now_s)
         if self.capture is not None:
             for timed, stage_mm in ready:
                 self.capture.profiles(timed, stage_mm)
-        placed = [self._place(timed, mm) for timed, mm in ready]
+        placed = [self._placed(timed, mm) for timed, mm in ready]
         for part in placed:
             self.points += len(part)
             if self._buffer is not None:
                 self._buffer.add(part)
-        fresh, self._fresh = self._fresh, []
-        return fresh, placed
+        return placed
 
     def set_calibration(self, calibration: Calibration) -> None:
         """Use ``calibration`` for packets processed later.
@@ -272,7 +276,7 @@ class Pipeline:
             self._fresh.append(part)
             self.placer.add_profiles(part, now_s)
 
-    def _place(self, timed: TimedProfiles, stage_mm: np.ndarray) -> PlacedPoints:
+    def _placed(self, timed: TimedProfiles, stage_mm: np.ndarray) -> PlacedPoints:
         points = place(timed.profiles, self.model, stage_mm, self.calibration.stage_direction)
         return PlacedPoints(points, timed.t_ns, timed.edge_ns, stage_mm, timed.sensor)
 

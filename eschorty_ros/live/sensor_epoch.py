@@ -79,8 +79,8 @@ class SensorTimes:
     t_us: NDArray[np.int64]
     edge_us: NDArray[np.int64]
 
-    def select(self, mask: NDArray[np.bool_] | NDArray[np.intp]) -> SensorTimes:
-        """Return the points where ``mask`` is set."""
+    def select(self, mask: NDArray[np.bool_] | NDArray[np.intp] | slice) -> SensorTimes:
+        """Return the points where ``mask`` is set, or of a slice."""
         return SensorTimes(self.epoch, self.t_us[mask], self.edge_us[mask])
 
     def to_ns(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -106,9 +106,9 @@ class TimedProfiles:
         sensor = SensorTimes(epoch, profiles.t_us + shift_us, profiles.edge_us + shift_us)
         return cls(profiles, *sensor.to_ns(), None if epoch.clock.exact else sensor)
 
-    def select(self, mask: NDArray[np.bool_]) -> TimedProfiles:
-        """Return the points where ``mask`` is set."""
-        if mask.all():
+    def select(self, mask: NDArray[np.bool_] | slice) -> TimedProfiles:
+        """Return the points where ``mask`` is set, or of a slice."""
+        if not isinstance(mask, slice) and mask.all():
             return self
         sensor = None if self.sensor is None else self.sensor.select(mask)
         return TimedProfiles(

@@ -72,10 +72,12 @@ class Run:
             if EPOCH_NS // 1000 <= at_us <= bench.track.last_us:
                 x_mm = bench.track.position_mm(np.array([at_us]))[0]
                 pipeline.placer.add_stage(at_us * 1000, x_mm)
-            live += sum(len(part) for part in pipeline.step(now_s)[1])
+            pipeline.complete(now_s)
+            live += sum(len(part) for part in pipeline.place(now_s))
         pipeline.close_period("sweep", now_s)
         for later_s in (0.0, 1.0, 10.0):
-            pipeline.step(now_s + later_s)
+            pipeline.complete(now_s + later_s)
+            pipeline.place(now_s + later_s)
         report = pipeline.end_scan()
         assert live > 0.8 * len(report.scan.points)
         return pipeline, report

@@ -89,12 +89,15 @@ class LiveScan:
                 pipeline.stream.set_laser(self.modulation, None, on_ns)
             pipeline.add_packet(packet, now_s)
             if index % 3 == 2:
-                pipeline.step(now_s)
-        pipeline.step(now_s)
+                pipeline.complete(now_s)
+                pipeline.place(now_s)
+        pipeline.complete(now_s)
+        pipeline.place(now_s)
         for t_us, position_mm in self.samples[row:]:
             pipeline.add_stage(ZERO_NS + t_us * 1000, position_mm)
         pipeline.close_period("s", now_s)
-        pipeline.step(now_s + 1.0)
+        pipeline.complete(now_s + 1.0)
+        pipeline.place(now_s + 1.0)
         return pipeline.end_scan()
 
 

@@ -86,7 +86,7 @@ class ClockLine:
 def _within(name: str, values: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
     """Return ``values`` as int64; refuse those that would exceed 64 bits when converted."""
     checked = times(name, values)
-    wrong = (checked > limit) | (checked < -limit)
-    if wrong.any():
-        raise ArgumentError(f"{name} holds {checked[wrong].flat[0]}; choose within {limit}")
+    for extreme in (checked.max(), checked.min()) if checked.size else ():
+        if not -limit <= extreme <= limit:
+            raise ArgumentError(f"{name} holds {extreme}; choose within {limit}")
     return checked

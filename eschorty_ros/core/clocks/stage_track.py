@@ -111,9 +111,13 @@ class StageTrack:
         """
         query = times("t_us", t_us)
         held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
-        if held.size == 0:
+        if held.size == 0 or query.size == 0:
             return np.full(query.shape, np.nan)
-        left = np.clip(np.searchsorted(held, query, side="right") - 1, 0, held.size - 1)
+        ends = np.searchsorted(held, [query.min(), query.max()], side="right") - 1
+        # The times of a few profiles are between the same two samples.
+        one = ends[0] == ends[1]
+        left = ends[0] if one else np.searchsorted(held, query, side="right") - 1
+        left = np.clip(left, 0, held.size - 1)
         right = np.minimum(left + 1, held.size - 1)
         since = query - held[left]
         gap = held[right] - held[left]

@@ -143,7 +143,8 @@ class Profiles(LineRows):
     @property
     def profile_count(self) -> int:
         """Number of different profiles."""
-        return int(np.count_nonzero(np.diff(self.edge_us))) + 1 if len(self) else 0
+        edge_us = self.edge_us
+        return int(np.count_nonzero(edge_us[1:] != edge_us[:-1])) + 1 if len(self) else 0
 
 
 def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDArray[np.void]:
@@ -232,9 +233,15 @@ def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction:
     points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
     position_mm : array_like of float64, shape (n,) or scalar
     stage_direction : array_like of float64, shape (3,)
+
+    Raises
+    ------
+    ArgumentError
+        When the direction is not a unit vector.
     """
-    for axis, offset_m in zip("xyz", stage_offset_m(position_mm, stage_direction), strict=True):
-        points[axis] += offset_m
+    for axis, share in zip("xyz", _unit(stage_direction).tolist(), strict=True):
+        if share:
+            points[axis] += share * reals("position_mm", position_mm) * 1e-3
 
 
 def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArray[np.float64]:
@@ -245,7 +252,12 @@ def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArra
     ArgumentError
         When the direction is not a unit vector.
     """
+    direction = _unit(stage_direction)
+    return np.multiply.outer(direction, reals("position_mm", position_mm)) * 1e-3
+
+
+def _unit(stage_direction: ArrayLike) -> NDArray[np.float64]:
     direction = vector("stage_direction", stage_direction)
     if direction.shape != (3,) or not abs(float(direction @ direction) - 1.0) < 1e-6:
         raise ArgumentError(f"stage_direction is {stage_direction!r}; give a unit vector x, y, z")
-    return np.multiply.outer(direction, reals("position_mm", position_mm)) * 1e-3
+    return direction

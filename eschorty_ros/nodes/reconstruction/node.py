@@ -55,10 +55,11 @@ from eschorty_ros.nodes.ros.spin import run
 
 _STAGE_DEPTH = 2000
 _STATE_S = 0.2
-# The points of a stream that has ended leave with the step after it, at their own interval.
-_IDLE_S = POINTS_INTERVAL_S
-# Fewer than the packets that a stream holds.
-_JOBS_PER_STEP = 256
+# While something waits for a time, a step follows this late; the points of a stream that has ended
+# leave with it, at their own interval. Else nothing is to be done before the next job.
+_WAITING_S, _IDLE_S = POINTS_INTERVAL_S, 1.0
+# Packets that have queued up are worked on in parts: all together would take 100 MB for a second.
+_JOBS_PER_STEP = 32
 # A step costs as much as the events of some packets of 1 ms; they wait for each other this long.
 _STEP_S = 0.004
 # Loading the compiled kernels takes less.
@@ -181,6 +182,7 @@ class ReconstructionNode(Node):
         """Stop the worker, then the node."""
         self._closing.set()
         if self._worker.is_alive():
+            self._jobs.post(lambda: None)
             self._worker.join(timeout=5.0)
             self._scans.end_recording()
         super().destroy_node()
@@ -270,7 +272,7 @@ class ReconstructionNode(Node):
         while not self._closing.wait(max(stepped_s + _STEP_S - time.monotonic(), 0.0)):
             stepped_s = time.monotonic()
             try:
-                job, begun = self._jobs.next(_IDLE_S), 0
+                job, begun = self._jobs.next(_WAITING_S if self._waits() else _IDLE_S), 0
                 while job is not None:
                     job()
                     begun += 1
@@ -295,11 +297,16 @@ class ReconstructionNode(Node):
             return
         self._outputs.packet(packet.data)
 
+    def _waits(self) -> bool:
+        """Return whether something waits for more than the next job."""
+        pipeline = self._pipeline
+        return bool(pipeline.stream.held or pipeline.placer.waiting or self._outputs.waits)
+
     def _step(self) -> None:
-        fresh, placed = self._pipeline.step(time.monotonic())
+        # A profile leaves before its points are placed, which it does not need.
+        self._outputs.profiles(self._pipeline.complete(time.monotonic()))
+        self._outputs.points(self._pipeline.place(time.monotonic()))
         until_ns = self._pipeline.stream.processed_until_ns
-        self._outputs.profiles(fresh)
-        self._outputs.points(placed)
         if until_ns is not None:
             self._outputs.event_frame(until_ns)
         self._scans.finish()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import Image, PointCloud2
 
@@ -53,6 +54,11 @@ class Outputs:
         self._frame: EventFrame | None = None
         self._frame_at_s = 0.0
 
+    @property
+    def waits(self) -> bool:
+        """Return whether points or an image wait until they are due."""
+        return bool(self._batch) or self._frame is not None
+
     def set_calibration(self, calibration: Calibration) -> None:
         """Use another calibration of the same sensor."""
         self._model = calibration.model()
@@ -77,26 +83,22 @@ class Outputs:
         """Publish each profile, or as many as the maximum rate allows."""
         if self._profile.get_subscription_count() == 0:
             return
-        for timed in map(self._spaced, fresh):
-            starts = _starts(timed.edge_ns)
-            if not starts.size:
-                continue
-            stamps_ns = np.minimum.reduceat(timed.t_ns, starts)
-            counts = np.diff(starts, append=len(timed.t_ns))
-            points = place_link(timed.profiles, self._model)
-            live = live_points(points, timed.t_ns, np.repeat(stamps_ns, counts))
-            for part, stamp_ns in zip(np.split(live, starts[1:]), stamps_ns.tolist(), strict=True):
-                self._profile.publish(cloud_message(part, stamp_ns, LINK))
+        for timed in fresh:
+            for profile in self._spaced(timed):
+                stamp_ns = int(profile.t_ns.min())
+                points = place_link(profile.profiles, self._model)
+                live = live_points(points, profile.t_ns, stamp_ns)
+                self._profile.publish(cloud_message(live, stamp_ns, LINK))
 
-    def _spaced(self, timed: TimedProfiles) -> TimedProfiles:
-        """Return the profiles that the maximum rate allows."""
-        starts = _starts(timed.edge_ns)
-        chosen = np.zeros(starts.size, np.bool_)
-        for index, edge_ns in enumerate(timed.edge_ns[starts].tolist()):
-            if abs(edge_ns - self._last_profile_ns) >= self._profile_spacing_ns:
-                self._last_profile_ns = edge_ns
-                chosen[index] = True
-        return timed.select(np.repeat(chosen, np.diff(starts, append=len(timed.t_ns))))
+    def _spaced(self, timed: TimedProfiles) -> Iterator[TimedProfiles]:
+        """Yield each profile that the maximum rate allows."""
+        edge_ns = timed.edge_ns
+        starts = np.flatnonzero(edge_ns[1:] != edge_ns[:-1]) + 1
+        for begin, end in pairwise([0, *starts.tolist(), edge_ns.size]):
+            begun_ns = int(edge_ns[begin])
+            if abs(begun_ns - self._last_profile_ns) >= self._profile_spacing_ns:
+                self._last_profile_ns = begun_ns
+                yield timed.select(slice(begin, end))
 
     def points(self, placed: list[PlacedPoints]) -> None:
         """Collect points and publish them as one cloud at most every 50 ms."""
@@ -128,8 +130,3 @@ class Outputs:
             with contextlib.suppress(ArgumentError):
                 points = height_map(points, scan.edge_ns, self._model.columns)
         self._scan.publish(cloud_message(points, stamp_ns, BASE))
-
-
-def _starts(edge_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return the index of the first point of each profile."""
-    return np.flatnonzero(np.diff(edge_ns, prepend=edge_ns[:1] - 1))

@@ -9,6 +9,8 @@ from eschorty_ros.core.base.files import config_folders
 HERE, NETWORK = "fastdds.xml", "two_hosts.xml"
 VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+# With it the profile sets how histories hold their messages, without it rmw_fastrtps does.
+_HISTORIES = "RMW_FASTRTPS_USE_QOS_FROM_XML"
 # Fast DDS 2 of these has another format of profiles.
 _OLD_DISTRIBUTIONS = ("humble", "iron", "jazzy")
 
@@ -28,6 +30,7 @@ def use_profile() -> None:
         profile = folder / (HERE if here else NETWORK)
         if profile.is_file():
             os.environ[VARIABLES[0]] = str(profile)
+            os.environ.setdefault(_HISTORIES, "1")
             if here:
                 # LOCALHOST would add shared memory to what the profile names.
                 os.environ[RANGE] = "SUBNET"

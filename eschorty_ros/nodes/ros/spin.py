@@ -27,6 +27,7 @@ from eschorty_ros.nodes.ros.alone import SecondNodes
 from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.dds_deadlock import DdsDeadlock, DdsDeadlockError
 from eschorty_ros.nodes.ros.executor import Spinning
+from eschorty_ros.nodes.ros.freed_memory import FreedMemory
 
 _TURN_S = 0.1
 _CLOSE_S = 3.0
@@ -151,12 +152,13 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         # What lives as long as the process need not be searched, which halts all threads.
         gc.freeze()
         spinning.start()
-        dds = DdsDeadlock()
+        dds, freed = DdsDeadlock(), FreedMemory()
         with _signal_pipe() as signals:
             while rclpy.ok() and not ending.requested:
                 spinning.raise_error()
                 second.look()
                 dds.look()
+                freed.trim()
                 if select.select([signals], [], [], _TURN_S)[0]:
                     os.read(signals, _SIGNALS_MAX)
     except KeyboardInterrupt:

@@ -1,5 +1,7 @@
 """Live clouds: one message a profile, a bounded rate, spans that fit their times."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, place
 from eschorty_ros.live.scan_buffer import PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles
-from eschorty_ros.nodes.reconstruction.outputs import Outputs
+from eschorty_ros.nodes.reconstruction import outputs as outputs_module
+from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
@@ -90,3 +93,22 @@ def test_points_further_apart_than_a_message_can_hold_are_in_two():
     messages = node.topics["points"]
     assert [message.width for message in messages] == [6, 3, 3]
     assert [t for message in messages for t in times_ns(message)] == far.t_ns.tolist()
+
+
+def test_points_wait_until_they_are_due(monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr(outputs_module, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    node = Node()
+    outputs = Outputs(node, CALIBRATION, 1000.0)
+    near = timed([0])
+    points = place(near.profiles, CALIBRATION.model(), 0.0, CALIBRATION.stage_direction)
+    placed = PlacedPoints(points, near.t_ns, near.edge_ns, np.zeros(len(points)))
+    outputs.points([placed])
+    assert not outputs.waits
+    outputs.points([placed])
+    assert outputs.waits
+    assert len(node.topics["points"]) == 1
+    now_s[0] += 1.01 * POINTS_INTERVAL_S
+    outputs.points([])
+    assert not outputs.waits
+    assert len(node.topics["points"]) == 2
