@@ -79,9 +79,12 @@ def best(task: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     return shortest, result
 
 
-def parts(data: bytes, modulation: Modulation, settings: Settings) -> Iterator[Profiles]:
+def parts(
+    data: bytes | memoryview, modulation: Modulation, settings: Settings
+) -> Iterator[Profiles]:
     """Yield the profiles chunk by chunk, as a recording or a stream is reconstructed."""
     reconstructor = Reconstructor(CALIBRATION, modulation, settings)
+    data = memoryview(data)
     for k in range(0, len(data), CHUNK_BYTES):
         yield reconstructor.push(data[k : k + CHUNK_BYTES])
     yield reconstructor.flush()
@@ -113,8 +116,9 @@ def column_sums(data: bytes, modulation: Modulation) -> int:
     return means
 
 
-def decode(data: bytes) -> Profiles:
+def decode(data: bytes | memoryview) -> Profiles:
     decoder = Decoder()
+    data = memoryview(data)
     for k in range(0, len(data), 1 << 17):
         decoder.decode(data[k : k + (1 << 17)])
     return Profiles.empty()
