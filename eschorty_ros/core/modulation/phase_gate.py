@@ -84,23 +84,27 @@ class GatePart(NamedTuple):
 
 
 @kernel(_nrt=False)
+def _is_outside(phase, begin, span):
+    return np.uint32(phase - np.uint32(begin)) > np.uint32(span)
+
+
+@kernel(_nrt=False)
 def _is_late(dt_us, polarity, gate):
     """Return true when an event ``dt_us`` after a rising edge is outside the gate."""
     if gate.step == 0:
         return False
     phase = np.uint32(np.uint32(dt_us) * np.uint32(gate.step))
     if polarity:
-        return np.uint32(phase - np.uint32(gate.on_begin)) > np.uint32(gate.on_span)
-    return np.uint32(phase - np.uint32(gate.off_begin)) > np.uint32(gate.off_span)
+        return _is_outside(phase, gate.on_begin, gate.on_span)
+    return _is_outside(phase, gate.off_begin, gate.off_span)
 
 
 @kernel(_nrt=False)
 def _steps_left(phase, begin, span, step):
     """Return 1 if a phase is outside a span, and the steps after which that is no longer so."""
-    behind = np.uint32(phase - np.uint32(begin))
-    if behind <= np.uint32(span):
-        return 0, np.int64(np.uint32(span) - behind) // step + 1
-    return 1, -(-np.int64(np.uint32(np.uint32(begin) - phase)) // step)
+    if _is_outside(phase, begin, span):
+        return 1, -(-np.int64(np.uint32(np.uint32(begin) - phase)) // step)
+    return 0, np.int64(np.uint32(np.uint32(begin + span) - phase)) // step + 1
 
 
 @kernel(_nrt=False)

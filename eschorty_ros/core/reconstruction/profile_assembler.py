@@ -467,18 +467,18 @@ def _write(rows, smoothing, few, delay_us, state, output):
             index += found
             end += np.uintp(found)
     for i in range(first, end):
-        k, c = np.uintp(output.flags[i]), np.uintp(output.column[i])
+        at = np.uintp(output.flags[i]), np.uintp(output.column[i])
         output.period[i] = period
         output.edge_us[i] = edge_us
-        output.t_us[i] = edge_us + rows.mean_dt_us[k, c] - delay_us
-        output.row[i] = smoothing.row[k, c]
-        output.sigma_row[i] = np.sqrt(smoothing.sigma2[k, c])
-        output.width_px[i] = np.sqrt(rows.variance[k, c])
-        output.events[i] = rows.events[k, c]
+        output.t_us[i] = edge_us + rows.mean_dt_us[at] - delay_us
+        output.row[i] = smoothing.row[at]
+        output.sigma_row[i] = np.sqrt(smoothing.sigma2[at])
+        output.width_px[i] = np.sqrt(rows.variance[at])
+        output.events[i] = rows.events[at]
         output.flags[i] = (
-            (MIXED if rows.mixed[k, c] else 0)
-            | (SENSOR_EDGE if rows.truncated[k, c] else 0)
-            | (FEW_EVENTS if rows.events[k, c] < few else 0)
+            (MIXED if rows.mixed[at] else 0)
+            | (SENSOR_EDGE if rows.truncated[at] else 0)
+            | (FEW_EVENTS if rows.events[at] < few else 0)
         )
     state.rows = end
 
