@@ -145,6 +145,11 @@ class PacketStream:
             total.update(reconstructor.counters)
         return total
 
+    @property
+    def warnings(self) -> list[str]:
+        """Return why most of the events gave no points so far, one line for each reason."""
+        return [] if self._reconstructor is None else self._reconstructor.warnings
+
     def announce_zero(self, zero_ns: int) -> None:
         """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
         epoch = self._epoch

@@ -7,6 +7,7 @@ from line_events import encoded, line_events
 from eschorty_ros.core.base.errors import FormatError
 from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
@@ -99,6 +100,18 @@ def test_packets_are_held_until_clock_and_modulation_are_known():
     seen = joined(subject.process(0.5) + subject.flush())
     np.testing.assert_array_equal(seen.row, plain(data).row)
     assert subject.packets_lost == 0
+
+
+def test_events_that_the_sensor_lost_are_a_warning():
+    data = line()
+    subject = announced()
+    run(subject, packets(data))
+    assert subject.warnings == []
+    dropped = np.array([w3.OTHERS << 12 | w3.DROPPED_EVENTS], "<u2").tobytes()
+    subject = announced()
+    run(subject, packets(data + dropped))
+    assert len(subject.warnings) == 1
+    assert "reports 1 times that its readout lost events" in subject.warnings[0]
 
 
 def test_held_packets_are_bounded_and_the_rest_counts_as_lost():

@@ -89,4 +89,6 @@ class Reports:
             return diagnostics.WARN, "no edges of the stage; check its wire to the camera", values
         if stream.packets_lost or placer.points_without_stage:
             return diagnostics.WARN, "packets or points were lost", values
+        if warnings := stream.warnings:
+            return diagnostics.WARN, "; ".join(warnings), values
         return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
