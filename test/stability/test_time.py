@@ -45,7 +45,7 @@ class LateDecoder(Decoder):
     def __init__(self, *size):
         super().__init__(*size)
         self.decode(b"\x00\x80")
-        self.memory.state.epoch_us += self.shift_us
+        self.memory.state["epoch_us"] += self.shift_us
         self.memory.state.floor_us += self.shift_us
 
 
