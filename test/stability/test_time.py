@@ -46,7 +46,7 @@ class LateDecoder(Decoder):
         super().__init__(*size)
         self.decode(b"\x00\x80")
         self.memory.state["epoch_us"] += self.shift_us
-        self.memory.state.floor_us += self.shift_us
+        self.memory.state["floor_us"] += self.shift_us
 
 
 @pytest.mark.hard_case(7)
