@@ -83,8 +83,8 @@ at a multiple of real time, a reconstruction node publishes every profile and th
 50 ms, and a third process receives both. *per CPU s* counts all of the node's process, *offline* is
 the same code without ROS. *MB* is the node's memory at the start and at the end. Latency is from
 the end of a period to the arrival of its profile; at half of real time a packet takes twice its
-time to fill. *first ms* is that of the first profile: the first events choose the periods of a
-profile, for a tenth of a second at most. *median* and *p99* are of those after the first second.
+time to fill. *first ms* is that of the first profile, which waits while the first events choose the
+periods of a profile. *median* and *p99* are of those after the first second.
 """
 
 

@@ -79,14 +79,12 @@ def best(task: Callable[[], Any], repeats: int) -> tuple[float, Any]:
     return shortest, result
 
 
-def parts(
-    data: bytes | memoryview, modulation: Modulation, settings: Settings
-) -> Iterator[Profiles]:
+def parts(data: bytes, modulation: Modulation, settings: Settings) -> Iterator[Profiles]:
     """Yield the profiles chunk by chunk, as a recording or a stream is reconstructed."""
     reconstructor = Reconstructor(CALIBRATION, modulation, settings)
-    data = memoryview(data)
-    for k in range(0, len(data), CHUNK_BYTES):
-        yield reconstructor.push(data[k : k + CHUNK_BYTES])
+    view = memoryview(data)
+    for k in range(0, len(view), CHUNK_BYTES):
+        yield reconstructor.push(view[k : k + CHUNK_BYTES])
     yield reconstructor.flush()
 
 
@@ -116,11 +114,10 @@ def column_sums(data: bytes, modulation: Modulation) -> int:
     return means
 
 
-def decode(data: bytes | memoryview) -> Profiles:
-    decoder = Decoder()
-    data = memoryview(data)
-    for k in range(0, len(data), 1 << 17):
-        decoder.decode(data[k : k + (1 << 17)])
+def decode(data: bytes) -> Profiles:
+    decoder, view = Decoder(), memoryview(data)
+    for k in range(0, len(view), 1 << 17):
+        decoder.decode(view[k : k + (1 << 17)])
     return Profiles.empty()
 
 

@@ -699,7 +699,7 @@ def _decode(words, i, until_us, through, memory, sink):
 
 
 def decode_into(emit: Any, name: str) -> Any:
-    """Return ``_decode`` compiled for a kernel ``emit``; ``name`` tells it from others."""
+    """Return ``_decode`` compiled for a kernel ``emit``; ``name`` distinguishes it from others."""
     vector = with_names(_vector, name, _emit=emit)
     triple = with_names(_triple_by_words, name, _vector=vector)
     return with_names(_decode, name, _emit=emit, _vector=vector, _triple_by_words=triple)

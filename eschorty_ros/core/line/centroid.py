@@ -160,7 +160,7 @@ class RowEstimate(NamedTuple):
     truncated: bool
 
 
-class _Seen(NamedTuple):
+class _ColumnReturns(NamedTuple):
     """Returns of a column and its events that follow the laser; ``doubtful`` ones may not."""
 
     found: Returns
@@ -496,12 +496,18 @@ def _is_cut(window, rows):
 
 
 @kernel
+def _is_alone(used, events):
+    """Return true when a window has so many of the events that no other is nearly as strong."""
+    return 3 * used > 2 * events
+
+
+@kernel
 def _is_clear(window, column, estimator, blink):
     """Return true when a window needs no search for others and no further test of its events."""
     events = window.sums.events
     return (
         events >= estimator.events_min
-        and 3 * events > 2 * column.events
+        and _is_alone(events, column.events)
         and not _is_cut(window, estimator.rows)
         and estimator.returns == _STRONGEST
         and (blink.step == 0 or _is_in_phase(window.sums))
@@ -509,7 +515,7 @@ def _is_clear(window, column, estimator, blink):
 
 
 @kernel(_nrt=False)
-def _seen(packed, column, c, half, columns, estimator, blink, window, row_counts):
+def _column_returns(packed, column, c, half, columns, estimator, blink, window, row_counts):
     """Search a column for its returns; ``window`` is that around its last row, if it has one."""
     testing = _is_windowed(estimator.method) and blink.step > 0
     doubtful = False
@@ -523,7 +529,7 @@ def _seen(packed, column, c, half, columns, estimator, blink, window, row_counts
             packed, column, found, half, estimator, blink, row_counts
         )
         if found.status == UNMODULATED:
-            return _Seen(found, column.events, True)
+            return _ColumnReturns(found, column.events, True)
     if estimator.returns != _STRONGEST:
         found = _all_returns(packed, column, half, estimator, found)
         if testing and found.second:
@@ -533,12 +539,12 @@ def _seen(packed, column, c, half, columns, estimator, blink, window, row_counts
     elif _is_windowed(estimator.method):
         used = found.window.sums.events
         if found.status == AMBIGUOUS or (
-            found.status == FOUND and 2 * (column.events - used) >= used
+            found.status == FOUND and not _is_alone(used, column.events)
         ):
             found = _stronger(packed, column, c, half, columns, estimator, blink, found)
         else:
             columns.rivals[c] = -1
-    return _Seen(found, column.events, doubtful)
+    return _ColumnReturns(found, column.events, doubtful)
 
 
 @kernel(_nrt=False)
@@ -622,11 +628,13 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
                     squares += variance * (used - 1)
                     freedom += used - 1
                 continue
-        seen = _seen(packed, column, c, half, columns, estimator, blink, window, row_counts)
-        found = seen.found
+        searched = _column_returns(
+            packed, column, c, half, columns, estimator, blink, window, row_counts
+        )
+        found = searched.found
         if found.status == UNMODULATED:
             unmodulated += 1
-        events_unmodulated += n - seen.events
+        events_unmodulated += n - searched.events
         if found.status != FOUND:
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
@@ -635,7 +643,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         columns.seeds[c] = neighbour = found.window.centre
         two += found.second
         window, other = _reported(estimator.returns, found)
-        left = _column(columns.starts[c], seen.events, blink.lit_us)
+        left = _column(columns.starts[c], searched.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
             estimate = _refined(
                 packed, left, c, window, line_variance, estimator, footprint, row_counts
@@ -644,7 +652,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             near_edge |= windowed and _is_cut(window, estimator.rows)
             if not windowed:
                 columns.seeds[c] = np.int64(np.rint(FRACTION * estimate.row))
-            if _put(k, c, window, estimate, variance, seen.doubtful, estimator, out):
+            if _put(k, c, window, estimate, variance, searched.doubtful, estimator, out):
                 events += n if k == 0 else 0
                 squares += variance * (used - 1)
                 freedom += used - 1

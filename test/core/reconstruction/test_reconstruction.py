@@ -374,6 +374,13 @@ def test_a_profile_has_as_many_periods_as_give_points(phase):
     assert_same(found, reconstruct(stream, modulation, Settings(periods_per_profile=every))[0])
 
 
+def test_a_dense_stream_gives_profiles_after_a_window_and_two_periods():
+    reconstructor = Reconstructor(CALIBRATION, KNOWN)
+    found = reconstructor.push(encoded(lines(periods=8)))
+    assert found.profile_count >= 6, f"seed {SEED}"
+    assert reconstructor.periods_per_profile == 1
+
+
 def test_a_flash_before_the_laser_does_not_choose_the_periods_of_a_profile():
     flash = lines(periods=2, columns=200, events=20.0, background=0.0)
     laser = lines(periods=40, columns=200, events=20.0, background=0.0, edge_us=3_000_000)
