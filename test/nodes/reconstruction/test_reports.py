@@ -1,0 +1,37 @@
+"""Diagnostics of the reconstruction node."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from line_events import encoded, line_events
+
+from eschorty_ros.core.evt3 import words as w3
+from eschorty_ros.core.modulation import Modulation
+from eschorty_ros.core.optics import load_calibration
+from eschorty_ros.core.reconstruction import Settings
+from eschorty_ros.live.job_queue import JobQueue
+from eschorty_ros.live.packet_times import Packet
+from eschorty_ros.live.pipeline import Pipeline
+from eschorty_ros.nodes.reconstruction.reports import Reports
+from eschorty_ros.nodes.ros import diagnostics
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_warning_of_the_reconstruction_is_the_line_of_the_diagnostics(lost):
+    rng = np.random.default_rng(3)
+    data = encoded(line_events(rng, lambda k, c: np.full(len(c), 300.0), periods=8, edge_us=1000))
+    if lost:
+        data += np.array([w3.OTHERS << 12 | w3.DROPPED_EVENTS], "<u2").tobytes()
+    pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
+    pipeline.stream.announce_zero(0)
+    pipeline.stream.set_laser(Modulation(70.0), 1_000_000)
+    pipeline.stream.add(Packet(0, 0, data), 0.0)
+    assert pipeline.complete(0.0), "seed 3"
+    node = SimpleNamespace(create_publisher=lambda *_: None)
+    level, line, _ = Reports(node, pipeline, JobQueue(1)).diagnose()
+    if lost:
+        assert level == diagnostics.WARN
+        assert "its readout lost events" in line
+    else:
+        assert (level, line) == (diagnostics.OK, "reconstructing")
