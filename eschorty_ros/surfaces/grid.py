@@ -15,7 +15,7 @@ from eschorty_ros.surfaces.profiles import period_s, profile_index
 CELLS_MAX = 50_000_000
 STEP_SIGMAS = 5.0
 """Of medians: neighbours share most of their points, so that this is a large difference."""
-# Smoothing over columns spreads a step over up to 4 differences: the median of 9 ignores it.
+# Smoothing, narrow at a step, spreads it over up to 4 differences: the median of 9 ignores it.
 _SLOPE_WINDOW = 9
 _LINES_AT_ONCE = 256
 

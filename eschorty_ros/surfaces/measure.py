@@ -113,7 +113,7 @@ def measure(
     - ``points``: POINT_DTYPE, shape (n,).
     - ``regions``: Without one, the pieces that steps of the range separate, without their rims.
     - ``common_mm``: Standard deviation of a range error that all points of a surface share, and by
-      which its two ends differ; by default a tenth of the points' own sigma.
+      which its two ends differ; by default `COMMON_SHARE` of the points' own sigma.
 
     Raises ``ArgumentError`` when the cloud is no sweep, or a region has too few points.
     """

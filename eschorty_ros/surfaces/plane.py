@@ -18,15 +18,15 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.surfaces.grid import CloudGrid
 
 POINTS_MIN = 30
-COMMON_SHARE = 0.1
+COMMON_SHARE = 0.16
 """Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
+MAD = 1.4826
+"""Standard deviation of Gaussian errors over their median absolute deviation."""
 _CUT_SIGMA = 4.0
-# Median absolute deviation to standard deviation of Gaussian errors.
-_MAD = 1.4826
 _ITERATIONS = 20
-# Errors of columns closer than 5 and of lines closer than 4 are alike; fewer than 4 strips show no
-# scatter.
-_STRIP_COLUMNS, _STRIP_LINES = 12, 6
+# Errors of columns closer than 17, which smoothing averages at most, and of lines closer than 4 are
+# alike; fewer than 4 strips show no scatter.
+_STRIP_COLUMNS, _STRIP_LINES = 24, 6
 _STRIPS = 4, 16
 _FLAT_CELLS = 8
 
@@ -126,7 +126,7 @@ def solve(design: Array, part: Part) -> tuple[Array, Array, Array, NDArray[np.bo
         )[0]
         residual = part.xyz[:, 0] - design @ values
         ratio = residual / part.sigma
-        scale = max(_MAD * float(np.median(np.abs(ratio[kept]))), 1.0)
+        scale = max(MAD * float(np.median(np.abs(ratio[kept]))), 1.0)
         before, kept = kept, np.abs(ratio) <= _CUT_SIGMA * scale
         if np.array_equal(kept, before):
             break

@@ -14,7 +14,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import join_points
 from eschorty_ros.simulation.scenes import load_open3d
 from eschorty_ros.surfaces.grid import organise
-from eschorty_ros.surfaces.plane import COMMON_SHARE, Part, clustered_covariance
+from eschorty_ros.surfaces.plane import COMMON_SHARE, MAD, Part, clustered_covariance
 from eschorty_ros.surfaces.profiles import period_s
 
 POINTS_MAX = 60_000
@@ -71,7 +71,6 @@ class _Shape(NamedTuple):
     cloud: Any
     part: Part
     normals: Array
-    normal_noise: float
 
 
 def register(
@@ -160,17 +159,16 @@ def _shape(open3d: Any, points: NDArray[np.void], origin_mm: Array) -> _Shape:
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
     normals = np.asarray(cloud.normals)
     normals *= -np.sign(normals[:, :1])
-    # The radius of that many neighbours on an area, and the slope of a plane through them.
+    # The radius of that many neighbours on an area.
     area = np.ptp(xyz[:, 1]) * np.ptp(xyz[:, 2]) / len(xyz)
     radius = math.sqrt(_NORMAL_NEIGHBOURS * area / math.pi)
-    noise = 2.0 * float(np.median(part.sigma)) / (radius * math.sqrt(_NORMAL_NEIGHBOURS))
     along = np.maximum(np.abs(normals[:, 0]) * part.sigma, 1e-3 * part.sigma)
     # Free along the surface: far beyond both sigma and spacing.
     free = (3.0 * radius) ** 2
     outer = np.einsum("ni,nj->nij", normals, normals)
     spread = free * (np.eye(3) - outer) + (along**2)[:, None, None] * outer
     cloud.covariances = open3d.utility.Matrix3dVector(spread)
-    return _Shape(cloud, part, normals, noise)
+    return _Shape(cloud, part, normals)
 
 
 def _pose(
@@ -182,7 +180,10 @@ def _pose(
     fixed = np.asarray(target.cloud.points)[theirs]
     turned = source.normals[ours] @ turn.T
     normals = target.normals[theirs]
-    normals = normals + turned * np.sign(np.sum(turned * normals, axis=1))[:, None]
+    turned *= np.sign(np.sum(turned * normals, axis=1))[:, None]
+    # The normals of one place in both clouds differ by their noise; half of it is in their mean.
+    noise = MAD * float(np.median(np.abs(turned - normals)[:, 1:])) / 2.0
+    normals = normals + turned
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     residual = np.sum(normals * (moved - fixed), axis=1)
     range_axis = turn[:, 0]
@@ -194,7 +195,6 @@ def _pose(
     ours = ours[near]
     centre = moved.mean(axis=0)
     design = np.column_stack([np.cross(moved - centre, normals), normals])
-    noise = math.hypot(target.normal_noise, source.normal_noise) / 2.0
     _refuse_sliding(design, sigma, noise)
     part = Part(source.part.line[ours], source.part.column[ours], moved, sigma)
     covariance = clustered_covariance(design, residual, part)

@@ -27,7 +27,7 @@ FREQUENCY_HZ = 70.0
 SPEED_MM_S = 300.0
 GATE_US = 1000
 DEFAULT = Settings()
-SMOOTHING = tuple(sorted({0, DEFAULT.smoothing_half_width, 5}))
+SMOOTHING = 0, 2, DEFAULT.smoothing_half_width
 BASELINE = "numpy baseline"
 
 _CHUNK_BYTES = 1 << 20

@@ -7,7 +7,7 @@ from eschorty_ros.core.storage import POINT_DTYPE
 PITCH_Y, PITCH_Z = 0.7, 0.25
 
 
-def cloud(range_mm, sigma_mm=0.3, smooth=5, seed=1):
+def cloud(range_mm, sigma_mm=0.17, smooth=17, seed=1):
     """A cloud of 60 lines and 400 columns; errors of ``smooth`` neighbouring columns are alike."""
     rng = np.random.default_rng(seed)
     line, column = np.mgrid[0:60, 0:400]

@@ -50,7 +50,7 @@ def test_the_sigmas_of_simulated_levels_cover_the_truth(tmp_path):
         assert inside[1] >= 0.85, name
 
 
-@pytest.mark.parametrize("smooth", [1, 5])
+@pytest.mark.parametrize("smooth", [1, 5, 17])
 def test_the_sigma_of_a_plane_follows_the_errors_that_neighbours_share(smooth):
     """Slopes of 40 noisy planes scatter as their sigmas state, with and without smoothing."""
     planes = [

@@ -153,10 +153,14 @@ class Rows(NamedTuple):
 
 
 class RowEstimate(NamedTuple):
-    """A row and its variance; ``truncated`` where the edge of the sensor cuts the line."""
+    """A row, its own variance and what its neighbours share of it.
+
+    ``truncated`` where the edge of the sensor cuts the line.
+    """
 
     row: float
     sigma2: float
+    common2: float
     truncated: bool
 
 
@@ -469,14 +473,15 @@ def _stronger(packed, column, c, half, columns, estimator, blink, found):
 
 @kernel
 def _row_estimate(row, variance, line_variance, events, estimator):
-    """Return a row with its own variance, which covers its bias where the sensor cuts the line."""
+    """Return a row with its variances; the shared one covers its bias where the sensor cuts it."""
     rows = estimator.rows
     sigma2 = _own_variance(variance, line_variance, events, row, rows, estimator.error_model)
     # Background widens a column without moving the line to the edge.
     line = min(variance, _BACKGROUND_FREE * line_variance)
     reach = _HALF_SPAN * np.sqrt(line)
     truncated = row < reach or rows - 1.0 - row < reach
-    return RowEstimate(row, sigma2 + _HALF_BIAS2 * line if truncated else sigma2, truncated)
+    common2 = estimator.error_model.common**2
+    return RowEstimate(row, sigma2, common2 + (_HALF_BIAS2 * line if truncated else 0.0), truncated)
 
 
 @kernel
@@ -547,7 +552,7 @@ def _column_returns(packed, column, c, half, columns, estimator, blink, window, 
     return _ColumnReturns(found, column.events, doubtful)
 
 
-@kernel(_nrt=False)
+@kernel(_nrt=False, forceinline=True)
 def _refined(packed, column, c, window, line_variance, estimator, footprint, row_counts):
     """Return the row of a window's line that a learned footprint or the median gives."""
     rows, method = estimator.rows, estimator.method
@@ -565,8 +570,9 @@ def _refined(packed, column, c, window, line_variance, estimator, footprint, row
     near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if learned >= 0.0 and (cut or near):
         best = min(max(best, -0.5), rows - 0.5)
-        bias2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
-        estimate = RowEstimate(best, learned + bias2, estimate.truncated)
+        common2 = estimator.error_model.common**2
+        common2 += _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
+        estimate = RowEstimate(best, learned, common2, estimate.truncated)
     return estimate
 
 
@@ -575,7 +581,7 @@ def _put(k, c, window, estimate, variance, doubtful, estimator, out):
     """Write a return of a column; return whether its width is that of a line."""
     out.row[k, c] = estimate.row
     out.sigma2[k, c] = estimate.sigma2
-    out.common2[k, c] = estimator.error_model.common**2
+    out.common2[k, c] = estimate.common2
     out.variance[k, c] = variance
     out.events[k, c] = window.sums.events
     out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / window.sums.events))
@@ -618,11 +624,16 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         window = _NO_WINDOW
         if windowed and estimator.seeded and seed >= 0:
             window = _mean_shift(packed, column, seed, half, 0, ROW_LAST)
-            if plain and _is_clear(window, column, estimator, blink):
+            if _is_clear(window, column, estimator, blink):
                 columns.rivals[c] = -1
                 columns.seeds[c] = neighbour = window.centre
                 row, variance, used = _mean(window), _variance(window.sums), window.sums.events
-                estimate = _row_estimate(row, variance, line_variance, used, estimator)
+                if plain:
+                    estimate = _row_estimate(row, variance, line_variance, used, estimator)
+                else:
+                    estimate = _refined(
+                        packed, column, c, window, line_variance, estimator, footprint, row_counts
+                    )
                 if _put(0, c, window, estimate, variance, False, estimator, out):
                     events += n
                     squares += variance * (used - 1)

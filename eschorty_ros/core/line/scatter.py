@@ -23,7 +23,7 @@ from eschorty_ros.core.base.kernel import kernel
 _APART = 5
 # Columns of a block; the differences of a block and its two neighbours count for its points. The
 # share of a profile's differences that the next keeps.
-_BLOCK = 16
+BLOCK = 16
 _KEPT = 0.5
 _DIFFERENCES_MIN = 8.0
 # A larger second difference is an edge of the surface, but where most are as large.
@@ -57,12 +57,13 @@ class Scatter(NamedTuple):
     own: Differences
     smoothed: Differences
     factor_max: float
+    alone: NDArray[np.float64]
 
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
-    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // _BLOCK) + 2))
-    return Scatter(Differences(*own), Differences(*smoothed), factor_max)
+    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK) + 2))
+    return Scatter(Differences(*own), Differences(*smoothed), factor_max, np.ones(columns))
 
 
 @kernel
@@ -77,18 +78,22 @@ def _forget_scatter(scatter):
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, rows, apart, edge_px, sums):
-    """Add a profile's differences of ``row``, columns ``apart``, to the sums.
+def _add_differences(row, sigma2, rows, averaged, edge_px, sums):
+    """Add a profile's differences of ``row``, means of so many columns ``averaged``, to the sums.
 
     Lines that the sensor's edge cuts are left out, and differences above ``edge_px``: edges of the
     surface, but where most are as large.
     """
     variance, cut, columns = rows.variance[0], rows.truncated[0], row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
-    largest = max(edge_px, _DEVIATIONS_MAX * usual)
     for block in range(1, sums.number.size - 1):
-        first = max((block - 1) * _BLOCK, apart)
-        last = min(block * _BLOCK, columns - apart)
+        first, last = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        most = 1.0
+        for c in range(np.uintp(first), np.uintp(last)):
+            most = max(most, averaged[c])
+        apart = max(_APART, np.int64(most) // 2 + 1)
+        largest = max(edge_px / np.sqrt(most), _DEVIATIONS_MAX * usual)
+        first, last = max(first, apart), min(last, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
             before, after = c - np.uintp(apart), c + np.uintp(apart)
@@ -96,7 +101,10 @@ def _add_differences(row, sigma2, rows, apart, edge_px, sums):
             whole = not (cut[before] | cut[c] | cut[after])
             if whole & (abs(difference) <= largest):
                 squares += difference * difference
-                expected += sigma2[before] + 4.0 * sigma2[c] + sigma2[after]
+                # Means of columns that overlap differ less.
+                shared = max(1.0 - apart / averaged[c], 0.0)
+                outer = sigma2[before] + sigma2[after]
+                expected += (1.0 - 4.0 / 3.0 * shared) * (outer + 4.0 * sigma2[c])
                 sizes += abs(difference)
                 # The square of a length is 12 variances of evenly lit rows.
                 wider = variance[before] - 2.0 * variance[c] + variance[after]
@@ -141,7 +149,7 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows, _APART, _EDGE_PX, sums)
+    _add_differences(rows.row[0], rows.sigma2[0], rows, scatter.alone, _EDGE_PX, sums)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
@@ -149,7 +157,7 @@ def _scale(rows, scatter, smoothing):
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         for k in range(returns):
-            for c in range(np.uintp((block - 1) * _BLOCK), np.uintp(min(block * _BLOCK, columns))):
+            for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
                 sigma2, cut = rows.sigma2[k, c], rows.truncated[k, c]
                 scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
                 gate_px = max(smoothing.gate_px, scattered)
@@ -163,13 +171,11 @@ def _scale_smoothed(rows, scatter, smoothing):
     """Scale the smoothed variances of a profile by the scatter left; add what neighbours share."""
     returns, columns = rows.row.shape
     sums, sigma2 = scatter.smoothed, smoothing.sigma2
-    averaged = 2 * smoothing.half_width + 1
-    edge_px = _EDGE_PX / np.sqrt(averaged)
-    _add_differences(smoothing.row[0], sigma2[0], rows, max(_APART, averaged), edge_px, sums)
+    _add_differences(smoothing.row[0], sigma2[0], rows, smoothing.used[0], _EDGE_PX, sums)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
         for k in range(returns):
-            for c in range(np.uintp((block - 1) * _BLOCK), np.uintp(min(block * _BLOCK, columns))):
+            for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
                 own2 = sigma2[k, c] * (1.0 if rows.truncated[k, c] else factor)
                 sigma2[k, c] = rows.common2[k, c] + own2

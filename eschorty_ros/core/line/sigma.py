@@ -46,8 +46,8 @@ class ErrorModel(NamedTuple):
 
 METHOD_ERRORS = {
     "mode_mean": ErrorModel(0.2, 0.89, 0.4),
-    "mean": ErrorModel(0.4, 0.82, 1.35),
-    "median": ErrorModel(0.2, 1.06, 1.6, median=True),
+    "mean": ErrorModel(0.4, 0.87, 1.35),
+    "median": ErrorModel(0.2, 1.06, 2.2, median=True),
     # Before a footprint is learned.
     "learned": ErrorModel(0.2, 0.89, 0.4),
 }

@@ -11,27 +11,85 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.unusual import Widths
+from eschorty_ros.core.line.scatter import BLOCK
+from eschorty_ros.core.line.unusual import WIDTH_PAIRS, Widths, empty_widths
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
+# Blocks of columns on either side that choose the half width of a block together. The share of a
+# profile's errors that the next keeps.
+_NEAR = 2
+_KEPT = 0.5
+
+
+class Averages(NamedTuple):
+    """Sums over each point and its neighbours by half width, shape (half widths, returns, columns).
+
+    They are those of the neighbours' differences from the point's row and of the points ``used``.
+    ``squares`` are a profile's squared errors of prediction, and ``before`` the sums of variances
+    and of spreads over the columns before each.
+    """
+
+    difference: NDArray[np.float64]
+    used: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    before: NDArray[np.float64]
 
 
 class Smoothing(NamedTuple):
     """Settings of smoothing and isolation, and the smoothed rows with their variance and width.
 
+    ``half_widths`` are those to choose from, and ``errors`` the squared errors of what neighbours
+    predict, by half width and block of columns. A row is the mean of the columns ``used``.
     ``gates_px`` are the gates of a profile's points: ``gate_px``, or more where rows scatter more.
     """
 
-    half_width: int
+    half_widths: NDArray[np.int64]
+    errors: NDArray[np.float64]
+    averages: Averages
     gate_px: float
     isolation_gate_px: float
     isolation_events: int
     isolated: NDArray[np.bool_]
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
+    used: NDArray[np.float64]
     gates_px: NDArray[np.float64]
     widths: Widths
+
+
+def half_widths(largest: int) -> NDArray[np.int64]:
+    """Return the half widths to choose from: powers of two up to the largest, and that one."""
+    powers = 1 << np.arange(largest.bit_length())
+    return np.unique(np.append(powers[powers < largest], largest))
+
+
+def empty_smoothing(
+    largest: int,
+    gate_px: float,
+    isolation_gate_px: float,
+    isolation_events: int,
+    shape: tuple[int, int],
+) -> Smoothing:
+    """Return the smoothing of profiles of a ``shape``, with half widths up to the ``largest``."""
+    columns, tried = shape[1], half_widths(largest)
+    blocks = -(-columns // BLOCK)
+    sums = np.zeros((2, tried.size, *shape))
+    row, sigma2, used, gates_px = np.zeros((4, *shape))
+    return Smoothing(
+        half_widths=tried,
+        errors=np.zeros((tried.size, blocks + 2 * _NEAR)),
+        averages=Averages(*sums, np.zeros(columns), np.zeros((2, columns + 1))),
+        gate_px=gate_px,
+        isolation_gate_px=isolation_gate_px,
+        isolation_events=isolation_events,
+        isolated=np.zeros(shape, np.bool_),
+        row=row,
+        sigma2=sigma2,
+        used=used,
+        gates_px=gates_px,
+        widths=empty_widths(*shape),
+    )
 
 
 @kernel(_nrt=False)
@@ -58,89 +116,151 @@ def _partner(row, k, c, other):
 
 
 @kernel(_nrt=False)
-def _add_pairs(rows, k, j, gates, sums):
-    """Add the neighbours ``j`` columns away to those points of return ``k`` that have all nearer.
-
-    ``sums`` are those of the rows' differences, the variances, the spreads and the points.
-    """
-    row, columns = rows.row, np.uintp(rows.row.shape[1])
-    difference, variance, spread2, used = sums
-    for c in range(np.uintp(j), columns - np.uintp(j)):
-        if used[k, c] == 2 * j - 1 and not np.isnan(row[k, c]):
-            left, before = _partner(row, k, c, c - np.uintp(j))
-            right, after = _partner(row, k, c, c + np.uintp(j))
-            if abs(left) <= gates[k, c] and abs(right) <= gates[k, c]:
-                difference[k, c] += left + right
-                variance[k, c] += rows.sigma2[before, c - j] + rows.sigma2[after, c + j]
-                spread2[k, c] += rows.variance[before, c - j] + rows.variance[after, c + j]
-                used[k, c] += 2.0
-
-
-@kernel(_nrt=False)
-def _add_values(values, total, used, j):
-    """Add the values ``j`` columns away to the totals of the points that use these neighbours."""
-    j, columns = np.uintp(j), np.uintp(total.shape[1])
-    number = 2.0 * j + 1.0
+def _add_pairs(row, gates, k, j, level, averages):
+    """Add neighbours ``j`` columns away to those points of return ``k`` that have all nearer."""
+    difference, used = averages.difference, averages.used
+    j, columns = np.uintp(j), np.uintp(row.shape[1])
     for c in range(j, columns - j):
-        pair = values[0, c - j] + values[0, c + j]
-        total[0, c] += pair if used[0, c] == number else 0.0
+        if used[level, k, c] == 2 * j - 1 and not np.isnan(row[k, c]):
+            left = _partner(row, k, c, c - j)[0]
+            right = _partner(row, k, c, c + j)[0]
+            if abs(left) <= gates[k, c] and abs(right) <= gates[k, c]:
+                difference[level, k, c] += left + right
+                used[level, k, c] += 2.0
 
 
 @kernel(_nrt=False)
-def _add_only_pairs(rows, j, gates, sums):
+def _add_only_pairs(row, gates, j, level, averages):
     """Add the neighbours as `_add_pairs` does, where a column has one return: in vectors."""
-    row = rows.row
-    difference, variance, spread2, used = sums
+    difference, used = averages.difference, averages.used
     number = 2.0 * j - 1.0
     j, columns = np.uintp(j), np.uintp(row.shape[1])
     for c in range(j, columns - j):
         left, right = row[0, c - j] - row[0, c], row[0, c + j] - row[0, c]
         gate = gates[0, c]
-        near = (used[0, c] == number) & (abs(left) <= gate) & (abs(right) <= gate)
-        difference[0, c] += left + right if near else 0.0
-        used[0, c] += 2.0 if near else 0.0
-    _add_values(rows.sigma2, variance, used, j)
-    _add_values(rows.variance, spread2, used, j)
+        near = (used[level, 0, c] == number) & (abs(left) <= gate) & (abs(right) <= gate)
+        difference[level, 0, c] += left + right if near else 0.0
+        used[level, 0, c] += 2.0 if near else 0.0
 
 
 @kernel(_nrt=False)
+def _add_errors(averages, level, errors):
+    """Add the squared errors with which the neighbours of each point predict it, by block."""
+    difference, used, squares = averages.difference, averages.used, averages.squares
+    _, returns, columns = used.shape
+    for k in range(returns):
+        for c in range(columns):
+            error = difference[level, k, c] / max(used[level, k, c] - 1.0, 1.0)
+            squares[c] = error * error
+        for block in range(errors.shape[1] - 2 * _NEAR):
+            total = 0.0
+            for c in range(np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))):
+                total += squares[c]
+            errors[level, block + _NEAR] += total
+
+
+@kernel(_nrt=False)
+def _sum_before(rows, before):
+    """Fill the sums of the variances and of the spreads of all columns before each."""
+    sigma2, variance = 0.0, 0.0
+    for c in range(np.uintp(rows.row.shape[1])):
+        found = not np.isnan(rows.row[0, c])
+        sigma2 += rows.sigma2[0, c] if found else 0.0
+        variance += rows.variance[0, c] if found else 0.0
+        before[0, c + np.uintp(1)], before[1, c + np.uintp(1)] = sigma2, variance
+
+
+@kernel(_nrt=False, forceinline=True)
+def _sums_of(rows, k, c, pairs, before):
+    """Return the sum of the variances of a point and its pairs of neighbours.
+
+    The second value is that of the spreads of the nearest of them.
+    """
+    near = min(pairs, np.uintp(WIDTH_PAIRS))
+    if rows.row.shape[0] == 1:
+        end, near_end = c + pairs + np.uintp(1), c + near + np.uintp(1)
+        sigma2 = before[0, end] - before[0, c - pairs]
+        return sigma2, before[1, near_end] - before[1, c - near]
+    sigma2, variance = rows.sigma2[k, c], rows.variance[k, c]
+    for j in range(np.uintp(1), pairs + np.uintp(1)):
+        for other in (c - j, c + j):
+            partner = _partner(rows.row, k, c, other)[1]
+            sigma2 += rows.sigma2[partner, other]
+            variance += rows.variance[partner, other] if j <= near else 0.0
+    return sigma2, variance
+
+
+@kernel(_nrt=False)
+def _best(errors, block):
+    """Return the half width, by its index, whose neighbours predict the rows near a block best."""
+    best, least, first = np.uintp(0), np.inf, np.uintp(block)
+    for level in range(np.uintp(errors.shape[0])):
+        error = 0.0
+        for i in range(np.uintp(2 * _NEAR + 1)):
+            error += errors[level, first + i]
+        if error <= least:
+            best, least = level, error
+    return best
+
+
+@kernel
 def _smooth(rows, smoothing):
     """Average each point with symmetric pairs of neighbours; return the number of averaged points.
 
     The pairs are added outwards up to the first one that is incomplete or beyond the gate: a slope
-    is preserved, no average crosses a larger step, no empty column is filled. The columns' own
-    variances ``sigma2`` are independent, so that of the mean of n is their sum over n squared. The
-    variance ``common2``, which neighbours share, is not reduced and not included yet.
+    is preserved, no average crosses a larger step, no empty column is filled. Of the half widths
+    that one is taken whose neighbours predict the rows near by best (leave-one-out
+    cross-validation). The columns' own variances ``sigma2`` are independent, so that of the mean of
+    n is their sum over n squared. The variance ``common2``, which neighbours share, is not reduced
+    and not included yet.
     """
-    out_row, out_sigma2 = smoothing.row, smoothing.sigma2
-    out_width, used = smoothing.widths.smoothed, smoothing.widths.used
+    widths, averages, errors = smoothing.widths, smoothing.averages, smoothing.errors
+    difference, used = averages.difference, averages.used
     returns, columns = rows.row.shape
-    for k in range(returns):
-        for c in range(columns):
-            out_row[k, c] = 0.0
-            out_sigma2[k, c] = rows.sigma2[k, c]
-        for c in range(columns):
-            out_width[k, c] = rows.variance[k, c]
-            used[k, c] = 1.0
-    sums = out_row, out_sigma2, out_width, used
-    for j in range(1, min(smoothing.half_width, (columns - 1) // 2) + 1):
-        if returns == 1:
-            _add_only_pairs(rows, j, smoothing.gates_px, sums)
-        else:
-            for k in range(returns):
-                _add_pairs(rows, k, j, smoothing.gates_px, sums)
+    difference[0], used[0] = 0.0, 1.0
+    errors *= _KEPT
+    added = 0
+    for level in range(smoothing.half_widths.size):
+        if level > 0:
+            difference[level], used[level] = difference[level - 1], used[level - 1]
+        half_width = smoothing.half_widths[level]
+        for j in range(added + 1, min(half_width, (columns - 1) // 2) + 1):
+            if returns == 1:
+                _add_only_pairs(rows.row, smoothing.gates_px, j, level, averages)
+            else:
+                for k in range(returns):
+                    _add_pairs(rows.row, smoothing.gates_px, k, j, level, averages)
+        added = half_width
+        _add_errors(averages, level, errors)
+    _sum_before(rows, averages.before)
+    for block in range(errors.shape[1] - 2 * _NEAR):
+        level = _best(errors, block)
+        first, end = np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))
+        for k in range(np.uintp(returns)):
+            for c in range(first, end):
+                n = used[level, k, c]
+                sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages.before)
+                smoothing.sigma2[k, c], widths.smoothed[k, c] = sums
+                smoothing.row[k, c], smoothing.used[k, c] = difference[level, k, c], n
+    return _divide(rows, smoothing)
+
+
+@kernel(_nrt=False)
+def _divide(rows, smoothing):
+    """Divide the sums of points and neighbours; return the number of averaged points."""
+    widths = smoothing.widths
+    returns, columns = rows.row.shape
     smoothed = 0
     for k in range(returns):
         for c in range(columns):
-            n = used[k, c]
-            out_row[k, c] = rows.row[k, c] + out_row[k, c] / n
+            n = smoothing.used[k, c]
+            smoothing.row[k, c] = rows.row[k, c] + smoothing.row[k, c] / n
+            smoothing.sigma2[k, c] /= n * n
             smoothed += n > 1.0
         for c in range(columns):
-            n = used[k, c]
-            out_sigma2[k, c] /= n * n
-        for c in range(columns):
-            width = np.sqrt(out_width[k, c] / used[k, c])
-            out_width[k, c] = np.nan if np.isnan(rows.row[k, c]) else width
+            near = min(smoothing.used[k, c], 2.0 * WIDTH_PAIRS + 1.0)
+            width = np.sqrt(widths.smoothed[k, c] / near)
+            widths.smoothed[k, c] = np.nan if np.isnan(rows.row[k, c]) else width
     return smoothed
 
 

@@ -29,22 +29,26 @@ _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
 _APART = 5
+# Neighbours on either side that a width is averaged with.
+WIDTH_PAIRS = 2
+_WIDTHS = 2.0 * WIDTH_PAIRS + 1.0
 # Steps of the running median of differences are this share of it, larger ones at first; standard
 # deviation over that median.
 _STEP = 1.0 / 1024.0
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
 _ROOT_3 = np.sqrt(3.0)
 _ROOT_12 = np.sqrt(12.0)
-# A point is marked when the missing or additional rows may move it by more of its deviations.
-_MARKED = 5.5
+# A point is marked when the missing or additional rows may move it by more deviations of a row
+# that is not smoothed.
+_MARKED = 2.5
 
 
 class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``number`` has the points by width and ``below`` their sums; ``state`` the median width and the
-    median difference of widths near each other. ``smoothed`` holds those of a profile, ``before``
-    widths and rows of the last one, and ``used`` the columns that each is the mean of.
+    median difference of widths near each other. ``smoothed`` holds those of a profile, and
+    ``before`` widths and rows of the last one.
     """
 
     number: NDArray[np.float64]
@@ -52,7 +56,6 @@ class Widths(NamedTuple):
     state: NDArray[np.float64]
     before: NDArray[np.float64]
     smoothed: NDArray[np.float64]
-    used: NDArray[np.float64]
 
 
 def empty_widths(returns: int, columns: int) -> Widths:
@@ -63,7 +66,6 @@ def empty_widths(returns: int, columns: int) -> Widths:
         state=np.zeros(2),
         before=np.full((2, returns, columns), np.nan),
         smoothed=np.full((returns, columns), np.nan),
-        used=np.ones((returns, columns)),
     )
 
 
@@ -138,7 +140,7 @@ def _mark_unusual(rows, smoothing, lit_share):
     known = widths.below[_BINS] >= _POINTS_MIN
     usual, median, sigma = state[0], state[1], _SIGMA_PER_MEDIAN * state[1]
     pairs = widths.below[_BINS] + 1.0
-    used, reach = 0.0, np.int64(1)
+    averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
             width, last_width, last_row = smoothed[k, c], before[0, k, c], before[1, k, c]
@@ -150,15 +152,16 @@ def _mark_unusual(rows, smoothing, lit_share):
             if np.isnan(width) or rows.truncated[k, c] or rows.events[k, c] < events_min:
                 continue
             weight = 1.0
-            if widths.used[k, c] != used:
-                used = widths.used[k, c]
-                reach = np.int64(max(np.rint(sigma * np.sqrt(5.0 / used) * _PER_ROW), 1.0))
+            if smoothing.used[k, c] != averaged:
+                averaged = smoothing.used[k, c]
+                share = _WIDTHS / min(averaged, _WIDTHS)
+                reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths, width, reach):
                 own2 = sigma2[k, c] - rows.common2[k, c]
                 steady = not way * way > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                 more2 = _unusual_variance(width, usual)
-                rows.mixed[k, c] = more2 > _MARKED**2 * own2
+                rows.mixed[k, c] = more2 > _MARKED**2 * rows.sigma2[k, c]
                 sigma2[k, c] += more2
             if not abs(width - last_width) > _STEADY * sigma:
                 widths.number[_bin(width)] += weight

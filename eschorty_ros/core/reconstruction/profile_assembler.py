@@ -56,8 +56,13 @@ from eschorty_ros.core.line.scatter import (
     empty_scatter,
 )
 from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
-from eschorty_ros.core.line.smoothing import Smoothing, _reject_isolated, _smooth
-from eschorty_ros.core.line.unusual import _mark_unusual, _restart_widths, empty_widths
+from eschorty_ros.core.line.smoothing import (
+    Smoothing,
+    _reject_isolated,
+    _smooth,
+    empty_smoothing,
+)
+from eschorty_ros.core.line.unusual import _mark_unusual, _restart_widths
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
@@ -384,16 +389,12 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
         scatter=empty_scatter(model.columns, _factor_max(settings)),
-        smoothing=Smoothing(
-            half_width=settings.smoothing_half_width,
-            gate_px=float(settings.smoothing_gate_px),
-            isolation_gate_px=float(settings.isolation_gate_px),
-            isolation_events=settings.isolation_events,
-            isolated=np.zeros(shape, np.bool_),
-            row=np.zeros(shape),
-            sigma2=np.zeros(shape),
-            gates_px=np.zeros(shape),
-            widths=empty_widths(*shape),
+        smoothing=empty_smoothing(
+            settings.smoothing_half_width,
+            float(settings.smoothing_gate_px),
+            float(settings.isolation_gate_px),
+            settings.isolation_events,
+            shape,
         ),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
@@ -421,6 +422,7 @@ def _begin_window(memory, state):
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:] = -1
     _forget_scatter(memory.scatter)
+    memory.smoothing.errors[:] = 0.0
     memory.delay[:] = 0.0
     _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths)

@@ -112,7 +112,11 @@ class Settings:
         0.0, 0.0, 1000.0, "m", "furthest range to reconstruct; 0 is no limit"
     )
     smoothing_half_width: int = _number(
-        2, 0, 20, "columns", "neighbours averaged on either side; 0 is off"
+        8,
+        0,
+        20,
+        "columns",
+        "most neighbours averaged on either side, fewer where rows show detail; 0 is off",
     )
     smoothing_gate_px: float = _number(
         2.0, 0.0, 100.0, "px",

@@ -35,8 +35,38 @@ def test_linear_slope_is_unbiased_everywhere():
 def test_each_row_is_the_mean_of_the_columns_around_it():
     rng = np.random.default_rng(5)
     row = 300 + 0.25 * rng.integers(-4, 5, 1280)
-    mean = np.convolve(row, np.full(5, 0.2), "valid")
-    np.testing.assert_allclose(smoothed(row)[0][2:-2], mean, rtol=0, atol=1e-12)
+    mean = np.convolve(row, np.full(3, 1 / 3), "valid")
+    np.testing.assert_allclose(smoothed(row, half_width=1)[0][1:-1], mean, rtol=0, atol=1e-12)
+
+
+def test_a_plane_is_smoothed_over_all_columns_asked_for():
+    rng = np.random.default_rng(5)
+    row = 300 + 0.25 * rng.integers(-1, 2, 1280)
+    mean = np.convolve(row, np.full(17, 1 / 17), "valid")
+    out = smoothed(row, half_width=8)[0][8:-8]
+    assert np.mean(np.abs(out - mean) < 1e-9) > 0.6, "seed 5"
+    assert out.std() < 1.25 * mean.std(), "seed 5"
+
+
+@pytest.mark.parametrize(("period", "kept"), [(8, 0.75), (12, 0.8), (24, 0.85), (96, 0.93)])
+def test_detail_stays_where_the_columns_show_it(period, kept):
+    """A wave of half a row is as exact as with the best of the fixed half widths."""
+    rng = np.random.default_rng(7)
+    wave = np.sin(2 * np.pi * np.arange(1280) / period)
+    row = 300 + np.rint(4 * (0.5 * wave + rng.normal(0.0, 0.2, 1280))) / 4
+    out = smoothed(row, half_width=8)[0] - 300.0
+    assert 4.0 * np.mean(out * wave) > kept, "seed 7"
+    fixed = [np.convolve(row - 300.0, np.full(n, 1 / n), "same") for n in (3, 5, 9, 17)]
+    error, *errors = (np.std((rows - 0.5 * wave)[8:-8]) for rows in (out, *fixed))
+    assert error < 1.25 * min(errors), "seed 7"
+
+
+def test_a_plane_beside_a_relief_is_smoothed_as_a_plane():
+    rng = np.random.default_rng(9)
+    true = np.where(np.arange(1280) < 640, 0.5 * np.sin(np.arange(1280)), 0.0)
+    row = 300 + np.rint(4 * (true + rng.normal(0.0, 0.2, 1280))) / 4
+    error = smoothed(row, half_width=8)[0] - 300.0 - true
+    assert error[704:-8].std() < 0.5 * error[8:576].std(), "seed 9"
 
 
 def test_step_is_not_blurred():

@@ -10,6 +10,9 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import design, laser_class, photons_per_column
 from eschorty_ros.simulation.scenes import NAMES, named
 
+LINE_PX = 22.0
+"""Full width of the simulated line, rows."""
+
 
 def run(*arguments):
     done = CliRunner().invoke(main, [str(argument) for argument in arguments])
@@ -44,12 +47,15 @@ def test_a_designed_build_is_simulated_and_reconstructed(
     run("simulate", "--calibration", build, "--scene", scene, "--stop", 20, "--out", recording)
     cloud = es.reconstruct(recording)
     found = cloud.score()
-    row_mm = float(loaded.model().range_per_row_mm(np.median(cloud.points["x"]) * 1e3))
+    range_mm = float(np.median(cloud.points["x"])) * 1e3
+    row_mm = float(loaded.model().range_per_row_mm(range_mm))
+    band_px = 25.0 * float(loaded.model().rows_per_mm_off_sheet(range_mm))
     print(scene, near_mm, found, row_mm)
     assert found.completeness > 0.98
     assert found.error_median_mm < 0.25 * row_mm
     assert abs(found.bias_mm) < 0.15 * row_mm
-    assert found.within_2_sigma > 0.85
+    # Where a band of the steps is thinner than the line, that of the next one shifts every row.
+    assert found.within_2_sigma > (0.85 if scene == "plane" or band_px > LINE_PX else 0.8)
 
 
 def test_named_scenes_stay_as_they_are_where_a_build_sees_them_and_are_in_view_elsewhere():
