@@ -26,7 +26,14 @@ from eschorty_ros.core.line.estimators import (
     _median,
     _variance,
 )
-from eschorty_ros.core.line.learned import _bias_left, _learned_row, _sample, make_footprint
+from eschorty_ros.core.line.learned import (
+    LEARNED_ROWS,
+    MEAN_ROWS,
+    _bias_left,
+    _learned_row,
+    _sample,
+    make_footprint,
+)
 from eschorty_ros.core.line.sigma import (
     SIGMA_COMMON_PX,
     SIGMA_FACTOR,
@@ -552,6 +559,12 @@ def _column_returns(packed, column, c, half, columns, estimator, blink, window, 
     return _ColumnReturns(found, column.events, doubtful)
 
 
+@kernel
+def _learns(footprint):
+    """Return true when the line's footprint is learned from the profile."""
+    return footprint.state.near_edge > 0 or footprint.state.choice != MEAN_ROWS
+
+
 @kernel(_nrt=False, forceinline=True)
 def _refined(packed, column, c, window, line_variance, estimator, footprint, row_counts):
     """Return the row of a window's line that a learned footprint or the median gives."""
@@ -559,16 +572,19 @@ def _refined(packed, column, c, window, line_variance, estimator, footprint, row
     row, variance = _mean(window), _variance(window.sums)
     cut = _is_windowed(method) and _is_cut(window, rows)
     best, learned = row, -1.0
-    if method == _LEARNED or footprint.state[3] > 0:
+    takes, trying = footprint.state.choice == LEARNED_ROWS, footprint.state.trying > 0
+    if _learns(footprint):
         _sample(packed, column, c, row, rows, footprint, row_counts)
-    if cut or method == _LEARNED:
+    if cut or trying or takes:
         best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
     if method == _MEDIAN:
         row = _median(packed, column, row_counts)
     used = window.sums.events
     estimate = _row_estimate(row, variance, line_variance, used, estimator)
     near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
-    if learned >= 0.0 and (cut or near):
+    if trying and near and not cut:
+        footprint.trial[c] = best - row
+    if learned >= 0.0 and (cut or (near and takes)):
         best = min(max(best, -0.5), rows - 0.5)
         common2 = estimator.error_model.common**2
         common2 += _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
@@ -604,7 +620,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
     unmodulated, events_unmodulated = np.int64(0), np.int64(0)
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
-    plain = estimator.method == _MODE_MEAN and footprint.state[3] == 0
+    plain = estimator.method == _MODE_MEAN and not _learns(footprint)
     near_edge = False
     packed = columns.packed
     line_variance = (half / HALF_PER_SIGMA) ** 2
@@ -668,7 +684,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
                 squares += variance * (used - 1)
                 freedom += used - 1
             window, other = other, window
-    footprint.state[3] = near_edge
+    footprint.state.near_edge = near_edge
     return PeriodSums(
         squares, freedom, events, few, ambiguous, two, unmodulated, events_unmodulated
     )

@@ -11,12 +11,13 @@ Log-likelihoods are integers: their sums are exact and do not depend on the orde
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
 # Places per row, counts that are told apart, candidates to either side of the first row.
@@ -42,6 +43,9 @@ _MOVES_MAX = 24
 # Where every line is cut, a computation from rows that are off leaves this part of their bias.
 _BIAS_KEPT = 0.85
 _OFF_LINE_PX = 1.0
+# Learned rows take twice the time of means. They pay where they scatter less than this share, as
+# means would of 1.6 times the events.
+_PAYS = 0.8
 # Shares of the posterior by the logarithm below the best; less counts as none.
 _SHARES = np.exp(-np.arange(8 * _LOG_ONE) / _LOG_ONE)
 
@@ -52,9 +56,12 @@ class Footprint(NamedTuple):
     ``log[k]`` is relative to that of no event but for ``log[0]``; ``empty`` is the sum of
     ``log[0]`` over all rows, by the line's place in its row and on over all candidates.
     ``rows_seen`` holds the events of the sampled columns' rows from ``first_row`` on, which is -1
-    where there is none. ``state`` is the number of profiles, of computations and of the columns
-    counted since; 1 while the sensor's edge cuts a line, which other estimators need a footprint
-    for; and the number of computations from lines that are all cut.
+    where there is none. ``trial`` is by how much the learned rows of a profile differ from means.
+
+    ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
+    since, and of the ``cut_computations`` from lines that are all cut; ``near_edge`` is 1 while the
+    sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in the profile
+    of the trial, and ``choice`` what followed from it, one of the three below.
     """
 
     pixels: NDArray[np.float64]
@@ -64,15 +71,19 @@ class Footprint(NamedTuple):
     likelihood: NDArray[np.int16]
     rows_seen: NDArray[np.uint8]
     first_row: NDArray[np.int64]
-    state: NDArray[np.int64]
+    trial: NDArray[np.float64]
+    state: Any
     reach: int
 
 
-def make_footprint(half_max: int, columns: int) -> Footprint:
+UNDECIDED, LEARNED_ROWS, MEAN_ROWS = 0, 1, 2
+
+
+def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Footprint:
     """Return a footprint to be learned, for windows of ``half_max`` and narrower."""
     reach = half_max // FRACTION + 2
     size = 2 * (_PLACES * reach + _SIDE) + 1
-    return Footprint(
+    footprint = Footprint(
         pixels=np.zeros((_COUNTS, size)),
         log=np.zeros((_COUNTS, size), np.int16),
         none=np.zeros(size, np.int16),
@@ -80,28 +91,41 @@ def make_footprint(half_max: int, columns: int) -> Footprint:
         likelihood=np.zeros(2 * _SIDE, np.int16),
         rows_seen=np.zeros((columns // _STRIDE + 1, 2 * reach + 1), np.uint8),
         first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
-        state=np.zeros(5, np.int64),
+        trial=np.zeros(columns),
+        state=record(
+            "profiles",
+            "computations",
+            "columns",
+            "cut_computations",
+            "near_edge",
+            "trying",
+            "choice",
+        ),
         reach=reach,
     )
+    footprint.state["choice"] = choice
+    return footprint
 
 
 @kernel
-def _forget(footprint):
-    """Begin to learn again."""
+def _begin_anew(footprint, known):
+    """Begin to learn again, with what is ``known`` of the footprint."""
     footprint.pixels[:] = 0.0
-    footprint.log[:] = 0
-    footprint.none[:] = 0
-    footprint.empty[:] = 0
-    footprint.likelihood[:] = 0
-    footprint.rows_seen[:] = 0
+    footprint.log[:] = known.log
+    footprint.none[:] = known.none
+    footprint.empty[:] = known.empty
     footprint.first_row[:] = -1
-    footprint.state[:] = 0
+    state, before = footprint.state, known.state
+    state.profiles = state.columns = state.near_edge = state.trying = 0
+    state.computations = before.computations
+    state.cut_computations = before.cut_computations
+    state.choice = before.choice
 
 
 @kernel(_nrt=False)
 def _bias_left(footprint):
     """Return the share of a cut line's bias that is left, 0 where whole lines are learned from."""
-    rounds = footprint.state[4]
+    rounds = footprint.state.cut_computations
     return _BIAS_KEPT**rounds if rounds > 0 else 0.0
 
 
@@ -124,7 +148,7 @@ def _sample(packed, column, c, row, rows, footprint, counts):
     ``counts`` is zeroed scratch, one per row.
     """
     slot = c // _STRIDE
-    if (c - footprint.state[0]) % _STRIDE != 0 or slot >= footprint.first_row.size:
+    if (c - footprint.state.profiles) % _STRIDE != 0 or slot >= footprint.first_row.size:
         return
     centre = np.int64(np.rint(row))
     first = max(centre - footprint.reach, np.int64(0))
@@ -201,7 +225,7 @@ def _learned_row(packed, column, row, rows, footprint, counts):
 
     ``counts`` is zeroed scratch, one per row.
     """
-    if footprint.state[1] == 0:
+    if footprint.state.computations == 0:
         return 0.0, -1.0
     place = np.int64(np.rint(_PLACES * row))
     reach = footprint.reach
@@ -243,13 +267,14 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
 
     Columns in which the sensor's edge cuts the line count where they are the majority.
     """
+    state = footprint.state
     whole = 2 * np.count_nonzero(truncated) < np.count_nonzero(np.isfinite(row))
     pixels = footprint.pixels
     middle = pixels.shape[1] // 2
     for slot in range(footprint.first_row.size):
         first = footprint.first_row[slot]
         footprint.first_row[slot] = -1
-        c = slot * _STRIDE + footprint.state[0] % _STRIDE
+        c = slot * _STRIDE + state.profiles % _STRIDE
         if first < 0 or c >= row.size or doubtful[c] or (whole and truncated[c]):
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
@@ -260,18 +285,41 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
             place = begin + np.int64(_PLACES * at)
             if 0 <= place <= 2 * middle:
                 pixels[footprint.rows_seen[slot, at], np.uintp(place)] += 1.0
-        footprint.state[2] += 1
-    footprint.state[0] += 1
-    doublings = min(max(footprint.state[1] - _ROUNDS, 0), _DOUBLINGS)
+        state.columns += 1
+    state.profiles += 1
+    doublings = min(max(state.computations - _ROUNDS, 0), _DOUBLINGS)
     columns = _COLUMNS_MIN << doublings
     if not whole:
         # More rounds: footprint and rows converge together.
-        columns = (_COLUMNS_MIN // 2) << min(footprint.state[4] // 12, _DOUBLINGS)
-    if footprint.state[2] >= columns:
+        columns = (_COLUMNS_MIN // 2) << min(state.cut_computations // 12, _DOUBLINGS)
+    if state.columns >= columns:
         _compute(footprint)
-        footprint.state[4] = 0 if whole else footprint.state[4] + 1
+        state.cut_computations = 0 if whole else state.cut_computations + 1
         pixels[:] = 0.0
-        footprint.state[2] = 0
+        state.columns = 0
+        state.trying = state.choice == UNDECIDED and state.computations >= _ROUNDS
+
+
+@kernel
+def _choose(footprint, row, late, always):
+    """Choose between learned rows and the means ``row`` by those of a profile with both.
+
+    With ``always`` it is the learned rows. Without such a profile the means are chosen when it is
+    ``late``. Returns true when a choice was made.
+    """
+    state = footprint.state
+    if state.choice != UNDECIDED:
+        return False
+    if state.trying > 0:
+        least = _median_difference(row)
+        if least < np.inf:
+            pays = always or _median_difference(row + footprint.trial) < _PAYS * least
+            state.choice = LEARNED_ROWS if pays else MEAN_ROWS
+        footprint.trial[:] = 0.0
+        state.trying = 0
+    if late and state.choice == UNDECIDED:
+        state.choice = LEARNED_ROWS if always else MEAN_ROWS
+    return state.choice != UNDECIDED
 
 
 @kernel
@@ -306,4 +354,4 @@ def _compute(footprint):
             if abs(at) <= _PLACES * reach:
                 total += none[middle + at]
         footprint.empty[place] = total
-    footprint.state[1] += 1
+    footprint.state.computations += 1

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.columns import PADDING
+from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, POLARITY, ROW_MASK, TIME_SHIFT
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import (
@@ -30,9 +31,6 @@ from eschorty_ros.core.modulation.phase_gate import (
 
 # The longest gate is half of the period, each further one half as long.
 _LENGTHS = 5
-# Distance of the columns of a second difference, and differences without which nothing is known.
-_APART = 5
-_DIFFERENCES_MIN = 64
 # Columns that are tested for moving together, and the mean square of their sum over the sum of
 # their squares, which is 1 by chance.
 _TOGETHER = 16
@@ -115,14 +113,6 @@ def _fill_rows(columns, half, gate, row):
 
 
 @kernel
-def _scatter(row):
-    """Return the median size of the second differences of rows, infinite where few are known."""
-    differences = np.abs(row[: -2 * _APART] - 2.0 * row[_APART:-_APART] + row[2 * _APART :])
-    known = differences[~np.isnan(differences)]
-    return np.median(known) if known.size >= _DIFFERENCES_MIN else np.inf
-
-
-@kernel
 def _move_together(row, others):
     """Return true when the differences of rows of near columns are alike."""
     ratios, blocks = 0.0, 0
@@ -155,7 +145,7 @@ def _learn_gate(columns, half, gate):
         return
     row, gated = np.empty(columns.seeds.size), np.empty(columns.seeds.size)
     found = _fill_rows(columns, half, state, row)
-    least = _scatter(row)
+    least = _median_difference(row)
     if least == np.inf:
         return
     state.known = 1
@@ -163,7 +153,7 @@ def _learn_gate(columns, half, gate):
         choice = gate.choices[k]
         if _fill_rows(columns, half, choice, gated) < _FOUND_MIN * found:
             continue
-        scatter = _scatter(gated)
+        scatter = _median_difference(gated)
         if scatter < least and not _move_together(gated, row):
             least = scatter
             state.step, state.late = choice.step, _usual_late(columns, choice)

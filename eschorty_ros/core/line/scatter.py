@@ -26,6 +26,8 @@ _APART = 5
 BLOCK = 16
 _KEPT = 0.5
 _DIFFERENCES_MIN = 8.0
+# Differences without which the scatter of a profile is not known.
+_OF_PROFILE_MIN = 64
 # A larger second difference is an edge of the surface, but where most are as large.
 _EDGE_PX = 4.0
 _DEVIATIONS_MAX = 3.0
@@ -87,13 +89,13 @@ def _add_differences(row, sigma2, rows, averaged, edge_px, sums):
     variance, cut, columns = rows.variance[0], rows.truncated[0], row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
     for block in range(1, sums.number.size - 1):
-        first, last = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
         most = 1.0
-        for c in range(np.uintp(first), np.uintp(last)):
+        for c in range(np.uintp(begin), np.uintp(end)):
             most = max(most, averaged[c])
-        apart = max(_APART, np.int64(most) // 2 + 1)
+        apart = max(_APART, int(most) // 2 + 1)
         largest = max(edge_px / np.sqrt(most), _DEVIATIONS_MAX * usual)
-        first, last = max(first, apart), min(last, columns - apart)
+        first, last = max(begin, apart), min(end, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp(first), np.uintp(max(first, last))):
             before, after = c - np.uintp(apart), c + np.uintp(apart)
@@ -116,6 +118,14 @@ def _add_differences(row, sigma2, rows, averaged, edge_px, sums):
         sums.sizes[block] = _KEPT * sums.sizes[block] + sizes
         sums.lengths2[block] = _KEPT * sums.lengths2[block] + lengths2
         sums.number[block] = _KEPT * sums.number[block] + number
+
+
+@kernel
+def _median_difference(row):
+    """Return the median size of the second differences of rows, infinite where few are known."""
+    differences = np.abs(row[: -2 * _APART] - 2.0 * row[_APART:-_APART] + row[2 * _APART :])
+    known = differences[~np.isnan(differences)]
+    return np.median(known) if known.size >= _OF_PROFILE_MIN else np.inf
 
 
 @kernel(_nrt=False)

@@ -74,12 +74,12 @@ def empty_smoothing(
     """Return the smoothing of profiles of a ``shape``, with half widths up to the ``largest``."""
     columns, tried = shape[1], half_widths(largest)
     blocks = -(-columns // BLOCK)
-    sums = np.zeros((2, tried.size, *shape))
+    differences, averaged = np.zeros((2, tried.size, *shape))
     row, sigma2, used, gates_px = np.zeros((4, *shape))
     return Smoothing(
         half_widths=tried,
         errors=np.zeros((tried.size, blocks + 2 * _NEAR)),
-        averages=Averages(*sums, np.zeros(columns), np.zeros((2, columns + 1))),
+        averages=Averages(differences, averaged, np.zeros(columns), np.zeros((2, columns + 1))),
         gate_px=gate_px,
         isolation_gate_px=isolation_gate_px,
         isolation_events=isolation_events,
@@ -193,11 +193,11 @@ def _sums_of(rows, k, c, pairs, before):
 @kernel(_nrt=False)
 def _best(errors, block):
     """Return the half width, by its index, whose neighbours predict the rows near a block best."""
-    best, least, first = np.uintp(0), np.inf, np.uintp(block)
-    for level in range(np.uintp(errors.shape[0])):
+    best, least, first = 0, np.inf, np.uintp(block)
+    for level in range(errors.shape[0]):
         error = 0.0
         for i in range(np.uintp(2 * _NEAR + 1)):
-            error += errors[level, first + i]
+            error += errors[np.uintp(level), first + i]
         if error <= least:
             best, least = level, error
     return best

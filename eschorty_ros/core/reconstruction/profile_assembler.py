@@ -20,6 +20,7 @@ from eschorty_ros.core.line.centroid import (
     Estimator,
     Rows,
     _estimate_columns,
+    _learns,
     check_method,
     empty_rows,
     half_width_fixed,
@@ -38,7 +39,15 @@ from eschorty_ros.core.line.columns import (
 )
 from eschorty_ros.core.line.delay import Light, _delay_us, light
 from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
-from eschorty_ros.core.line.learned import Footprint, _forget, _learn, make_footprint
+from eschorty_ros.core.line.learned import (
+    MEAN_ROWS,
+    UNDECIDED,
+    Footprint,
+    _begin_anew,
+    _choose,
+    _learn,
+    make_footprint,
+)
 from eschorty_ros.core.line.learned_gate import (
     LearnedGate,
     _forget_gate,
@@ -77,7 +86,8 @@ WINDOW_EVENTS = 1 << 21
 """Events after which, with the next profile, the estimate of the line starts again.
 
 A window of the stream so depends on no event before it, and windows can be reconstructed at the
-same time. Only a footprint that is learned goes on.
+same time, but for the footprint: windows begin with what the first one has learned when rows are
+chosen, and while the sensor's edge cuts a line learning goes on.
 """
 _OUTPUT_PROFILES = 64
 _HALF_MIN = 3 * FRACTION
@@ -152,6 +162,7 @@ class _Memory(NamedTuple):
     gate: LearnedGate
     blink: Blink
     footprint: Footprint
+    known: Footprint
     scatter: Scatter
     smoothing: Smoothing
     light: Light
@@ -165,7 +176,7 @@ class _Memory(NamedTuple):
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    With ``one_window`` the pass ends with the window of the estimate.
+    With ``one_window`` the pass ends with the window of the estimate, or when rows are chosen.
     """
 
     floor_us: int
@@ -203,6 +214,7 @@ class ProfileAssembler:
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
+        self._first_choice = _first_choice(settings)
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state = np.zeros(1, _STATE)[0]
         self._memory = _allocate(settings, model)
@@ -221,6 +233,9 @@ class ProfileAssembler:
         )
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
+        self._memory.known.state["choice"] = self._first_choice
+        self._memory.known.state["computations"] = 0
+        self._memory.footprint.state["near_edge"] = 0
         _begin_window(self._memory, self._state)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
@@ -236,21 +251,16 @@ class ProfileAssembler:
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state["rows"] = 0
         self._done = []
-        _forget(self._memory.footprint)
+        self._memory.footprint.state["near_edge"] = 0
+        self._memory = self._memory._replace(known=before._memory.known)
         _begin_window(self._memory, self._state)
         self._state["status"] = _EMPTY
         self._state["edge_us"] = self._state["part_us"] = edges.t_us[edge]
         self._state["period"] = edges.period[edge]
 
-    def exchange_footprints(self, other: ProfileAssembler) -> None:
-        """Go on with the footprint of ``other``, which gets that of this one."""
-        mine, others = self._memory.footprint, other._memory.footprint
-        self._memory = self._memory._replace(footprint=others)
-        other._memory = other._memory._replace(footprint=mine)
-
     @property
     def window_is_over(self) -> bool:
-        """Return whether the last pass over words ended with the window."""
+        """Return whether the last pass over words ended with the window, or with a choice."""
         return bool(self._state["over"])
 
     @property
@@ -259,14 +269,14 @@ class ProfileAssembler:
         return int(self._memory.window_events - self._state["window"])
 
     @property
-    def has_learned(self) -> bool:
-        """Return whether a line's footprint was learned since the last ``forget``."""
-        return bool(self._memory.footprint.state.any())
+    def is_choosing(self) -> bool:
+        """Return whether learned rows or means are still to be chosen."""
+        return bool(self._memory.footprint.state["choice"] == UNDECIDED)
 
     @property
-    def learns(self) -> bool:
-        """Return whether the next profile is learned from."""
-        return bool(self._memory.footprint.state[3])
+    def is_cut(self) -> bool:
+        """Return whether the sensor's edge cuts the line of the last profile."""
+        return bool(self._memory.footprint.state["near_edge"])
 
     @property
     def counters(self) -> dict[str, int]:
@@ -388,6 +398,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         estimator=estimator,
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
+        known=make_footprint(estimator.half_max, model.columns),
         scatter=empty_scatter(model.columns, _factor_max(settings)),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
@@ -406,6 +417,12 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     )
 
 
+def _first_choice(settings: Settings) -> int:
+    """Return whether a stream learns whether to take learned rows, or is of means."""
+    means = settings.centroid == "mode_mean" and settings.detail == "off"
+    return MEAN_ROWS if means or settings.centroid in FULL_COLUMN_METHODS else UNDECIDED
+
+
 def _factor_max(settings: Settings) -> float:
     """Return the largest factor of a variance by the scatter of rows."""
     if settings.centroid in FULL_COLUMN_METHODS:
@@ -416,7 +433,7 @@ def _factor_max(settings: Settings) -> float:
 
 @kernel
 def _begin_window(memory, state):
-    """Drop the last rows, the line's width, the scatter and the usual widths."""
+    """Drop the last rows, the line's width, the scatter, the usual widths and the footprint."""
     state.window = 0
     state.half = memory.estimator.half_max
     memory.columns.seeds[:] = -1
@@ -426,6 +443,8 @@ def _begin_window(memory, state):
     memory.delay[:] = 0.0
     _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths)
+    if memory.footprint.state.near_edge == 0:
+        _begin_anew(memory.footprint, memory.known)
 
 
 @kernel
@@ -488,13 +507,14 @@ def _write(rows, smoothing, few, delay_us, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, gate, blink, footprint, scatter, smoothing = memory[:7]
+    columns, estimator, gate, blink, footprint, known, scatter, smoothing = memory[:8]
     light, rows, row_counts = memory.light, memory.rows, memory.row_counts
     if gate.choices.size > 0:
         _learn_gate(columns, state.half, gate)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated
+    learns, ends = _learns(footprint), state.window >= memory.window_events
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, row_counts)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > estimator.half_max
@@ -509,18 +529,17 @@ def _close(memory, state, counters):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _mark_unusual(rows, smoothing, light.lit_share)
-    if estimator.method == _LEARNED or footprint.state[3] > 0:
+    if _choose(footprint, rows.row[0], ends, estimator.method == _LEARNED):
+        # Later windows begin with what is known now.
+        _begin_anew(known, footprint)
+    if learns:
         doubtful, truncated = rows.doubtful[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, light)
     _write(rows, smoothing, few, delay_us, state, memory.output)
-    if state.window >= memory.window_events:
-        if estimator.method == _LEARNED:
-            state.window = 0
-            _forget_gate(gate)
-        else:
-            _begin_window(memory, state)
+    if ends:
+        _begin_window(memory, state)
 
 
 @kernel
@@ -648,9 +667,11 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
         if state.status == _FILLED and state.rows > rows_max:
             break
         filled = state.status == _FILLED
+        choosing = memory.footprint.state.choice == UNDECIDED
         _begin_period(edges, edge, memory, state, counters)
         edge += 1
-        if span.one_window and filled and state.window == 0:
+        chosen = choosing and memory.footprint.state.choice != UNDECIDED
+        if span.one_window and filled and (chosen or state.window == 0):
             state.over = 1
             break
     return _Progress(np.int64(i), edge)

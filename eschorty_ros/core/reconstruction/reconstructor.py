@@ -100,12 +100,10 @@ class Reconstructor:
         if settings.noise_filter == "activity":
             self._filter = ActivityFilter(model.columns, model.rows)
         self._assembler: ProfileAssembler | WindowAssembler
-        # A learned footprint follows the whole stream.
-        alone = integer("jobs", jobs, 1, JOBS_MAX) == 1 or settings.centroid == "learned"
-        self._jobs = 1 if alone else jobs
+        self._jobs = integer("jobs", jobs, 1, JOBS_MAX)
         self._assembler = (
             ProfileAssembler(settings, model)
-            if alone
+            if jobs == 1
             else WindowAssembler(settings, model, jobs, self._hand_on)
         )
         self._compensator: StepCompensator | None = None

@@ -52,13 +52,12 @@ class WindowAssembler:
     A window begins without knowledge of the events before it, so that any thread can decode it from
     the words' place on: a pass that only counts events finds where, and with which decoder's state.
     That is compared with the state in which the window before ends. Where they differ, in a stream
-    with faults, and where a footprint was learned, the window is assembled again, behind the one
-    before it. So rows and counts are those of one assembler, in the same order.
+    with faults, and where the sensor's edge cuts the line, the window is assembled again, behind
+    the one before it. So rows and counts are those of one assembler, in the same order.
 
     Parameters
     ----------
     settings : Settings
-        Not with ``centroid`` learned, which follows the whole stream.
     model : RangeModel
     jobs : int
         Threads.
@@ -124,8 +123,11 @@ class WindowAssembler:
             return Cut(*self._open.merge_words(words, decoder, span, edges))
         self._words, self._span, self._edges = words, span._replace(one_window=True), edges
         self._decoder, self._first_decoder = decoder, decoder
-        probe, cut, left, going = _copy(decoder), Cut(0, 0), self._open.events_left, True
-        running = deque([self._start(cut, decoder, decoder, self._open)])
+        self._at, going = Cut(0, 0), True
+        if self._open.is_choosing:
+            going = self._go_on()
+        probe, cut, left = _copy(decoder), self._at, self._open.events_left
+        running = deque([self._start(cut, decoder, decoder, self._open)] if going else [])
         while going:
             found = next_cut(words, cut, edges.t_us, left, probe)
             if found is None:
@@ -191,16 +193,10 @@ class WindowAssembler:
         if assembler is self._open:
             self._hand_on(result)
             return assembler.window_is_over
-        learned = assembler.has_learned or self._open.learns
-        if (
-            not going
-            or learned
-            or window.begin != self._at
-            or not self._decoder.is_at(window.first)
-        ):
+        at_end = window.begin == self._at and self._decoder.is_at(window.first)
+        if not going or self._open.is_cut or not at_end:
             self._idle.append(assembler)
             return going and self._go_on()
-        assembler.exchange_footprints(self._open)
         self._counts.update(self._open.counters)
         if self._decoder is not self._first_decoder:
             self._first_decoder.add_counts(self._decoder)

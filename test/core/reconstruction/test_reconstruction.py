@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from independent_pixels import FIRST_EDGE_US, Camera, stream, wavy
 from line_events import encoded, line_events
 from reconstructing import CALIBRATION, KNOWN, assert_same, reconstruct
 
@@ -118,6 +119,26 @@ def test_threads_give_the_same_points_and_counts(case, monkeypatch):
             parts = [parallel.push(data[k : k + half]) for k in range(0, len(data), half)]
             assert_same(serial, Profiles.concatenate([*parts, parallel.flush()]))
             assert a.counters == parallel.counters
+
+
+def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monkeypatch):
+    """Chosen after 7 profiles of 60, with windows of a dozen; half of the events are lost."""
+    monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 400_000)
+    camera = Camera(periods=60)
+    events = camera.line(wavy)
+    kept = camera.rng.random(events[0].size) < 0.5
+    data = stream(tuple(values[kept] for values in events))
+    modulation = Modulation(camera.frequency_hz, on_edge_us=FIRST_EDGE_US)
+    serial, a = reconstruct(data, modulation, Settings())
+    means, _ = reconstruct(data, modulation, Settings(detail="off"))
+    late = serial.period > 10
+    assert np.mean(serial.row[~late] == means.row[~late]) > 0.5
+    assert np.mean(serial.row[late] == means.row[late]) < 0.1
+    for jobs in (2, 5):
+        parallel = Reconstructor(CALIBRATION, modulation, Settings(), jobs)
+        parts = [parallel.push(data), parallel.flush()]
+        assert_same(serial, Profiles.concatenate(parts))
+        assert a.counters == parallel.counters
 
 
 def test_windows_are_found_without_decoding_what_is_before_them(monkeypatch):
