@@ -113,20 +113,23 @@ class StageTrack:
         held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
         if held.size == 0 or query.size == 0:
             return np.full(query.shape, np.nan)
-        ends = np.searchsorted(held, [query.min(), query.max()], side="right") - 1
+        low, high = query.min(), query.max()
+        outside = low < held[0] or high > held[-1]
+        first, last = np.searchsorted(held, [low, high], side="right") - 1
+        held, nm = (kept[max(first, 0) : last + 2] for kept in (held, nm))
         # The times of a few profiles are between the same two samples.
-        one = ends[0] == ends[1]
-        left = ends[0] if one else np.searchsorted(held, query, side="right") - 1
-        left = np.clip(left, 0, held.size - 1)
+        one = first == last
+        left = 0 if one else np.maximum(np.searchsorted(held, query, side="right") - 1, 0)
         right = np.minimum(left + 1, held.size - 1)
         since = query - held[left]
         gap = held[right] - held[left]
         step_nm = (nm[right] - nm[left]).astype(np.float64)
-        position = (nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM
-        unknown = (query < held[left]) | (query > held[right])
-        if self.max_gap_us is not None:
-            unknown |= (gap > self.max_gap_us) & (since > 0)
-        return np.where(unknown, np.nan, position)
+        position = np.asarray((nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM)
+        if outside:
+            position[(query < held[left]) | (query > held[right])] = np.nan
+        if self.max_gap_us is not None and np.any(long := gap > self.max_gap_us):
+            position[long & (since > 0)] = np.nan
+        return position
 
     def samples_from(self, t_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return times and positions (mm) of the samples kept, those before ``t_us`` left out."""
