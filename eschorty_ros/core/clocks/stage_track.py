@@ -115,20 +115,19 @@ class StageTrack:
             return np.full(query.shape, np.nan)
         low, high = query.min(), query.max()
         outside = low < held[0] or high > held[-1]
+        # The times of a few profiles are between two samples or three.
         first, last = np.searchsorted(held, [low, high], side="right") - 1
         held, nm = (kept[max(first, 0) : last + 2] for kept in (held, nm))
-        # The times of a few profiles are between the same two samples.
-        one = first == last
-        left = 0 if one else np.maximum(np.searchsorted(held, query, side="right") - 1, 0)
-        right = np.minimum(left + 1, held.size - 1)
+        right = np.minimum(np.arange(1, held.size + 1), held.size - 1)
+        gap, step_nm = held[right] - held, (nm[right] - nm).astype(np.float64)
+        left = 0 if first == last else np.searchsorted(held[1:], query, side="right")
         since = query - held[left]
-        gap = held[right] - held[left]
-        step_nm = (nm[right] - nm[left]).astype(np.float64)
-        position = np.asarray((nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM)
+        part = since / np.maximum(gap, 1)[left]
+        position = np.asarray((nm[left] + step_nm[left] * part) / NM_PER_MM)
         if outside:
-            position[(query < held[left]) | (query > held[right])] = np.nan
-        if self.max_gap_us is not None and np.any(long := gap > self.max_gap_us):
-            position[long & (since > 0)] = np.nan
+            position[(query < held[0]) | (query > held[-1])] = np.nan
+        if self.max_gap_us is not None and (gap > self.max_gap_us).any():
+            position[(gap > self.max_gap_us)[left] & (since > 0)] = np.nan
         return position
 
     def samples_from(self, t_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
