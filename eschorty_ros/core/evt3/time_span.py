@@ -12,6 +12,7 @@ from eschorty_ros.core.base.arrays import byte_view
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import words as w3
 
+# Words searched at once; TIME_HIGH is one of some hundred.
 _BLOCK = 64
 # A stream repeats its time far more often.
 _SEARCHED = 8192
@@ -29,7 +30,7 @@ class BeginTime(NamedTuple):
 
 
 def begin_time(data: bytes | bytearray | memoryview) -> BeginTime:
-    """Return the time words of the first 8192 words that say when a piece of a stream begins.
+    """Return when a piece of a stream begins by the time words among its first 8192.
 
     Raises ``ArgumentError`` for anything but bytes.
     """

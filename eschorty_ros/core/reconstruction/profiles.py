@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, selection, vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.optics import RangeModel
@@ -163,13 +163,21 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
     ndarray of POINT_DTYPE, shape (len(profiles),)
         Metres and seconds; ``sigma`` is the range's standard deviation. REFLECTANCE_DTYPE where
         the profiles have a reflectance.
+
+    Raises
+    ------
+    ArgumentError
+        When an array of the profiles has another dtype or length.
     """
     known = profiles.reflectance is not None
     origin_us = integer("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
     points = np.empty(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
-    values = (np.ascontiguousarray(getattr(profiles, name)) for name in _Measured._fields)
+    measured = (
+        exact(name, getattr(profiles, name), _DTYPES[name], len(profiles))
+        for name in _Measured._fields
+    )
     lateral = _Lateral(float(model.principal_column), model.slope_per_column, float(model.b_mm))
-    _fill_link(_Measured(*values), lateral, origin_us, points)
+    _fill_link(_Measured(*measured), lateral, origin_us, points)
     if known:
         points["reflectance"] = profiles.reflectance
         points["reflectance_sigma"] = profiles.reflectance_sigma
@@ -242,14 +250,7 @@ def place(
     ArgumentError
         When the positions do not match the points or the direction is not a unit vector.
     """
-    position = reals("stage_position_mm", stage_position_mm)
-    if position.ndim and position.shape != (len(profiles),):
-        raise ArgumentError(
-            f"stage_position_mm has shape {position.shape}; give one position for each of the "
-            f"{len(profiles)} points"
-        )
-    if not position.ndim:
-        position = np.full(len(profiles), position)
+    position = _positions("stage_position_mm", stage_position_mm, len(profiles))
     known = np.isfinite(position)
     if not known.all():
         profiles = profiles.select(known)
@@ -271,11 +272,21 @@ def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction:
     Raises
     ------
     ArgumentError
-        When the direction is not a unit vector.
+        When the positions do not match the points or the direction is not a unit vector.
     """
-    direction, position = _unit(stage_direction), reals("position_mm", position_mm)
-    position = np.ascontiguousarray(position)
-    _move(points, np.full(points.shape, position) if position.size == 1 else position, direction)
+    _move(points, _positions("position_mm", position_mm, len(points)), _unit(stage_direction))
+
+
+def _positions(name: str, position_mm: ArrayLike, points: int) -> NDArray[np.float64]:
+    """Return one position for each point, for compiled code."""
+    position = reals(name, position_mm)
+    if not position.ndim:
+        return np.full(points, position)
+    if position.shape != (points,):
+        raise ArgumentError(
+            f"{name} has shape {position.shape}; give one position for each of the {points} points"
+        )
+    return np.ascontiguousarray(position)
 
 
 @kernel
