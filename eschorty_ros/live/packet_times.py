@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.evt3 import begin_time, time_span_us
 from eschorty_ros.core.evt3 import words as w3
 
 WRAP_US = 1 << 24
-# A stream repeats its time far more often than the latter, mostly within the first.
-_WORDS_SEARCHED = 256, 8192
 # A stream without losses skips less of its own time than this between two packets.
 _STEP_US = 100_000
 # A packet at most this many numbers back that is stamped no later was overtaken in transit.
@@ -36,12 +35,10 @@ class Packet:
 
 def check_span(data: Any) -> None:
     """Raise ``FormatError`` for a packet whose time runs on for longer than any packet lasts."""
-    words = _words(data)
-    high = words[words & 0xF000 == w3.TIME_HIGH << 12] & 0xFFF
-    span_us = int((np.diff(high) & 0xFFF).sum(dtype=np.int64)) << 12
+    span_us = time_span_us(data)
     if span_us > _SPAN_MAX_US:
         raise FormatError(
-            f"a packet of {len(words)} words spans {span_us * 1e-6:.0f} s; send EVT3 as it comes"
+            f"a packet of {len(data)} bytes spans {span_us * 1e-6:.0f} s; send EVT3 as it comes"
         )
 
 
@@ -84,21 +81,14 @@ def skips_time(data: Any, before_us: int | None) -> bool:
 
 
 def _first_word_us(data: Any, before_us: int | None) -> int | None:
-    for count in _WORDS_SEARCHED:
-        words = _words(data)[:count]
-        low = np.flatnonzero(words >> 12 == w3.TIME_LOW)
-        if low.size:
-            break
-    high = np.flatnonzero(words >> 12 == w3.TIME_HIGH)
-    if high.size and (low.size == 0 or high[0] < low[0]):
-        until = low[0] if low.size else words.size
-        t_us = int(words[high[high < until][-1]] & 0xFFF) << 12
-    elif low.size and before_us is not None:
+    high, low = begin_time(data)
+    if high >= 0:
+        t_us = high << 12
+    elif low >= 0 and before_us is not None:
         t_us = before_us & ~0xFFF
     else:
         return None
-    if low.size:
-        t_us |= int(words[low[0]] & 0xFFF)
+    t_us |= max(low, 0)
     if before_us is None:
         return t_us
     return t_us + round((before_us - t_us) / WRAP_US) * WRAP_US

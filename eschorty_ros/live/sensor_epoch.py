@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from eschorty_ros.core.clocks import EdgeClock, PulseTrain, SensorClock, StageTrack
 from eschorty_ros.core.reconstruction import Profiles
 
-_NEVER_US = -(1 << 62)
 _PULSES_MISSING = 30
 
 
@@ -63,12 +62,12 @@ class SensorEpoch:
         self._position_mm = position_mm
         self.edges_missing = self._passed_mm > _PULSES_MISSING * self.edges.pulses.interval_mm
 
-    def covered(self, t_us: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask of the sensor times before the last fitted edge; all without edges."""
+    def covers(self, t_us: NDArray[np.int64]) -> bool:
+        """Return whether no sensor time is after the last fitted edge; true without edges."""
         if not self.expects_edges:
-            return np.ones(t_us.shape, dtype=bool)
+            return True
         until_us = self.edges.until_us
-        return t_us <= (_NEVER_US if until_us is None else until_us)
+        return until_us is not None and int(t_us.max()) <= until_us
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +127,7 @@ class TimedProfiles:
             return int(self.t_ns.max())
         return self.sensor.epoch.clock.to_ns(int(self.sensor.t_us.max()))
 
-    def covered(self) -> NDArray[np.bool_]:
-        """Return a mask of the points whose times are covered by edges, all without edges."""
-        if self.sensor is None:
-            return np.ones(len(self.t_ns), dtype=bool)
-        return self.sensor.epoch.covered(self.sensor.t_us)
+    @property
+    def covered(self) -> bool:
+        """Return whether edges cover the times of all points; true without edges."""
+        return self.sensor is None or self.sensor.epoch.covers(self.sensor.t_us)

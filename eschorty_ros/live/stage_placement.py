@@ -90,23 +90,22 @@ class StagePlacer:
         if last_us is not None and (self._sampled is None or self._sampled[0] != last_us):
             self._sampled = last_us, now_s
         for arrived_s, waiting in self._waiting:
-            expired = now_s - arrived_s > self.timeout_s
+            waited_s = now_s - arrived_s
             # All of a part together: to copy those that are known costs more than they gain.
-            if not expired and (last_us is None or waiting.latest_ns() // NS_PER_US > last_us):
+            if waited_s <= self.timeout_s and (
+                last_us is None
+                or waiting.latest_ns() // NS_PER_US > last_us
+                or (waited_s <= _EDGE_WAIT_S and not waiting.covered)
+            ):
                 left.append((arrived_s, waiting))
                 continue
             timed = waiting.retimed()
-            t_us = timed.t_ns // NS_PER_US
-            early = t_us > last_us if last_us is not None else np.ones(len(t_us), dtype=bool)
-            if now_s - arrived_s <= min(_EDGE_WAIT_S, self.timeout_s):
-                early |= ~timed.covered()
-            if early.any() and not expired:
-                left.append((arrived_s, waiting))
-                continue
-            position_mm = self.track.position_mm(t_us)
-            known = ~early & ~np.isnan(position_mm)
+            position_mm = self.track.position_mm(timed.t_ns // NS_PER_US)
+            known = ~np.isnan(position_mm)
             self.points_without_stage += int(np.count_nonzero(~known))
-            if known.any():
+            if known.all():
+                placed.append((timed, position_mm))
+            elif known.any():
                 placed.append((timed.select(known), position_mm[known]))
         self._waiting = left
         self.waiting = sum(len(timed.profiles) for _, timed in left)

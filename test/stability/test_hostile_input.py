@@ -167,6 +167,8 @@ CALLS: dict[str, Call] = {
     "evt3.Decoder": call(evt3.Decoder, width=SIDE, height=SIDE),
     "evt3.Decoder.decode": call(method(evt3.Decoder, "decode"), data=BYTES),
     "evt3.WordCounter.add": call(method(evt3.WordCounter, "add"), data=BYTES),
+    "evt3.begin_time": call(evt3.begin_time, data=BYTES),
+    "evt3.time_span_us": call(evt3.time_span_us, data=BYTES),
     "evt3.ActivityFilter": call(
         evt3.ActivityFilter, width=SIDE, height=SIDE, window_us=(5, integer(0, 1_000_001))
     ),
@@ -315,6 +317,12 @@ CALLS: dict[str, Call] = {
     ),
     "reconstruction.place_link": call(
         partial(reconstruction.place_link, blank_profiles(N), MODEL), origin_us=(0, integer(2**63))
+    ),
+    "reconstruction.live_points": call(
+        reconstruction.live_points,
+        points=(POINTS, Kind(["abc", None, np.zeros(N)])),
+        t_ns=(np.zeros(N, np.int64), Kind(["abc", None, np.zeros(N), np.zeros(N - 1, np.int64)])),
+        stamp_ns=(0, integer(2**63)),
     ),
     "reconstruction.place": call(
         partial(reconstruction.place, blank_profiles(N), MODEL),
@@ -486,7 +494,8 @@ def test_good_input_is_accepted(name):
 
 NOT_FOR_USERS = {
     # Plain records that the package makes.
-    "calibration.CalibrationFit", "calibration.Post", "evt3.Counters", "evt3.EventArrays",
+    "calibration.CalibrationFit", "calibration.Post", "evt3.BeginTime", "evt3.Counters",
+    "evt3.EventArrays",
     "evt3.Events", "evt3.Triggers", "line.Centroids", "optics.DesignTable",
     "optics.LaserClass", "reconstruction.Result", "storage.Recording", "storage.ScanLog",
     # Their arguments are objects of the package, or go to functions of the table.

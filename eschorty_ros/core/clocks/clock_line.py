@@ -44,15 +44,18 @@ class ClockLine:
     def to_ns(self, t_us: Time) -> Time:
         """Return the ROS time (ns) of sensor time ``t_us``; scalar in, ``int`` out."""
         if isinstance(t_us, np.ndarray):
-            since = _within("t_us", t_us, T_US_LIMIT) - self.origin_us
-            return self._elapsed_ns(_within("t_us", since, self._reach_us)) + self.origin_ns
+            reach_us = self._reach_us
+            low = max(-T_US_LIMIT, self.origin_us - reach_us)
+            high = min(T_US_LIMIT, self.origin_us + reach_us)
+            since = _within("t_us", t_us, low, high) - self.origin_us
+            return self._elapsed_ns(since) + self.origin_ns
         since_us = integer("t_us", t_us, -T_US_LIMIT, T_US_LIMIT) - self.origin_us
         return int(self._elapsed_ns(since_us)) + self.origin_ns
 
     def to_us(self, t_ns: Time) -> Time:
         """Return the sensor time (us, nearest, halves up) of ROS time ``t_ns``."""
         if isinstance(t_ns, np.ndarray):
-            return self._since_us(_within("t_ns", t_ns, TIME_LIMIT) - self.origin_ns)
+            return self._since_us(_within("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT) - self.origin_ns)
         return int(self._since_us(integer("t_ns", t_ns, -TIME_LIMIT, TIME_LIMIT) - self.origin_ns))
 
     def shifted(self, by_ns: int) -> ClockLine:
@@ -83,10 +86,10 @@ class ClockLine:
         return found + self.origin_us
 
 
-def _within(name: str, values: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
+def _within(name: str, values: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
     """Return ``values`` as int64; refuse those that would exceed 64 bits when converted."""
     checked = times(name, values)
     for extreme in (checked.max(), checked.min()) if checked.size else ():
-        if not -limit <= extreme <= limit:
-            raise ArgumentError(f"{name} holds {extreme}; choose within {limit}")
+        if not low <= extreme <= high:
+            raise ArgumentError(f"{name} holds {extreme}; choose {low} to {high}")
     return checked

@@ -113,20 +113,22 @@ class StageTrack:
         held, nm = self._t_us[self._begin : self._end], self._nm[self._begin : self._end]
         if held.size == 0 or query.size == 0:
             return np.full(query.shape, np.nan)
-        ends = np.searchsorted(held, [query.min(), query.max()], side="right") - 1
-        # The times of a few profiles are between the same two samples.
-        one = ends[0] == ends[1]
-        left = ends[0] if one else np.searchsorted(held, query, side="right") - 1
-        left = np.clip(left, 0, held.size - 1)
-        right = np.minimum(left + 1, held.size - 1)
+        low, high = query.min(), query.max()
+        outside = low < held[0] or high > held[-1]
+        # The times of a few profiles are between two samples or three.
+        first, last = np.searchsorted(held, [low, high], side="right") - 1
+        held, nm = (kept[max(first, 0) : last + 2] for kept in (held, nm))
+        right = np.minimum(np.arange(1, held.size + 1), held.size - 1)
+        gap, step_nm = held[right] - held, (nm[right] - nm).astype(np.float64)
+        left = 0 if first == last else np.searchsorted(held[1:], query, side="right")
         since = query - held[left]
-        gap = held[right] - held[left]
-        step_nm = (nm[right] - nm[left]).astype(np.float64)
-        position = (nm[left] + step_nm * (since / np.maximum(gap, 1))) / NM_PER_MM
-        unknown = (query < held[left]) | (query > held[right])
-        if self.max_gap_us is not None:
-            unknown |= (gap > self.max_gap_us) & (since > 0)
-        return np.where(unknown, np.nan, position)
+        part = since / np.maximum(gap, 1)[left]
+        position = np.asarray((nm[left] + step_nm[left] * part) / NM_PER_MM)
+        if outside:
+            position[(query < held[0]) | (query > held[-1])] = np.nan
+        if self.max_gap_us is not None and (gap > self.max_gap_us).any():
+            position[(gap > self.max_gap_us)[left] & (since > 0)] = np.nan
+        return position
 
     def samples_from(self, t_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return times and positions (mm) of the samples kept, those before ``t_us`` left out."""

@@ -7,11 +7,13 @@ from eschorty_ros.core.evt3.activity_filter import ActivityFilter
 from eschorty_ros.core.evt3.decoder import Counters, Decoder
 from eschorty_ros.core.evt3.encoder import Encoder, sort_readout
 from eschorty_ros.core.evt3.events import EVENT_DTYPE, EventArrays, Events, Triggers
+from eschorty_ros.core.evt3.time_span import BeginTime, begin_time, time_span_us
 from eschorty_ros.core.evt3.word_count import WordCounter
 
 __all__ = [
     "EVENT_DTYPE",
     "ActivityFilter",
+    "BeginTime",
     "Counters",
     "Decoder",
     "Encoder",
@@ -19,5 +21,7 @@ __all__ = [
     "Events",
     "Triggers",
     "WordCounter",
+    "begin_time",
     "sort_readout",
+    "time_span_us",
 ]

@@ -179,6 +179,11 @@ class RangeModel:
         along_mm = baseline_mm * math.cos(theta) - self.k_mm - self.b_mm
         return along_mm, baseline_mm * math.sin(theta)
 
+    @property
+    def slope_per_column(self) -> float:
+        """Lateral offset per column and mm of depth, ``p / k``."""
+        return self.pixel_um * 1e-3 / self.k_mm
+
     def normalised_column(self, column: ArrayLike) -> Array:
         """Return ``u``: 0 at the principal column, 1 half a sensor further, any shape."""
         return np.asarray((reals("column", column) - self.principal_column) / (0.5 * self.columns))
@@ -239,7 +244,7 @@ class RangeModel:
     def column_slope(self, column: ArrayLike) -> Array:
         """Return the lateral offset per mm of depth: ``(column - c0) p / k``, mm per mm."""
         offset = reals("column", column) - self.principal_column
-        return np.asarray(offset * (self.pixel_um * 1e-3 / self.k_mm))
+        return np.asarray(offset * self.slope_per_column)
 
     def lateral_mm(self, column: ArrayLike, range_mm: ArrayLike) -> Array:
         """Return the position along the laser line, mm, of a point at ``range_mm`` in ``column``.

@@ -1,5 +1,6 @@
 """From the camera's bytes to profiles and points."""
 
+from eschorty_ros.core.reconstruction.live_cloud import LIVE_DTYPE, LIVE_SPAN_NS, live_points
 from eschorty_ros.core.reconstruction.offline import (
     Result,
     reconstruct_recording,
@@ -19,12 +20,15 @@ from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
 from eschorty_ros.core.reconstruction.warm_up import warm_up
 
 __all__ = [
+    "LIVE_DTYPE",
+    "LIVE_SPAN_NS",
     "NOISE_FILTERS",
     "Profiles",
     "Reconstructor",
     "Result",
     "Settings",
     "add_stage",
+    "live_points",
     "place",
     "place_link",
     "reconstruct_recording",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eschorty_ros.core.base.arrays import TIME_LIMIT, integer, reals, selection, vector
+from eschorty_ros.core.base.arrays import TIME_LIMIT, exact, integer, reals, selection, vector
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 
@@ -108,7 +109,7 @@ class LineRows:
         return type(self)(**chosen)
 
     def _values(self) -> dict[str, Any]:
-        return {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     def _unknown(self) -> Self:
         """Return the rows with a reflectance of NaN."""
@@ -162,21 +163,61 @@ def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDA
     ndarray of POINT_DTYPE, shape (len(profiles),)
         Metres and seconds; ``sigma`` is the range's standard deviation. REFLECTANCE_DTYPE where
         the profiles have a reflectance.
+
+    Raises
+    ------
+    ArgumentError
+        When an array of the profiles has another dtype or length.
     """
     known = profiles.reflectance is not None
-    integer("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
-    points = np.zeros(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
-    points["x"] = profiles.range_mm * 1e-3
-    points["z"] = model.lateral_mm(profiles.column, profiles.range_mm) * 1e-3
-    points["intensity"] = profiles.events
-    points["sigma"] = profiles.sigma_mm * 1e-3
-    points["t"] = (profiles.t_us - np.int64(origin_us)) * 1e-6
-    points["column"] = profiles.column
-    points["flags"] = profiles.flags
+    origin_us = integer("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
+    points = np.empty(len(profiles), dtype=REFLECTANCE_DTYPE if known else POINT_DTYPE)
+    measured = (
+        exact(name, getattr(profiles, name), _DTYPES[name], len(profiles))
+        for name in _Measured._fields
+    )
+    lateral = _Lateral(float(model.principal_column), model.slope_per_column, float(model.b_mm))
+    _fill_link(_Measured(*measured), lateral, origin_us, points)
     if known:
         points["reflectance"] = profiles.reflectance
         points["reflectance_sigma"] = profiles.reflectance_sigma
     return points
+
+
+class _Measured(NamedTuple):
+    """Arrays of `Profiles` that a point is made of."""
+
+    range_mm: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+    t_us: NDArray[np.int64]
+    column: NDArray[np.uint16]
+    events: NDArray[np.uint32]
+    flags: NDArray[np.uint16]
+
+
+class _Lateral(NamedTuple):
+    """Constants of `RangeModel.lateral_mm`."""
+
+    principal_column: float
+    slope_per_column: float
+    b_mm: float
+
+
+@kernel
+def _fill_link(measured, lateral, origin_us, points):
+    """Set all fields of points in the moving frame but those of a reflectance."""
+    for i in range(np.uintp(points.size)):
+        slope = (measured.column[i] - lateral.principal_column) * lateral.slope_per_column
+        depth_mm = measured.range_mm[i] + lateral.b_mm
+        lateral_mm = slope * depth_mm if depth_mm > 0.0 else np.nan
+        points[i].x = measured.range_mm[i] * 1e-3
+        points[i].y = 0.0
+        points[i].z = lateral_mm * 1e-3
+        points[i].intensity = measured.events[i]
+        points[i].sigma = measured.sigma_mm[i] * 1e-3
+        points[i].t = (measured.t_us[i] - origin_us) * 1e-6
+        points[i].column = measured.column[i]
+        points[i].flags = measured.flags[i]
 
 
 def place(
@@ -209,13 +250,7 @@ def place(
     ArgumentError
         When the positions do not match the points or the direction is not a unit vector.
     """
-    position = reals("stage_position_mm", stage_position_mm)
-    if position.ndim and position.shape != (len(profiles),):
-        raise ArgumentError(
-            f"stage_position_mm has shape {position.shape}; give one position for each of the "
-            f"{len(profiles)} points"
-        )
-    position = np.broadcast_to(position, (len(profiles),))
+    position = _positions("stage_position_mm", stage_position_mm, len(profiles))
     known = np.isfinite(position)
     if not known.all():
         profiles = profiles.select(known)
@@ -237,11 +272,34 @@ def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction:
     Raises
     ------
     ArgumentError
-        When the direction is not a unit vector.
+        When the positions do not match the points or the direction is not a unit vector.
     """
-    for axis, share in zip("xyz", _unit(stage_direction).tolist(), strict=True):
-        if share:
-            points[axis] += share * reals("position_mm", position_mm) * 1e-3
+    _move(points, _positions("position_mm", position_mm, len(points)), _unit(stage_direction))
+
+
+def _positions(name: str, position_mm: ArrayLike, points: int) -> NDArray[np.float64]:
+    """Return one position for each point, for compiled code."""
+    position = reals(name, position_mm)
+    if not position.ndim:
+        return np.full(points, position)
+    if position.shape != (points,):
+        raise ArgumentError(
+            f"{name} has shape {position.shape}; give one position for each of the {points} points"
+        )
+    return np.ascontiguousarray(position)
+
+
+@kernel
+def _move(points, position_mm, direction):
+    """Move points along the axes that the stage's direction has a part of."""
+    x, y, z = direction[0], direction[1], direction[2]
+    for i in range(np.uintp(points.size)):
+        if x != 0.0:
+            points[i].x += x * position_mm[i] * 1e-3
+        if y != 0.0:
+            points[i].y += y * position_mm[i] * 1e-3
+        if z != 0.0:
+            points[i].z += z * position_mm[i] * 1e-3
 
 
 def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArray[np.float64]:

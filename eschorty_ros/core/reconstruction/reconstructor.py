@@ -257,10 +257,9 @@ class Reconstructor:
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
             profiles = profiles.select(within)
-        flagged = profiles.flags != 0
-        self._counts["points_flagged"] += int(np.count_nonzero(flagged))
+        self._counts["points_flagged"] += int(np.count_nonzero(profiles.flags))
         if self.settings.keep == "good":
-            profiles = profiles.select(~flagged)
+            profiles = profiles.select(profiles.flags == 0)
         self._counts["points"] += len(profiles)
         return profiles
 

@@ -14,18 +14,13 @@ from sensor_msgs.msg import Image, PointCloud2
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction import place_link
+from eschorty_ros.core.reconstruction import LIVE_SPAN_NS, live_points, place_link
 from eschorty_ros.core.storage import height_map, join_points
 from eschorty_ros.live.event_frame import EventFrame
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.cloud_messages import (
-    LIVE_SPAN_NS,
-    cloud_message,
-    image_message,
-    live_points,
-)
+from eschorty_ros.nodes.ros.cloud_messages import cloud_message, image_message
 from eschorty_ros.nodes.ros.transforms import BASE, LINK, OPTICAL
 
 POINTS_INTERVAL_S = 0.05

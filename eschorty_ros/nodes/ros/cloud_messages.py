@@ -10,25 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2, PointField
 
-from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
-
-
-def live_dtype(scan_dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the layout of a live cloud: that of the assembled scan with ``t`` as uint32."""
-    names = scan_dtype.names or ()
-    return np.dtype([(name, "<u4" if name == "t" else scan_dtype[name].str) for name in names])
-
-
-LIVE_DTYPE = live_dtype(POINT_DTYPE)
-"""Point of a live cloud: metres, events used, metres, ns since the header's stamp, column.
-
-The points of an assembled scan (``POINT_DTYPE``) have ``t`` in seconds as float64: a uint32 of
-nanoseconds ends at 4.29 s, shorter than most scans.
-"""
-
-LIVE_SPAN_NS = 4_000_000_000
-"""Longest time one live cloud may span, just under the range of its uint32 ``t``."""
 
 _POINT_FIELD_TYPES = {
     "u1": PointField.UINT8,
@@ -90,21 +72,6 @@ def points_from_message(message: PointCloud2, *, organized: bool = False) -> NDA
     if organized and message.height > 1:
         return points.reshape(message.height, message.width)
     return points if message.is_dense else points[np.isfinite(points["x"])]
-
-
-def live_points(
-    scan_points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int | NDArray[np.int64]
-) -> NDArray[Any]:
-    """Return an assembled scan's points in the layout of a live cloud, ``t`` from ``stamp_ns``.
-
-    All of ``t_ns`` must be within ``LIVE_SPAN_NS`` after the stamp, or the stamp of each.
-    """
-    live = np.empty(len(scan_points), live_dtype(scan_points.dtype))
-    for name in scan_points.dtype.names or ():
-        if name != "t":
-            live[name] = scan_points[name]
-    live["t"] = t_ns - stamp_ns
-    return live
 
 
 def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:

@@ -10,14 +10,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.reconstruction import LIVE_DTYPE, live_points
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
 from eschorty_ros.nodes.reconstruction.inputs import laser_settings
 from eschorty_ros.nodes.ros import transforms
 from eschorty_ros.nodes.ros.cloud_messages import (
-    LIVE_DTYPE,
     cloud_message,
     image_message,
-    live_points,
     points_from_message,
 )
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stamp_from_ns
