@@ -39,9 +39,9 @@ class ProfileLength:
     background before the laser is on. Of their columns, weighted by events, one has ``sum n^2 / sum
     n - 1`` events, with ``n`` the events of each column. One period is a profile where it has half
     of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the default of
-    ``events_min``. Else a profile gets as many periods as give `EVENTS_WANTED`, by the events of
-    the next block, since pixels give more when the laser is switched on. Blocks without light do
-    not count. A block has `BLOCK_US`, or whole periods with enough events, but two periods at
+    ``events_min``. Else a profile gets as many periods as give `EVENTS_WANTED`. Where the first
+    block gives less than that in a period the next one counts, since pixels give more when the
+    laser is switched on. Blocks without light do not count. A block has `BLOCK_US`, or whole periods with enough events, but two periods at
     least.
 
     Parameters
@@ -77,14 +77,14 @@ class ProfileLength:
             if last and t[-1] < end_us + self._span_us:
                 # A short stream has no complete block.
                 begin = first
-            for _ in range(2):
+            for enough in (EVENTS_WANTED, EVENTS_WANTED / 2.0):
                 end_us = self._block_end_us(t, begin, end_us)
                 if watermark_us <= end_us and not last:
                     return 0
                 end = int(np.searchsorted(t, end_us))
                 if self._is_lit(held, begin, end):
                     events = self._events(held, begin, end)
-                if 2.0 * events >= EVENTS_WANTED:
+                if events >= enough:
                     return 1
                 begin = end
             if events > 0.0 or last:
