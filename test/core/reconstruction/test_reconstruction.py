@@ -16,6 +16,7 @@ from eschorty_ros.core.reconstruction import (
     Profiles,
     Reconstructor,
     Settings,
+    add_stage,
     place,
     place_link,
     profile_assembler,
@@ -481,6 +482,16 @@ def test_placing():
     z_m = MODEL.lateral_mm(found.column, found.range_mm) * 1e-3
     np.testing.assert_allclose(link["z"], z_m, atol=1e-7)
     np.testing.assert_array_equal(link["t"], (found.t_us - 1000) * 1e-6)
+
+
+def test_arrays_that_do_not_match_the_points_are_refused():
+    found, _ = reconstruct(encoded(lines(periods=2)))
+    points, direction = place_link(found, MODEL), (0.0, 1.0, 0.0)
+    for wrong in (np.zeros(len(found) - 1), np.zeros(1)):
+        with pytest.raises(ArgumentError, match="position_mm"):
+            add_stage(points, wrong, direction)
+    with pytest.raises(ArgumentError, match="range_mm"):
+        place_link(replace(found, range_mm=found.range_mm[1:]), MODEL)
 
 
 def test_settings_describe_themselves_and_refuse_bad_values():
