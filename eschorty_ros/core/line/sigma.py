@@ -24,7 +24,7 @@ from eschorty_ros.core.base.kernel import kernel
 
 SIGMA_FACTOR = 0.05
 SIGMA_FLOOR_PX = 0.28
-SIGMA_COMMON_PX = 0.045
+SIGMA_COMMON_PX = 0.036
 _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0

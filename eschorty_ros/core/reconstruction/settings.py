@@ -75,11 +75,6 @@ class Settings:
     """
 
     centroid: str = _choice("mode_mean", CENTROIDS, "column estimator")
-    detail: str = _choice(
-        "auto", ("auto", "off"),
-        "auto: mode_mean learns the line's footprint and takes learned rows, at twice the time, "
-        "where these scatter less by a fifth",
-    )  # fmt: skip
     returns: str = _choice(
         "strongest", RETURNS, "which of two surfaces in one column to report; first is the nearest"
     )
@@ -172,6 +167,11 @@ class Settings:
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
         "part of it that neighbouring columns share and smoothing does not reduce",
+    )  # fmt: skip
+    detail: str = _choice(
+        "auto", ("auto", "off"),
+        "auto: mode_mean learns the line's footprint and takes learned rows, at twice the time, "
+        "where these scatter less by a fifth",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
