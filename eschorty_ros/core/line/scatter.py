@@ -83,10 +83,9 @@ def _forget_scatter(scatter):
 def _add_differences(row, sigma2, rows, averaged, edge_px, sums):
     """Add a profile's differences of ``row``, means of so many columns ``averaged``, to the sums.
 
-    Lines that the sensor's edge cuts are left out, and differences above ``edge_px``: edges of the
-    surface, but where most are as large.
+    Differences above ``edge_px`` are left out: edges of the surface, but where most are as large.
     """
-    variance, cut, columns = rows.variance[0], rows.truncated[0], row.size
+    variance, columns = rows.variance[0], row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
     for block in range(1, sums.number.size - 1):
         begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
@@ -100,8 +99,7 @@ def _add_differences(row, sigma2, rows, averaged, edge_px, sums):
         for c in range(np.uintp(first), np.uintp(max(first, last))):
             before, after = c - np.uintp(apart), c + np.uintp(apart)
             difference = row[before] - 2.0 * row[c] + row[after]
-            whole = not (cut[before] | cut[c] | cut[after])
-            if whole & (abs(difference) <= largest):
+            if abs(difference) <= largest:
                 squares += difference * difference
                 # Means of columns that overlap differ less.
                 shared = max(1.0 - apart / averaged[c], 0.0)
@@ -172,7 +170,7 @@ def _scale(rows, scatter, smoothing):
                 scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
                 gate_px = max(smoothing.gate_px, scattered)
                 smoothing.gates_px[k, c] = smoothing.gate_px if cut else gate_px
-                rows.sigma2[k, c] = sigma2 if cut else factor * sigma2
+                rows.sigma2[k, c] = factor * sigma2
                 rows.common2[k, c] += 0.0 if cut else locking2
 
 
@@ -187,5 +185,4 @@ def _scale_smoothed(rows, scatter, smoothing):
         factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
         for k in range(returns):
             for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
-                own2 = sigma2[k, c] * (1.0 if rows.truncated[k, c] else factor)
-                sigma2[k, c] = rows.common2[k, c] + own2
+                sigma2[k, c] = rows.common2[k, c] + factor * sigma2[k, c]
