@@ -41,8 +41,8 @@ class ProfileLength:
     of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the default of
     ``events_min``. Else a profile gets as many periods as give `EVENTS_WANTED`. Where the first
     block gives less than that in a period the next one counts, since pixels give more when the
-    laser is switched on. Blocks without light do not count. A block has `BLOCK_US`, or whole periods with enough events, but two periods at
-    least.
+    laser is switched on. Blocks without light do not count. A block has `BLOCK_US`, or whole
+    periods with enough events, but two periods at least.
 
     Parameters
     ----------
