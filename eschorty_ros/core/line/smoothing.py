@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.scatter import BLOCK
-from eschorty_ros.core.line.unusual import WIDTH_PAIRS, Widths, empty_widths
+from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths, empty_widths
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
@@ -258,7 +258,7 @@ def _divide(rows, smoothing):
             smoothing.sigma2[k, c] /= n * n
             smoothed += n > 1.0
         for c in range(columns):
-            near = min(smoothing.used[k, c], 2.0 * WIDTH_PAIRS + 1.0)
+            near = min(smoothing.used[k, c], WIDTH_COLUMNS)
             width = np.sqrt(widths.smoothed[k, c] / near)
             widths.smoothed[k, c] = np.nan if np.isnan(rows.row[k, c]) else width
     return smoothed

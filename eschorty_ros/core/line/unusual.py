@@ -29,9 +29,9 @@ _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
 _APART = 5
-# Neighbours on either side that a width is averaged with.
+# Neighbours on either side that a width is averaged with, and the columns of such a mean.
 WIDTH_PAIRS = 2
-_WIDTHS = 2.0 * WIDTH_PAIRS + 1.0
+WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
 # Steps of the running median of differences are this share of it, larger ones at first; standard
 # deviation over that median.
 _STEP = 1.0 / 1024.0
@@ -154,7 +154,7 @@ def _mark_unusual(rows, smoothing, lit_share):
             weight = 1.0
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
-                share = _WIDTHS / min(averaged, _WIDTHS)
+                share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths, width, reach):
                 own2 = sigma2[k, c] - rows.common2[k, c]

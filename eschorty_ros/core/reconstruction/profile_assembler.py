@@ -233,8 +233,9 @@ class ProfileAssembler:
         )
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
-        self._memory.known.state["choice"] = self._first_choice
-        self._memory.known.state["computations"] = 0
+        known = self._memory.known.state
+        known["choice"] = self._first_choice
+        known["computations"] = known["cut_computations"] = 0
         self._memory.footprint.state["near_edge"] = 0
         _begin_window(self._memory, self._state)
 
