@@ -294,7 +294,6 @@ CALLS: dict[str, Call] = {
         events_min=(1, integer(0)),
         sigma_factor=(0.24, number(-1.0)),
         sigma_floor_px=(0.2, number(-1.0)),
-        sigma_common_px=(0.1, number(-1.0)),
     ),
     "line.relative_reflectance": call(
         line.relative_reflectance,

@@ -9,11 +9,11 @@ from eschorty_ros.core.line.centroid import (
     check_method,
     estimate,
 )
+from eschorty_ros.core.line.course import SIGMA_COMMON_PX
 from eschorty_ros.core.line.estimators import FWHM_PER_SIGMA, HALF_WIDTH_PER_FWHM
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
 from eschorty_ros.core.line.sigma import (
     METHOD_ERRORS,
-    SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
 )

@@ -35,7 +35,6 @@ from eschorty_ros.core.line.learned import (
     make_footprint,
 )
 from eschorty_ros.core.line.sigma import (
-    SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
     VARIANCE_PER_WIDTH2,
@@ -247,7 +246,6 @@ def estimate(
     events_min: int = 1,
     sigma_factor: float = SIGMA_FACTOR,
     sigma_floor_px: float = SIGMA_FLOOR_PX,
-    sigma_common_px: float = SIGMA_COMMON_PX,
 ) -> Centroids:
     """Return the row of the line in each column, independently of the others.
 
@@ -271,7 +269,7 @@ def estimate(
         Rows of the sensor, at most 1023.
     events_min : int
         Columns with fewer events in the window give NaN.
-    sigma_factor, sigma_floor_px, sigma_common_px : float
+    sigma_factor, sigma_floor_px : float
         Error model of ``sigma_row``, see `sigma`.
 
     Returns
@@ -319,7 +317,7 @@ def estimate(
         rows=height,
         half_max=half_width_fixed(line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * line_width_px**2,
-        error_model=error_model(method, sigma_factor, sigma_floor_px, sigma_common_px),
+        error_model=error_model(method, sigma_factor, sigma_floor_px),
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
     columns, row_counts = grouped_columns(row_array, offset_array), make_row_counts()
@@ -487,8 +485,7 @@ def _row_estimate(row, variance, line_variance, events, estimator):
     line = min(variance, _BACKGROUND_FREE * line_variance)
     reach = _HALF_SPAN * np.sqrt(line)
     truncated = row < reach or rows - 1.0 - row < reach
-    common2 = estimator.error_model.common**2
-    return RowEstimate(row, sigma2, common2 + (_HALF_BIAS2 * line if truncated else 0.0), truncated)
+    return RowEstimate(row, sigma2, _HALF_BIAS2 * line if truncated else 0.0, truncated)
 
 
 @kernel
@@ -586,8 +583,7 @@ def _refined(packed, column, c, window, line_variance, estimator, footprint, row
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
         best = min(max(best, -0.5), rows - 0.5)
-        common2 = estimator.error_model.common**2
-        common2 += _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
+        common2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
         estimate = RowEstimate(best, learned, common2, estimate.truncated)
     return estimate
 

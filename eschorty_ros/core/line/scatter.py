@@ -132,7 +132,8 @@ def _ratio(sums, block, factor_max):
     near = slice(block - 1, block + 2)
     if factor_max == 0.0 or sums.number[near].sum() < _DIFFERENCES_MIN:
         return -1.0
-    return min(sums.squares[near].sum() / sums.expected[near].sum(), FACTOR_MAX)
+    ratio = sums.squares[near].sum() / sums.expected[near].sum()
+    return min(max(ratio, 1.0 / FACTOR_MAX), FACTOR_MAX)
 
 
 @kernel(_nrt=False)

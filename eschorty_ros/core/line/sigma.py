@@ -7,8 +7,8 @@ The variance of a row has two parts. The column's own is reduced by smoothing ov
 with s the standard deviation of the N rows used and s0 that of the line itself. The first term is
 small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
 from the mismatch of the pixels' thresholds, which more events of the same pixels do not reduce. The
-last term is for events that are not the line's, which scatter independently. Neighbouring columns
-share the other part, ``common^2``.
+last term is for events that are not the line's, which scatter independently. The other part is
+what neighbouring columns share (`course`).
 
 The constants are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
 1000 Hz. In a stream the columns' own part is scaled by the scatter of near columns (`scatter`), so
@@ -24,7 +24,6 @@ from eschorty_ros.core.base.kernel import kernel
 
 SIGMA_FACTOR = 0.05
 SIGMA_FLOOR_PX = 0.28
-SIGMA_COMMON_PX = 0.036
 _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
@@ -41,7 +40,6 @@ class ErrorModel(NamedTuple):
     floor: float
     background: float
     median: bool = False
-    common: float = 0.0
 
 
 METHOD_ERRORS = {
@@ -53,12 +51,7 @@ METHOD_ERRORS = {
 }
 
 
-def error_model(
-    method: str,
-    sigma_factor: float,
-    sigma_floor_px: float,
-    sigma_common_px: float,
-) -> ErrorModel:
+def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> ErrorModel:
     """Return the error model of an estimator.
 
     Raises
@@ -70,7 +63,6 @@ def error_model(
     return own._replace(
         factor=own.factor * number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),
         floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, _SIGMA_LIMIT),
-        common=number("sigma_common_px", sigma_common_px, 0.0, _SIGMA_LIMIT),
     )
 
 

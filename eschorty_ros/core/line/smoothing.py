@@ -69,6 +69,7 @@ def empty_smoothing(
     gate_px: float,
     isolation_gate_px: float,
     isolation_events: int,
+    common_px: float,
     shape: tuple[int, int],
 ) -> Smoothing:
     """Return the smoothing of profiles of a ``shape``, with half widths up to the ``largest``."""
@@ -88,7 +89,7 @@ def empty_smoothing(
         sigma2=sigma2,
         used=used,
         gates_px=gates_px,
-        widths=empty_widths(*shape),
+        widths=empty_widths(*shape, common_px),
     )
 
 

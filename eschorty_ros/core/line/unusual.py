@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.course import Course, _follow, empty_course
+from eschorty_ros.core.line.scatter import BLOCK
 
 _PER_ROW = 16
 _BINS = 1 << 10
@@ -47,8 +49,9 @@ class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``number`` has the points by width and ``below`` their sums; ``state`` the median width and the
-    median difference of widths near each other. ``smoothed`` holds those of a profile, and
-    ``before`` widths and rows of the last one.
+    median difference of widths near each other. ``smoothed`` holds those of a profile,
+    ``at_rest`` less what their way adds, and ``before`` widths and rows of the last one. The
+    ``course`` has what changes.
     """
 
     number: NDArray[np.float64]
@@ -56,16 +59,21 @@ class Widths(NamedTuple):
     state: NDArray[np.float64]
     before: NDArray[np.float64]
     smoothed: NDArray[np.float64]
+    at_rest: NDArray[np.float64]
+    course: Course
 
 
-def empty_widths(returns: int, columns: int) -> Widths:
+def empty_widths(returns: int, columns: int, common_px: float) -> Widths:
     """Return no widths."""
+    smoothed, at_rest = np.full((2, returns, columns), np.nan)
     return Widths(
         number=np.zeros(_BINS),
         below=np.zeros(_BINS + 1),
         state=np.zeros(2),
         before=np.full((2, returns, columns), np.nan),
-        smoothed=np.full((returns, columns), np.nan),
+        smoothed=smoothed,
+        at_rest=at_rest,
+        course=empty_course(columns, common_px),
     )
 
 
@@ -81,6 +89,7 @@ def _restart_widths(widths):
     widths.below[:] = 0.0
     widths.state[:] = 0.0
     widths.before[:] = np.nan
+    widths.course.recent[:] = 0.0
 
 
 @kernel(_nrt=False)
@@ -128,13 +137,38 @@ def _at_rest(width, usual, way):
 
 
 @kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, lit_share):
-    """Mark the mixed points of a profile's smoothed rows and widen their variance.
+def _follow_line(rows, smoothing, lit_share):
+    """Take what their way adds off the widths of a profile's points, and follow the line's course.
 
     A line is lit for ``lit_share`` of the time between two profiles. Weak points show no width.
     """
+    row, widths = smoothing.row, smoothing.widths
+    before, now = widths.before, widths.course.now
+    returns, columns = row.shape
+    known, usual = widths.below[_BINS] >= _POINTS_MIN, widths.state[0]
+    now[:] = 0.0
+    for k in range(returns):
+        for c in range(columns):
+            width, way = widths.smoothed[k, c], row[k, c] - before[1, k, c]
+            if known and np.isfinite(way):
+                width = _at_rest(width, usual, lit_share * way)
+            widths.at_rest[k, c] = width
+            shown = not rows.truncated[k, c] and rows.events[k, c] >= smoothing.isolation_events
+            if k == 0 and shown and not np.isnan(row[k, c]):
+                block = c // BLOCK + 1
+                now[0, block] += row[k, c]
+                now[1, block] += width
+                now[2, block] += rows.sigma2[k, c]
+                now[3, block] += 1.0
+    sigma = _SIGMA_PER_MEDIAN * widths.state[1]
+    _follow(widths.course, usual if known else 0.0, WIDTH_COLUMNS * sigma * sigma)
+
+
+@kernel(_nrt=False)
+def _mark_unusual(rows, smoothing, lit_share):
+    """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
-    events_min = smoothing.isolation_events
+    _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
     smoothed, before, state = widths.smoothed, widths.before, widths.state
     known = widths.below[_BINS] >= _POINTS_MIN
@@ -143,26 +177,27 @@ def _mark_unusual(rows, smoothing, lit_share):
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
-            width, last_width, last_row = smoothed[k, c], before[0, k, c], before[1, k, c]
+            width, last_width, last_row = widths.at_rest[k, c], before[0, k, c], before[1, k, c]
             way = row[k, c] - last_row
-            if known and np.isfinite(way):
-                width = _at_rest(width, usual, lit_share * way)
             before[0, k, c], before[1, k, c] = width, row[k, c]
+            own2 = sigma2[k, c] - rows.common2[k, c]
+            sigma2[k, c] += widths.course.moved2[c // BLOCK + 1]
             rows.mixed[k, c] = False
-            if np.isnan(width) or rows.truncated[k, c] or rows.events[k, c] < events_min:
+            weak = rows.events[k, c] < smoothing.isolation_events
+            if np.isnan(width) or rows.truncated[k, c] or weak:
                 continue
-            weight = 1.0
+            weight, more2 = 1.0, widths.course.passing2[c // BLOCK + 1]
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths, width, reach):
-                own2 = sigma2[k, c] - rows.common2[k, c]
                 steady = not way * way > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
-                more2 = _unusual_variance(width, usual)
-                rows.mixed[k, c] = more2 > _MARKED**2 * rows.sigma2[k, c]
-                sigma2[k, c] += more2
+                unusual2 = _unusual_variance(width, usual)
+                rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
+                more2 = max(more2, unusual2)
+            sigma2[k, c] += more2
             if not abs(width - last_width) > _STEADY * sigma:
                 widths.number[_bin(width)] += weight
             if c >= _APART and not np.isnan(smoothed[k, c - _APART]):

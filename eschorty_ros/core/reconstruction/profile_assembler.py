@@ -388,7 +388,6 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             settings.centroid,
             settings.sigma_factor,
             settings.sigma_floor_px,
-            settings.sigma_common_px,
         ),
     )
     returns = 2 if settings.returns == "all" else 1
@@ -406,6 +405,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             float(settings.smoothing_gate_px),
             float(settings.isolation_gate_px),
             settings.isolation_events,
+            settings.sigma_common_px,
             shape,
         ),
         light=Light(),

@@ -8,7 +8,6 @@ from eschorty_ros.core.line import (
     FULL_COLUMN_METHODS,
     METHOD_ERRORS,
     METHODS,
-    SIGMA_COMMON_PX,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
     estimate,
@@ -76,7 +75,7 @@ def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
         assert abs(error) <= 2.0 * found.sigma_row[0], background
         sigma[background] = found.sigma_row[0]
     own = METHOD_ERRORS["mean"]
-    floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2 + SIGMA_COMMON_PX**2
+    floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2
     spread2 = (own.factor * SIGMA_FACTOR) ** 2 * line.var(ddof=1) / line.size
     assert sigma[0] == pytest.approx(np.sqrt(floor2 + spread2), rel=1e-12)
     assert sigma[0] < sigma[1] < sigma[3]

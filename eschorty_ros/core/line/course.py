@@ -1,0 +1,74 @@
+"""What changes with the line from profile to profile, by block of columns, and moves its rows.
+
+A line whose rows are where they were has the same error in all profiles. One that moves is behind
+by a part of a row, as pixels remember where it was, in all columns alike. One that gets narrower
+for a few profiles passes an edge, and is off by half of the rows that are missing at most. Means
+over blocks show changes that are too small to be seen in a column.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.scatter import BLOCK
+
+# Most that a moving line is behind, as the pixels of the simulation remember: 0.035 to 0.067 px.
+SIGMA_COMMON_PX = 0.04
+# Profiles whose mean a profile is compared with.
+_PROFILES = 16.0
+# Half of the full width of evenly lit rows over their standard deviation.
+_ROOT_3 = np.sqrt(3.0)
+
+
+class Course(NamedTuple):
+    """Mean row and width of the recent profiles by block, and the variances that follow from them.
+
+    The first and the last block are outside the sensor. ``now`` has the sums of a profile's rows,
+    widths, variances of rows and points, ``recent`` the recent means and the number of profiles. A
+    line that moves is off by the standard deviation ``common_px`` at most: the variance ``moved2``;
+    ``passing2`` is that of an edge that it passes.
+    """
+
+    now: NDArray[np.float64]
+    recent: NDArray[np.float64]
+    moved2: NDArray[np.float64]
+    passing2: NDArray[np.float64]
+    common_px: float
+
+
+def empty_course(columns: int, common_px: float) -> Course:
+    """Return the course of a line before its first profile."""
+    blocks = -(-columns // BLOCK) + 2
+    return Course(np.zeros((4, blocks)), np.zeros((3, blocks)), *np.zeros((2, blocks)), common_px)
+
+
+@kernel(_nrt=False)
+def _follow(course, usual, width_variance):
+    """Compare the sums of a profile with recent profiles, and add them.
+
+    A line is not narrower than the ``usual`` width because it was wider when it passed an edge.
+    """
+    now, recent = course.now, course.recent
+    for block in range(1, now.shape[1] - 1):
+        near = slice(block - 1, block + 2)
+        points, profiles = now[3, near].sum(), recent[2, block]
+        course.moved2[block], course.passing2[block] = course.common_px**2, 0.0
+        if points == 0.0:
+            continue
+        row, width = now[0, near].sum() / points, now[1, near].sum() / points
+        moved = row - recent[0, block] if profiles > 0.0 else np.inf
+        moved2 = moved * moved - now[2, near].sum() / (points * points)
+        narrower = max(min(recent[1, block], usual) - width, 0.0)
+        passing2 = _ROOT_3**2 * (narrower * narrower - width_variance / points)
+        course.moved2[block] = min(max(moved2, 0.0), course.common_px**2)
+        course.passing2[block] = max(passing2, 0.0)
+        profiles = min(profiles + 1.0, _PROFILES)
+        # The first profiles, of pixels just lit, are soon forgotten.
+        weight = 2.0 / (profiles + 1.0)
+        recent[0, block] += weight * (row - recent[0, block])
+        recent[1, block] += weight * (width - recent[1, block])
+        recent[2, block] = profiles
