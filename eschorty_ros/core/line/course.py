@@ -20,8 +20,10 @@ from eschorty_ros.core.line.scatter import BLOCK
 SIGMA_COMMON_PX = 0.04
 # Profiles whose mean a profile is compared with.
 _PROFILES = 16.0
-# Half of the full width of evenly lit rows over their standard deviation.
-_ROOT_3 = np.sqrt(3.0)
+# Most that an edge moves the row per change of the width: by half of the rows that are missing, or
+# by half of the gap in the middle of evenly lit rows.
+_PER_NARROWER = np.sqrt(3.0)
+_PER_WIDER = 2.0 / np.sqrt(3.0)
 
 
 class Course(NamedTuple):
@@ -47,10 +49,10 @@ def empty_course(columns: int, common_px: float) -> Course:
 
 
 @kernel(_nrt=False)
-def _follow(course, usual, width_variance):
+def _follow(course, known, usual, width_variance):
     """Compare the sums of a profile with recent profiles, and add them.
 
-    A line is not narrower than the ``usual`` width because it was wider when it passed an edge.
+    A line that has its ``usual`` width again, where it is ``known``, has passed the edge.
     """
     now, recent = course.now, course.recent
     for block in range(1, now.shape[1] - 1):
@@ -62,8 +64,10 @@ def _follow(course, usual, width_variance):
         row, width = now[0, near].sum() / points, now[1, near].sum() / points
         moved = row - recent[0, block] if profiles > 0.0 else np.inf
         moved2 = moved * moved - now[2, near].sum() / (points * points)
-        narrower = max(min(recent[1, block], usual) - width, 0.0)
-        passing2 = _ROOT_3**2 * (narrower * narrower - width_variance / points)
+        narrower = min(recent[1, block], usual) - width
+        wider = width - max(recent[1, block], usual)
+        shift = max(_PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
+        passing2 = shift * shift - _PER_NARROWER**2 * width_variance / points
         course.moved2[block] = min(max(moved2, 0.0), course.common_px**2)
         course.passing2[block] = max(passing2, 0.0)
         profiles = min(profiles + 1.0, _PROFILES)

@@ -161,7 +161,7 @@ def _follow_line(rows, smoothing, lit_share):
                 now[2, block] += rows.sigma2[k, c]
                 now[3, block] += 1.0
     sigma = _SIGMA_PER_MEDIAN * widths.state[1]
-    _follow(widths.course, usual if known else 0.0, WIDTH_COLUMNS * sigma * sigma)
+    _follow(widths.course, known, usual, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel(_nrt=False)

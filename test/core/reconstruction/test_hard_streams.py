@@ -50,26 +50,41 @@ def test_a_line_that_moves_while_it_is_lit_keeps_its_points():
     assert len(found) > 0.998 * 12 * 1280, f"seed {camera.seed}"
 
 
-@pytest.mark.parametrize("rows", [-16.0, 40.0])
-def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows):
-    camera = Camera(periods=40)
+def _beside_a_step(camera: Camera, rows: float) -> tuple[Profiles, np.ndarray, np.ndarray]:
+    """Return points while a step passes the line, their errors in mm, how far the step is in px."""
 
     def step(k):
         """Return where the step is in the line, rows from its centre."""
-        return (20 - k) * 0.16 * camera.half_width_px
+        return (camera.periods // 2 - k) * 0.16 * camera.half_width_px
 
     near = camera.line(wavy, part=lambda k: (-28.0, step(k)))
     far = camera.line(lambda k, c: wavy(k, c) + rows, part=lambda k: (step(k), 28.0))
     found, _ = points(camera, near, far)
     found = found.select(found.period >= 4)
-    truth = wavy(found.period, found.column.astype(float))
-    truth = truth + np.where(step(found.period) > 0.0, 0.0, rows)
-    error = found.range_mm - MODEL.range_mm(truth)
-    crossing = np.abs(step(found.period)) < 1.4 * camera.half_width_px
+    away_px = step(found.period)
+    truth = wavy(found.period, found.column.astype(float)) + np.where(away_px > 0.0, 0.0, rows)
+    return found, found.range_mm - MODEL.range_mm(truth), away_px
+
+
+@pytest.mark.parametrize("rows", [-16.0, 40.0])
+def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows):
+    camera = Camera(periods=40)
+    found, error, away_px = _beside_a_step(camera, rows)
+    crossing = np.abs(away_px) < 1.4 * camera.half_width_px
     good = found.flags == 0
     assert np.mean(good[~crossing]) > 0.99, f"seed {camera.seed}"
     assert np.quantile(np.abs(error[crossing & good]), 0.95) < 2.2
     assert np.mean(np.abs(error)[~good] < 2.0 * found.sigma_mm[~good]) > 0.8
+
+
+@pytest.mark.parametrize("rows", [-1.0, 1.0])
+def test_sigma_holds_what_a_step_of_a_row_moves_the_line_by(rows):
+    camera = Camera(periods=60)
+    found, error, away_px = _beside_a_step(camera, rows)
+    crossing = np.abs(away_px) < camera.half_width_px
+    assert np.mean(np.abs(error)[crossing] < 2.0 * found.sigma_mm[crossing]) > 0.75
+    assert np.mean(np.abs(error)[crossing] < 4.0 * found.sigma_mm[crossing]) > 0.98
+    assert np.median(found.sigma_mm[~crossing]) < 0.15, f"seed {camera.seed}"
 
 
 @pytest.mark.parametrize("frequency_hz", [70.0, 1000.0])
