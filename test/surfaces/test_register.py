@@ -55,9 +55,10 @@ def test_known_poses_are_within_the_reported_covariance():
         (lambda y, z: 1300.0 + 4.0 * np.sin(y / 5.0) + 0.0 * z, "slides along z"),
     ],
 )
-def test_surfaces_that_slide_are_refused(surface, words):
+@pytest.mark.parametrize("sigma_mm", [0.08, 0.17, 0.6])
+def test_surfaces_that_slide_are_refused_whatever_the_noise(surface, words, sigma_mm):
     with pytest.raises(ArgumentError, match=words):
-        register(cloud(surface), cloud(surface, seed=2))
+        register(cloud(surface, sigma_mm), cloud(surface, sigma_mm, seed=2))
 
 
 def test_clouds_apart_are_refused_and_a_start_brings_them_together():

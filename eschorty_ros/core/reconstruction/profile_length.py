@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import HeldEvents
@@ -17,8 +18,14 @@ PERIODS_MAX = 1000
 EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
 _BLOCK_PERIODS = 2
+_PERIODS_MIN = 4
 _BLOCK_EVENTS = 1 << 16
 _HELD_EVENTS_MAX = 1 << 22
+# Part of the columns that may have few events.
+_FEW_SHARE = 1.0 / 24.0
+# Standard deviation of the events of even profiles over their mean, and their number to know it.
+_UNEVEN_SHARE = 0.2
+_PROFILES_MIN = 4
 # Events of a window that are looked at, evenly spread.
 _SAMPLE = 4096
 # Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
@@ -36,13 +43,14 @@ class ProfileLength:
 
     They are a block behind the first estimation window that is modulated, or has a line where
     pixels are too slow to follow: the choice does not depend on how the stream is split, nor on the
-    background before the laser is on. Of their columns, weighted by events, one has ``sum n^2 / sum
-    n - 1`` events, with ``n`` the events of each column. One period is a profile where it has half
-    of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the default of
-    ``events_min``. Else a profile gets as many periods as give `EVENTS_WANTED`. Where the first
-    block gives less than that in a period the next one counts, since pixels give more when the
-    laser is switched on. Blocks without light do not count. A block has `BLOCK_US`, or whole
-    periods with enough events, but two periods at least.
+    background before the laser is on. One period is a profile where at most one in 24 columns has
+    less than a quarter of `EVENTS_WANTED`, the default of ``events_min``; columns count by their
+    pairs of events, which background has few of. Else a profile has as many periods as give
+    `EVENTS_WANTED`, or the next number with which profiles are even: pixels that follow every third
+    period give most events in two of three. Where one period is not enough in the first block, with
+    twice as many events, the next one counts, since pixels give more when the laser is switched on.
+    Blocks without light do not count. A block has `BLOCK_US`, but two periods at least; the first
+    one ends with enough events after four.
 
     Parameters
     ----------
@@ -60,7 +68,7 @@ class ProfileLength:
 
         1 where too many events do not follow the laser, or none do and these are the ``last``.
         """
-        t = held.arrays[0]
+        t, period_us = held.arrays[0], self._modulation.period_us
         while True:
             while self._window is None:
                 begin = self._seen
@@ -68,61 +76,75 @@ class ProfileLength:
                 if window is None and not last:
                     return 0
                 self._seen = end = t.size if window is None else begin + window.size
-                if self._is_lit(held, begin, end):
+                if self._edge_us(held, begin, end) is not None:
                     self._window = begin, end
                 elif window is None or end > _HELD_EVENTS_MAX:
                     return 1
             first, begin = self._window
-            end_us, events = int(t[begin - 1]), 0.0
+            end_us, periods = int(t[begin - 1]), 0
             if last and t[-1] < end_us + self._span_us:
                 # A short stream has no complete block.
                 begin = first
-            for enough in (EVENTS_WANTED, EVENTS_WANTED / 2.0):
-                end_us = self._block_end_us(t, begin, end_us)
+            for least in (EVENTS_WANTED // 2, EVENTS_WANTED // 4):
+                end_us = self._block_end_us(t, begin, end_us, periods == 0)
                 if watermark_us <= end_us and not last:
                     return 0
                 end = int(np.searchsorted(t, end_us))
-                if self._is_lit(held, begin, end):
-                    events = self._events(held, begin, end)
-                if events >= enough:
+                edge_us = self._edge_us(held, begin, end)
+                if edge_us is not None and edge_us <= t[end - 1]:
+                    after = int(np.searchsorted(t, edge_us))
+                    t_us, columns = (values[after:end] for values in held.arrays[:2])
+                    periods = self._periods((t_us - edge_us) / period_us, columns, least)
+                if periods == 1:
                     return 1
                 begin = end
-            if events > 0.0 or last:
-                break
+            if periods > 0 or last:
+                return max(periods, 1)
             # The light was on for less than a window.
             self._seen, self._window = begin, None
-        wanted = math.ceil(EVENTS_WANTED / max(events, 1e-9))
-        return min(wanted, periods_max(self._modulation)) if events > 0.0 else 1
 
-    def _block_end_us(self, t_us: NDArray[np.int64], begin: int, begin_us: int) -> int:
+    def _block_end_us(self, t_us: NDArray[np.int64], begin: int, begin_us: int, short: bool) -> int:
         """Return the end of the block that begins with an event and at a time."""
         end_us = begin_us + self._span_us
-        if t_us.size > begin + _BLOCK_EVENTS:
+        if short and t_us.size > begin + _BLOCK_EVENTS:
             period_us = self._modulation.period_us
             periods = math.ceil((int(t_us[begin + _BLOCK_EVENTS]) - begin_us) / period_us)
-            end_us = min(end_us, begin_us + round(max(periods, _BLOCK_PERIODS) * period_us))
+            end_us = min(end_us, begin_us + round(max(periods, _PERIODS_MIN) * period_us))
         return end_us
 
-    def _is_lit(self, held: HeldEvents, begin: int, end: int) -> bool:
-        """Return true when held events follow the laser or are on a line."""
+    def _edge_us(self, held: HeldEvents, begin: int, end: int) -> int | None:
+        """Return an edge of the laser that held events follow, or are on a line; else none."""
         if begin == end:
-            return False
+            return None
         sample = slice(begin, end, max((end - begin) // _SAMPLE, 1))
         t, x, y, p = (values[sample] for values in held.arrays)
-        return estimate_phase(t, p, self._modulation).found or _is_line(x, y)
+        phase = estimate_phase(t, p, self._modulation)
+        return phase.edge_us if phase.found or _is_line(x, y) else None
 
-    def _events(self, held: HeldEvents, begin: int, end: int) -> float:
-        """Return the events of a lit column in a period."""
-        t_us, columns = (values[begin:end] for values in held.arrays[:2])
-        turns = ((t_us - t_us[0]) / self._modulation.period_us).astype(np.int64)
-        counts = np.bincount(columns).astype(np.float64)
-        return (float(counts @ counts) / t_us.size - 1.0) / _participating(np.bincount(turns))
+    def _periods(self, turns: Array, columns: NDArray[np.uint16], least: int) -> int:
+        """Return the periods of a profile; one where a period has the ``least`` events.
 
-
-def _participating(counts: NDArray[np.int64]) -> float:
-    """Return how many entries the counts are spread over: the number of equal ones."""
-    total = float(counts.sum())
-    return total * total / float(counts @ counts)
+        ``turns`` are the times of the events since an edge, periods.
+        """
+        shape = int(turns[-1]) + 1, int(columns.max()) + 1
+        index = turns.astype(np.int64) * shape[1] + columns
+        counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
+        # The last period may not be whole.
+        counts = counts[: max(round(float(turns[-1])), 1)]
+        of_column = counts.sum(axis=0)
+        pairs = of_column * (of_column - 1)
+        lit = pairs / max(pairs.sum(), 1)
+        if np.mean((counts < least) @ lit) <= _FEW_SHARE:
+            return 1
+        events = max(float((counts @ lit).mean()), 1e-9)
+        wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)
+        in_period = counts.sum(axis=1)
+        for periods in range(wanted, len(counts) // _PROFILES_MIN + 1):
+            whole = in_period[: len(counts) // periods * periods]
+            profiles = whole.reshape(-1, periods).sum(axis=1)
+            if profiles.std() <= _UNEVEN_SHARE * profiles.mean():
+                return periods
+        return wanted
 
 
 def _is_line(columns: NDArray[np.uint16], rows: NDArray[np.uint16]) -> bool:

@@ -95,6 +95,18 @@ def test_few_events_are_no_flag_where_all_points_have_few(frequency_hz):
     assert np.mean(found.flags == 0) > 0.95, f"seed {camera.seed}"
 
 
+@pytest.mark.parametrize("frequency_hz", [2000.0, 5000.0, 10_000.0])
+def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequency_hz, tmp_path):
+    narrow = replace(CALIBRATION, columns=160, principal_column=79.5)
+    sweep = (10.0, 16.0, 300.0)
+    recording = simulate_recording(tmp_path, Plane(), narrow, Modulation(frequency_hz), *sweep, 1)
+    found = reconstruct_recording(recording).profiles
+    assert len(found) > 0.98 * found.profile_count * 160, "seed 1"
+    stage_mm = recording.stage.position_mm(found.t_us)
+    error_mm = found.range_mm - true_range_mm(Plane(), narrow.model(), stage_mm, found.column)
+    assert np.median(np.abs(error_mm)) < 0.4, "seed 1"
+
+
 def test_good_points_of_a_face_that_is_swept_fast_have_no_flag(tmp_path):
     narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
     scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
