@@ -15,6 +15,8 @@ _PIECE_BYTES = 1 << 25
 _CHUNK_BYTES = 1 << 20
 _CHUNK_EVENTS = 1 << 16
 _FEW = 10
+# Difference of a multiple of the frequency from a whole one.
+_WHOLE = 0.01
 _LOSSES = {
     "columns_too_few_events": "columns have fewer events than events_min = {0.events_min}; lower "
     "it, or raise periods_per_profile = {0.periods_per_profile}",
@@ -53,10 +55,13 @@ def recording_warnings(
     reader = RawReader(recording.events_path)
     stated_hz, shown_hz = recording.modulation.frequency_hz, _frequency_hz(recording, reader)
     found += _geometry(recording, reader)
-    if shown_hz not in (None, stated_hz):
+    if shown_hz is not None and shown_hz != stated_hz:
+        multiple = stated_hz / shown_hz
+        whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
+        or_slow = f", or the pixels follow one period of {multiple:.0f}" if whole else ""
         found.append(
             f"frequency_hz is {stated_hz:g} in laser.yaml and the events show {shown_hz:.4g} Hz; "
-            "correct it"
+            f"correct it{or_slow}"
         )
     without_stage = counters["points_without_stage"]
     if without_stage:
