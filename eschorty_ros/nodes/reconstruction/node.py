@@ -305,7 +305,8 @@ class ReconstructionNode(Node):
     def _step(self) -> None:
         # A profile leaves before its points are placed, which it does not need.
         self._outputs.profiles(self._pipeline.complete(time.monotonic()))
-        self._outputs.points(self._pipeline.place(time.monotonic()))
+        if self._outputs.points_due:
+            self._outputs.points(self._pipeline.place(time.monotonic()))
         until_ns = self._pipeline.stream.processed_until_ns
         if until_ns is not None:
             self._outputs.event_frame(until_ns)

@@ -54,6 +54,11 @@ class Outputs:
         """Return whether points or an image wait until they are due."""
         return bool(self._batch) or self._frame is not None
 
+    @property
+    def points_due(self) -> bool:
+        """Return whether points that come now need not wait."""
+        return time.monotonic() - self._points_at_s >= POINTS_INTERVAL_S
+
     def set_calibration(self, calibration: Calibration) -> None:
         """Use another calibration of the same sensor."""
         self._model = calibration.model()
@@ -76,7 +81,7 @@ class Outputs:
 
     def profiles(self, fresh: list[TimedProfiles]) -> None:
         """Publish each profile, or as many as the maximum rate allows."""
-        if self._profile.get_subscription_count() == 0:
+        if not fresh or self._profile.get_subscription_count() == 0:
             return
         for timed in fresh:
             for profile in self._spaced(timed):
@@ -97,14 +102,15 @@ class Outputs:
 
     def points(self, placed: list[PlacedPoints]) -> None:
         """Collect points and publish them as one cloud at most every 50 ms."""
+        self._batch.extend(placed)
+        if not self._batch or not self.points_due:
+            return
+        # One that is late does not delay the next one.
+        now_s, due_s = time.monotonic(), self._points_at_s + POINTS_INTERVAL_S
+        self._points_at_s = due_s if now_s < due_s + POINTS_INTERVAL_S else now_s
         if self._points.get_subscription_count() == 0:
             self._batch.clear()
             return
-        self._batch.extend(placed)
-        now_s = time.monotonic()
-        if not self._batch or now_s - self._points_at_s < POINTS_INTERVAL_S:
-            return
-        self._points_at_s = now_s
         points = join_points([part.points for part in self._batch])
         t_ns = np.concatenate([part.t_ns for part in self._batch])
         self._batch.clear()
