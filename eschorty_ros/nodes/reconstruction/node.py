@@ -47,7 +47,7 @@ from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import diagnostics, qos, transforms
 from eschorty_ros.nodes.ros.border import refusals
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stage_position_mm
-from eschorty_ros.nodes.ros.executor import QueueingGroup
+from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
@@ -131,27 +131,26 @@ class ReconstructionNode(Node):
 
     def _make_interfaces(self) -> None:
         override = {"qos_overriding_options": qos.overridable()}
-        arrivals = QueueingGroup()
+        short = ShortGroup()
         self.create_subscription(EventPacket, "camera/events", self._on_packet,
-                                 qos.events(), callback_group=arrivals, **override)  # fmt: skip
+                                 qos.events(), callback_group=short, **override)  # fmt: skip
         stream = self._pipeline.stream
         self._announcement = LatchedState(
             self, TimeReference, "camera/clock", self._on_clock,
-            lambda: self._post(stream.forget_zero),
+            lambda: self._post(stream.forget_zero), short,
         )  # fmt: skip
         LatchedState(
             self, PositionTrigger, "stage/trigger", self._on_trigger,
-            lambda: self._post(partial(stream.set_pulses, None)),
+            lambda: self._post(partial(stream.set_pulses, None)), short,
         )  # fmt: skip
-        self.create_subscription(
-            LaserState, "laser/state", self._on_laser, qos.latched(qos.STATE_HISTORY)
-        )
+        self.create_subscription(LaserState, "laser/state", self._on_laser,
+                                 qos.latched(qos.STATE_HISTORY), callback_group=short)  # fmt: skip
         self.create_subscription(
             Odometry,
             "stage/odom",
             self._on_stage,
             qos.stream(_STAGE_DEPTH),
-            callback_group=arrivals,
+            callback_group=short,
             **override,
         )
         Heartbeat(self, "reconstruction/heartbeat", self._running)
@@ -164,6 +163,7 @@ class ReconstructionNode(Node):
             self.parameters["stage_timeout"],
             self._publish_scan,
             self._recorder,
+            short,
         )
         if self.parameters["publish_tf"]:
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
@@ -171,8 +171,8 @@ class ReconstructionNode(Node):
             now_ns = self.get_clock().now().nanoseconds
             self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_STATE_S, self._reports.publish_state, clock=steady)
-        self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose)
+        self.create_timer(_STATE_S, self._reports.publish_state, short, steady)
+        self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose, short)
 
     def safe_state(self) -> None:
         """End a calibration under way: on its way out the laser goes off."""

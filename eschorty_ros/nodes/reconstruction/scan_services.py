@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -46,6 +46,7 @@ class ScanServices:
     - ``stage_timeout_s``: Longest wait of points for the stage after the end.
     - ``publish``: Publishes a finished scan, given the ROS time (ns) for one without points.
     - ``recorder``: Returns a recorder for a scan's log, ``None`` when scans are not recorded.
+    - ``short``: Group of callbacks that wait for nothing.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class ScanServices:
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
         recorder: Callable[[str, float, float], ScanRecorder | None],
+        short: CallbackGroup,
     ) -> None:
         self._node, self._pipeline, self._topics = node, pipeline, topics
         self._in_worker, self._running = in_worker, running
@@ -76,10 +78,11 @@ class ScanServices:
         self._client = OnePublisher()
         self._sender: Sender | None = None
         self._begun_s, self._had_client = 0.0, False
-        node.create_subscription(Header, CLIENT_HEARTBEAT, self._on_heartbeat, qos.heartbeat())
-        node.create_timer(
-            _CHECK_S, self._check_client, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_subscription(
+            Header, CLIENT_HEARTBEAT, self._on_heartbeat, qos.heartbeat(), callback_group=short
         )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_CHECK_S, self._check_client, short, steady)
 
     def finish(self) -> None:
         """Publish an ended scan once all its points are placed; called in the worker."""

@@ -38,10 +38,10 @@ _LOG_S = 5.0
 _TAKEN_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class QueueingGroup(MutuallyExclusiveCallbackGroup):
-    """Callbacks that queue what has arrived and return: they run in the executor's own thread.
+class ShortGroup(MutuallyExclusiveCallbackGroup):
+    """Short callbacks that wait for nothing: they run in the executor's own thread.
 
-    A message of a fast stream then costs one change of threads less.
+    Each then costs one change of threads less.
     """
 
 
@@ -243,7 +243,7 @@ class EventExecutor(_Redirecting, _Events):
         return bool(super().shutdown(timeout_sec))
 
     def _submit(self, group: CallbackGroup, work: Work) -> None:
-        if isinstance(group, QueueingGroup):
+        if isinstance(group, ShortGroup):
             work()
             return
         # A pool that has ended takes no more.
