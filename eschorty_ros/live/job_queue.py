@@ -38,6 +38,10 @@ class JobQueue:
         """Queue a small job; return ``False`` and count it when the queue is full."""
         return self._append(job, False)
 
+    def post_later(self, job: Job) -> bool:
+        """Queue a small job that need not end a wait for the next one."""
+        return self._append(job, False, wakes=False)
+
     def post_bulk(self, job: Job) -> bool:
         """Queue a bulk job; return ``False`` and count it when the queue is full."""
         return self._append(job, True)
@@ -80,12 +84,13 @@ class JobQueue:
             self._bulk -= bulk
             return job
 
-    def _append(self, job: Job, bulk: bool) -> bool:
+    def _append(self, job: Job, bulk: bool, wakes: bool = True) -> bool:
         with self._arrived:
             if (bulk and self._bulk >= self._bulk_max) or len(self._jobs) >= _JOBS_MAX:
                 self.overflows += 1
                 return False
             self._jobs.append((job, bulk))
             self._bulk += bulk
-            self._arrived.notify()
+            if wakes:
+                self._arrived.notify()
             return True

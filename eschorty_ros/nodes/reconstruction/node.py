@@ -165,6 +165,7 @@ class ReconstructionNode(Node):
             self._recorder,
             short,
         )
+        self._tf: Any = None
         if self.parameters["publish_tf"]:
             self._tf = self.create_publisher(TFMessage, "/tf", qos.stream(100))
             self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
@@ -209,8 +210,9 @@ class ReconstructionNode(Node):
     def _on_stage(self, message: Odometry, info: Mapping[str, Any]) -> None:
         self._stage.check(info)
         t_ns, position_mm = ns_from_stamp(message.header.stamp), stage_position_mm(message)
-        self._jobs.post(partial(self._pipeline.add_stage, t_ns, position_mm))
-        if self.parameters["publish_tf"]:
+        # What waits for a position waits for the next cloud of points, too.
+        self._jobs.post_later(partial(self._pipeline.add_stage, t_ns, position_mm))
+        if self._tf is not None and self._tf.get_subscription_count():
             x, y, z = self.calibration.stage_direction
             carriage = transforms.carriage(t_ns, position_mm, (x, y, z))
             self._tf.publish(TFMessage(transforms=[carriage]))
