@@ -173,10 +173,10 @@ build-package:
 	  && cmake --install $(BUILD)/$(NAME); } > $$LOG 2>&1 \
 	|| { tail -n 40 $$LOG; echo "Building $(NAME) failed; the whole log is in $$LOG"; exit 1; }
 
-# numba compiles again what has changed since, when it is used.
-$(BUILD)/kernels.stamp: $(SETUP)
+# numba compiles again what has changed since, when it is used. No ROS: it goes beside the interfaces with --jobs.
+$(BUILD)/kernels.stamp: $(BUILD)/run.stamp
 	@echo "Compiling kernels, for a minute or two"
-	@$(ENTER) eschorty compile
+	@NUMBA_CACHE_DIR="$(BUILD)/numba" $(VENV)/bin/python -c 'from eschorty_ros.cli import main; main(["compile"])'
 	@touch $@
 
 # The checkout's Python sources come first, the installed interfaces after them.
