@@ -27,7 +27,8 @@ VENV := $(ROOT)/.venv
 BUILD := $(ROOT)/.build
 PREFIX := $(BUILD)/install
 SETUP := $(BUILD)/setup.sh
-PIP := $(VENV)/bin/pip --disable-pip-version-check install --quiet --constraint requirements/constraints.txt
+# Most modules are never imported; Python compiles those that are.
+PIP := $(VENV)/bin/pip --disable-pip-version-check install --quiet --no-compile --constraint requirements/constraints.txt
 ENTER := . $(SETUP) &&
 
 ifdef ROS_DISTRO
