@@ -316,7 +316,7 @@ def estimate(
         events_min=events_min,
         rows=height,
         half_max=half_width_fixed(line_width_px),
-        line_variance=VARIANCE_PER_WIDTH2 * line_width_px**2,
+        line_variance=VARIANCE_PER_WIDTH2 * float(line_width_px) ** 2,
         error_model=error_model(method, sigma_factor, sigma_floor_px),
     )
     found = empty_rows(2 if returns == "all" else 1, offset_array.size - 1)
