@@ -2,6 +2,7 @@
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,8 @@ class DdsThread:
         named = threading.Event()
         threading.Thread(target=self._run, args=(named,), daemon=True).start()
         named.wait()
+        # Until it blocks it still runs now and then.
+        time.sleep(0.1)
 
     def _run(self, named: threading.Event) -> None:
         Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text("dds.udp.7400")
