@@ -45,7 +45,8 @@ class Course(NamedTuple):
 def empty_course(columns: int, common_px: float) -> Course:
     """Return the course of a line before its first profile."""
     blocks = -(-columns // BLOCK) + 2
-    return Course(np.zeros((4, blocks)), np.zeros((3, blocks)), *np.zeros((2, blocks)), common_px)
+    now, recent, (moved2, passing2) = (np.zeros((n, blocks)) for n in (4, 3, 2))
+    return Course(now, recent, moved2, passing2, common_px)
 
 
 @kernel(_nrt=False)
