@@ -47,7 +47,7 @@ EXTERNAL := $(foreach package,event_camera_msgs tf2_msgs,$(if $(call provided,$(
 INTERFACES := CMakeLists.txt package.xml $(wildcard msg/* srv/* action/* cmake/* config/* launch/*) \
               $(shell find external_msgs -type f)
 
-.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-scans test-single test-long test-floor quick check lint format types contracts clean
+.PHONY: help setup scan report docs tradeoff faults reference picture moving-picture test test-scans test-single test-floor quick check lint format types contracts clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -85,14 +85,11 @@ faults: $(SETUP)
 reference: $(SETUP)
 	@$(ENTER) python docs/interfaces.py && python docs/policies.py
 
-# Pure parts share the cores; then whole scans go beside single nodes and devices, and long computations
-# take what these leave of the cores. The emulated bench runs in real time, and a computer that stalls fails
-# a scan: what failed runs once more.
-PURE := $(addprefix test/,core live control simulation stability surfaces report viewer)
-LONG := test/experiments $(wildcard test/test_*.py) $(addprefix test/cli/test_,calibrate_command.py cli.py)
-SCANS := $(filter-out $(LONG),$(wildcard test/cli/test_*.py)) \
-         $(addprefix test/,launch nodes/scanner nodes/ros/test_ctrl_c.py nodes/viewer nodes/test_hostile_messages.py)
-SINGLE := test $(addprefix --ignore=,$(PURE) $(LONG) $(SCANS))
+# Pure parts share the cores, the longest first; then whole scans beside single nodes and devices. The
+# emulated bench runs in real time, and a computer that stalls fails a scan: what failed runs once more.
+PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
+SCANS := $(addprefix test/,cli launch nodes/scanner nodes/ros nodes/viewer nodes/test_hostile_messages.py)
+SINGLE := test $(addprefix --ignore=,$(PURE) $(SCANS))
 once_more = { (($$? == 1)) && echo "Once more:" && pytest $(1) --last-failed --last-failed-no-failures none -o cache_dir=$(BUILD)/$@; }
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
@@ -100,13 +97,11 @@ test: $(SETUP) $(BUILD)/test.stamp
 else
 test: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
-	@$(MAKE) --no-print-directory --jobs=3 --output-sync=line test-scans test-single test-long
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=line test-scans test-single
 
-test-scans: tests = $(SCANS)
-test-single: tests = $(SINGLE)
-test-long: tests = $(LONG)
-test-scans test-single test-long: $(SETUP) $(BUILD)/test.stamp
-	@$(ENTER) $(if $(filter %long,$@),nice) pytest $(tests) -o cache_dir=$(BUILD)/$@ || $(call once_more,$(tests))
+test-scans test-single: tests = $(if $(filter %scans,$@),$(SCANS),$(SINGLE))
+test-scans test-single: $(SETUP) $(BUILD)/test.stamp
+	@$(ENTER) pytest $(tests) -o cache_dir=$(BUILD)/$@ || $(call once_more,$(tests))
 endif
 
 quick: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
