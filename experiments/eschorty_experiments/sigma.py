@@ -44,8 +44,11 @@ SWEEPS = ((70.0, 100.0, 50.0), (300.0, 200.0, 30.0), (1000.0, 300.0, 24.0))
 MORE_SWEEPS = ((70.0, 20.0, 4.0), (70.0, 300.0, 60.0), (5000.0, 100.0, 3.0), (20_000.0, 50.0, 1.0))
 START_MM = 40.0
 ONE_SIGMA, TWO_SIGMA = (0.64, 0.77), (0.93, 0.98)
-ON_SCENES, OF_ALL = (0.62, 0.84), (0.57, 0.84)
-"""Bands of the share within one sigma of every scene: on surfaces, and of all points."""
+OF_SCENES = (0.57, 0.84)
+"""Band of the share within one sigma of every scene, on surfaces and of all points.
+
+On 160 columns it scatters by 0.04 from seed to seed.
+"""
 SATURATED_HZ = 1000.0
 """Beyond, profiles have few events per point, and sigma has no band."""
 THICKNESS_PX = 22.0
@@ -128,11 +131,10 @@ def _scene_findings(sweep: tuple[float, float, float], measured: list[Ratios]) -
     kind = (METHODS[0], frequency_hz, speed_mm_s)
     mine = [one for one in measured if (one.method, one.frequency_hz, one.speed_mm_s) == kind]
     findings = []
-    for words, mixed, (low, high) in (("", False, ON_SCENES), (", edges included", None, OF_ALL)):
+    low, high = OF_SCENES if frequency_hz <= SATURATED_HZ else (-math.inf, math.inf)
+    for words, mixed in (("", False), (", edges included", None)):
         shares = [one.within(1.0, mixed) for one in mine]
         name = f"{frequency_hz:g} Hz, {speed_mm_s:g} mm/s: share within 1 sigma{words}"
-        if frequency_hz > SATURATED_HZ:
-            low, high = -math.inf, math.inf
         findings.append(Finding(f"{name}, lowest of the scenes", min(shares), low=low))
         findings.append(Finding(f"{name}, highest", max(shares), high=high))
     return findings

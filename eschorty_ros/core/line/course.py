@@ -40,13 +40,17 @@ class Course(NamedTuple):
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
     common_px: float
+    windowed: bool
 
 
-def empty_course(columns: int, common_px: float) -> Course:
-    """Return the course of a line before its first profile."""
+def empty_course(columns: int, common_px: float, windowed: bool) -> Course:
+    """Return the course of a line before its first profile.
+
+    That of full columns, not ``windowed``, is not followed: their widths are those of background.
+    """
     blocks = -(-columns // BLOCK) + 2
     now, recent, (moved2, passing2) = (np.zeros((n, blocks)) for n in (4, 3, 2))
-    return Course(now, recent, moved2, passing2, common_px)
+    return Course(now, recent, moved2, passing2, common_px, windowed)
 
 
 @kernel(_nrt=False)
@@ -60,7 +64,7 @@ def _follow(course, known, usual, width_variance):
         near = slice(block - 1, block + 2)
         points, profiles = now[3, near].sum(), recent[2, block]
         course.moved2[block], course.passing2[block] = course.common_px**2, 0.0
-        if points == 0.0:
+        if points == 0.0 or not course.windowed:
             continue
         row, width = now[0, near].sum() / points, now[1, near].sum() / points
         moved = row - recent[0, block] if profiles > 0.0 else np.inf

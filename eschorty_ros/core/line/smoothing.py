@@ -70,6 +70,7 @@ def empty_smoothing(
     isolation_gate_px: float,
     isolation_events: int,
     common_px: float,
+    windowed: bool,
     shape: tuple[int, int],
 ) -> Smoothing:
     """Return the smoothing of profiles of a ``shape``, with half widths up to the ``largest``."""
@@ -89,7 +90,7 @@ def empty_smoothing(
         sigma2=sigma2,
         used=used,
         gates_px=gates_px,
-        widths=empty_widths(*shape, common_px),
+        widths=empty_widths(*shape, common_px, windowed),
     )
 
 

@@ -63,7 +63,7 @@ class Widths(NamedTuple):
     course: Course
 
 
-def empty_widths(returns: int, columns: int, common_px: float) -> Widths:
+def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
     smoothed, at_rest = np.full((2, returns, columns), np.nan)
     return Widths(
@@ -73,7 +73,7 @@ def empty_widths(returns: int, columns: int, common_px: float) -> Widths:
         before=np.full((2, returns, columns), np.nan),
         smoothed=smoothed,
         at_rest=at_rest,
-        course=empty_course(columns, common_px),
+        course=empty_course(columns, common_px, windowed),
     )
 
 

@@ -406,6 +406,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             float(settings.isolation_gate_px),
             settings.isolation_events,
             settings.sigma_common_px,
+            settings.centroid not in FULL_COLUMN_METHODS,
             shape,
         ),
         light=Light(),

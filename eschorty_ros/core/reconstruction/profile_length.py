@@ -43,10 +43,10 @@ class ProfileLength:
 
     They are a block behind the first estimation window that is modulated, or has a line where
     pixels are too slow to follow: the choice does not depend on how the stream is split, nor on the
-    background before the laser is on. One period is a profile where at most one in 24 columns has
-    less than a quarter of `EVENTS_WANTED`, the default of ``events_min``; columns count by their
-    pairs of events, which background has few of. Else a profile has as many periods as give
-    `EVENTS_WANTED`, or the next number with which profiles are even: pixels that follow every third
+    background before the laser is on. A column counts by its pairs of events, which background has
+    few of. One period is a profile where it has half of `EVENTS_WANTED`: of Poisson counts with a
+    mean of 8, one in 24 is less than 4, the default of ``events_min``. Else, or where periods are
+    not even and more columns have less, a profile has as many periods as give `EVENTS_WANTED`, or the next number with which profiles are even: pixels that follow every third
     period give most events in two of three. Where one period is not enough in the first block, with
     twice as many events, the next one counts, since pixels give more when the laser is switched on.
     Blocks without light do not count. A block has `BLOCK_US`, but two periods at least; the first
@@ -85,7 +85,7 @@ class ProfileLength:
             if last and t[-1] < end_us + self._span_us:
                 # A short stream has no complete block.
                 begin = first
-            for least in (EVENTS_WANTED // 2, EVENTS_WANTED // 4):
+            for enough in (EVENTS_WANTED, EVENTS_WANTED // 2):
                 end_us = self._block_end_us(t, begin, end_us, periods == 0)
                 if watermark_us <= end_us and not last:
                     return 0
@@ -94,7 +94,7 @@ class ProfileLength:
                 if edge_us is not None and edge_us <= t[end - 1]:
                     after = int(np.searchsorted(t, edge_us))
                     t_us, columns = (values[after:end] for values in held.arrays[:2])
-                    periods = self._periods((t_us - edge_us) / period_us, columns, least)
+                    periods = self._periods((t_us - edge_us) / period_us, columns, enough)
                 if periods == 1:
                     return 1
                 begin = end
@@ -121,8 +121,8 @@ class ProfileLength:
         phase = estimate_phase(t, p, self._modulation)
         return phase.edge_us if phase.found or _is_line(x, y) else None
 
-    def _periods(self, turns: Array, columns: NDArray[np.uint16], least: int) -> int:
-        """Return the periods of a profile; one where a period has the ``least`` events.
+    def _periods(self, turns: Array, columns: NDArray[np.uint16], enough: int) -> int:
+        """Return the periods of a profile; one where a column has ``enough`` events in a period.
 
         ``turns`` are the times of the events since an edge, periods.
         """
@@ -131,20 +131,23 @@ class ProfileLength:
         counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
         # The last period may not be whole.
         counts = counts[: max(round(float(turns[-1])), 1)]
-        of_column = counts.sum(axis=0)
+        of_column, in_period = counts.sum(axis=0), counts.sum(axis=1)
         pairs = of_column * (of_column - 1)
         lit = pairs / max(pairs.sum(), 1)
-        if np.mean((counts < least) @ lit) <= _FEW_SHARE:
-            return 1
         events = max(float((counts @ lit).mean()), 1e-9)
+        few = np.mean((counts < EVENTS_WANTED // 4) @ lit)
+        if events >= enough and (few <= _FEW_SHARE or _are_even(in_period, 1)):
+            return 1
         wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)
-        in_period = counts.sum(axis=1)
-        for periods in range(wanted, len(counts) // _PROFILES_MIN + 1):
-            whole = in_period[: len(counts) // periods * periods]
-            profiles = whole.reshape(-1, periods).sum(axis=1)
-            if profiles.std() <= _UNEVEN_SHARE * profiles.mean():
-                return periods
-        return wanted
+        longer = range(wanted, len(counts) // _PROFILES_MIN + 1)
+        return next((periods for periods in longer if _are_even(in_period, periods)), wanted)
+
+
+def _are_even(in_period: NDArray[np.int64], periods: int) -> bool:
+    """Return whether profiles of so many periods have about the same number of events."""
+    whole = in_period[: len(in_period) // periods * periods]
+    profiles = whole.reshape(-1, periods).sum(axis=1)
+    return bool(profiles.std() <= _UNEVEN_SHARE * profiles.mean())
 
 
 def _is_line(columns: NDArray[np.uint16], rows: NDArray[np.uint16]) -> bool:
