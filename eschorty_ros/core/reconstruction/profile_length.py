@@ -46,11 +46,12 @@ class ProfileLength:
     background before the laser is on. A column counts by its pairs of events, which background has
     few of. One period is a profile where it has half of `EVENTS_WANTED`: of Poisson counts with a
     mean of 8, one in 24 is less than 4, the default of ``events_min``. Else, or where periods are
-    not even and more columns have less, a profile has as many periods as give `EVENTS_WANTED`, or the next number with which profiles are even: pixels that follow every third
-    period give most events in two of three. Where one period is not enough in the first block, with
-    twice as many events, the next one counts, since pixels give more when the laser is switched on.
-    Blocks without light do not count. A block has `BLOCK_US`, but two periods at least; the first
-    one ends with enough events after four.
+    not even and more columns have less, a profile has as many periods as give `EVENTS_WANTED`, or
+    the next number with which profiles are even: pixels that follow every third period give most
+    events in two of three. Where one period is not enough in the first block, with twice as many
+    events, the next one counts, since pixels give more when the laser is switched on. Blocks
+    without light do not count. A block has `BLOCK_US`, but two periods at least; the first one ends
+    with enough events after four.
 
     Parameters
     ----------
