@@ -43,9 +43,9 @@ _MOVES_MAX = 24
 # Where every line is cut, a computation from rows that are off leaves this part of their bias.
 _BIAS_KEPT = 0.85
 _OFF_LINE_PX = 1.0
-# Learned rows take twice the time of means. They pay where they scatter less than this share, as
-# means would of 1.6 times the events.
-_PAYS = 0.8
+# Learned rows take twice the time of means. They pay where they scatter less than means of twice
+# the events would.
+_PAYS = np.sqrt(0.5)
 # Shares of the posterior by the logarithm below the best; less counts as none.
 _SHARES = np.exp(-np.arange(8 * _LOG_ONE) / _LOG_ONE)
 

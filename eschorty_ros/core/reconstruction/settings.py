@@ -171,7 +171,7 @@ class Settings:
     detail: str = _choice(
         "auto", ("auto", "off"),
         "auto: mode_mean learns the line's footprint and takes learned rows, at twice the time, "
-        "where these scatter less by a fifth",
+        "where these scatter less than means of twice the events would",
     )  # fmt: skip
 
     def __post_init__(self) -> None:
