@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import platform
 import subprocess
@@ -106,7 +107,7 @@ class Run(NamedTuple):
 
 
 def write_recording(folder: Path, modulation: Modulation, data: bytes, repeats: int) -> Path:
-    """Write a recording of a stage at rest: ``data`` that many times, each later than the last."""
+    """Write a recording of a stage at rest: ``data`` that many times, each whole periods later."""
     folder.mkdir()
     write_laser_yaml(folder / LASER_FILE, modulation)
     save_calibration(single.CALIBRATION, folder / CALIBRATION_FILE)
@@ -114,7 +115,8 @@ def write_recording(folder: Path, modulation: Modulation, data: bytes, repeats: 
     with RawWriter(folder / EVENTS_FILE) as file:
         words = np.frombuffer(data, "<u2").copy()
         is_high = words >> 12 == TIME_HIGH
-        steps = int((words[is_high] & 0xFFF)[-1]) + 2
+        whole = 1_000_000 // math.gcd(round(4096 * modulation.frequency_hz), 1_000_000)
+        steps = -(-(int((words[is_high] & 0xFFF)[-1]) + 2) // whole) * whole
         for _ in range(repeats):
             file.write(words.tobytes())
             words[is_high] = TIME_HIGH << 12 | ((words[is_high] + steps) & 0xFFF)
