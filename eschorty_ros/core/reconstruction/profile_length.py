@@ -83,11 +83,12 @@ class ProfileLength:
                     return 1
             first, begin = self._window
             end_us, periods = int(t[begin - 1]), 0
+            block: tuple[Array, NDArray[np.uint16]] | None = None
             if last and t[-1] < end_us + self._span_us:
                 # A short stream has no complete block.
                 begin = first
             for enough in (EVENTS_WANTED, EVENTS_WANTED // 2):
-                end_us = self._block_end_us(t, begin, end_us, periods == 0)
+                end_us = self._block_end_us(t, begin, end_us, block is None)
                 if watermark_us <= end_us and not last:
                     return 0
                 end = int(np.searchsorted(t, end_us))
@@ -95,7 +96,9 @@ class ProfileLength:
                 if edge_us is not None and edge_us <= t[end - 1]:
                     after = int(np.searchsorted(t, edge_us))
                     t_us, columns = (values[after:end] for values in held.arrays[:2])
-                    periods = self._periods((t_us - edge_us) / period_us, columns, enough)
+                    block = (t_us - edge_us) / period_us, columns
+                if block is not None:
+                    periods = self._periods(*block, enough)
                 if periods == 1:
                     return 1
                 begin = end
