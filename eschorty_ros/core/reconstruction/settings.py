@@ -166,7 +166,7 @@ class Settings:
     )  # fmt: skip
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
-        "part of it that neighbouring columns share and smoothing does not reduce",
+        "part of it that the columns of a moving line share, as pixels remember where it was",
     )  # fmt: skip
     detail: str = _choice(
         "auto", ("auto", "off"),
