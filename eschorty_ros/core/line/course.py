@@ -22,7 +22,7 @@ SIGMA_COMMON_PX = 0.04
 _PROFILES = 16.0
 # Most that an edge moves the row per change of the width: by half of the rows that are missing, or
 # by half of the gap in the middle of evenly lit rows.
-_PER_NARROWER = np.sqrt(3.0)
+PER_NARROWER = np.sqrt(3.0)
 _PER_WIDER = 2.0 / np.sqrt(3.0)
 
 
@@ -71,8 +71,8 @@ def _follow(course, known, usual, width_variance):
         moved2 = moved * moved - now[2, near].sum() / (points * points)
         narrower = min(recent[1, block], usual) - width
         wider = width - max(recent[1, block], usual)
-        shift = max(_PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
-        passing2 = shift * shift - _PER_NARROWER**2 * width_variance / points
+        shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
+        passing2 = shift * shift - PER_NARROWER**2 * width_variance / points
         course.moved2[block] = min(max(moved2, 0.0), course.common_px**2)
         course.passing2[block] = max(passing2, 0.0)
         profiles = min(profiles + 1.0, _PROFILES)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.course import Course, _follow, empty_course
+from eschorty_ros.core.line.course import PER_NARROWER, Course, _follow, empty_course
 from eschorty_ros.core.line.scatter import BLOCK
 
 _PER_ROW = 16
@@ -38,7 +38,6 @@ WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
 # deviation over that median.
 _STEP = 1.0 / 1024.0
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
-_ROOT_3 = np.sqrt(3.0)
 _ROOT_12 = np.sqrt(12.0)
 # A point is marked when the missing or additional rows may move it by more deviations of a row
 # that is not smoothed.
@@ -106,7 +105,7 @@ def _unusual_variance(width, usual):
     A line with missing rows is off by half of them at most, one with more by what they scatter.
     """
     if width < usual:
-        return (_ROOT_3 * (usual - width)) ** 2
+        return (PER_NARROWER * (usual - width)) ** 2
     return width * width - usual * usual
 
 
