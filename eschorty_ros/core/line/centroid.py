@@ -137,6 +137,24 @@ class Estimator(NamedTuple):
     error_model: ErrorModel
 
 
+class Found(NamedTuple):
+    """Sums over the window of each return, shape (returns, columns), and what replaces its mean.
+
+    Rows are relative to the ``first`` one of the window. ``held`` are the events of the column, in
+    the window or not. ``row`` replaces the mean, and ``sigma2`` and ``common2`` the variances where
+    they are known; NaN where nothing does.
+    """
+
+    first: NDArray[np.int64]
+    d: NDArray[np.int64]
+    d2: NDArray[np.int64]
+    time_us: NDArray[np.int64]
+    held: NDArray[np.int64]
+    row: NDArray[np.float64]
+    sigma2: NDArray[np.float64]
+    common2: NDArray[np.float64]
+
+
 class Rows(NamedTuple):
     """The returns of each column, shape (returns, columns), NaN where there is none.
 
@@ -146,6 +164,7 @@ class Rows(NamedTuple):
     ``ambiguous`` has shape (columns,).
     """
 
+    found: Found
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
     common2: NDArray[np.float64]
@@ -156,18 +175,6 @@ class Rows(NamedTuple):
     doubtful: NDArray[np.bool_]
     mixed: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
-
-
-class RowEstimate(NamedTuple):
-    """A row, its own variance and what its neighbours share of it.
-
-    ``truncated`` where the edge of the sensor cuts the line.
-    """
-
-    row: float
-    sigma2: float
-    common2: float
-    truncated: bool
 
 
 class _ColumnReturns(NamedTuple):
@@ -228,11 +235,12 @@ def make_row_counts() -> NDArray[np.int64]:
 def empty_rows(returns: int, columns: int) -> Rows:
     """Return the rows of ``columns`` columns without any return."""
     shape = returns, columns
+    found = Found(*np.zeros((5, *shape), np.int64), *np.full((3, *shape), np.nan))
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
     truncated, doubtful, mixed = np.zeros((3, *shape), np.bool_)
     flags = truncated, doubtful, mixed, np.zeros(columns, np.bool_)
-    return Rows(row, sigma2, common2, variance, events, mean_dt_us, *flags)
+    return Rows(found, row, sigma2, common2, variance, events, mean_dt_us, *flags)
 
 
 def estimate(
@@ -477,18 +485,6 @@ def _stronger(packed, column, c, half, columns, estimator, blink, found):
 
 
 @kernel
-def _row_estimate(row, variance, line_variance, events, estimator):
-    """Return a row with its variances; the shared one covers its bias where the sensor cuts it."""
-    rows = estimator.rows
-    sigma2 = _own_variance(variance, line_variance, events, row, rows, estimator.error_model)
-    # Background widens a column without moving the line to the edge.
-    line = min(variance, _BACKGROUND_FREE * line_variance)
-    reach = _HALF_SPAN * np.sqrt(line)
-    truncated = row < reach or rows - 1.0 - row < reach
-    return RowEstimate(row, sigma2, _HALF_BIAS2 * line if truncated else 0.0, truncated)
-
-
-@kernel
 def _reported(returns, found):
     """Return the windows to report, nearest (least row) first; the same twice when it is one."""
     a, b = found.window, found.other
@@ -563,8 +559,8 @@ def _learns(footprint):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _refined(packed, column, c, window, line_variance, estimator, footprint, row_counts):
-    """Return the row of a window's line that a learned footprint or the median gives."""
+def _refine(packed, column, k, c, window, line_variance, estimator, footprint, row_counts, found):
+    """Set the row of a window's line that a learned footprint or the median gives."""
     rows, method = estimator.rows, estimator.method
     row, variance = _mean(window), _variance(window.sums)
     cut = _is_windowed(method) and _is_cut(window, rows)
@@ -575,32 +571,120 @@ def _refined(packed, column, c, window, line_variance, estimator, footprint, row
     if cut or trying or takes:
         best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
     if method == _MEDIAN:
-        row = _median(packed, column, row_counts)
-    used = window.sums.events
-    estimate = _row_estimate(row, variance, line_variance, used, estimator)
-    near = used * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
+        found.row[k, c] = _median(packed, column, row_counts)
+    near = window.sums.events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if trying and near and not cut:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
-        best = min(max(best, -0.5), rows - 0.5)
-        common2 = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
-        estimate = RowEstimate(best, learned, common2, estimate.truncated)
-    return estimate
+        found.row[k, c] = min(max(best, -0.5), rows - 0.5)
+        found.sigma2[k, c] = learned
+        found.common2[k, c] = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
 
 
 @kernel(_nrt=False, forceinline=True)
-def _put(k, c, window, estimate, variance, doubtful, estimator, out):
-    """Write a return of a column; return whether its width is that of a line."""
-    out.row[k, c] = estimate.row
-    out.sigma2[k, c] = estimate.sigma2
-    out.common2[k, c] = estimate.common2
-    out.variance[k, c] = variance
-    out.events[k, c] = window.sums.events
-    out.mean_dt_us[k, c] = np.int64(np.rint(window.sums.time_us / window.sums.events))
+def _put(k, c, window, held, doubtful, out):
+    """Write the sums of a return of a column."""
+    found, sums = out.found, window.sums
+    out.events[k, c] = sums.events
     out.doubtful[k, c] = doubtful
-    out.truncated[k, c] = estimate.truncated
-    narrow = variance <= _BACKGROUND_FREE * estimator.line_variance
-    return not estimate.truncated and (_is_windowed(estimator.method) or narrow)
+    found.first[k, c] = window.first
+    found.d[k, c] = sums.d
+    found.d2[k, c] = sums.d2
+    found.time_us[k, c] = sums.time_us
+    found.held[k, c] = held
+
+
+@kernel(_nrt=False)
+def _mean_rows(first, d, events, row):
+    """Set the mean rows of windows, NaN where there is none."""
+    for c in range(np.uintp(row.size)):
+        row[c] = (events[c] * first[c] + d[c]) / events[c] if events[c] > 0 else np.nan
+
+
+@kernel(_nrt=False)
+def _variances(d, d2, events, variance):
+    """Set the sample variances of windows; of rows that are all the same they are exactly 0."""
+    for c in range(np.uintp(variance.size)):
+        n = events[c]
+        variance[c] = (n * d2[c] - d[c] * d[c]) / max(float(n) * (n - 1), 1.0)
+
+
+@kernel(_nrt=False)
+def _mean_times(time_us, events, mean_dt_us):
+    """Set the mean times of windows, us."""
+    for c in range(np.uintp(mean_dt_us.size)):
+        mean_dt_us[c] = np.int64(np.rint(time_us[c] / max(events[c], 1)))
+
+
+@kernel(_nrt=False)
+def _own_variances(variance, row, events, line_variance, estimator, sigma2):
+    """Set the variances of rows that are the columns' own."""
+    rows, model = estimator.rows, estimator.error_model
+    for c in range(np.uintp(row.size)):
+        n = max(events[c], 1)
+        sigma2[c] = _own_variance(variance[c], line_variance, n, row[c], rows, model)
+
+
+@kernel(_nrt=False)
+def _cut_lines(variance, row, line_variance, rows, truncated, common2):
+    """Mark lines that the sensor's edge cuts; their shared variance covers the bias."""
+    for c in range(np.uintp(row.size)):
+        # Background widens a column without moving the line to the edge.
+        line = min(variance[c], _BACKGROUND_FREE * line_variance)
+        common2[c] = line if min(row[c], rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
+    for c in range(np.uintp(row.size)):
+        truncated[c] = common2[c] > 0.0
+        common2[c] *= _HALF_BIAS2
+
+
+@kernel(_nrt=False)
+def _replace(new, values):
+    """Replace values by new ones where there are any, and forget these."""
+    for c in range(np.uintp(values.size)):
+        values[c] = values[c] if np.isnan(new[c]) else new[c]
+        new[c] = np.nan
+
+
+@kernel(_nrt=False)
+def _rows_of_windows(out, line_variance, estimator, refined):
+    """Turn the sums of all windows into rows with their variances.
+
+    Loops over all columns, each over a few arrays, run in vectors.
+    """
+    found, is_median = out.found, estimator.method == _MEDIAN
+    for k in range(out.row.shape[0]):
+        events, row, variance, sigma2 = out.events[k], out.row[k], out.variance[k], out.sigma2[k]
+        _mean_rows(found.first[k], found.d[k], events, row)
+        _variances(found.d[k], found.d2[k], events, variance)
+        _mean_times(found.time_us[k], events, out.mean_dt_us[k])
+        if is_median:
+            _replace(found.row[k], row)
+        _own_variances(variance, row, events, line_variance, estimator, sigma2)
+        _cut_lines(variance, row, line_variance, estimator.rows, out.truncated[k], out.common2[k])
+        if refined and not is_median:
+            _replace(found.row[k], row)
+            _replace(found.sigma2[k], sigma2)
+            _replace(found.common2[k], out.common2[k])
+
+
+@kernel(_nrt=False)
+def _pooled(out, estimator):
+    """Return the pooled squares of the rows used, their degrees of freedom and events held.
+
+    Lines that are cut, and full columns with background, do not have the width of a line.
+    """
+    squares, freedom, held = 0.0, np.int64(0), np.int64(0)
+    most = _BACKGROUND_FREE * estimator.line_variance
+    windowed = _is_windowed(estimator.method)
+    for k in range(out.row.shape[0]):
+        for c in range(np.uintp(out.row.shape[1])):
+            whole = out.events[k, c] > 0 and not out.truncated[k, c]
+            if whole and (windowed or out.variance[k, c] <= most):
+                used = out.events[k, c] - 1
+                squares += out.variance[k, c] * used
+                freedom += used
+                held += out.found.held[k, c] if k == 0 else 0
+    return squares, freedom, held
 
 
 @kernel(_nrt=False)
@@ -609,15 +693,13 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
 
     Events that do not follow the laser are left out, unless ``blink`` is no test.
     """
-    out.row[:] = np.nan
-    squares = 0.0
-    freedom, events, few = np.int64(0), np.int64(0), np.int64(0)
-    ambiguous, two = np.int64(0), np.int64(0)
+    out.events[:] = 0
+    few, ambiguous, two = np.int64(0), np.int64(0), np.int64(0)
     unmodulated, events_unmodulated = np.int64(0), np.int64(0)
     neighbour = np.int64(-1)
     windowed = _is_windowed(estimator.method)
     plain = estimator.method == _MODE_MEAN and not _learns(footprint)
-    near_edge = False
+    near_edge, refined = False, not plain
     packed = columns.packed
     line_variance = (half / HALF_PER_SIGMA) ** 2
     if half <= estimator.half_max:
@@ -632,24 +714,22 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             few += n > 0
             continue
         column = _column(columns.starts[c], n, blink.lit_us)
-        seed = columns.seeds[c] if columns.seeds[c] >= 0 else neighbour
+        known = columns.seeds[c] >= 0
+        if not known:
+            # A choice of two values would make each column wait for the one before.
+            columns.seeds[c] = neighbour
         window = _NO_WINDOW
-        if windowed and estimator.seeded and seed >= 0:
-            window = _mean_shift(packed, column, seed, half, 0, ROW_LAST)
+        if windowed and estimator.seeded and columns.seeds[c] >= 0:
+            window = _mean_shift(packed, column, columns.seeds[c], half, 0, ROW_LAST)
             if _is_clear(window, column, estimator, blink):
                 columns.rivals[c] = -1
                 columns.seeds[c] = neighbour = window.centre
-                row, variance, used = _mean(window), _variance(window.sums), window.sums.events
-                if plain:
-                    estimate = _row_estimate(row, variance, line_variance, used, estimator)
-                else:
-                    estimate = _refined(
-                        packed, column, c, window, line_variance, estimator, footprint, row_counts
-                    )
-                if _put(0, c, window, estimate, variance, False, estimator, out):
-                    events += n
-                    squares += variance * (used - 1)
-                    freedom += used - 1
+                _put(0, c, window, n, False, out)
+                if not plain:
+                    _refine(
+                        packed, column, 0, c, window, line_variance, estimator, footprint,
+                        row_counts, out.found,
+                    )  # fmt: skip
                 continue
         searched = _column_returns(
             packed, column, c, half, columns, estimator, blink, window, row_counts
@@ -662,25 +742,25 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
             few += found.status == TOO_FEW
+            if not known:
+                columns.seeds[c] = -1
             continue
         columns.seeds[c] = neighbour = found.window.centre
         two += found.second
         window, other = _reported(estimator.returns, found)
         left = _column(columns.starts[c], searched.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
-            estimate = _refined(
-                packed, left, c, window, line_variance, estimator, footprint, row_counts
-            )
-            variance, used = _variance(window.sums), window.sums.events
+            _put(k, c, window, n, searched.doubtful, out)
+            _refine(
+                packed, left, k, c, window, line_variance, estimator, footprint, row_counts,
+                out.found,
+            )  # fmt: skip
+            refined = True
             near_edge |= windowed and _is_cut(window, estimator.rows)
-            if not windowed:
-                columns.seeds[c] = np.int64(np.rint(FRACTION * estimate.row))
-            if _put(k, c, window, estimate, variance, searched.doubtful, estimator, out):
-                events += n if k == 0 else 0
-                squares += variance * (used - 1)
-                freedom += used - 1
             window, other = other, window
     footprint.state.near_edge = near_edge
+    _rows_of_windows(out, line_variance, estimator, refined)
+    squares, freedom, events = _pooled(out, estimator)
     return PeriodSums(
         squares, freedom, events, few, ambiguous, two, unmodulated, events_unmodulated
     )

@@ -80,12 +80,12 @@ def _forget_scatter(scatter):
 
 
 @kernel(_nrt=False)
-def _add_differences(row, sigma2, rows, averaged, edge_px, sums):
+def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
     """Add a profile's differences of ``row``, means of so many columns ``averaged``, to the sums.
 
     Differences above ``edge_px`` are left out: edges of the surface, but where most are as large.
     """
-    variance, columns = rows.variance[0], row.size
+    columns = row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
     for block in range(1, sums.number.size - 1):
         begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
@@ -158,7 +158,7 @@ def _scale(rows, scatter, smoothing):
     """
     returns, columns = rows.row.shape
     sums = scatter.own
-    _add_differences(rows.row[0], rows.sigma2[0], rows, scatter.alone, _EDGE_PX, sums)
+    _add_differences(rows.row[0], rows.sigma2[0], rows.variance[0], scatter.alone, _EDGE_PX, sums)
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
@@ -180,7 +180,9 @@ def _scale_smoothed(rows, scatter, smoothing):
     """Scale the smoothed variances of a profile by the scatter left; add what neighbours share."""
     returns, columns = rows.row.shape
     sums, sigma2 = scatter.smoothed, smoothing.sigma2
-    _add_differences(smoothing.row[0], sigma2[0], rows, smoothing.used[0], _EDGE_PX, sums)
+    _add_differences(
+        smoothing.row[0], sigma2[0], rows.variance[0], smoothing.used[0], _EDGE_PX, sums
+    )
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0

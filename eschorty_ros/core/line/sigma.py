@@ -66,7 +66,7 @@ def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> Erro
     )
 
 
-@kernel
+@kernel(forceinline=True)
 def _background(excess, count, row, rows):
     """Return the number of background events, evenly spread, behind ``excess`` variance.
 
@@ -78,7 +78,7 @@ def _background(excess, count, row, rows):
     return excess * count / square, offset * offset / square
 
 
-@kernel
+@kernel(forceinline=True)
 def _own_variance(variance, line_variance, count, row, rows, model):
     """Return the variance of one column's row, px squared, without what its neighbours share.
 
@@ -97,6 +97,5 @@ def _own_variance(variance, line_variance, count, row, rows, model):
         sigma2 += model.background**2 * events * coherent * step2
     else:
         sigma2 += model.background**2 * excess / count * coherent
-    if count < 2 or variance == 0.0:
-        sigma2 = max(sigma2, 1.0 / 12.0 + floor2)
-    return sigma2
+    least = 1.0 / 12.0 + floor2 if (count < 2) | (variance == 0.0) else 0.0
+    return max(sigma2, least)

@@ -249,20 +249,22 @@ def _smooth(rows, smoothing):
 
 @kernel(_nrt=False)
 def _divide(rows, smoothing):
-    """Divide the sums of points and neighbours; return the number of averaged points."""
-    widths = smoothing.widths
-    returns, columns = rows.row.shape
+    """Divide the sums of points and neighbours; return the number of averaged points.
+
+    Loops over all columns, each over a few arrays, run in vectors.
+    """
     smoothed = 0
-    for k in range(returns):
-        for c in range(columns):
-            n = smoothing.used[k, c]
-            smoothing.row[k, c] = rows.row[k, c] + smoothing.row[k, c] / n
-            smoothing.sigma2[k, c] /= n * n
-            smoothed += n > 1.0
-        for c in range(columns):
-            near = min(smoothing.used[k, c], WIDTH_COLUMNS)
-            width = np.sqrt(widths.smoothed[k, c] / near)
-            widths.smoothed[k, c] = np.nan if np.isnan(rows.row[k, c]) else width
+    for k in range(rows.row.shape[0]):
+        own, row, used = rows.row[k], smoothing.row[k], smoothing.used[k]
+        sigma2, width = smoothing.sigma2[k], smoothing.widths.smoothed[k]
+        for c in range(np.uintp(own.size)):
+            row[c] = own[c] + row[c] / used[c]
+        for c in range(np.uintp(own.size)):
+            sigma2[c] /= used[c] * used[c]
+            smoothed += used[c] > 1.0
+        for c in range(np.uintp(own.size)):
+            near = min(used[c], WIDTH_COLUMNS)
+            width[c] = np.nan if np.isnan(own[c]) else np.sqrt(width[c] / near)
     return smoothed
 
 

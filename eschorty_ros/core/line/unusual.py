@@ -136,31 +136,41 @@ def _at_rest(width, usual, way):
 
 
 @kernel(_nrt=False)
+def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
+    """Set widths less what the way of their lines since the last profile adds.
+
+    A line is lit for ``lit_share`` of the time between two profiles.
+    """
+    for c in range(np.uintp(row.size)):
+        way = row[c] - last_row[c]
+        at_rest[c] = _at_rest(smoothed[c], usual, lit_share * (0.0 if np.isnan(way) else way))
+
+
+@kernel(_nrt=False)
 def _follow_line(rows, smoothing, lit_share):
     """Take what their way adds off the widths of a profile's points, and follow the line's course.
 
-    A line is lit for ``lit_share`` of the time between two profiles. Weak points show no width.
+    Weak points show no width.
     """
     row, widths = smoothing.row, smoothing.widths
-    before, now = widths.before, widths.course.now
+    now, at_rest, last_row = widths.course.now, widths.at_rest, widths.before[1]
     returns, columns = row.shape
-    known, usual = widths.below[_BINS] >= _POINTS_MIN, widths.state[0]
-    now[:] = 0.0
+    known = widths.below[_BINS] >= _POINTS_MIN
+    usual = widths.state[0] if known else np.inf
     for k in range(returns):
-        for c in range(columns):
-            width, way = widths.smoothed[k, c], row[k, c] - before[1, k, c]
-            if known and np.isfinite(way):
-                width = _at_rest(width, usual, lit_share * way)
-            widths.at_rest[k, c] = width
-            shown = not rows.truncated[k, c] and rows.events[k, c] >= smoothing.isolation_events
-            if k == 0 and shown and not np.isnan(row[k, c]):
-                block = c // BLOCK + 1
-                now[0, block] += row[k, c]
-                now[1, block] += width
-                now[2, block] += rows.sigma2[k, c]
-                now[3, block] += 1.0
+        _take_off_way(widths.smoothed[k], row[k], last_row[k], usual, lit_share, at_rest[k])
+    for block in range(1, now.shape[1] - 1):
+        total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
+        for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
+            weak = rows.truncated[0, c] | (rows.events[0, c] < smoothing.isolation_events)
+            if not (weak | np.isnan(row[0, c])):
+                total += row[0, c]
+                width += at_rest[0, c]
+                sigma2 += rows.sigma2[0, c]
+                points += 1.0
+        now[0, block], now[1, block], now[2, block], now[3, block] = total, width, sigma2, points
     sigma = _SIGMA_PER_MEDIAN * widths.state[1]
-    _follow(widths.course, known, usual, WIDTH_COLUMNS * sigma * sigma)
+    _follow(widths.course, known, widths.state[0], WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel(_nrt=False)
@@ -178,7 +188,6 @@ def _mark_unusual(rows, smoothing, lit_share):
         for c in range(columns):
             width, last_width, last_row = widths.at_rest[k, c], before[0, k, c], before[1, k, c]
             way = row[k, c] - last_row
-            before[0, k, c], before[1, k, c] = width, row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
             sigma2[k, c] += widths.course.moved2[c // BLOCK + 1]
             rows.mixed[k, c] = False
@@ -206,5 +215,8 @@ def _mark_unusual(rows, smoothing, lit_share):
                 pairs += 1.0
                 step = max(1.0 / pairs, _STEP)
                 median *= 1.0 + (step if difference > median else -step)
+    for k in range(returns):
+        for c in range(np.uintp(columns)):
+            before[0, k, c], before[1, k, c] = widths.at_rest[k, c], row[k, c]
     state[1] = median
     _update(widths, columns)
