@@ -159,7 +159,7 @@ class Rows(NamedTuple):
     """The returns of each column, shape (returns, columns), NaN where there is none.
 
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
-    neighbours share. A ``doubtful`` one may be background that follows the laser by chance, a
+    neighbours share. An ``uncertain`` one may be background that follows the laser by chance, a
     ``mixed`` one is on two surfaces.
     ``ambiguous`` has shape (columns,).
     """
@@ -172,17 +172,17 @@ class Rows(NamedTuple):
     events: NDArray[np.int64]
     mean_dt_us: NDArray[np.int64]
     truncated: NDArray[np.bool_]
-    doubtful: NDArray[np.bool_]
+    uncertain: NDArray[np.bool_]
     mixed: NDArray[np.bool_]
     ambiguous: NDArray[np.bool_]
 
 
 class _ColumnReturns(NamedTuple):
-    """Returns of a column and its events that follow the laser; ``doubtful`` ones may not."""
+    """Returns of a column and its events that follow the laser; ``uncertain`` ones may not."""
 
     found: Returns
     events: np.int64
-    doubtful: bool
+    uncertain: bool
 
 
 class PeriodSums(NamedTuple):
@@ -238,8 +238,8 @@ def empty_rows(returns: int, columns: int) -> Rows:
     found = Found(*np.zeros((5, *shape), np.int64), *np.full((3, *shape), np.nan))
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
-    truncated, doubtful, mixed = np.zeros((3, *shape), np.bool_)
-    flags = truncated, doubtful, mixed, np.zeros(columns, np.bool_)
+    truncated, uncertain, mixed = np.zeros((3, *shape), np.bool_)
+    flags = truncated, uncertain, mixed, np.zeros(columns, np.bool_)
     return Rows(found, row, sigma2, common2, variance, events, mean_dt_us, *flags)
 
 
@@ -523,14 +523,14 @@ def _is_clear(window, column, estimator, blink):
 def _column_returns(packed, column, c, half, columns, estimator, blink, window, row_counts):
     """Search a column for its returns; ``window`` is that around its last row, if it has one."""
     testing = _is_windowed(estimator.method) and blink.step > 0
-    doubtful = False
+    uncertain = False
     found = Returns(FOUND, False, window, window)
     if window.sums.events < estimator.events_min or 2 * window.sums.events <= column.events:
         found = _search(packed, column, half, estimator)
     if testing and not (
         found.status == TOO_FEW or (found.status == FOUND and _is_in_phase(found.window.sums))
     ):
-        found, column, doubtful = _modulated(
+        found, column, uncertain = _modulated(
             packed, column, found, half, estimator, blink, row_counts
         )
         if found.status == UNMODULATED:
@@ -549,7 +549,7 @@ def _column_returns(packed, column, c, half, columns, estimator, blink, window, 
             found = _stronger(packed, column, c, half, columns, estimator, blink, found)
         else:
             columns.rivals[c] = -1
-    return _ColumnReturns(found, column.events, doubtful)
+    return _ColumnReturns(found, column.events, uncertain)
 
 
 @kernel
@@ -582,11 +582,11 @@ def _refine(packed, column, k, c, window, line_variance, estimator, footprint, r
 
 
 @kernel(_nrt=False, forceinline=True)
-def _put(k, c, window, held, doubtful, out):
+def _put(k, c, window, held, uncertain, out):
     """Write the sums of a return of a column."""
     found, sums = out.found, window.sums
     out.events[k, c] = sums.events
-    out.doubtful[k, c] = doubtful
+    out.uncertain[k, c] = uncertain
     found.first[k, c] = window.first
     found.d[k, c] = sums.d
     found.d2[k, c] = sums.d2
@@ -750,7 +750,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         window, other = _reported(estimator.returns, found)
         left = _column(columns.starts[c], searched.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
-            _put(k, c, window, n, searched.doubtful, out)
+            _put(k, c, window, n, searched.uncertain, out)
             _refine(
                 packed, left, k, c, window, line_variance, estimator, footprint, row_counts,
                 out.found,

@@ -108,7 +108,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
 
 
 @kernel
-def _begin_anew(footprint, known):
+def _restart_from(footprint, known):
     """Begin to learn again, with what is ``known`` of the footprint."""
     footprint.pixels[:] = 0.0
     footprint.log[:] = known.log
@@ -262,7 +262,7 @@ def _learned_row(packed, column, row, rows, footprint, counts):
 
 
 @kernel
-def _learn(footprint, row, smoothed, doubtful, truncated, rows):
+def _learn(footprint, row, smoothed, uncertain, truncated, rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
     Columns in which the sensor's edge cuts the line count where they are the majority.
@@ -275,7 +275,7 @@ def _learn(footprint, row, smoothed, doubtful, truncated, rows):
         first = footprint.first_row[slot]
         footprint.first_row[slot] = -1
         c = slot * _STRIDE + state.profiles % _STRIDE
-        if first < 0 or c >= row.size or doubtful[c] or (whole and truncated[c]):
+        if first < 0 or c >= row.size or uncertain[c] or (whole and truncated[c]):
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
             continue

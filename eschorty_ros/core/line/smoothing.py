@@ -280,7 +280,7 @@ def _is_isolated(row, k, c, gate):
 
 @kernel(_nrt=False)
 def _reject_isolated(rows, smoothing):
-    """Set weak and doubtful points without a neighbour near in rows to NaN; return their number."""
+    """Set weak and uncertain points without a neighbour near in rows to NaN; return their number."""
     row, isolated = rows.row, smoothing.isolated
     returns, columns = row.shape
     count = 0
@@ -289,7 +289,7 @@ def _reject_isolated(rows, smoothing):
             isolated[k, c] = (
                 not np.isnan(row[k, c])
                 and smoothing.isolation_events > 0
-                and (rows.doubtful[k, c] or rows.events[k, c] < smoothing.isolation_events)
+                and (rows.uncertain[k, c] or rows.events[k, c] < smoothing.isolation_events)
                 and _is_isolated(row, k, c, smoothing.isolation_gate_px)
             )
             count += isolated[k, c]

@@ -43,7 +43,7 @@ from eschorty_ros.core.line.learned import (
     MEAN_ROWS,
     UNDECIDED,
     Footprint,
-    _begin_anew,
+    _restart_from,
     _choose,
     _learn,
     make_footprint,
@@ -446,7 +446,7 @@ def _begin_window(memory, state):
     _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths)
     if memory.footprint.state.near_edge == 0:
-        _begin_anew(memory.footprint, memory.known)
+        _restart_from(memory.footprint, memory.known)
 
 
 @kernel
@@ -533,10 +533,10 @@ def _close(memory, state, counters):
     _mark_unusual(rows, smoothing, light.lit_share)
     if _choose(footprint, rows.row[0], ends, estimator.method == _LEARNED):
         # Later windows begin with what is known now.
-        _begin_anew(known, footprint)
+        _restart_from(known, footprint)
     if learns:
-        doubtful, truncated = rows.doubtful[0], rows.truncated[0]
-        _learn(footprint, rows.row[0], smoothing.row[0], doubtful, truncated, estimator.rows)
+        uncertain, truncated = rows.uncertain[0], rows.truncated[0]
+        _learn(footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.rows)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, light)
     _write(rows, smoothing, few, delay_us, state, memory.output)
