@@ -590,19 +590,24 @@ def _begin_period(edges, edge, memory, state, counters):
 def _merge_part(events, edges, i, edge, drain, memory, state, counters):
     """Merge events from ``i`` on, and with ``drain`` the edges behind the last one."""
     rows_max = memory.output.row.size - memory.rows.row.size
-    t = events.t
+    t, edges_us = events.t, edges.t_us
     far = np.int64(1 << 62)
     while True:
-        limit_us = edges.t_us[edge] if edge < edges.t_us.size else far
+        limit_us = edges_us[edge] if edge < edges_us.size else far
         if i < t.size and t[i] < limit_us:
             i = _fill(events, i, limit_us, memory, state, counters)
             if state.full:
                 return i, edge
-        if edge == edges.t_us.size or (i == t.size and not drain):
+        if edge == edges_us.size or (i == t.size and not drain):
             return i, edge
         if state.status == _FILLED and state.rows > rows_max:
             return i, edge
+        # In the dark many periods end at once.
+        first, next_us = edge, t[i] if i < t.size else far
+        while edge + 1 < edges_us.size and edges_us[edge + 1] <= next_us:
+            edge += 1
         _begin_period(edges, edge, memory, state, counters)
+        counters.periods_empty += edge - first
         edge += 1
 
 
