@@ -47,18 +47,19 @@ def supervisor(laser: DelayedLaser) -> Iterator[LaserSupervisor]:
 
 
 class Turns:
-    """A lock that counts who has asked for it."""
+    """A lock that counts who waits for it; reading back does not."""
 
     def __init__(self) -> None:
         self.asked = 0
-        self._lock = threading.Lock()
+        lock = threading.Lock()
+        self.acquire, self.release = lock.acquire, lock.release
 
     def __enter__(self) -> None:
         self.asked += 1
-        self._lock.acquire()
+        self.acquire()
 
     def __exit__(self, *_: object) -> None:
-        self._lock.release()
+        self.release()
 
 
 def in_thread(step: Callable[[], None], failures: list[str]) -> threading.Thread:
