@@ -1,7 +1,7 @@
-"""Kill a command at each step that it takes with files, and let its disk be full at many sizes.
+"""Kill commands at each step that they take with files, and let their disk be full at many sizes.
 
-``python killed_writes.py COMMAND FOLDER``: exit code 0 when no run left a truncated file, and the
-run after it nothing temporary.
+``python killed_writes.py FOLDER``: exit code 0 when no run left a truncated file, and the run after
+it nothing temporary.
 """
 
 import json
@@ -123,7 +123,6 @@ def temporary():
 
 
 def main_test(command, base):
-    prepare(base / "prepared")
     arguments = COMMANDS[command]
     work = base / "work"
 
@@ -186,4 +185,7 @@ def main_test(command, base):
 
 
 if __name__ == "__main__":
-    main_test(sys.argv[1], Path(sys.argv[2]))
+    base = Path(sys.argv[1])
+    prepare(base / "prepared")
+    for command in COMMANDS:
+        main_test(command, base)
