@@ -68,7 +68,7 @@ class Capture:
         assert observer.change_state("camera", "deactivate")
         first = len(self.packets)
         assert observer.change_state("camera", "activate")
-        wait_until(lambda: len(self.packets) > first + 300, "packets of the second run")
+        wait_until(lambda: len(self.packets) > first + 100, "packets of the second run")
         assert observer.change_state("camera", "deactivate")
 
 
