@@ -107,26 +107,33 @@ def test_pixels_just_switched_on_do_not_choose_the_periods_of_a_profile(frequenc
     assert np.median(np.abs(error_mm)) < 0.4, "seed 1"
 
 
-def test_good_points_of_a_face_that_is_swept_fast_have_no_flag(tmp_path):
+@pytest.fixture(scope="module")
+def swept_face(tmp_path_factory):
+    """Points of a face that is swept fast, with these settings, and their errors in mm."""
     narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
     scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
-    recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep)
-    found = reconstruct_recording(recording).profiles
-    stage_mm = recording.stage.position_mm(found.t_us)
-    error_mm = found.range_mm - true_range_mm(scene, narrow.model(), stage_mm, found.column)
+    folder = tmp_path_factory.mktemp("face")
+    recording = simulate_recording(folder, scene, narrow, Modulation(70.0), *sweep)
+
+    def reconstructed(**settings):
+        found = reconstruct_recording(recording, Settings(**settings)).profiles
+        stage_mm = recording.stage.position_mm(found.t_us)
+        truth_mm = true_range_mm(scene, narrow.model(), stage_mm, found.column)
+        return found, found.range_mm - truth_mm
+
+    return reconstructed
+
+
+def test_good_points_of_a_face_that_is_swept_fast_have_no_flag(swept_face):
+    found, error_mm = swept_face()
     assert np.mean(found.flags[np.abs(error_mm) < 1.0] != 0) < 0.015
 
 
-def test_a_learned_footprint_does_not_pull_lines_that_move_while_they_are_lit(tmp_path):
-    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
-    scene, sweep = named("face", narrow.model()), (10.0, 190.0, 300.0)
-    recording = simulate_recording(tmp_path, scene, narrow, Modulation(70.0), *sweep)
-    p95_mm = {}
-    for method in ("mode_mean", "learned"):
-        found = reconstruct_recording(recording, Settings(centroid=method)).profiles
-        stage_mm = recording.stage.position_mm(found.t_us)
-        truth_mm = true_range_mm(scene, narrow.model(), stage_mm, found.column)
-        p95_mm[method] = np.nanquantile(np.abs(found.range_mm - truth_mm), 0.95)
+def test_a_learned_footprint_does_not_pull_lines_that_move_while_they_are_lit(swept_face):
+    p95_mm = {
+        method: np.nanquantile(np.abs(swept_face(centroid=method)[1]), 0.95)
+        for method in ("mode_mean", "learned")
+    }
     assert p95_mm["learned"] < 1.2 * p95_mm["mode_mean"]
 
 
