@@ -280,7 +280,7 @@ def _is_isolated(row, k, c, gate):
 
 @kernel(_nrt=False)
 def _reject_isolated(rows, smoothing):
-    """Set weak and uncertain points without a neighbour near in rows to NaN; return their number."""
+    """Set weak or uncertain points without a neighbour near in rows to NaN; return their number."""
     row, isolated = rows.row, smoothing.isolated
     returns, columns = row.shape
     count = 0

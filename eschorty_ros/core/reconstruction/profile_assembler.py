@@ -43,9 +43,9 @@ from eschorty_ros.core.line.learned import (
     MEAN_ROWS,
     UNDECIDED,
     Footprint,
-    _restart_from,
     _choose,
     _learn,
+    _restart_from,
     make_footprint,
 )
 from eschorty_ros.core.line.learned_gate import (
