@@ -16,11 +16,11 @@ from eschorty_ros.core.modulation.phase_estimate import (
 
 END_OF_STREAM_US = 1 << 61
 _HELD_EVENTS_MAX = 1 << 22
-# Length of a block: 100 ppm are then at most 0.2 % of a period up to 1 kHz, and 3 % at 20 kHz.
-BLOCK_PERIODS = 8
+# Length of a block: 100 ppm are then at most 0.3 % of a period up to 2 kHz, and 3 % at 20 kHz.
+BLOCK_PERIODS = 32
 BLOCK_US = 16_000
 _EVENTS_MIN = 128
-_EVENTS_MAX = 4096
+_EVENTS_ENOUGH = 2048
 _GAIN = 0.5
 # Shares of the period. A larger difference is not drift but a generator that was restarted, if two
 # blocks agree on it.
@@ -32,11 +32,12 @@ class PhaseLock:
     """Anchors an ``EdgeSchedule`` and, where the phase was estimated, tracks it by the events.
 
     A generator and a sensor with clocks of their own drift apart: 100 ppm are a period of 1 kHz
-    after 10 s. So the phase is estimated again for every block of periods, from the block's first
-    events, and the edges after the block are moved by half of the difference. A phase that differs
-    by more than an eighth of a period in two successive blocks replaces the old one: the laser was
-    switched off and on. Blocks are counted in periods and closed before any later event is
-    assigned, so the result does not depend on how the stream is split.
+    after 10 s. So the phase is estimated again for every block of periods, from events all over its
+    first period or more, and the edges after the block are moved by half of the difference. Events
+    of a part of a period would follow any laser. A phase that differs by more than an eighth of a
+    period in two successive blocks replaces the old one: the laser was switched off and on. Blocks
+    are counted in periods and closed before any later event is assigned, so the result does not
+    depend on how the stream is split.
 
     Nothing is moved where ``on_edge_us`` is given or triggers come.
 
@@ -68,9 +69,9 @@ class PhaseLock:
         self._difference: float | None = None
         self._corrections = 0
         self._relocks = 0
-        self._count = 0
-        self._t = np.empty(_EVENTS_MAX, np.int64)
-        self._p = np.empty(_EVENTS_MAX, np.uint8)
+        self._forget()
+        self._t = np.empty(2 * _EVENTS_ENOUGH, np.int64)
+        self._p = np.empty(2 * _EVENTS_ENOUGH, np.uint8)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -142,13 +143,38 @@ class PhaseLock:
         return watermark_us if self._block_end_us is None else min(watermark_us, self._block_end_us)
 
     def observe(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
-        """Keep the block's first events of those that were assigned, in time order."""
-        size = min(t_us.size, _EVENTS_MAX - self._count)
-        if self._block_end_us is None or size <= 0:
+        """Keep enough events of the block's first period or periods; those assigned, in order."""
+        if not self.observes or t_us.size == 0:
             return
-        new = slice(self._count, self._count + size)
-        self._t[new], self._p[new] = t_us[:size], polarity[:size]
-        self._count += size
+        if self._seen == 0:
+            self._begin_us = int(t_us[0])
+        inside = int(np.searchsorted(t_us, self._begin_us + self._modulation.period_us))
+        self._keep(t_us[:inside], polarity[:inside])
+        more = slice(inside, inside + max(_EVENTS_ENOUGH - self._count, 0))
+        self._keep(t_us[more], polarity[more])
+        self._observed = inside < t_us.size and self._count >= _EVENTS_ENOUGH
+
+    def _keep(self, t_us: NDArray[np.int64], polarity: NDArray[np.uint8]) -> None:
+        """Keep every so many events, twice as many when there is no room."""
+        at = -self._seen % self._stride
+        while at < t_us.size:
+            if self._count == self._t.size:
+                self._count //= 2
+                self._t[: self._count], self._p[: self._count] = self._t[::2], self._p[::2]
+                at += (self._seen + at) % (2 * self._stride)
+                self._stride *= 2
+                continue
+            size = min(-(-(t_us.size - at) // self._stride), self._t.size - self._count)
+            old = slice(at, at + size * self._stride, self._stride)
+            new = slice(self._count, self._count + size)
+            self._t[new], self._p[new] = t_us[old], polarity[old]
+            self._count += size
+            at += size * self._stride
+        self._seen += t_us.size
+
+    def _forget(self) -> None:
+        self._begin_us = self._seen = self._count = 0
+        self._stride, self._observed = 1, False
 
     @property
     def tracks(self) -> bool:
@@ -158,7 +184,7 @@ class PhaseLock:
     @property
     def observes(self) -> bool:
         """Return whether more of the block's events have to be observed."""
-        return self._block_end_us is not None and self._count < _EVENTS_MAX
+        return self._block_end_us is not None and not self._observed
 
     def close_block(self, watermark_us: int) -> bool:
         """Close the block that ends before ``watermark_us``; return whether there was one.
@@ -174,7 +200,7 @@ class PhaseLock:
             estimate = estimate_phase(t_us, polarity, self._modulation)
             if estimate.found:
                 self._correct(estimate.edge_us)
-        self._count = 0
+        self._forget()
         self._block_end_us = None if triggered else self.schedule.middle_after(self._block)
         return True
 
