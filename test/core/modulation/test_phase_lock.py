@@ -13,13 +13,13 @@ SINGLE = Settings(events_min=1, isolation_events=0, smoothing_half_width=0, peri
 EDGE_US = 1000
 
 
-def bursts(frequency_hz, seconds, ppm=0.0, *, per_period=32, edge_us=EDGE_US, seed=SEED):
+def bursts(frequency_hz, seconds, ppm=0.0, *, per_period=32, edge_us=EDGE_US, duty=0.5, seed=SEED):
     """Events of 16 columns: half after each edge of a generator whose period is ``ppm`` longer."""
     rng = np.random.default_rng(seed)
     period_us = 1e6 / frequency_hz * (1 + ppm * 1e-6)
     k = np.arange(int(seconds * 1e6 / period_us))
     t, p = [], []
-    for polarity, share in ((1, 0.0), (0, 0.5)):
+    for polarity, share in ((1, 0.0), (0, duty)):
         start = np.repeat(edge_us + (k + share) * period_us, per_period // 2)
         t.append(start + rng.gamma(2.0, min(60.0, period_us / 8) / 2, start.size))
         p.append(np.full(start.size, polarity))
@@ -101,6 +101,19 @@ def test_a_laser_switched_off_and_on_again_has_its_new_phase(pause_us, share):
     assert np.abs(off(settled, 1000.0, 0.0, restart_us)).max() < 0.02
     assert counts["phase_relocks"] == 1
     assert (np.diff(edges) > 400).all()
+
+
+@pytest.mark.parametrize("duty", [0.2, 0.8])
+def test_background_of_a_part_of_a_period_is_no_phase(duty):
+    """In half a dark period there is more of it than is needed for an estimate."""
+    periods = 160
+    end_us = EDGE_US + int(periods * 1e6 / 70.0)
+    line = bursts(70.0, (periods + 1) / 70.0, per_period=3000, duty=duty)
+    data = Encoder().encode(*sort_readout(*joined(line, noise(EDGE_US, end_us, 9000 * periods))))
+    edges_us, counts = edges_of(data, Modulation(70.0, duty=duty))
+    assert np.abs(off(edges_us, 70.0, 0.0)).max() < 0.02, f"seed {SEED}"
+    assert edges_us.size >= periods
+    assert counts["phase_relocks"] == 0
 
 
 def test_a_known_phase_is_not_corrected():
