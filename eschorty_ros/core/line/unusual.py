@@ -30,6 +30,7 @@ _STEADY = 2.0 * np.sqrt(2.0)
 _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
+_PROFILES_KNOWN = 64
 _APART = 5
 # Neighbours on either side that a width is averaged with, and the columns of such a mean.
 WIDTH_PAIRS = 2
@@ -76,17 +77,33 @@ def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -
     )
 
 
+def empty_known_widths() -> NDArray[np.float64]:
+    """Return room for the ``number`` and ``state`` of widths."""
+    return np.zeros(_BINS + 2)
+
+
 @kernel
 def _bin(width):
     return min(np.int64(width * _PER_ROW), _BINS - 1)
 
 
 @kernel
-def _restart_widths(widths):
-    """Forget all widths."""
-    widths.number[:] = 0.0
-    widths.below[:] = 0.0
-    widths.state[:] = 0.0
+def _keep_widths(widths, known):
+    """Keep the usual widths as ``known`` ones, which count as many profiles."""
+    points = _PROFILES_KNOWN * widths.smoothed.shape[1]
+    known[:_BINS] = widths.number * (points / max(widths.number.sum(), 1.0))
+    known[_BINS:] = widths.state
+
+
+@kernel
+def _restart_widths(widths, known, begins_known):
+    """Forget all widths but the ``known`` ones, if any."""
+    share = 1.0 if begins_known else 0.0
+    widths.number[:] = share * known[:_BINS]
+    widths.state[:] = share * known[_BINS:]
+    widths.below[0] = 0.0
+    for b in range(_BINS):
+        widths.below[b + 1] = widths.below[b] + widths.number[b]
     widths.before[:] = np.nan
     widths.course.recent[:] = 0.0
 

@@ -71,7 +71,12 @@ from eschorty_ros.core.line.smoothing import (
     _smooth,
     empty_smoothing,
 )
-from eschorty_ros.core.line.unusual import _mark_unusual, _restart_widths
+from eschorty_ros.core.line.unusual import (
+    _keep_widths,
+    _mark_unusual,
+    _restart_widths,
+    empty_known_widths,
+)
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
@@ -86,9 +91,12 @@ WINDOW_EVENTS = 1 << 21
 """Events after which, with the next profile, the estimate of the line starts again.
 
 A window of the stream so depends on no event before it, and windows can be reconstructed at the
-same time, but for the footprint: windows begin with what the first one has learned when rows are
-chosen, and while the sensor's edge cuts a line learning goes on.
+same time, but for what the first one has learned by then: the footprint when rows are chosen, usual
+widths and the line's width a few profiles later. While the sensor's edge cuts a line learning goes
+on.
 """
+# Profiles of the first window, at least, that show the usual widths.
+_KNOWN_PROFILES = 16
 _OUTPUT_PROFILES = 64
 _HALF_MIN = 3 * FRACTION
 _WIDTH_MIN_DOF = 64
@@ -120,12 +128,14 @@ _COUNTERS = np.dtype(
 # ``part_us`` is where the part of the gate begins, ``status`` one of the three below, ``half`` the
 # half width of a window for the open period in fixed point, ``rows`` the number of rows in the
 # output, ``full`` 1 while a column needs more room, ``window`` the number of events since the
-# estimate started, ``over`` 1 where a pass ended with it.
+# estimate started, ``over`` 1 where a pass ended with it. ``profiles`` counts those since the
+# restart, ``known_half`` is 0 until windows begin with what is known.
 _STATE = np.dtype(
     [
         (name, np.int64)
         for name in (
             "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "over",
+            "profiles", "known_half",
         )
     ]
 )  # fmt: skip
@@ -163,6 +173,7 @@ class _Memory(NamedTuple):
     blink: Blink
     footprint: Footprint
     known: Footprint
+    known_widths: NDArray[np.float64]
     scatter: Scatter
     smoothing: Smoothing
     light: Light
@@ -176,7 +187,7 @@ class _Memory(NamedTuple):
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    With ``one_window`` the pass ends with the window of the estimate, or when rows are chosen.
+    With ``one_window`` the pass ends with the window of the estimate, or when enough is known.
     """
 
     floor_us: int
@@ -237,6 +248,7 @@ class ProfileAssembler:
         known["choice"] = self._first_choice
         known["computations"] = known["cut_computations"] = 0
         self._memory.footprint.state["near_edge"] = 0
+        self._state["profiles"] = self._state["known_half"] = 0
         _begin_window(self._memory, self._state)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
@@ -246,14 +258,18 @@ class ProfileAssembler:
         """
         memory = before._memory
         self._memory = self._memory._replace(
-            gate=same_gate(memory.gate), blink=memory.blink, light=memory.light
+            gate=same_gate(memory.gate),
+            blink=memory.blink,
+            light=memory.light,
+            known=memory.known,
+            known_widths=memory.known_widths,
         )
+        self._state["known_half"] = before._state["known_half"]
         self._memory.columns.counts[:] = 0
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state["rows"] = 0
         self._done = []
         self._memory.footprint.state["near_edge"] = 0
-        self._memory = self._memory._replace(known=before._memory.known)
         _begin_window(self._memory, self._state)
         self._state["status"] = _EMPTY
         self._state["edge_us"] = self._state["part_us"] = edges.t_us[edge]
@@ -261,7 +277,7 @@ class ProfileAssembler:
 
     @property
     def window_is_over(self) -> bool:
-        """Return whether the last pass over words ended with the window, or with a choice."""
+        """Return whether the last pass over words ended with the window, or knows enough."""
         return bool(self._state["over"])
 
     @property
@@ -270,9 +286,9 @@ class ProfileAssembler:
         return int(self._memory.window_events - self._state["window"])
 
     @property
-    def is_choosing(self) -> bool:
-        """Return whether learned rows or means are still to be chosen."""
-        return bool(self._memory.footprint.state["choice"] == UNDECIDED)
+    def is_learning(self) -> bool:
+        """Return whether the first window still learns what later ones begin with."""
+        return bool(self._state["known_half"] == 0)
 
     @property
     def is_cut(self) -> bool:
@@ -399,6 +415,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
+        known_widths=empty_known_widths(),
         scatter=empty_scatter(model.columns, _factor_max(settings)),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
@@ -435,16 +452,16 @@ def _factor_max(settings: Settings) -> float:
 
 @kernel
 def _begin_window(memory, state):
-    """Drop the last rows, the line's width, the scatter, the usual widths and the footprint."""
+    """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
     state.window = 0
-    state.half = memory.estimator.half_max
+    state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:] = -1
     _forget_scatter(memory.scatter)
     memory.smoothing.errors[:] = 0.0
     memory.delay[:] = 0.0
     _forget_gate(memory.gate)
-    _restart_widths(memory.smoothing.widths)
+    _restart_widths(memory.smoothing.widths, memory.known_widths, state.known_half > 0)
     if memory.footprint.state.near_edge == 0:
         _restart_from(memory.footprint, memory.known)
 
@@ -509,14 +526,16 @@ def _write(rows, smoothing, few, delay_us, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, gate, blink, footprint, known, scatter, smoothing = memory[:8]
+    columns, estimator, gate, blink, footprint, known = memory[:6]
+    scatter, smoothing = memory.scatter, memory.smoothing
     light, rows, row_counts = memory.light, memory.rows, memory.row_counts
     if gate.choices.size > 0:
         _learn_gate(columns, state.half, gate)
         gated = _use_late(columns, gate)
         counters.events_binned -= gated
         counters.events_gated += gated
-    learns, ends = _learns(footprint), state.window >= memory.window_events
+    learns, late = _learns(footprint), state.window >= memory.window_events
+    half = state.half
     sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, row_counts)
     state.half = _adapted_half(state.half, sums, estimator.half_max)
     counters.profiles_too_wide += state.half > estimator.half_max
@@ -531,16 +550,25 @@ def _close(memory, state, counters):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _mark_unusual(rows, smoothing, light.lit_share)
-    if _choose(footprint, rows.row[0], ends, estimator.method == _LEARNED):
+    state.profiles += 1
+    enough = state.profiles >= _KNOWN_PROFILES
+    if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):
         # Later windows begin with what is known now.
         _restart_from(known, footprint)
     if learns:
         uncertain, truncated = rows.uncertain[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.rows)
+    if state.known_half == 0:
+        if half >= estimator.half_max and state.half > half:
+            # Its window cuts a line that is wider than expected.
+            smoothing.widths.number[:] = 0.0
+        if enough and footprint.state.choice != UNDECIDED:
+            state.known_half = state.half
+            _keep_widths(smoothing.widths, memory.known_widths)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, light)
     _write(rows, smoothing, few, delay_us, state, memory.output)
-    if ends:
+    if late and state.known_half > 0:
         _begin_window(memory, state)
 
 
@@ -674,11 +702,11 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
         if state.status == _FILLED and state.rows > rows_max:
             break
         filled = state.status == _FILLED
-        choosing = memory.footprint.state.choice == UNDECIDED
+        learning = state.known_half == 0
         _begin_period(edges, edge, memory, state, counters)
         edge += 1
-        chosen = choosing and memory.footprint.state.choice != UNDECIDED
-        if span.one_window and filled and (chosen or state.window == 0):
+        learned = learning and state.known_half > 0
+        if span.one_window and filled and (learned or state.window == 0):
             state.over = 1
             break
     return _Progress(np.int64(i), edge)

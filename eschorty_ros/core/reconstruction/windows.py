@@ -124,7 +124,7 @@ class WindowAssembler:
         self._words, self._span, self._edges = words, span._replace(one_window=True), edges
         self._decoder, self._first_decoder = decoder, decoder
         self._at, going = Cut(0, 0), True
-        if self._open.is_choosing:
+        if self._open.is_learning:
             going = self._go_on()
         probe, cut, left = _copy(decoder), self._at, self._open.events_left
         running = deque([self._start(cut, decoder, decoder, self._open)] if going else [])
