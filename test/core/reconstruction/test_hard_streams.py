@@ -66,11 +66,22 @@ def _beside_a_step(camera: Camera, rows: float) -> tuple[Profiles, np.ndarray, n
     return found, found.range_mm - MODEL.range_mm(truth), away_px
 
 
-@pytest.mark.parametrize("rows", [-16.0, 40.0])
-def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows):
-    camera = Camera(periods=40)
+MANY_EVENTS = {"threshold": 0.14, "events_max": 9}
+
+
+@pytest.mark.parametrize(
+    ("rows", "camera", "half_widths"),
+    [
+        (-16.0, Camera(periods=40), 1.4),
+        (40.0, Camera(periods=40), 1.4),
+        (6.0, Camera(periods=40, **MANY_EVENTS), 1.7),
+    ],
+    ids=["nearer", "farther", "220 events per column"],
+)
+def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows, camera, half_widths):
+    """More sensitive pixels see a thicker line."""
     found, error, away_px = _beside_a_step(camera, rows)
-    crossing = np.abs(away_px) < 1.4 * camera.half_width_px
+    crossing = np.abs(away_px) < half_widths * camera.half_width_px
     good = found.flags == 0
     assert np.mean(good[~crossing]) > 0.99, f"seed {camera.seed}"
     assert np.quantile(np.abs(error[crossing & good]), 0.95) < 2.2
@@ -206,7 +217,7 @@ def test_what_does_not_follow_the_laser_moves_no_points(case):
 @pytest.mark.parametrize(
     ("camera", "settings"),
     [
-        (Camera(threshold=0.14, events_max=9, periods=4), {}),
+        (Camera(periods=4, **MANY_EVENTS), {}),
         (Camera(frequency_hz=1000.0, periods=28), {"periods_per_profile": 14}),
     ],
     ids=["220 events per column", "14 periods per profile"],
