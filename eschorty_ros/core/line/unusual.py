@@ -40,6 +40,8 @@ WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
 _STEP = 1.0 / 1024.0
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
 _ROOT_12 = np.sqrt(12.0)
+# Columns to either side that move as a column does.
+_BESIDE = BLOCK + BLOCK // 2
 # A point is marked when the missing or additional rows may move it by more deviations of a row
 # that is not smoothed.
 _MARKED = 2.5
@@ -149,18 +151,30 @@ def _at_rest(width, usual, way):
     Rows that it leaves or reaches widen it by the way, hence its standard deviation by up to the
     way's over the square root of 12.
     """
-    return min(width, max(usual, width - abs(way) / _ROOT_12))
+    return min(width, max(usual, width - way / _ROOT_12))
+
+
+@kernel(_nrt=False)
+def _way(row, last_row, column):
+    """Return how far the line has moved in a column since the last profile; 0 if not known."""
+    c = np.uintp(column)
+    way = abs(row[c] - last_row[c])
+    return 0.0 if np.isnan(way) else way
 
 
 @kernel(_nrt=False)
 def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
     """Set widths less what the way of their lines since the last profile adds.
 
-    A line is lit for ``lit_share`` of the time between two profiles.
+    A line is lit for ``lit_share`` of the time between two profiles. A leap of few columns, to a
+    glint, is no way: it is as long as that of columns beside them at most.
     """
-    for c in range(np.uintp(row.size)):
-        way = row[c] - last_row[c]
-        at_rest[c] = _at_rest(smoothed[c], usual, lit_share * (0.0 if np.isnan(way) else way))
+    beside, last = np.intp(_BESIDE), np.intp(row.size - 1)
+    for c in range(np.intp(row.size)):
+        before, after = max(c - beside, np.intp(0)), min(c + beside, last)
+        near = max(_way(row, last_row, before), _way(row, last_row, after))
+        way = min(_way(row, last_row, c), near)
+        at_rest[c] = _at_rest(smoothed[c], usual, lit_share * way)
 
 
 @kernel(_nrt=False)

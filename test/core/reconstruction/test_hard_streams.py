@@ -88,6 +88,20 @@ def test_points_on_both_sides_of_a_step_are_flagged_or_right(rows, camera, half_
     assert np.mean(np.abs(error)[~good] < 2.0 * found.sigma_mm[~good]) > 0.8
 
 
+def test_a_glint_is_flagged():
+    """It is broader than the line, and so may be a line that moves; columns beside it do not."""
+    camera, bright = Camera(periods=30), Camera(periods=30, half_width_px=15.0, seed=6)
+
+    def glint(k, c):
+        return np.where((k in (20, 21)) & (c >= 600) & (c < 620), wavy(k, c) - 150.0, np.nan)
+
+    found, _ = points(camera, camera.line(wavy), bright.line(glint))
+    off = np.abs(error_px(found)) > 10.0
+    assert off.sum() > 30, f"seeds {camera.seed} and {bright.seed}"
+    assert np.all(found.flags[off] > 0)
+    assert np.mean(found.flags[~off] > 0) < 0.01
+
+
 @pytest.mark.parametrize("rows", [-1.0, 1.0])
 def test_sigma_holds_what_a_step_of_a_row_moves_the_line_by(rows):
     camera = Camera(periods=60)
