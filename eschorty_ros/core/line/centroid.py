@@ -29,7 +29,6 @@ from eschorty_ros.core.line.estimators import (
 from eschorty_ros.core.line.learned import (
     LEARNED_ROWS,
     MEAN_ROWS,
-    _bias_left,
     _learned_row,
     _sample,
     make_footprint,
@@ -578,7 +577,12 @@ def _refine(packed, column, k, c, window, line_variance, estimator, footprint, r
     if learned >= 0.0 and (cut or (near and takes)):
         found.row[k, c] = min(max(best, -0.5), rows - 0.5)
         found.sigma2[k, c] = learned
-        found.common2[k, c] = _HALF_BIAS2 * variance * _bias_left(footprint) ** 2
+        bias = 0.0
+        if footprint.state.cut_computations > 0:
+            # No whole line has been seen. The part that is left is off by so much, less what the
+            # footprint of cut lines explains.
+            bias = max(np.sqrt(_HALF_BIAS2 * variance) - abs(best - row), 0.0)
+        found.common2[k, c] = bias * bias
 
 
 @kernel(_nrt=False, forceinline=True)

@@ -40,8 +40,6 @@ _SMOOTHING_PASSES = 4
 _PRIOR_PIXELS = 2.0
 _PRIOR_COUNT = 0.02
 _MOVES_MAX = 24
-# Where every line is cut, a computation from rows that are off leaves this part of their bias.
-_BIAS_KEPT = 0.85
 _OFF_LINE_PX = 1.0
 # Learned rows take twice the time of means. They pay where they scatter less than means of twice
 # the events would.
@@ -120,13 +118,6 @@ def _restart_from(footprint, known):
     state.computations = before.computations
     state.cut_computations = before.cut_computations
     state.choice = before.choice
-
-
-@kernel(_nrt=False)
-def _bias_left(footprint):
-    """Return the share of a cut line's bias that is left, 0 where whole lines are learned from."""
-    rounds = footprint.state.cut_computations
-    return _BIAS_KEPT**rounds if rounds > 0 else 0.0
 
 
 @kernel(_nrt=False, forceinline=True)
