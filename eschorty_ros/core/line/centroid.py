@@ -607,10 +607,14 @@ def _mean_rows(first, d, events, row):
 
 @kernel(_nrt=False)
 def _variances(d, d2, events, variance):
-    """Set the sample variances of windows; of rows that are all the same they are exactly 0."""
+    """Set the sample variances of windows, NaN where there is none.
+
+    Of rows that are all the same they are exactly 0.
+    """
     for c in range(np.uintp(variance.size)):
         n = events[c]
-        variance[c] = (n * d2[c] - d[c] * d[c]) / max(float(n) * (n - 1), 1.0)
+        squares = n * d2[c] - d[c] * d[c]
+        variance[c] = squares / max(float(n) * (n - 1), 1.0) if n > 0 else np.nan
 
 
 @kernel(_nrt=False)

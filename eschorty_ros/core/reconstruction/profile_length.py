@@ -26,6 +26,8 @@ _FEW_SHARE = 1.0 / 24.0
 # Standard deviation of the events of even profiles over their mean, and their number to know it.
 _UNEVEN_SHARE = 0.2
 _PROFILES_MIN = 4
+# Part of the events of the fullest period that periods in the dark do not reach.
+_LIT_SHARE = 0.125
 # Events of a window that are looked at, evenly spread.
 _SAMPLE = 4096
 # Cells of 16 x 16 pixels: a line is in one to four of a column's 45, background in all.
@@ -135,11 +137,14 @@ class ProfileLength:
         counts = np.bincount(index, minlength=shape[0] * shape[1]).reshape(shape)
         # The last period may not be whole.
         counts = counts[: max(round(float(turns[-1])), 1)]
+        # The laser may be on for a part of the block.
+        lit = np.flatnonzero(counts.sum(axis=1) >= _LIT_SHARE * counts.sum(axis=1).max())
+        counts = counts[lit[0] : lit[-1] + 1]
         of_column, in_period = counts.sum(axis=0), counts.sum(axis=1)
         pairs = of_column * (of_column - 1)
-        lit = pairs / max(pairs.sum(), 1)
-        events = max(float((counts @ lit).mean()), 1e-9)
-        few = np.mean((counts < EVENTS_WANTED // 4) @ lit)
+        weights = pairs / max(pairs.sum(), 1)
+        events = max(float((counts @ weights).mean()), 1e-9)
+        few = np.mean((counts < EVENTS_WANTED // 4) @ weights)
         if events >= enough and (few <= _FEW_SHARE or _are_even(in_period, 1)):
             return 1
         wanted = max(min(math.ceil(EVENTS_WANTED / events), periods_max(self._modulation)), 2)

@@ -34,6 +34,10 @@ _STAGE_EDGES_MAX = 1024
 """Most pieces with edges that are kept until ``take_stage_edges`` is called."""
 
 
+# More columns whose events do not follow the laser are not those of things that move.
+_UNMODULATED_SHARE = 0.1
+
+
 class Reconstructor:
     """Bytes in, profiles out; the same points however the bytes are split.
 
@@ -348,11 +352,13 @@ class Reconstructor:
                 f"frequency ({self.modulation.frequency_hz:g} Hz) and the polarity of the events"
             )
             return found
-        if counts["columns_unmodulated"] > counts["points"]:
+        unmodulated = counts["columns_unmodulated"]
+        if unmodulated > _UNMODULATED_SHARE * (counts["points"] + unmodulated):
+            share = unmodulated / (counts["points"] + unmodulated)
             found.append(
-                f"the events of {counts['columns_unmodulated']} columns do not follow the laser at "
-                f"{self.modulation.frequency_hz:g} Hz and gave no points; check the frequency and "
-                "that the laser is on"
+                f"the events of {unmodulated} columns ({share:.0%} of those with enough) do not "
+                f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
+                "check frequency and laser, or choose a lower frequency where pixels are too slow"
             )
         if counts["sensor_drop_words"]:
             found.append(

@@ -331,6 +331,15 @@ def test_a_readout_that_reports_lost_events_has_a_warning():
     assert len(warning) < 300
 
 
+def test_a_recording_of_two_periods_has_two_profiles():
+    """Periods in the dark behind them do not count when their length is chosen."""
+    camera, dark = Camera(periods=2), Camera(periods=12)
+    found, reconstructor = points(camera, camera.line(wavy), dark.scattered(1e4))
+    assert reconstructor.periods_per_profile == 1, f"seed {camera.seed}"
+    assert len(found) > 0.999 * 2 * 1280
+    assert not reconstructor.warnings
+
+
 def _sloping(towards: float):
     return lambda k, c: np.abs(towards - 3.0 - 0.06 * c) + 0.0 * k
 
