@@ -558,10 +558,15 @@ def _learns(footprint):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _refine(packed, column, k, c, window, line_variance, estimator, footprint, row_counts, found):
-    """Set the row of a window's line that a learned footprint or the median gives."""
+def _refine(packed, column, at, window, line_variance, estimator, footprint, row_counts, found):
+    """Set the row of a window's line that a learned footprint or the median gives.
+
+    ``at`` is the place of the return: its number and its column.
+    """
+    c = at[1]
     rows, method = estimator.rows, estimator.method
-    row, variance = _mean(window), _variance(window.sums)
+    events, d = window.sums.events, window.sums.d
+    row, variance = _mean(events, window.first, d), _variance(events, d, window.sums.d2)
     cut = _is_windowed(method) and _is_cut(window, rows)
     best, learned = row, -1.0
     takes, trying = footprint.state.choice == LEARNED_ROWS, footprint.state.trying > 0
@@ -570,51 +575,46 @@ def _refine(packed, column, k, c, window, line_variance, estimator, footprint, r
     if cut or trying or takes:
         best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
     if method == _MEDIAN:
-        found.row[k, c] = _median(packed, column, row_counts)
-    near = window.sums.events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
+        found.row[at] = _median(packed, column, row_counts)
+    near = events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if trying and near and not cut:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
-        found.row[k, c] = min(max(best, -0.5), rows - 0.5)
-        found.sigma2[k, c] = learned
+        found.row[at] = min(max(best, -0.5), rows - 0.5)
+        found.sigma2[at] = learned
         bias = 0.0
         if footprint.state.cut_computations > 0:
             # No whole line has been seen. The part that is left is off by so much, less what the
             # footprint of cut lines explains.
             bias = max(np.sqrt(_HALF_BIAS2 * variance) - abs(best - row), 0.0)
-        found.common2[k, c] = bias * bias
+        found.common2[at] = bias * bias
 
 
 @kernel(_nrt=False, forceinline=True)
-def _put(k, c, window, held, uncertain, out):
+def _put(at, window, held, uncertain, out):
     """Write the sums of a return of a column."""
     found, sums = out.found, window.sums
-    out.events[k, c] = sums.events
-    out.uncertain[k, c] = uncertain
-    found.first[k, c] = window.first
-    found.d[k, c] = sums.d
-    found.d2[k, c] = sums.d2
-    found.time_us[k, c] = sums.time_us
-    found.held[k, c] = held
+    out.events[at] = sums.events
+    out.uncertain[at] = uncertain
+    found.first[at] = window.first
+    found.d[at] = sums.d
+    found.d2[at] = sums.d2
+    found.time_us[at] = sums.time_us
+    found.held[at] = held
 
 
 @kernel(_nrt=False)
 def _mean_rows(first, d, events, row):
-    """Set the mean rows of windows, NaN where there is none."""
+    """Set the mean rows of windows."""
     for c in range(np.uintp(row.size)):
-        row[c] = (events[c] * first[c] + d[c]) / events[c] if events[c] > 0 else np.nan
+        row[c] = _mean(events[c], first[c], d[c])
 
 
 @kernel(_nrt=False)
 def _variances(d, d2, events, variance):
-    """Set the sample variances of windows, NaN where there is none.
-
-    Of rows that are all the same they are exactly 0.
-    """
+    """Set the sample variances of windows."""
     for c in range(np.uintp(variance.size)):
-        n = events[c]
-        squares = n * d2[c] - d[c] * d[c]
-        variance[c] = squares / max(float(n) * (n - 1), 1.0) if n > 0 else np.nan
+        variance[c] = _variance(events[c], d[c], d2[c])
 
 
 @kernel(_nrt=False)
@@ -732,10 +732,10 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             if _is_clear(window, column, estimator, blink):
                 columns.rivals[c] = -1
                 columns.seeds[c] = neighbour = window.centre
-                _put(0, c, window, n, False, out)
+                _put((0, c), window, n, False, out)
                 if not plain:
                     _refine(
-                        packed, column, 0, c, window, line_variance, estimator, footprint,
+                        packed, column, (0, c), window, line_variance, estimator, footprint,
                         row_counts, out.found,
                     )  # fmt: skip
                 continue
@@ -758,9 +758,9 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         window, other = _reported(estimator.returns, found)
         left = _column(columns.starts[c], searched.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
-            _put(k, c, window, n, searched.uncertain, out)
+            _put((k, c), window, n, searched.uncertain, out)
             _refine(
-                packed, left, k, c, window, line_variance, estimator, footprint, row_counts,
+                packed, left, (k, c), window, line_variance, estimator, footprint, row_counts,
                 out.found,
             )  # fmt: skip
             refined = True

@@ -13,20 +13,17 @@ HALF_WIDTH_PER_FWHM = 1.3
 HALF_PER_SIGMA = HALF_WIDTH_PER_FWHM * FWHM_PER_SIGMA * FRACTION
 
 
-@kernel
-def _mean(window):
-    """Return the mean row of a window's events."""
-    events = window.sums.events
-    return (events * window.first + window.sums.d) / events
+@kernel(forceinline=True)
+def _mean(events, first, d):
+    """Return the mean row of events, NaN of none; ``d`` is their sum, relative to row ``first``."""
+    return (events * first + d) / events if events > 0 else np.nan
 
 
-@kernel
-def _variance(sums):
-    """Return the sample variance; the numerator is an exact integer, so a constant column has 0."""
-    n = sums.events
-    if n < 2:
-        return 0.0
-    return (n * sums.d2 - sums.d * sums.d) / (float(n) * (n - 1))
+@kernel(forceinline=True)
+def _variance(events, d, d2):
+    """Return the sample variance, NaN of none; of rows that are all the same it is exactly 0."""
+    squares = events * d2 - d * d
+    return squares / max(float(events) * (events - 1), 1.0) if events > 0 else np.nan
 
 
 @kernel(_nrt=False)
