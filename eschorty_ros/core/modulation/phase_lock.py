@@ -173,8 +173,12 @@ class PhaseLock:
         self._seen += t_us.size
 
     def _forget(self) -> None:
-        self._begin_us = self._seen = self._count = 0
-        self._stride, self._observed = 1, False
+        """Forget the events of a block: their first time, the number seen and of those kept."""
+        self._begin_us: int = 0
+        self._seen: int = 0
+        self._count: int = 0
+        self._stride: int = 1
+        self._observed: bool = False
 
     @property
     def tracks(self) -> bool:
