@@ -69,7 +69,9 @@ class PhaseLock:
         self._difference: float | None = None
         self._corrections = 0
         self._relocks = 0
-        self._forget()
+        # Events of the block: the first one's time, those seen, and those kept, one in ``stride``.
+        self._begin_us = self._seen = self._count = 0
+        self._stride, self._observed = 1, False
         self._t = np.empty(2 * _EVENTS_ENOUGH, np.int64)
         self._p = np.empty(2 * _EVENTS_ENOUGH, np.uint8)
 
@@ -173,12 +175,7 @@ class PhaseLock:
         self._seen += t_us.size
 
     def _forget(self) -> None:
-        """Forget the events of a block: their first time, the number seen and of those kept."""
-        self._begin_us: int = 0
-        self._seen: int = 0
-        self._count: int = 0
-        self._stride: int = 1
-        self._observed: bool = False
+        self._seen, self._count, self._stride, self._observed = 0, 0, 1, False
 
     @property
     def tracks(self) -> bool:
