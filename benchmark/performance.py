@@ -233,7 +233,7 @@ def main() -> None:
     )
     text += header(ONE_THREAD)
     for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.4)):
-        text += one_thread(frequency_hz, 1.5 * share, arguments.repeats)
+        text += one_thread(frequency_hz, 4.0 * share, arguments.repeats)
     text += THREADS_TEXT + header(THREADS)
     with tempfile.TemporaryDirectory() as made:
         for frequency_hz, share in ((70.0, 1.0), (1000.0, 0.15)):
