@@ -312,6 +312,8 @@ class Spinning:
         # It would hold the interpreter's lock for as long as the thread spins.
         if not self._thread.is_alive():
             self.executor.shutdown(timeout_sec=timeout_s)
+            for node in self.executor.get_nodes():
+                self.executor.remove_node(node)
 
     def _spin(self) -> None:
         # Without a limit rclpy 9.1's EventsExecutor never waits.

@@ -10,6 +10,7 @@ import select
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -21,6 +22,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from eschorty_ros.control.heartbeat import CHECK_S
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError
 from eschorty_ros.hardware.base.launcher import end_with_launcher
 from eschorty_ros.nodes.ros.alone import SecondNodes
@@ -213,9 +215,15 @@ def _exit_without_dds(nodes: Sequence[Node]) -> None:
     os._exit(1)
 
 
-def _tear_down(nodes: Sequence[Node], spinning: Spinning | None) -> None:
+def _tear_down(nodes: list[Node], spinning: Spinning | None) -> None:
     if spinning is not None:
         spinning.end()
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
+    nodes.clear()
+    # DDS leaves when nothing refers to a node any more; until then others list it for 20 s. Threads
+    # of heartbeats end with their next look at the context.
+    time.sleep(2.0 * CHECK_S)
+    gc.unfreeze()
+    gc.collect()

@@ -62,7 +62,11 @@ def test_in_the_middle_of_a_sweep(tmp_path: Path) -> None:
         with scenarios.bench(domain, log) as bench:
             bench.start(**scenarios.SLOW)
             bench.wait_for_sweep()
-        assert_ctrl_c_ends(running)
+        with Observer(domain) as observer:
+            listed = observer.node.get_node_names
+            wait_until(lambda: set(running) <= set(listed()), "the nodes")
+            assert_ctrl_c_ends(running)
+            wait_until(lambda: not set(running) & set(listed()), "the end of all nodes", 5.0)
         assert log.read_text().splitlines()[-1].endswith("OFF")
 
 
