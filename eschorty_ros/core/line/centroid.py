@@ -136,7 +136,7 @@ class Estimator(NamedTuple):
     error_model: ErrorModel
 
 
-class Found(NamedTuple):
+class Windows(NamedTuple):
     """Sums over the window of each return, shape (returns, columns), and what replaces its mean.
 
     Rows are relative to the ``first`` one of the window. ``held`` are the events of the column, in
@@ -163,7 +163,7 @@ class Rows(NamedTuple):
     ``ambiguous`` has shape (columns,).
     """
 
-    found: Found
+    windows: Windows
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
     common2: NDArray[np.float64]
@@ -234,12 +234,12 @@ def make_row_counts() -> NDArray[np.int64]:
 def empty_rows(returns: int, columns: int) -> Rows:
     """Return the rows of ``columns`` columns without any return."""
     shape = returns, columns
-    found = Found(*np.zeros((5, *shape), np.int64), *np.full((3, *shape), np.nan))
+    windows = Windows(*np.zeros((5, *shape), np.int64), *np.full((3, *shape), np.nan))
     row, sigma2, common2, variance = np.full((4, *shape), np.nan)
     events, mean_dt_us = np.zeros((2, *shape), np.int64)
     truncated, uncertain, mixed = np.zeros((3, *shape), np.bool_)
     flags = truncated, uncertain, mixed, np.zeros(columns, np.bool_)
-    return Rows(found, row, sigma2, common2, variance, events, mean_dt_us, *flags)
+    return Rows(windows, row, sigma2, common2, variance, events, mean_dt_us, *flags)
 
 
 def estimate(
@@ -558,7 +558,7 @@ def _learns(footprint):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _refine(packed, column, at, window, line_variance, estimator, footprint, row_counts, found):
+def _refine(packed, column, at, window, line_variance, estimator, footprint, row_counts, windows):
     """Set the row of a window's line that a learned footprint or the median gives.
 
     ``at`` is the place of the return: its number and its column.
@@ -575,32 +575,32 @@ def _refine(packed, column, at, window, line_variance, estimator, footprint, row
     if cut or trying or takes:
         best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
     if method == _MEDIAN:
-        found.row[at] = _median(packed, column, row_counts)
+        windows.row[at] = _median(packed, column, row_counts)
     near = events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if trying and near and not cut:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
-        found.row[at] = min(max(best, -0.5), rows - 0.5)
-        found.sigma2[at] = learned
+        windows.row[at] = min(max(best, -0.5), rows - 0.5)
+        windows.sigma2[at] = learned
         bias = 0.0
         if footprint.state.cut_computations > 0:
             # No whole line has been seen. The part that is left is off by so much, less what the
             # footprint of cut lines explains.
             bias = max(np.sqrt(_HALF_BIAS2 * variance) - abs(best - row), 0.0)
-        found.common2[at] = bias * bias
+        windows.common2[at] = bias * bias
 
 
 @kernel(_nrt=False, forceinline=True)
 def _put(at, window, held, uncertain, out):
     """Write the sums of a return of a column."""
-    found, sums = out.found, window.sums
+    windows, sums = out.windows, window.sums
     out.events[at] = sums.events
     out.uncertain[at] = uncertain
-    found.first[at] = window.first
-    found.d[at] = sums.d
-    found.d2[at] = sums.d2
-    found.time_us[at] = sums.time_us
-    found.held[at] = held
+    windows.first[at] = window.first
+    windows.d[at] = sums.d
+    windows.d2[at] = sums.d2
+    windows.time_us[at] = sums.time_us
+    windows.held[at] = held
 
 
 @kernel(_nrt=False)
@@ -659,20 +659,20 @@ def _rows_of_windows(out, line_variance, estimator, refined):
 
     Loops over all columns, each over a few arrays, run in vectors.
     """
-    found, is_median = out.found, estimator.method == _MEDIAN
+    windows, is_median = out.windows, estimator.method == _MEDIAN
     for k in range(out.row.shape[0]):
         events, row, variance, sigma2 = out.events[k], out.row[k], out.variance[k], out.sigma2[k]
-        _mean_rows(found.first[k], found.d[k], events, row)
-        _variances(found.d[k], found.d2[k], events, variance)
-        _mean_times(found.time_us[k], events, out.mean_dt_us[k])
+        _mean_rows(windows.first[k], windows.d[k], events, row)
+        _variances(windows.d[k], windows.d2[k], events, variance)
+        _mean_times(windows.time_us[k], events, out.mean_dt_us[k])
         if is_median:
-            _replace(found.row[k], row)
+            _replace(windows.row[k], row)
         _own_variances(variance, row, events, line_variance, estimator, sigma2)
         _cut_lines(variance, row, line_variance, estimator.rows, out.truncated[k], out.common2[k])
         if refined and not is_median:
-            _replace(found.row[k], row)
-            _replace(found.sigma2[k], sigma2)
-            _replace(found.common2[k], out.common2[k])
+            _replace(windows.row[k], row)
+            _replace(windows.sigma2[k], sigma2)
+            _replace(windows.common2[k], out.common2[k])
 
 
 @kernel(_nrt=False)
@@ -691,7 +691,7 @@ def _pooled(out, estimator):
                 used = out.events[k, c] - 1
                 squares += out.variance[k, c] * used
                 freedom += used
-                held += out.found.held[k, c] if k == 0 else 0
+                held += out.windows.held[k, c] if k == 0 else 0
     return squares, freedom, held
 
 
@@ -736,7 +736,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
                 if not plain:
                     _refine(
                         packed, column, (0, c), window, line_variance, estimator, footprint,
-                        row_counts, out.found,
+                        row_counts, out.windows,
                     )  # fmt: skip
                 continue
         searched = _column_returns(
@@ -761,7 +761,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             _put((k, c), window, n, searched.uncertain, out)
             _refine(
                 packed, left, (k, c), window, line_variance, estimator, footprint, row_counts,
-                out.found,
+                out.windows,
             )  # fmt: skip
             refined = True
             near_edge |= windowed and _is_cut(window, estimator.rows)

@@ -98,16 +98,12 @@ def _keep_widths(widths, known):
 
 
 @kernel
-def _restart_widths(widths, known, begins_known):
-    """Forget all widths but the ``known`` ones, if any."""
-    share = 1.0 if begins_known else 0.0
-    widths.number[:] = share * known[:_BINS]
-    widths.state[:] = share * known[_BINS:]
-    widths.below[0] = 0.0
-    for b in range(_BINS):
-        widths.below[b + 1] = widths.below[b] + widths.number[b]
+def _restart_widths(widths, known):
+    """Forget all widths but the ``known`` ones, zeros where there are none."""
+    widths.number[:], widths.state[:] = known[:_BINS], known[_BINS:]
     widths.before[:] = np.nan
     widths.course.recent[:] = 0.0
+    _update(widths, widths.smoothed.shape[1])
 
 
 @kernel(_nrt=False)

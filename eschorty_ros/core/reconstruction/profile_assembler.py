@@ -249,6 +249,7 @@ class ProfileAssembler:
         known["computations"] = known["cut_computations"] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["profiles"] = self._state["known_half"] = 0
+        self._memory.known_widths[:] = 0.0
         _begin_window(self._memory, self._state)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
@@ -461,7 +462,7 @@ def _begin_window(memory, state):
     memory.smoothing.errors[:] = 0.0
     memory.delay[:] = 0.0
     _forget_gate(memory.gate)
-    _restart_widths(memory.smoothing.widths, memory.known_widths, state.known_half > 0)
+    _restart_widths(memory.smoothing.widths, memory.known_widths)
     if memory.footprint.state.near_edge == 0:
         _restart_from(memory.footprint, memory.known)
 

@@ -138,9 +138,11 @@ class ProfileLength:
         # The last period may not be whole.
         counts = counts[: max(round(float(turns[-1])), 1)]
         # The laser may be on for a part of the block.
-        lit = np.flatnonzero(counts.sum(axis=1) >= _LIT_SHARE * counts.sum(axis=1).max())
-        counts = counts[lit[0] : lit[-1] + 1]
-        of_column, in_period = counts.sum(axis=0), counts.sum(axis=1)
+        in_period = counts.sum(axis=1)
+        lit = np.flatnonzero(in_period >= _LIT_SHARE * in_period.max())
+        on = slice(lit[0], lit[-1] + 1)
+        counts, in_period = counts[on], in_period[on]
+        of_column = counts.sum(axis=0)
         pairs = of_column * (of_column - 1)
         weights = pairs / max(pairs.sum(), 1)
         events = max(float((counts @ weights).mean()), 1e-9)

@@ -312,6 +312,7 @@ class Spinning:
         # It would hold the interpreter's lock for as long as the thread spins.
         if not self._thread.is_alive():
             self.executor.shutdown(timeout_sec=timeout_s)
+            # It refers to the callbacks of its nodes where no garbage collector looks.
             for node in self.executor.get_nodes():
                 self.executor.remove_node(node)
 
