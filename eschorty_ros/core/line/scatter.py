@@ -8,7 +8,9 @@ remove.
 
 What neighbours share over more columns no difference of rows shows, but the line does: its ends are
 whole pixels, each off by a twelfth of a squared row. The middle of two is off by that less a
-quarter of the variance of the length between them. Scatter of the ends dithers it.
+quarter of the variance of the length between them. Scatter of the ends dithers it. Pixels with
+more events than one at either edge of the laser have more levels of light that they count. Each
+level has ends of its own, and the row is the mean of all.
 """
 
 from __future__ import annotations
@@ -54,12 +56,16 @@ class Differences(NamedTuple):
 
 
 class Scatter(NamedTuple):
-    """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most."""
+    """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
+
+    A profile has so many edges of the laser as ``laser_edges``.
+    """
 
     own: Differences
     smoothed: Differences
     factor_max: float
     alone: NDArray[np.float64]
+    laser_edges: int = 2
 
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
@@ -137,17 +143,36 @@ def _ratio(sums, block, factor_max):
 
 
 @kernel(_nrt=False)
-def _locking2(sums, block):
+def _levels(rows, begin, end, laser_edges):
+    """Return the mean number of levels that the pixels of columns count at an edge of the laser.
+
+    The ends of two levels are two pixels, so that half of a line's length has no more.
+    """
+    events, length, number = 0.0, 0.0, 0.0
+    for k in range(rows.row.shape[0]):
+        for c in range(np.uintp(begin), np.uintp(end)):
+            found = not np.isnan(rows.row[k, c])
+            events += rows.events[k, c] if found else 0.0
+            length += np.sqrt(rows.variance[k, c] / _WHOLE) if found else 0.0
+            number += 1.0 if found else 0.0
+    levels = events / (laser_edges * max(length, 1.0))
+    return max(min(levels, 0.5 * length / max(number, 1.0)), 1.0)
+
+
+@kernel(_nrt=False)
+def _locking2(sums, block, levels):
     """Return the variance that rows near a block share as the line's ends are whole pixels.
 
-    A row is the mean of two ends, so that an end scatters by two of its variances. These follow
-    from the mean size of differences: rows that leap to the next pixel are no scatter.
+    A row is the mean of two ends for each of the levels, so that an end scatters by two of its
+    variances for each. These follow from the mean size of differences: rows that leap to the next
+    pixel are no scatter. Scatter dithers the first harmonic of an end's error.
     """
     near = slice(block - 1, block + 2)
     number = sums.number[near].sum()
     size = sums.sizes[near].sum() / number
-    end2 = 2.0 * _SQUARE_PER_SIZE2 * size * size / 6.0
-    return max(_WHOLE - 0.25 * sums.lengths2[near].sum() / number - end2, 0.0)
+    end2 = 2.0 * levels * _SQUARE_PER_SIZE2 * size * size / 6.0
+    middle2 = max(_WHOLE - 0.25 * sums.lengths2[near].sum() / number, 0.0)
+    return middle2 / levels * np.exp(-((2.0 * np.pi) ** 2) * end2)
 
 
 @kernel(_nrt=False)
@@ -162,11 +187,13 @@ def _scale(rows, scatter, smoothing):
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
-        locking2 = _locking2(sums, block) if measured else 0.0
+        begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        levels = _levels(rows, begin, end, scatter.laser_edges)
+        locking2 = _locking2(sums, block, levels) if measured else 0.0
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         for k in range(returns):
-            for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
+            for c in range(np.uintp(begin), np.uintp(end)):
                 sigma2, cut = rows.sigma2[k, c], rows.truncated[k, c]
                 scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
                 gate_px = max(smoothing.gate_px, scattered)

@@ -240,7 +240,10 @@ class ProfileAssembler:
             # They hold background, which comes at any time.
             lit = lit._replace(delay_max_us=Light().delay_max_us)
         self._memory = self._memory._replace(
-            gate=make_gate(modulation, self._gate_us), blink=blink(modulation, every), light=lit
+            gate=make_gate(modulation, self._gate_us),
+            blink=blink(modulation, every),
+            light=lit,
+            scatter=self._memory.scatter._replace(laser_edges=2 * every),
         )
         self._state["status"] = _CLOSED
         self._memory.columns.counts[:] = 0
@@ -262,6 +265,7 @@ class ProfileAssembler:
             gate=same_gate(memory.gate),
             blink=memory.blink,
             light=memory.light,
+            scatter=self._memory.scatter._replace(laser_edges=memory.scatter.laser_edges),
             known=memory.known,
             known_widths=memory.known_widths,
         )

@@ -288,6 +288,16 @@ def test_sigma_covers_what_pixels_without_noise_hide(tmp_path):
     assert np.median(sigma_mm) < 1.2 * np.sqrt(np.mean(error**2))
 
 
+@pytest.mark.parametrize("mismatch", [0.03, 0.12])
+def test_sigma_of_pixels_with_many_events_is_not_that_of_whole_pixels(mismatch):
+    """Pixels with ten events at an edge of the laser average the ends of as many levels."""
+    camera = Camera(threshold=0.2, events_max=20, mismatch=mismatch)
+    found, _ = points(camera, camera.line(wavy))
+    error, sigma = np.abs(error_px(found)), found.sigma_row
+    assert np.median(sigma) < 2.0 * np.quantile(error, 0.6827), f"seed {camera.seed}"
+    assert np.mean(error < 2.0 * sigma) > 0.9
+
+
 def _swapped(camera: Camera) -> Events:
     t, x, y, p = camera.line(wavy)
     return t, x, y, 1 - p
