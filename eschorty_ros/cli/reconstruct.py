@@ -107,8 +107,8 @@ def command(
 
     \b
     --json prints events, dropped_events, profiles, periods_per_profile, points, seconds,
-    events_per_second, sigma_median_m (null when there is no point), warnings,
-    points_without_stage and counters (those that are not zero); for a recording with truth.csv
+    events_per_second, sigma_median_m (null when there is no point), pass_lag_ms (lag taken off and
+    its sigma; null without passes forth and back), warnings, points_without_stage and counters (those that are not zero); for a recording with truth.csv
     also score: periods, points, completeness, error_median_mm, error_p95_mm, bias_mm,
     within_1_sigma, within_2_sigma, off_target (points where nothing is), flagged, and
     good_median_mm, good_p95_mm, good_within_1_sigma and good_within_2_sigma of the points without a
@@ -263,7 +263,7 @@ def _print(
         click.echo(json.dumps({**first, **facts}))
     if as_json or not facts["points"]:
         return
-    sigma = facts["sigma_median_m"]
+    sigma, lag = facts["sigma_median_m"], facts["pass_lag_ms"]
     pairs(
         str(target),
         {
@@ -273,6 +273,7 @@ def _print(
             "periods per profile": f"{facts['periods_per_profile']}",
             "points": f"{facts['points']:,}",
             "median sigma": "none" if sigma is None else f"{sigma * 1e3:.3f} mm",
+            **({} if lag is None else {"lag taken off": "{:.2f} ± {:.2f} ms".format(*lag)}),
             "seconds": f"{facts['seconds']:.2f}",
             "events/s": f"{facts['events_per_second']:.3g}",
             **({} if measured is None else accuracy_rows(measured)),
@@ -301,6 +302,7 @@ def summary(result: Result) -> dict[str, Any]:
         "seconds": result.seconds,
         "events_per_second": result.events_per_second,
         "sigma_median_m": float(np.median(points["sigma"])) if len(points) else None,
+        "pass_lag_ms": result.pass_lag and [1e-3 * value for value in result.pass_lag],
         "warnings": list(result.warnings),
         "points_without_stage": result.counters["points_without_stage"],
         "counters": {name: count for name, count in result.counters.items() if count},

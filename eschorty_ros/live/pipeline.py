@@ -9,7 +9,14 @@ import numpy as np
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction import Settings, add_stage, place
+from eschorty_ros.core.reconstruction import (
+    PassLag,
+    Settings,
+    add_stage,
+    pass_lag,
+    place,
+    take_off_lag,
+)
 from eschorty_ros.core.storage import Points
 from eschorty_ros.live.calibration_capture import Capture
 from eschorty_ros.live.packet_stream import PacketStream
@@ -39,6 +46,7 @@ class ScanReport:
     points_outside: int
     points_over_limit: int
     profiles_expected: int
+    pass_lag: PassLag | None = None
 
     @property
     def completeness(self) -> float:
@@ -241,12 +249,17 @@ class Pipeline:
     def end_scan(self) -> ScanReport:
         """Return the scan that was collected.
 
-        Points are placed again, by the clock as fitted to the entire sweep.
+        Points are placed again, by the clock as fitted to the entire sweep, and less the lag that
+        passes forth and back show.
         """
         assert self._buffer is not None
         buffer, self._buffer = self._buffer, None
         self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
+        where = scan.points, scan.stamp_ns // NS_PER_US, self.placer.track
+        lag = pass_lag(*where)
+        if lag is not None:
+            take_off_lag(*where, self.calibration.stage_direction, lag.lag_us)
         self.end_recording(scan.points)
         events, packets, lost, dropped, without = (
             now - before for now, before in zip(self._losses(), self._losses_at_begin, strict=True)
@@ -261,6 +274,7 @@ class Pipeline:
             buffer.points_outside,
             buffer.points_over_limit,
             self._coverage.profiles(self.stream.profile_rate_hz),
+            lag,
         )
 
     def end_recording(self, points: Points | None, reason: str = "") -> None:

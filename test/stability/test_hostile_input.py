@@ -504,6 +504,7 @@ NOT_FOR_USERS = {
     "reconstruction.add_stage", "reconstruction.reconstruct_recording",
     "reconstruction.recorded_settings", "reconstruction.region_window",
     "storage.finite_points", "storage.height_map",
+    "reconstruction.PassLag", "reconstruction.pass_lag", "reconstruction.take_off_lag",
     "reconstruction.stage_offset_m", "reconstruction.stage_speed_mm_s", "reconstruction.warm_up",
     # Parts of the streaming pipeline.
     "clocks.ClockLine", "clocks.EdgeClock", "clocks.LowerEnvelope", "clocks.MotionPlan",

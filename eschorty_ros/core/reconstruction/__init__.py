@@ -7,6 +7,7 @@ from eschorty_ros.core.reconstruction.offline import (
     recorded_settings,
     stage_speed_mm_s,
 )
+from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import (
     Profiles,
     add_stage,
@@ -23,12 +24,14 @@ __all__ = [
     "LIVE_DTYPE",
     "LIVE_SPAN_NS",
     "NOISE_FILTERS",
+    "PassLag",
     "Profiles",
     "Reconstructor",
     "Result",
     "Settings",
     "add_stage",
     "live_points",
+    "pass_lag",
     "place",
     "place_link",
     "reconstruct_recording",
@@ -36,5 +39,6 @@ __all__ = [
     "region_window",
     "stage_offset_m",
     "stage_speed_mm_s",
+    "take_off_lag",
     "warm_up",
 ]

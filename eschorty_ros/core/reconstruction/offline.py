@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.numbers import short
+from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
 from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings
@@ -52,6 +53,8 @@ class Result:
         One line each.
     organized : ndarray of POINT_DTYPE, shape (profiles, columns), or None
         ``points`` as a height map, with the setting ``organized``.
+    pass_lag : PassLag or None
+        What has been taken off times and places of the points, which passes forth and back show.
     """
 
     points: NDArray[np.void]
@@ -63,6 +66,7 @@ class Result:
     seconds: float
     warnings: tuple[str, ...]
     organized: NDArray[np.void] | None = None
+    pass_lag: PassLag | None = None
 
     @property
     def events_per_second(self) -> float:
@@ -120,6 +124,12 @@ def reconstruct_recording(
         cloud.add(reconstructor.flush())
         profiles, points, organized = cloud.joined()
     origin_us = reconstructor.first_t_us or 0
+    lag = pass_lag(points, origin_us, recording.stage)
+    if lag is not None:
+        direction = recording.calibration.stage_direction
+        for part in (points,) if organized is None else (points, organized.reshape(-1)):
+            take_off_lag(part, origin_us, recording.stage, direction, lag.lag_us)
+        profiles = replace(profiles, t_us=profiles.t_us - round(lag.lag_us))
     newest_us = reconstructor.newest_t_us
     span_us = None if newest_us is None else (origin_us, newest_us)
     seconds = time.perf_counter() - began
@@ -137,6 +147,7 @@ def reconstruct_recording(
         seconds,
         (*warnings, *recording_warnings(recording, used, counters, points, span_us)),
         organized,
+        lag,
     )
 
 
@@ -229,7 +240,7 @@ class _Array:
         if not self._stream.tell():
             return none
         self._stream.flush()
-        data = mmap.mmap(self._stream.fileno(), 0, access=mmap.ACCESS_READ)
+        data = mmap.mmap(self._stream.fileno(), 0)
         return np.frombuffer(data, none.dtype).reshape(-1, *none.shape[1:])
 
 

@@ -90,6 +90,9 @@ class ScanServices:
         if self._ended is not None and not self._pipeline.placer.holds(self._ended_s):
             ended, self._ended = self._ended, None
             report = self._pipeline.end_scan()
+            if report.pass_lag is not None:
+                lag = "{:.2f} ± {:.2f} ms".format(*(1e-3 * value for value in report.pass_lag))
+                self._node.get_logger().info(f"points were {lag} behind the stage; taken off")
             self._publish(report.scan, self._node.get_clock().now().nanoseconds)
             ended(report)
 
