@@ -107,13 +107,14 @@ def command(
 
     \b
     --json prints events, dropped_events, profiles, periods_per_profile, points, seconds,
-    events_per_second, sigma_median_m (null when there is no point), pass_lag_ms (lag taken off and
-    its sigma; null without passes forth and back), warnings, points_without_stage and counters (those that are not zero); for a recording with truth.csv
+    events_per_second, sigma_median_m (null when there is no point), warnings,
+    points_without_stage and counters (those that are not zero); for a recording with truth.csv
     also score: periods, points, completeness, error_median_mm, error_p95_mm, bias_mm,
     within_1_sigma, within_2_sigma, off_target (points where nothing is), flagged, and
     good_median_mm, good_p95_mm, good_within_1_sigma and good_within_2_sigma of the points without a
-    flag; without those that no point gives. Of several recordings it prints one object a line, with
-    recording first, and error alone where it failed.
+    flag; without those that no point gives. Where passes forth and back show a lag, pass_lag_ms has
+    it and its sigma. Of several recordings it prints one object a line, with recording first, and
+    error alone where it failed.
 
     \b
     Examples:
@@ -263,7 +264,7 @@ def _print(
         click.echo(json.dumps({**first, **facts}))
     if as_json or not facts["points"]:
         return
-    sigma, lag = facts["sigma_median_m"], facts["pass_lag_ms"]
+    sigma, lag = facts["sigma_median_m"], facts.get("pass_lag_ms")
     pairs(
         str(target),
         {
@@ -302,8 +303,8 @@ def summary(result: Result) -> dict[str, Any]:
         "seconds": result.seconds,
         "events_per_second": result.events_per_second,
         "sigma_median_m": float(np.median(points["sigma"])) if len(points) else None,
-        "pass_lag_ms": result.pass_lag and [1e-3 * value for value in result.pass_lag],
         "warnings": list(result.warnings),
         "points_without_stage": result.counters["points_without_stage"],
         "counters": {name: count for name, count in result.counters.items() if count},
+        **({"pass_lag_ms": [1e-3 * us for us in result.pass_lag]} if result.pass_lag else {}),
     }
