@@ -30,7 +30,7 @@ _STEADY = 2.0 * np.sqrt(2.0)
 _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
-_PROFILES_KNOWN = 64
+_PROFILES_KNOWN = 16
 _APART = 5
 # Neighbours on either side that a width is averaged with, and the columns of such a mean.
 WIDTH_PAIRS = 2

@@ -95,7 +95,7 @@ same time, but for what the first one has learned by then: the footprint when ro
 widths and the line's width a few profiles later. While the sensor's edge cuts a line learning goes
 on.
 """
-# Profiles of the first window, at least, that show the usual widths.
+# Profiles of the first window, as full of points as any, that show the usual widths.
 _KNOWN_PROFILES = 16
 _OUTPUT_PROFILES = 64
 _HALF_MIN = 3 * FRACTION
@@ -128,14 +128,14 @@ _COUNTERS = np.dtype(
 # ``part_us`` is where the part of the gate begins, ``status`` one of the three below, ``half`` the
 # half width of a window for the open period in fixed point, ``rows`` the number of rows in the
 # output, ``full`` 1 while a column needs more room, ``window`` the number of events since the
-# estimate started, ``over`` 1 where a pass ended with it. ``profiles`` counts those since the
-# restart, ``known_half`` is 0 until windows begin with what is known.
+# estimate started, ``over`` 1 where a pass ended with it. ``points`` are those since the restart,
+# ``points_most`` the most of a profile, ``known_half`` is 0 until windows begin with what is known.
 _STATE = np.dtype(
     [
         (name, np.int64)
         for name in (
             "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "over",
-            "profiles", "known_half",
+            "points", "points_most", "known_half",
         )
     ]
 )  # fmt: skip
@@ -251,7 +251,7 @@ class ProfileAssembler:
         known["choice"] = self._first_choice
         known["computations"] = known["cut_computations"] = 0
         self._memory.footprint.state["near_edge"] = 0
-        self._state["profiles"] = self._state["known_half"] = 0
+        self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
         self._memory.known_widths[:] = 0.0
         _begin_window(self._memory, self._state)
 
@@ -555,8 +555,7 @@ def _close(memory, state, counters):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     _mark_unusual(rows, smoothing, light.lit_share)
-    state.profiles += 1
-    enough = state.profiles >= _KNOWN_PROFILES
+    enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):
         # Later windows begin with what is known now.
         _restart_from(known, footprint)
@@ -572,7 +571,11 @@ def _close(memory, state, counters):
             _keep_widths(smoothing.widths, memory.known_widths)
     few = _few_events(rows, smoothing.isolation_events)
     delay_us = _delay_us(rows, memory.delay, light)
+    before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)
+    points = np.int64(state.rows - before)
+    state.points += points
+    state.points_most = max(state.points_most, points)
     if late and state.known_half > 0:
         _begin_window(memory, state)
 

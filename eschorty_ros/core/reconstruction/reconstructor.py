@@ -352,9 +352,12 @@ class Reconstructor:
                 f"frequency ({self.modulation.frequency_hz:g} Hz) and the polarity of the events"
             )
             return found
-        unmodulated = counts["columns_unmodulated"]
-        if unmodulated > _UNMODULATED_SHARE * (counts["points"] + unmodulated):
-            share = unmodulated / (counts["points"] + unmodulated)
+        unmodulated, points = counts["columns_unmodulated"], counts["points"]
+        share = unmodulated / max(points + unmodulated, 1)
+        # Background of dark columns has fewer events than a line.
+        line = counts["events_binned"] - counts["events_unmodulated"]
+        dark = 2 * counts["events_unmodulated"] * points < line * unmodulated
+        if share > _UNMODULATED_SHARE and not dark:
             found.append(
                 f"the events of {unmodulated} columns ({share:.0%} of those with enough) do not "
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "

@@ -102,6 +102,16 @@ def test_a_glint_is_flagged():
     assert np.mean(found.flags[~off] > 0) < 0.01
 
 
+def test_background_before_the_line_does_not_choose_its_usual_width():
+    """Twenty periods of background come first, which has some wide lines by chance."""
+    camera = Camera(periods=50, threshold=0.2, events_max=20)
+    line = camera.line(lambda k, column: np.where(k < 20, np.nan, wavy(k, column)))
+    found, reconstructor = points(camera, line, camera.scattered(8e6))
+    lit = found.period >= 20
+    assert np.mean(found.flags[lit] > 0) < 0.03, f"seed {camera.seed}"
+    assert not any("follow" in line for line in reconstructor.warnings)
+
+
 @pytest.mark.parametrize("rows", [-1.0, 1.0])
 def test_sigma_holds_what_a_step_of_a_row_moves_the_line_by(rows):
     camera = Camera(periods=60)
