@@ -19,8 +19,10 @@ from eschorty_ros.core.reconstruction.profiles import add_stage
 # Columns of a cell; bands of columns, the scatter of whose lags gives the deviation of their mean.
 _COLUMNS = 8
 _BANDS = 16
-# Steeper cells are on a step.
+# Steeper cells are on a step, and those whose slope does not go on for this way to either side: the
+# thickness of the line makes a slope of a step.
 _SLOPE_MAX = 1.0
+_SMOOTH_MM = 8.0
 # Least cells of a band, and bands with so many.
 _CELLS_MIN = 16
 _BANDS_MIN = 4
@@ -156,11 +158,15 @@ def _lag_left(samples: _Samples, lag_us: float) -> PassLag | None:
             (stage_mm, at_mm), (speed, samples.speed_mm_us), (range_mm, samples.range_mm)
         ):  # fmt: skip
             means[back] = (np.bincount(cell, values[mine], number.size) / number).reshape(shape)
-    slopes = (range_mm[:, 2:] - range_mm[:, :-2]) / (stage_mm[:, 2:] - stage_mm[:, :-2])
+    slopes = _slopes(range_mm, stage_mm, 1)[:, 1:-1]
     slope, square = slopes.mean(axis=0), slopes.prod(axis=0)
+    half = max(round(0.5 * _SMOOTH_MM / pitch_mm), 1)
+    beside = _slopes(range_mm, stage_mm, half).mean(axis=0)
     (forth_mm, back_mm), faster = stage_mm[:, 1:-1], np.diff(speed[:, 1:-1], axis=0)[0]
     apart_mm = range_mm[0, 1:-1] - range_mm[1, 1:-1] - slope * (forth_mm - back_mm)
     known = np.isfinite(apart_mm) & (np.abs(slopes) < _SLOPE_MAX).all(axis=0)
+    for way in (-half, half):
+        known &= np.abs(slope - np.roll(beside, way, axis=0)[1:-1]) < 0.5 * np.abs(slope)
     left_us = 0.0
     for _ in range(_ROUNDS):
         if not known.any():
@@ -177,3 +183,15 @@ def _lag_left(samples: _Samples, lag_us: float) -> PassLag | None:
         return None
     errors = [products[band].sum() - left_us * squares[band].sum() for band in enough]
     return PassLag(float(left_us), float(np.linalg.norm(errors) / abs(squares.sum())))
+
+
+def _slopes(
+    range_mm: NDArray[np.float64], stage_mm: NDArray[np.float64], reach: int
+) -> NDArray[np.float64]:
+    """Return the slopes between the cells ``reach`` before and behind each; NaN without these."""
+    slopes = np.full(range_mm.shape, np.nan)
+    two = 2 * reach
+    if range_mm.shape[1] > two:
+        rise_mm = range_mm[:, two:] - range_mm[:, :-two]
+        slopes[:, reach:-reach] = rise_mm / (stage_mm[:, two:] - stage_mm[:, :-two])
+    return slopes

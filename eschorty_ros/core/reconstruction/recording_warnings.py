@@ -10,7 +10,7 @@ from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
 
-_PIECE_BYTES = 1 << 25
+_PIECE_BYTES = 1 << 23
 # Counting has a cost for each chunk, too, and so many events of one show what all do.
 _CHUNK_BYTES = 1 << 20
 _CHUNK_EVENTS = 1 << 16
