@@ -25,12 +25,13 @@ from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param, from_settings
 from eschorty_ros.nodes.ros.peers import Publishers
 from eschorty_ros.nodes.ros.spin import run
 
-# Every change and every read-back is published, too.
+# Every change and, with light, every read-back is published, too.
 STATE_RATE_HZ = 2.0
 THREADS = 4
 WATCHED = ("camera", "stage")
