@@ -388,7 +388,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
         reason = check_text("reason", message.reason)
         monitor.update_laser(
             LaserStatus(message.output, message.frequency, message.duty, reason),
-            age_s(node, info, message.header.stamp),
+            age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
     def on_reconstruction(message: ReconstructionState, info: Mapping[str, Any]) -> None:
@@ -402,7 +402,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
                 check_text("scan_id", message.scan_id),
                 message.packet_age,
             ),
-            age_s(node, info, message.header.stamp),
+            age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
     def on_stage(message: Odometry, info: Mapping[str, Any]) -> None:
@@ -412,7 +412,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
             ns_from_stamp(message.header.stamp),
             stage_position_mm(message),
             mm_from_m(speed_m_s),
-            age_s(node, info, message.header.stamp),
+            age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
     def on_heartbeat(message: Header, info: Mapping[str, Any]) -> None:
