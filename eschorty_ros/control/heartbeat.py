@@ -67,11 +67,12 @@ class HeartbeatSchedule:
 
     Public attributes:
     - ``healthy``: True when the last heartbeat reported a healthy device.
+    - ``left``: Heartbeats that are to report a stop.
     """
 
     def __init__(self) -> None:
         self.healthy = False
-        self._left = 0
+        self.left = 0
         self._recovery_checks = 0
         self._sent_s = 0.0
 
@@ -87,10 +88,10 @@ class HeartbeatSchedule:
         )
         healthy |= self.healthy and self._recovery_checks > 0
         if healthy:
-            self._left = LAST_HEARTBEATS
+            self.left = LAST_HEARTBEATS
         due = healthy != self.healthy or now_s - self._sent_s >= PERIOD_S
-        if not due or self._left == 0:
+        if not due or self.left == 0:
             return None
         self.healthy, self._sent_s = healthy, now_s
-        self._left -= not healthy
+        self.left -= not healthy
         return heartbeat_text(stopped=not healthy)

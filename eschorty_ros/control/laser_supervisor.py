@@ -15,6 +15,8 @@ from eschorty_ros.hardware.base.stalls import StallMeter
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 
 WATCH_PERIOD_S = 0.02
+# Without light there is nothing to disable. A turn so late is no stall yet.
+_DARK_PERIOD_S = 0.1
 _STOP_TIMEOUT_S = 1.0
 
 
@@ -81,8 +83,13 @@ class LaserSupervisor:
         self._receive(self._checked_readback(laser))
         self._stalls = StallMeter(WATCH_PERIOD_S)
         self._watchdogs = [
-            _Watchdog("laser watchdog", self._check_interlock, WATCH_PERIOD_S, self._fail),
-            _Watchdog("laser read-back", self._check_readback, self._readback_period_s, self._fail),
+            _Watchdog("laser watchdog", self._check_interlock, self._watch_period_s, self._fail),
+            _Watchdog(
+                "laser read-back",
+                self._check_readback,
+                lambda: self._readback_period_s,
+                self._fail,
+            ),
         ]
 
     def close(self) -> None:
@@ -142,6 +149,8 @@ class LaserSupervisor:
                     raise DeviceError(f"laser refused: {refusal}")
                 self._record.requested = LaserOutput.ON
                 self.interlock.note_enabled()
+            for watchdog in self._watchdogs:
+                watchdog.wake()
             try:
                 laser.enable()
                 readback = self._checked_readback(laser)
@@ -242,6 +251,9 @@ class LaserSupervisor:
         for text in self._record.receive(readback):
             self._log(text)
 
+    def _watch_period_s(self) -> float:
+        return WATCH_PERIOD_S if self._record.requested is LaserOutput.ON else _DARK_PERIOD_S
+
     def _check_interlock(self) -> None:
         stall_s = self._stalls.measure()
         # Under the lock: the output may be being disabled already.
@@ -275,12 +287,13 @@ class LaserSupervisor:
         with self._lock:
             if self._in_flight.is_void(ticket):
                 return
+            news = readback != self._record.readback or readback.output is not LaserOutput.OFF
             self._store(readback)
             reason = self._record.must_disable(readback)
             # The state that is published names why the light ended.
             if reason:
                 self.trip(reason)
-            else:
+            elif news:
                 self.report()
 
     def _fail(self, error: Exception) -> None:
@@ -289,7 +302,7 @@ class LaserSupervisor:
 
 
 class _Watchdog:
-    """Calls ``check`` every ``period_s`` in a thread until ``stop``.
+    """Calls ``check`` every ``period_s()`` in a thread until ``stop``.
 
     It ends with the first failure, with which it calls ``fail``.
     """
@@ -298,23 +311,32 @@ class _Watchdog:
         self,
         name: str,
         check: Callable[[], None],
-        period_s: float,
+        period_s: Callable[[], float],
         fail: Callable[[Exception], None],
     ) -> None:
         self._check, self._period_s, self._fail = check, period_s, fail
-        self._stopped = threading.Event()
+        self._stopped = False
+        self._woken = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """Begin no further check; wait up to 1 s for one in progress."""
-        self._stopped.set()
+        self._stopped = True
+        self.wake()
         if self._thread is not threading.current_thread():
             self._thread.join(_STOP_TIMEOUT_S)
 
+    def wake(self) -> None:
+        """Begin the next period now."""
+        self._woken.set()
+
     def _run(self) -> None:
         try:
-            while not self._stopped.wait(self._period_s):
-                self._check()
+            while not self._stopped:
+                if self._woken.wait(self._period_s()):
+                    self._woken.clear()
+                else:
+                    self._check()
         except Exception as error:
             self._fail(error)

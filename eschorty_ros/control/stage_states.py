@@ -27,7 +27,8 @@ def states_since(
     newest = stage.state()
     since_ns = newest.t_ns - last_ns
     rests = rested and not newest.moving
-    if -_CLOCK_BACK_NS <= since_ns <= (REST_NS if rests else 0):
+    # One that is a little early is as good.
+    if -_CLOCK_BACK_NS <= since_ns <= (REST_NS // 2 if rests else 0):
         return []
     # In a longer stall the stage may have moved.
     if rests and since_ns <= 2 * REST_NS:

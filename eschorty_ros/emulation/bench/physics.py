@@ -30,8 +30,9 @@ Pulses = Callable[[int, int], list[tuple[int, bool]]]
 _PACKET_US = 4_000
 # Shorter packets leave together.
 _PACKET_MIN_US = 1_000
-# Those of a dark scene always do.
 _AT_ONCE_US = 16_000
+# Those of a dark scene leave together, too.
+_DARK_US = 32_000
 _SLEEP_MIN_S = 1e-4
 _PULSE_MAX_NS = 1_000_000_000
 _PPB = 1_000_000_000
@@ -245,7 +246,7 @@ class Physics:
 
     @property
     def _step_us(self) -> int:
-        return max(self.packet_us, _PACKET_MIN_US if self._light.on else _AT_ONCE_US)
+        return max(self.packet_us, _PACKET_MIN_US if self._light.on else _DARK_US)
 
     def _simulate(self) -> bool:
         """Advance the world by some packets at most; returns whether it advanced."""

@@ -33,7 +33,7 @@ class HealthMonitor:
         self._session = session
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._last_streaming_s = time.monotonic()
+        self._quiet_at_s = time.monotonic() + _QUIET_S
         self._requested_s: float | None = None
         self._failure: DeviceError | None = None
 
@@ -62,7 +62,7 @@ class HealthMonitor:
 
     def note_streaming(self) -> None:
         """Record that the camera sent events or was opened."""
-        self._last_streaming_s = time.monotonic()
+        self._quiet_at_s = time.monotonic() + _QUIET_S
         self._failure = None
 
     def raise_failure(self) -> None:
@@ -79,7 +79,7 @@ class HealthMonitor:
         self._requested_s = time.monotonic()
         try:
             if session.is_streaming():
-                self._last_streaming_s = time.monotonic()
+                self._quiet_at_s = time.monotonic() + _QUIET_S
                 return
             failure = DeviceError(
                 "camera: it has stopped streaming by itself (reset or power dip); check its power"
@@ -106,9 +106,9 @@ class HealthMonitor:
 
     def _run(self) -> None:
         measured_s = -math.inf
-        while not self._ending.wait(_TICK_S):
+        while not self._ending.wait(max(self._quiet_at_s - time.monotonic(), _TICK_S)):
             now_s = time.monotonic()
-            if now_s - self._last_streaming_s > _QUIET_S:
+            if now_s > self._quiet_at_s:
                 self._check_streaming()
             elif now_s - measured_s > _TEMPERATURE_EVERY_S:
                 measured_s = now_s

@@ -32,6 +32,8 @@ from eschorty_ros.hardware.laser_guard.messages import Message, Wire, failure_me
 from eschorty_ros.hardware.laser_guard.opening import maker, open_again
 
 _TURN_S = 0.02
+DARK_TURN_S = 0.1
+"""Longest turn of a guard or its owner while the laser is off and not armed."""
 _RENEW_S = 0.05
 _WATCH_LIMIT_S = 0.2
 _RETRY_S = 0.25
@@ -58,7 +60,8 @@ class Guard:
         self._laser: RenewedLaser | None = None
         self._jobs: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
         self._in_flight = CommandsInFlight()
-        self._lit = False
+        self._dark = True
+        self._lit = threading.Event()
         self._tripped = ""
         # Why the output may be on although it was disabled, and the thread that retries.
         self._unknown = ""
@@ -78,7 +81,8 @@ class Guard:
             poller.register(owner, select.POLLIN)
         try:
             while self._closing is None:
-                ready = dict(poller.poll(_TURN_S * 1e3))
+                turn_s = DARK_TURN_S if self._dark and not self._lit.is_set() else _TURN_S
+                ready = dict(poller.poll(turn_s * 1e3))
                 stall_s = self._stalls.measure()
                 self._received_s = min(self._received_s + stall_s, self._stalls.measured_s)
                 if owner in ready:
@@ -112,8 +116,11 @@ class Guard:
         if command == "close":
             self._closing = message
         elif command == "disable":
+            self._dark = True
             self._answer(message, self._disable)
         else:
+            if command == "arm":
+                self._dark = False
             if command == "open":
                 self._heartbeat_timeout_s = message["heartbeat_timeout_s"]
             self._jobs.put((self._in_flight.ticket(), message))
@@ -133,7 +140,7 @@ class Guard:
 
     def _trip(self, fault: str) -> None:
         self._tripped = f"laser guard: {fault}"
-        lit = self._lit
+        lit = self._lit.is_set()
         try:
             self._disable()
         except Exception as error:
@@ -157,12 +164,13 @@ class Guard:
                     self._laser.disable()
             except Exception as error:
                 self._unknown = str(error)
-                if self._lit:
+                if self._lit.is_set():
                     self._unknown = f"{error}; trying again"
                     self._retrying = threading.Thread(target=self._retry, name="laser off")
                     self._retrying.start()
                 raise
-            self._lit, self._unknown = False, ""
+            self._lit.clear()
+            self._unknown = ""
 
     def _retry(self) -> None:
         """Open the generator again and again until its output is off."""
@@ -183,7 +191,8 @@ class Guard:
         with contextlib.suppress(Exception):
             self._laser.close()
         self._laser = open_again(self._make, serial)
-        self._lit, self._unknown = False, ""
+        self._lit.clear()
+        self._unknown = ""
 
     def _finish(self) -> None:
         if self._closing is not None:
@@ -229,7 +238,8 @@ class Guard:
             return laser.configure(Modulation(**message["modulation"]))
         if command == "readback":
             readback = laser.readback()
-            self._lit |= readback.output is not LaserOutput.OFF
+            if readback.output is not LaserOutput.OFF:
+                self._lit.set()
             return asdict(replace(readback, reason=readback.reason or self._tripped))
         self._in_flight.refuse_void(ticket)
         if command == "arm":
@@ -240,10 +250,10 @@ class Guard:
 
     def _renew(self) -> None:
         pause, pause_s = threading.Event(), _RENEW_S
-        while not pause.wait(pause_s):
+        while self._lit.wait() and not pause.wait(pause_s):
             pause_s, laser = _RENEW_S, self._laser
             watched = time.monotonic() - self._stalls.measured_s < _WATCH_LIMIT_S
-            if laser is None or not self._lit or self._tripped or not watched:
+            if laser is None or not self._lit.is_set() or self._tripped or not watched:
                 continue
             try:
                 pause_s = laser.renew()
@@ -260,7 +270,7 @@ class Guard:
     def _enable(self, laser: RenewedLaser, ticket: int) -> None:
         if self._tripped:
             raise DeviceError(f"laser refused: {self._tripped}; arm it again")
-        self._lit = True
+        self._lit.set()
         laser.enable()
         try:
             self._in_flight.refuse_void(ticket)

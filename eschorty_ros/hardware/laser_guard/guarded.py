@@ -23,6 +23,7 @@ from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.hardware.base.priority import GUARD_NICE, raise_priority
 from eschorty_ros.hardware.base.protocols import DeviceIdentity, LaserReadback
 from eschorty_ros.hardware.base.stalls import process_fault
+from eschorty_ros.hardware.laser_guard.guard import DARK_TURN_S
 from eschorty_ros.hardware.laser_guard.messages import (
     Message,
     Wire,
@@ -73,6 +74,7 @@ class GuardedLaser:
         self._numbers = itertools.count()
         self._waiting: dict[int, queue.SimpleQueue[Message]] = {}
         self._opened = self._closing = self._dismissed = self._ending = False
+        self._dark = True
         self._lost = ""
         self._direct = threading.Lock()
         self._off_confirmed = False
@@ -112,6 +114,7 @@ class GuardedLaser:
 
     def arm(self) -> None:
         """Allow the next ``enable``."""
+        self._dark = False
         self._call("arm", self._answer_timeout_s)
 
     def enable(self) -> None:
@@ -132,6 +135,7 @@ class GuardedLaser:
                 if not self._lost:
                     raise
             else:
+                self._dark = True
                 return
         # The watching thread does it now, or has tried.
         self._thread.join(EXIT_TIMEOUT_S)
@@ -205,7 +209,8 @@ class GuardedLaser:
         poller.register(self._wire.fileno(), select.POLLIN)
         heartbeat_at_s = 0.0
         while not self._ending:
-            poller.poll(_TURN_S * 1e3)
+            turn_s = min(DARK_TURN_S, self._heartbeat_s) if self._dark else _TURN_S
+            poller.poll(turn_s * 1e3)
             messages = self._wire.receive()
             if messages is None:
                 if not self._dismissed:

@@ -18,7 +18,7 @@ from eschorty_ros.core.base.errors import DeviceError, DeviceGoneError, DeviceTi
 from eschorty_ros.hardware.stage.apt_framer import AptFramer
 from eschorty_ros.hardware.stage.apt_messages import Frame
 
-_READ_S = 0.05
+_READ_S = 0.2
 _STOP_LOCK_S = 0.01
 _PORT_ERRORS = (OSError, TypeError, ValueError)
 
@@ -45,8 +45,10 @@ class SerialPort(Protocol):
 class _Timer:
     """A periodic action of the writer."""
 
-    def __init__(self, period_ns: int, action: Callable[[], None], due_ns: int) -> None:
-        self.period_ns, self.action, self.due_ns = period_ns, action, due_ns
+    def __init__(
+        self, period_s: Callable[[], float], action: Callable[[], None], due_ns: int
+    ) -> None:
+        self.period_s, self.action, self.due_ns = period_s, action, due_ns
 
 
 def _port_failure(error: Exception) -> DeviceGoneError:
@@ -79,7 +81,10 @@ class AptLink:
         self._port = port
         self._on_frame, self._on_lost = on_frame, on_lost
         self._wait = wait
-        self._changed = threading.Condition(threading.RLock())
+        lock = threading.RLock()
+        self._changed = threading.Condition(lock)
+        # Frames that come need not wake the writer.
+        self._queued = threading.Condition(lock)
         self._port_lock = threading.Lock()
         self._queue: deque[bytes] = deque()
         self._timers: list[_Timer] = []
@@ -95,18 +100,18 @@ class AptLink:
             self._threads.append(thread)
             thread.start()
 
-    def call_every(self, period_s: float, action: Callable[[], None]) -> None:
-        """Let the writer call ``action`` at once and then every ``period_s``."""
-        with self._changed:
-            self._timers.append(_Timer(round(period_s * 1e9), action, self.now_ns()))
-            self._changed.notify_all()
+    def call_every(self, period_s: Callable[[], float], action: Callable[[], None]) -> None:
+        """Let the writer call ``action`` at once and then every ``period_s()``."""
+        with self._queued:
+            self._timers.append(_Timer(period_s, action, self.now_ns()))
+            self._queued.notify_all()
 
     def send(self, frame: bytes) -> None:
         """Queue a frame."""
         self._check()
-        with self._changed:
+        with self._queued:
             self._queue.append(frame)
-            self._changed.notify_all()
+            self._queued.notify_all()
 
     def send_now(self, *frames: bytes) -> None:
         """Write past every queue, in the caller's thread; on the wire when it returns.
@@ -194,7 +199,8 @@ class AptLink:
         for timer in self._timers:
             if timer.due_ns <= now_ns:
                 # After a stall one call, not all that were missed.
-                timer.due_ns = max(timer.due_ns + timer.period_ns, now_ns + timer.period_ns // 2)
+                period_ns = round(timer.period_s() * 1e9)
+                timer.due_ns = max(timer.due_ns + period_ns, now_ns + period_ns // 2)
                 timer.action()
         while self._queue:
             self.write(self._queue.popleft())
@@ -206,6 +212,7 @@ class AptLink:
         self._closing.set()
         with self._changed:
             self._changed.notify_all()
+            self._queued.notify_all()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout=1.0)
@@ -228,6 +235,7 @@ class AptLink:
         self._on_lost(failure)
         with self._changed:
             self._changed.notify_all()
+            self._queued.notify_all()
 
     def _run(self, loop: Callable[[], None]) -> None:
         try:
@@ -253,6 +261,6 @@ class AptLink:
     def _write_loop(self) -> None:
         while not self._closing.is_set() and self._lost is None:
             idle_s = self.service()
-            with self._changed:
+            with self._queued:
                 if not self._queue and not self._closing.is_set():
-                    self._changed.wait(idle_s)
+                    self._queued.wait(idle_s)

@@ -30,7 +30,7 @@ _CLOSE_S = 1.2
 _READ_NS = 100_000
 _READS_MAX = 10
 # At rest a reading comes twice in the least lag, so that a state is between two of them.
-_REST_POLL_NS = 50_000_000
+_REST_POLL_S = 0.05
 _PROFILED, _IMMEDIATE = 2, 1
 _ON, _OFF = 1, 2
 
@@ -75,7 +75,6 @@ class AptStage:
         self._lock = threading.RLock()
         self._stopping: list[tuple[int, bytes]] = []
         self._closed = False
-        self._polled_ns = 0
         # Both counters show a stop and an order that cross, on either side.
         self._stops = self._orders = 0
         # Frames that come at once wait for the tracker.
@@ -104,9 +103,9 @@ class AptStage:
         self.trigger = self._setup.write_trigger(axis)
         self._setup.send("set_enabled", state=_ON)
         self._tracker.begin_motion(Kind.STOP, 0.0, 0.0, self.speed_max_mm_s, _ENABLE_S)
-        self._link.call_every(_KEEP_ALIVE_S, self._keep_alive)
-        self._link.call_every(1.0 / self._settings.poll_hz, self._poll)
-        self._link.call_every(_HEALTH_S, self._check_health)
+        self._link.call_every(lambda: _KEEP_ALIVE_S, self._keep_alive)
+        self._link.call_every(self._poll_s, self.request_status)
+        self._link.call_every(lambda: _HEALTH_S, self._check_health)
         if not self._link.wait_until(lambda: self._tracker.status is not None, _FIRST_STATUS_S):
             raise DeviceTimeoutError(
                 f"stage: {self.identity.model} sends no status; check that no other program uses it"
@@ -268,11 +267,9 @@ class AptStage:
     def _keep_alive(self) -> None:
         self._link.write(apt.pack("keep_alive", self._settings.address))
 
-    def _poll(self) -> None:
-        now_ns = self._link.now_ns()
-        if self._tracker.motion is not None or now_ns - self._polled_ns >= _REST_POLL_NS:
-            self._polled_ns = now_ns
-            self.request_status()
+    def _poll_s(self) -> float:
+        period_s = 1.0 / self._settings.poll_hz
+        return period_s if self._tracker.motion is not None else max(period_s, _REST_POLL_S)
 
     def request_status(self) -> None:
         """Request a status unless one is on its way; see ``Actions``."""

@@ -32,8 +32,8 @@ from eschorty_ros.nodes.ros.parameters import Param
 from eschorty_ros.nodes.ros.spin import run
 
 READ_TIMEOUT_S = 0.02
-# A third of the age from which events count as late.
-DARK_PAUSE_S = 0.03
+# Together with the packets of an emulated camera less than the age from which events count as late.
+DARK_PAUSE_S = 0.05
 STOP_TIMEOUT_S = 3.0
 LATE_S = 0.1
 

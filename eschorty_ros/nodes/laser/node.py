@@ -25,12 +25,13 @@ from eschorty_ros.hardware.laser_guard.guarded import GuardedLaser
 from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.ros import diagnostics, drivers, qos
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
+from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param, from_settings
 from eschorty_ros.nodes.ros.peers import Publishers
 from eschorty_ros.nodes.ros.spin import run
 
-# Every change and every read-back is published, too.
+# Every change and, with light, every read-back is published, too.
 STATE_RATE_HZ = 2.0
 THREADS = 4
 WATCHED = ("camera", "stage")
@@ -98,22 +99,26 @@ class LaserNode(DeviceNode):
         self.create_service(
             Trigger, "laser/reset_interlock", self._on_reset, callback_group=control
         )
-        reports = MutuallyExclusiveCallbackGroup()
         self._contacts = Publishers(self, "laser/interlock")
         self._allowed = {
             name if name.startswith("/") else f"{self.get_namespace().rstrip('/')}/{name}"
             for name in self.parameters["allowed_peers"].replace(",", " ").split()
         }
         self.create_subscription(
-            Bool, "laser/interlock", self._on_interlock, qos.stream(10), callback_group=reports
+            Bool,
+            "laser/interlock",
+            self._on_interlock,
+            qos.stream(10),
+            callback_group=MutuallyExclusiveCallbackGroup(),
         )
+        heartbeats = ShortGroup()
         for topic in interlock.topics:
             self.create_subscription(
                 Header,
                 topic,
                 partial(self._on_heartbeat, topic, Publishers(self, topic)),
                 qos.heartbeat(),
-                callback_group=reports,
+                callback_group=heartbeats,
             )
         self.create_timer(1.0 / STATE_RATE_HZ, self._supervisor.report, clock=self.steady_clock)
         diagnostics.Diagnostics(self, self._report)

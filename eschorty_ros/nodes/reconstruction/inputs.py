@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 from eschorty_ros.core.base.errors import ArgumentError
@@ -10,9 +11,13 @@ from eschorty_ros.core.clocks import PulseTrain
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.nodes.ros.border import check_text
-from eschorty_ros.nodes.ros.conversions import mm_from_m, ns_from_stamp
+from eschorty_ros.nodes.ros.conversions import NS_PER_S, mm_from_m, ns_from_stamp
 
 _PACKET_MAX_BYTES = 16_000_000
+# A serialized message begins with its encoding; its numbers are aligned to what follows.
+_LITTLE_ENDIAN, _BODY_AT = b"\0\1", 4
+# Seconds, nanoseconds and the size of the frame's text; seq, time_base and the size of encoding.
+_STAMP, _NUMBERS, _SIZE = struct.Struct("<iII"), struct.Struct("<QQI"), struct.Struct("<I")
 _INTERVAL_M = 1e-6, 1.0
 
 
@@ -48,16 +53,40 @@ def pulse_train(trigger: Any) -> PulseTrain | None:
     return PulseTrain(mm_from_m(float(trigger.first)), interval_mm, count)
 
 
-def packet_from_message(message: Any, source: bytes) -> Packet:
-    """Return the packet of an ``EventPacket``.
+def packet_from_message(message: bytes, source: bytes) -> Packet:
+    """Return the packet of a serialized ``EventPacket``, with a view of the events in it.
 
-    Raises ``ArgumentError`` when it has another encoding or more bytes than a packet may have.
+    To make an object of the message costs as much as some thousand events.
+
+    Raises ``ArgumentError`` when it cannot be read, has another encoding or more bytes than a
+    packet may have.
     """
-    size = len(message.events)
+    if message[:2] != _LITTLE_ENDIAN:
+        raise ArgumentError("a packet is not serialized in little-endian order; send it so")
+    try:
+        sec, nanosec, frame = _STAMP.unpack_from(message, _BODY_AT)
+        # Of the frame's text, height and width.
+        at = _aligned(_aligned(_BODY_AT + _STAMP.size + frame, 4) + 8, 8)
+        seq, _, text = _NUMBERS.unpack_from(message, at)
+        at += _NUMBERS.size
+        encoding = message[at : at + text].rstrip(b"\0").decode()
+        # After is_bigendian.
+        at = _aligned(at + text + 1, 4)
+        (size,) = _SIZE.unpack_from(message, at)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ArgumentError(f"a packet cannot be read: {error}") from error
+    if encoding != "evt3":
+        raise ArgumentError(f"encoding is {short(encoding)}; set the camera to evt3")
     if size > _PACKET_MAX_BYTES:
         raise ArgumentError(
             f"a packet has {size} bytes; send {_PACKET_MAX_BYTES} at most, at a lower threshold"
         )
-    if message.encoding != "evt3":
-        raise ArgumentError(f"encoding is {short(message.encoding)}; set the camera to evt3")
-    return Packet(message.seq, ns_from_stamp(message.header.stamp), message.events, source)
+    events = memoryview(message)[at + _SIZE.size :][:size]
+    if len(events) < size:
+        raise ArgumentError(f"a packet of {size} bytes ends after {len(events)}")
+    return Packet(seq, sec * NS_PER_S + nanosec, events, source)
+
+
+def _aligned(at: int, size: int) -> int:
+    """Return the first place from ``at`` on for a number of this size."""
+    return at + (_BODY_AT - at) % size

@@ -133,7 +133,8 @@ class ReconstructionNode(Node):
         override = {"qos_overriding_options": qos.overridable()}
         short = ShortGroup()
         self.create_subscription(EventPacket, "camera/events", self._on_packet,
-                                 qos.events(), callback_group=short, **override)  # fmt: skip
+                                 qos.events(), callback_group=short, raw=True,
+                                 **override)  # fmt: skip
         stream = self._pipeline.stream
         self._announcement = LatchedState(
             self, TimeReference, "camera/clock", self._on_clock,
@@ -190,9 +191,9 @@ class ReconstructionNode(Node):
 
     # Callbacks: queue and return.
 
-    def _on_packet(self, message: EventPacket, info: Mapping[str, Any]) -> None:
+    def _on_packet(self, message: bytes, info: Mapping[str, Any]) -> None:
         packet = packet_from_message(message, self._camera.check(info))
-        self._reports.packet_ages.add(age_s(self, info, message.header.stamp))
+        self._reports.packet_ages.add(age_s(self, info, packet.stamp_ns))
         self._jobs.post_bulk(partial(self._add_packet, packet))
 
     def _on_clock(self, message: TimeReference) -> None:

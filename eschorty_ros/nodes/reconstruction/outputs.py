@@ -20,7 +20,7 @@ from eschorty_ros.live.event_frame import EventFrame
 from eschorty_ros.live.scan_buffer import AssembledScan, PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.cloud_messages import cloud_message, image_message
+from eschorty_ros.nodes.ros.cloud_messages import cloud_message, image_message, serialized_cloud
 from eschorty_ros.nodes.ros.transforms import BASE, LINK, OPTICAL
 
 POINTS_INTERVAL_S = 0.05
@@ -88,7 +88,7 @@ class Outputs:
                 stamp_ns = int(profile.t_ns.min())
                 points = place_link(profile.profiles, self._model)
                 live = live_points(points, profile.t_ns, stamp_ns)
-                self._profile.publish(cloud_message(live, stamp_ns, LINK))
+                self._profile.publish(serialized_cloud([live], stamp_ns, LINK))
 
     def _spaced(self, timed: TimedProfiles) -> Iterator[TimedProfiles]:
         """Yield each profile that the maximum rate allows."""
@@ -111,16 +111,22 @@ class Outputs:
         if self._points.get_subscription_count() == 0:
             self._batch.clear()
             return
-        points = join_points([part.points for part in self._batch])
-        t_ns = np.concatenate([part.t_ns for part in self._batch])
+        parts = [(part.points, part.t_ns) for part in self._batch if len(part)]
         self._batch.clear()
-        while len(points):
-            stamp_ns = int(t_ns.min())
-            later = t_ns >= stamp_ns + LIVE_SPAN_NS
-            now = slice(None) if not later.any() else ~later
-            live = live_points(points[now], t_ns[now], stamp_ns)
-            self._points.publish(cloud_message(live, stamp_ns, BASE))
-            points, t_ns = points[later], t_ns[later]
+        if len({points.dtype for points, _ in parts}) > 1:
+            joined = join_points([points for points, _ in parts])
+            parts = [(joined, np.concatenate([t_ns for _, t_ns in parts]))]
+        while parts:
+            stamp_ns = min(int(t_ns.min()) for _, t_ns in parts)
+            live, left = [], []
+            for points, t_ns in parts:
+                later = t_ns >= stamp_ns + LIVE_SPAN_NS
+                if later.any():
+                    left.append((points[later], t_ns[later]))
+                    points, t_ns = points[~later], t_ns[~later]
+                live.append(live_points(points, t_ns, stamp_ns))
+            self._points.publish(serialized_cloud(live, stamp_ns, BASE))
+            parts = left
 
     def scan(self, scan: AssembledScan, fallback_stamp_ns: int, organized: bool) -> None:
         """Publish an assembled scan, also an empty one; ``organized``: as a height map."""

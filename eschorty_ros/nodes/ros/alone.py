@@ -28,12 +28,15 @@ class SecondNodes:
     A hidden node marks each one, with its state and start: one that runs stays, and of two that
     start together the first one. A node that was killed on this host counts no more, though
     discovery holds its name for some seconds.
+
+    Public attributes:
+    - ``looking``: False when the 10 s are over.
     """
 
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._marks = [_Mark(node) for node in nodes]
         self._begun_s = self._looked_s = time.monotonic()
-        self._looking = True
+        self.looking = True
 
     def wait(self) -> None:
         """Look before the nodes are spun; see ``look``."""
@@ -51,9 +54,9 @@ class SecondNodes:
         Raises ``DeviceError`` when another node of a name runs, or has begun to start earlier.
         """
         now_s = time.monotonic()
-        if self._looking and now_s - self._looked_s >= _POLL_S:
+        if self.looking and now_s - self._looked_s >= _POLL_S:
             self._looked_s = now_s
-            self._looking = now_s - self._begun_s < _LOOK_S
+            self.looking = now_s - self._begun_s < _LOOK_S
             for mark in self._marks:
                 mark.check()
 

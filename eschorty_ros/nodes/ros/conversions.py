@@ -8,8 +8,8 @@ from builtin_interfaces.msg import Time
 
 from eschorty_ros.core.base.numbers import number
 
-_NS_PER_S = 1_000_000_000
-_STAMP_MIN_NS, _STAMP_MAX_NS = -(_NS_PER_S << 31), (_NS_PER_S << 31) - 1
+NS_PER_S = 1_000_000_000
+_STAMP_MIN_NS, _STAMP_MAX_NS = -(NS_PER_S << 31), (NS_PER_S << 31) - 1
 
 
 def stamp_from_ns(t_ns: int) -> Time:
@@ -17,13 +17,13 @@ def stamp_from_ns(t_ns: int) -> Time:
 
     A time outside, which no clock shows, becomes the nearest end.
     """
-    seconds, nanoseconds = divmod(min(max(int(t_ns), _STAMP_MIN_NS), _STAMP_MAX_NS), _NS_PER_S)
+    seconds, nanoseconds = divmod(min(max(int(t_ns), _STAMP_MIN_NS), _STAMP_MAX_NS), NS_PER_S)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
 def ns_from_stamp(stamp: Time) -> int:
     """Return the int64 nanoseconds of a message stamp; exact."""
-    return int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def mm_from_m(metres: float) -> float:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from eschorty_ros.core.base.errors import DeviceError
 
-_PERIOD_S = 1.0
-# In a second of which no thread of DDS runs, messages do not wait, however busy the computer is.
-_LOOKS_MAX = 10
+_PERIOD_S = 2.0
+# While no thread of DDS runs for so long, messages do not wait, however busy the computer is.
+_LOOKS_MAX = 5
 _SELF = Path("/proc/self")
 
 
@@ -20,7 +20,7 @@ class DdsDeadlockError(DeviceError):
 
 
 class DdsDeadlock:
-    """Looks once a second whether messages wait at the process's sockets while no DDS thread runs.
+    """Looks every 2 s whether messages wait at the process's sockets while no DDS thread runs.
 
     Fast DDS 3.2 may lock up when a publisher or client ends while it is answered: the thread that
     removes it waits for the one of the timers, which waits for a lock of the first (upstream issue
@@ -36,7 +36,7 @@ class DdsDeadlock:
     def look(self) -> None:
         """Look if it is time to.
 
-        Raises ``DdsDeadlockError`` after 10 looks in a row that found the threads blocked. Looks
+        Raises ``DdsDeadlockError`` after 5 looks in a row that found the threads blocked. Looks
         count, not time: a process that was stopped finds messages, too, when it continues.
         """
         now_s = time.monotonic()
@@ -59,9 +59,9 @@ class DdsDeadlock:
             return True
         before = self._switches
         self._switches = {task: _switches(task) for task in _dds_threads()}
-        changed = [task for task, count in self._switches.items() if before.get(task) != count]
-        self._ran = next(iter(changed), None)
-        return bool(changed) or not self._switches
+        since = {task: count - before.get(task, 0) for task, count in self._switches.items()}
+        self._ran = max(since, key=since.__getitem__, default=None)
+        return any(since.values()) or not since
 
 
 def _dds_threads() -> list[Path]:

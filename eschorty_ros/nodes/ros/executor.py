@@ -31,7 +31,8 @@ from eschorty_ros.nodes.ros.border import note_error
 Work = Callable[[], None]
 _Events: Any = getattr(_rclpy, "EventsExecutor", object)
 
-_TURN_S = 0.1
+_TURN_S = 1.0
+_POLL_S = 0.1
 _PAUSE_S = 3e-4
 _LINE_MAX = 300
 _LOG_S = 5.0
@@ -262,9 +263,9 @@ class ThreadsExecutor(_Redirecting, MultiThreadedExecutor):
         MultiThreadedExecutor.__init__(self, threads, context=context)
 
     def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
-        """Run callbacks; ``future`` is not looked at."""
+        """Run callbacks for a while; ``future`` is not looked at."""
         with contextlib.suppress(ExternalShutdownException):
-            self.spin_once(timeout_sec=timeout_sec)
+            self.spin_once(timeout_sec=_POLL_S)
             # While a callback runs, rclpy 9 polls for the next of its group without a pause and
             # would hold the interpreter's lock.
             time.sleep(_PAUSE_S)
@@ -289,6 +290,7 @@ class Spinning:
         self.executor: Any = make(threads, context=context or get_default_context())
         for number, handler in handlers.items():
             signal.signal(number, handler)
+        self._turn = rclpy.task.Future()
         self._thread = threading.Thread(target=self._spin, name="executor", daemon=True)
 
     def start(self) -> None:
@@ -307,6 +309,7 @@ class Spinning:
     def end(self, timeout_s: float = 1.0) -> None:
         """Begin no more callbacks, and wait for the thread as long as that."""
         self.stop_callbacks()
+        self._turn.set_result(None)
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.
@@ -318,9 +321,12 @@ class Spinning:
 
     def _spin(self) -> None:
         # Without a limit rclpy 9.1's EventsExecutor never waits.
-        while self.executor.context.ok() and not self.executor.ending:
+        while self.executor.context.ok():
+            self._turn = rclpy.task.Future()
+            if self.executor.ending:
+                return
             try:
-                self.executor.spin_until_future_complete(rclpy.task.Future(), _TURN_S)
+                self.executor.spin_until_future_complete(self._turn, _TURN_S)
             except Exception as error:
                 # Such as a message that cannot be read.
                 text = f"{error!r}"[:_LINE_MAX]

@@ -23,23 +23,47 @@ class Heartbeat:
 
     - ``topic``: ``camera/heartbeat`` or the like.
     - ``healthy``: Returns whether the device works now; called in the thread, must not wait.
+    - ``wanted``: Returns whether a heartbeat may come; ``begin`` starts the thread, which ends when
+      none may and the last one has been sent. When omitted it begins at once.
     """
 
-    def __init__(self, node: Node, topic: str, healthy: Callable[[], bool]) -> None:
-        self._node = node
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        healthy: Callable[[], bool],
+        wanted: Callable[[], bool] | None = None,
+    ) -> None:
+        self._node, self._topic = node, topic
+        self._wanted = wanted or (lambda: True)
+        self._lock = threading.Lock()
+        self._runs = False
         self._healthy = healthy
         self._schedule = HeartbeatSchedule()
         self._publisher = node.create_publisher(Header, topic, qos.heartbeat())
-        threading.Thread(target=self._run, name=topic, daemon=True).start()
+        if wanted is None:
+            self.begin()
 
     @property
     def healthy(self) -> bool:
         """Return whether the last heartbeat reported a healthy device."""
         return self._schedule.healthy
 
+    def begin(self) -> None:
+        """Start the thread unless it runs; what ``wanted`` returns must have changed before."""
+        with self._lock:
+            if not self._runs:
+                self._runs = True
+                threading.Thread(target=self._run, name=self._topic, daemon=True).start()
+
+    def _ends(self) -> bool:
+        with self._lock:
+            self._runs = self._schedule.left > 0 or self._wanted()
+            return not self._runs
+
     def _run(self) -> None:
         stalls = StallMeter(CHECK_S)
-        while True:
+        while not self._ends():
             time.sleep(CHECK_S)
             if not self._node.context.ok():
                 return

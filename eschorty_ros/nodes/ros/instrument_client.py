@@ -12,7 +12,7 @@ from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -39,6 +39,7 @@ from eschorty_ros.nodes.ros.conversions import (
     ns_from_stamp,
     stage_position_mm,
 )
+from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.peers import OnePublisher, age_s
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
@@ -104,7 +105,9 @@ class InstrumentClient(PacedWaiting):
         self._node_timeout_s = node_timeout_s
         self._service_timeout_s = service_timeout_s
         self._heartbeat_on = False
-        self._heartbeat = Heartbeat(node, CLIENT_HEARTBEAT, self._light_requested)
+        self._heartbeat = Heartbeat(
+            node, CLIENT_HEARTBEAT, self._light_requested, lambda: self._heartbeat_on
+        )
         self._sent: Any = None
 
     def subscribe(self) -> None:
@@ -230,6 +233,7 @@ class InstrumentClient(PacedWaiting):
         """See ``Instrument``."""
         self.tick()
         self._heartbeat_on = True
+        self._heartbeat.begin()
         self.wait(lambda: self._heartbeat.healthy, self._service_timeout_s,
                   "laser: no heartbeat of its own")  # fmt: skip
         ends_s = time.monotonic() + self._service_timeout_s
@@ -384,7 +388,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
         reason = check_text("reason", message.reason)
         monitor.update_laser(
             LaserStatus(message.output, message.frequency, message.duty, reason),
-            age_s(node, info, message.header.stamp),
+            age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
     def on_reconstruction(message: ReconstructionState, info: Mapping[str, Any]) -> None:
@@ -398,7 +402,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
                 check_text("scan_id", message.scan_id),
                 message.packet_age,
             ),
-            age_s(node, info, message.header.stamp),
+            age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
     def on_stage(message: Odometry, info: Mapping[str, Any]) -> None:
@@ -408,7 +412,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
             ns_from_stamp(message.header.stamp),
             stage_position_mm(message),
             mm_from_m(speed_m_s),
-            age_s(node, info, message.header.stamp),
+            age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
     def on_heartbeat(message: Header, info: Mapping[str, Any]) -> None:
@@ -416,7 +420,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
         monitor.update_heartbeat(check_text("frame_id", message.frame_id))
 
     # One message at a time, so that samples stay in order.
-    group = MutuallyExclusiveCallbackGroup()
+    group = ShortGroup()
     for kind, topic_name, callback, profile in (
         (LaserState, "laser/state", on_laser, qos.latched(qos.STATE_HISTORY)),
         (ReconstructionState, "reconstruction/state", on_reconstruction, 10),

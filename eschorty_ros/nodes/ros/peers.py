@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
@@ -15,7 +14,6 @@ from rclpy.subscription import Subscription
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
 _SILENCE_NS = 250_000_000
 _CHECK_S = 1.0
@@ -121,12 +119,12 @@ class LatchedState:
         self._publisher = _publisher(info)
 
 
-def age_s(node: Node, info: Mapping[str, Any], stamp: Time) -> float:
+def age_s(node: Node, info: Mapping[str, Any], stamp_ns: int) -> float:
     """Return the age of a message on arrival by this node's clock, however late it is taken."""
     clock = node.get_clock()
     simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
     received_ns = clock.now().nanoseconds if simulated else int(info["received_timestamp"])
-    return (received_ns - ns_from_stamp(stamp)) * 1e-9
+    return (received_ns - stamp_ns) * 1e-9
 
 
 def publishers_fault(node: Node, topic: str) -> str:

@@ -31,7 +31,9 @@ from eschorty_ros.nodes.ros.dds_deadlock import DdsDeadlock, DdsDeadlockError
 from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.ros.freed_memory import FreedMemory
 
-_TURN_S = 0.1
+_START_TURN_S = 0.1
+# An error of a timer ends the node after half a second at most; each turn wakes the process.
+_TURN_S = 0.5
 _CLOSE_S = 3.0
 _SIGNALS_MAX = 64
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -161,7 +163,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
                 second.look()
                 dds.look()
                 freed.trim()
-                if select.select([signals], [], [], _TURN_S)[0]:
+                turn_s = _START_TURN_S if second.looking else _TURN_S
+                if select.select([signals], [], [], turn_s)[0]:
                     os.read(signals, _SIGNALS_MAX)
     except KeyboardInterrupt:
         pass

@@ -231,7 +231,7 @@ class StageNode(DeviceNode):
             with unless_shut_down(self):
                 self._publish_odom()
             if self._rested:
-                self._begun.wait(REST_NS * 0.5e-9)
+                self._begun.wait(REST_NS * 1e-9)
                 self._begun.clear()
             else:
                 time.sleep(1.0 / self.parameters["odom_rate"])

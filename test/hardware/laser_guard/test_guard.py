@@ -335,7 +335,7 @@ def test_a_living_owner_is_not_reported_as_gone(
     monkeypatch.undo()
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     serving = guard.Guard(Wire(there), os.getpid())
-    serving._lit = True
+    serving._lit.set()
     here.close()
     serving.run()
     there.close()

@@ -114,7 +114,7 @@ def test_a_thread_that_ends_by_an_error_stops_the_stage(
         if thread == "apt reader":
             stage._tracker.add_status = broken  # type: ignore[method-assign]
         else:
-            stage._link.call_every(1.0, broken)
+            stage._link.call_every(lambda: 1.0, broken)
         wait_until(lambda: failed(stage), "the failure")
         assert not stage.healthy
         for call in (stage.state, stage.home, lambda: stage.move_to(10.0, 10.0)):

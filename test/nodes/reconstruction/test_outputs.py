@@ -4,6 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, place
@@ -20,7 +22,9 @@ COLUMNS = 3
 
 
 class Publisher(list):
-    publish = list.append
+    def publish(self, message):
+        serialized = isinstance(message, bytes)
+        self.append(deserialize_message(message, PointCloud2) if serialized else message)
 
     def get_subscription_count(self):
         return 1

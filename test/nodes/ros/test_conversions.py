@@ -7,7 +7,9 @@ import pytest
 from eschorty_ros.msg import LaserState
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.reconstruction import LIVE_DTYPE, live_points
@@ -18,6 +20,7 @@ from eschorty_ros.nodes.ros.cloud_messages import (
     cloud_message,
     image_message,
     points_from_message,
+    serialized_cloud,
 )
 from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stamp_from_ns
 
@@ -56,6 +59,17 @@ def test_live_cloud_counts_ns_from_its_stamp():
     assert seen["t"].tolist() == [0, 1, 3_999_999_999, 7]
     np.testing.assert_array_equal(seen["x"], points["x"])
     assert [(f.name, f.offset) for f in message.fields[:3]] == [("x", 0), ("y", 4), ("z", 8)]
+
+
+@pytest.mark.parametrize("frame_id", ["a", "ab", "abc", "abcd", "eschorty_link"])
+@pytest.mark.parametrize("dtype", [LIVE_DTYPE, POINT_DTYPE, REFLECTANCE_DTYPE])
+def test_a_serialized_cloud_is_that_of_all_parts(frame_id, dtype):
+    points = np.frombuffer(np.random.default_rng(5).bytes(9 * dtype.itemsize), dtype)
+    for ends in ([], [4], [0, 9]):
+        parts = np.split(points, ends)
+        serialized = serialized_cloud(parts, 10**18 + 7, frame_id)
+        message = deserialize_message(serialized, PointCloud2)
+        assert message == cloud_message(points, 10**18 + 7, frame_id)
 
 
 def test_reflectance_goes_along_when_the_points_have_it():
