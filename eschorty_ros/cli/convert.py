@@ -25,7 +25,12 @@ STORAGES = ("mcap", "sqlite3")
 )
 @bag_options
 def command(
-    source: Path, target: Path, storage: str, frequency: float | None, calibration: str | None
+    source: Path,
+    target: Path,
+    storage: str,
+    frequency: float | None,
+    calibration: str | None,
+    packet_period: float,
 ) -> None:
     """Make a bag of the recording SOURCE, or a recording of the bag SOURCE; TARGET is new.
 
@@ -46,7 +51,7 @@ def command(
     from eschorty_ros.live.bag_files import is_bag
 
     if is_bag(source):
-        recording_of(source, target, frequency, calibration)
+        recording_of(source, target, frequency, calibration, packet_period)
         click.echo(str(target))
         return
     if frequency is not None or calibration is not None:
@@ -62,6 +67,7 @@ def recording_of(
     folder: Path,
     frequency: float | None,
     calibration: str | None,
+    packet_period_ms: float,
     settings: dict[str, Any] | None = None,
 ) -> None:
     """Write the recording of a bag, with these settings; what it lacks is a warning."""
@@ -69,6 +75,6 @@ def recording_of(
     from eschorty_ros.live.bag_conversion import bag_to_recording
 
     build = None if calibration is None else load_calibration(calibration)
-    lacking = bag_to_recording(bag, folder, build, frequency, settings)
+    lacking = bag_to_recording(bag, folder, build, frequency, settings, 1e-3 * packet_period_ms)
     if lacking:
         click.echo(f"eschorty: warning: {lacking}", err=True)

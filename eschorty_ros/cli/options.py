@@ -84,6 +84,14 @@ def bag_options(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.FloatRange(16, 20_000),
             help="For a bag without laser/state: modulation frequency, Hz.",
         ),
+        click.option(
+            "--packet-period",
+            type=click.FloatRange(0, 100),
+            default=4.0,
+            show_default=True,
+            help="For a bag without camera/clock: time over which the camera collects events "
+            "before it sends them, ms.",
+        ),
     ):
         command = option(command)
     return command

@@ -91,6 +91,7 @@ def command(
     as_json: bool,
     frequency: float | None,
     calibration: str | None,
+    packet_period: float,
     **settings: Any,
 ) -> None:
     """Turn each RECORDING, a folder or a rosbag2, into a point cloud.
@@ -146,6 +147,7 @@ def command(
         given=_given(settings),
         frequency=frequency,
         calibration=calibration,
+        packet_period_ms=packet_period,
         show=dask is None,
     )
     calls = list(zip(recordings, targets, strict=True))
@@ -199,6 +201,7 @@ def reconstruct_to(
     given: dict[str, Any],
     frequency: float | None,
     calibration: str | None,
+    packet_period_ms: float,
     show: bool,
 ) -> tuple[dict[str, Any], Accuracy | None]:
     """Write the cloud of a recording, if it has points; return its summary and its errors.
@@ -213,8 +216,9 @@ def reconstruct_to(
     if not is_bag(recording):
         return _reconstruct(load_recording(recording), target, jobs, given, show)
     with temporary_folder() as made:
-        recording_of(recording, made / recording.stem, frequency, calibration, given)
-        return _reconstruct(load_recording(made / recording.stem), target, jobs, given, show)
+        folder = made / recording.stem
+        recording_of(recording, folder, frequency, calibration, packet_period_ms, given)
+        return _reconstruct(load_recording(folder), target, jobs, given, show)
 
 
 def _reconstruct(

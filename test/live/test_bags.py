@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recorded_scan
+from click.testing import CliRunner
 from recorded_scan import LiveScan
 from rosbags.typesys import get_types_from_msg
 
+from eschorty_ros.cli import main
 from eschorty_ros.core.base.errors import EschortyError
+from eschorty_ros.core.optics import save_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
 from eschorty_ros.core.storage import load_recording
 from eschorty_ros.live import bag_files
@@ -79,6 +82,13 @@ def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path
     np.testing.assert_array_equal(found["x"], expected["x"])
     # A stamp is that of the packet's first bytes, exact here but for its 10 ms rhythm.
     np.testing.assert_allclose(found["y"], expected["y"], atol=1e-4, rtol=0)
+    save_calibration(build, tmp_path / "build.yaml")
+    options = "--frequency", "70", "--calibration", str(tmp_path / "build.yaml")
+    command = "convert", str(tmp_path / "bag"), str(tmp_path / "sent"), *options
+    assert CliRunner().invoke(main, command).exit_code == 0
+    # A camera that collects events for 4 ms sends them so much later, at 50 mm/s.
+    sent = points(load_recording(tmp_path / "sent"))
+    assert np.median(sent["y"] - found["y"]) == pytest.approx(-2e-4, abs=1e-6)
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", bytes(1000)])
