@@ -158,15 +158,19 @@ class Settings:
         "nothing is",
     )  # fmt: skip
     sigma_factor: float = _number(
-        SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"
-    )
+        SIGMA_FACTOR, 0.0, 10.0, "",
+        "factor on s/sqrt(N) in a row's standard deviation, times a constant of the centroid; the "
+        "scatter of the stream's rows scales the result",
+    )  # fmt: skip
     sigma_floor_px: float = _number(
         SIGMA_FLOOR_PX, 0.0, 10.0, "px",
-        "part of a column's standard deviation that more events do not reduce",
+        "part of a row's standard deviation that more events do not reduce; multiplied and scaled "
+        "as with sigma_factor",
     )  # fmt: skip
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
-        "part of it that the columns of a moving line share, as pixels remember where it was",
+        "part of a row's standard deviation that the columns of a moving line share, as pixels "
+        "remember where it was",
     )  # fmt: skip
     detail: str = _choice(
         "auto", ("auto", "off"),
