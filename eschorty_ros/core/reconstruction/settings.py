@@ -123,11 +123,15 @@ class Settings:
         "neighbours further off in rows are not averaged, unless rows scatter as much",
     )  # fmt: skip
     isolation_gate_px: float = _number(
-        12.0, 0.0, 720.0, "px", "a weak point needs a neighbouring column this near in rows"
-    )
+        12.0, 0.0, 720.0, "px",
+        "a point with fewer events than isolation_events needs a neighbouring column this near in "
+        "rows",
+    )  # fmt: skip
     isolation_events: int = _number(
-        10, 0, 1000, "events", "points with fewer events than this are weak"
-    )
+        10, 0, 1000, "events",
+        "points with fewer need a neighbour, see isolation_gate_px; with less than half of the "
+        "profile's mean, too, they have the flag few_events",
+    )  # fmt: skip
     reflectance: str = _choice(
         "off", SWITCH, "relative reflectance of every point, as two more fields of the cloud"
     )
