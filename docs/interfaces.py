@@ -46,7 +46,7 @@ TOPICS = {
     "stage/odom": "position along the stage in `pose.pose.position.y`, speed in `twist`",
     "stage/trigger": "positions of the stage's pulses to the camera",
     "stage/heartbeat": "10 Hz while the stage is active",
-    "profile": "one period in `eschorty_link`; `profile_rate_max` at most",
+    "profile": "one profile in `eschorty_link`; `profile_rate_max` at most",
     "points": "batches in `eschorty_base`, 20 Hz at most",
     "scan/points": "the assembled scan in `eschorty_base`",
     "event_frame": "recent events, `mono8`, 10 Hz at most",

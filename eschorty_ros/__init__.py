@@ -18,12 +18,12 @@ The names below are the public Python interface, imported on first use; all othe
     >>> reconstructor = es.Reconstructor(build, es.Modulation(frequency_hz=70.0))
     >>> stage, count = es.StageTrack(), 0
     >>> stage.append(recording.stage_samples["t_us"], recording.stage_samples["position_mm"])
-    >>> for data in es.RawReader("rec/events.raw"):  # the camera's next bytes, EVT3
-    ...     profiles = reconstructor.push(data)
+    >>> def placed(profiles):
     ...     stage_mm = stage.position_mm(profiles.t_us)
-    ...     points = es.place(profiles, reconstructor.model, stage_mm, build.stage_direction)
-    ...     count += len(points)
-    >>> count + len(reconstructor.flush()) == len(cloud.points)
+    ...     return es.place(profiles, reconstructor.model, stage_mm, build.stage_direction)
+    >>> for data in es.RawReader("rec/events.raw"):  # the camera's next bytes, EVT3
+    ...     count += len(placed(reconstructor.push(data)))
+    >>> count + len(placed(reconstructor.flush())) == len(cloud.points)
     True
 """
 

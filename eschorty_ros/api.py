@@ -85,7 +85,8 @@ def reconstruct(
     unknown = sorted(settings.keys() - {field.name for field in fields(Settings)})
     if unknown:
         raise ArgumentError(
-            f"there is no setting {unknown[0]!r}; `eschorty reconstruct --help` lists them"
+            f"there is no setting {unknown[0]!r}; `help(es.Settings)` lists them, and laser and "
+            "calibration are those of the recording's files"
         )
     loaded = recording if isinstance(recording, Recording) else load_recording(recording)
     chosen = replace(recorded_settings(loaded), **settings)

@@ -23,9 +23,9 @@ Report = Callable[[float, str], None]
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Report]:
-    """Show the share done on stderr: a bar on a terminal, else a line every few seconds.
+    """Show the share done on stderr: a bar on a terminal, else a line when it has changed.
 
-    The share stays below 100 % until the block ends. The lines come also while nothing is reported.
+    The share stays below 100 % until the block ends. Lines are some seconds apart.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -49,9 +49,13 @@ def progress_bar(title: str) -> Iterator[Report]:
         bar.update(task, completed=newest[0], note=note)
 
     def print_lines() -> None:
+        printed = ""
         while not ended.wait(LINE_EVERY_S):
             share, note = newest
-            print(f"{title}: {share:.0%} {note}".rstrip(), file=sys.stderr, flush=True)
+            line = f"{title}: {share:.0%} {note}".rstrip()
+            if line != printed:
+                print(line, file=sys.stderr, flush=True)
+                printed = line
 
     if bar.disable:
         threading.Thread(target=print_lines, daemon=True).start()

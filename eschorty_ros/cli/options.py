@@ -23,7 +23,8 @@ _SWEEP = (
         type=click.FloatRange(16, 20_000),
         default=70.0,
         show_default=True,
-        help="Modulation frequency, Hz: one profile per period.",
+        help="Modulation frequency, Hz; one profile per period, or per several where one has too "
+        "few events.",
     ),
     click.option(
         "--speed",

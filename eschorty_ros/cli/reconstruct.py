@@ -125,6 +125,7 @@ def command(
       eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
       eschorty reconstruct monday/* --dask tcp://host:8786
     """  # noqa: D301
+    from eschorty_ros.core.storage import RAW_ALONE
     from eschorty_ros.live.bag_files import is_bag
 
     several = len(recordings) > 1
@@ -133,7 +134,9 @@ def command(
     for recording in recordings:
         bag = is_bag(recording)
         if recording.is_file() and not bag:
-            raise click.BadParameter(f"{recording} is a file; give a recording's folder or a bag")
+            raise click.BadParameter(
+                f"{recording} is a file; give a recording's folder or a bag; {RAW_ALONE}"
+            )
         if not bag and (frequency is not None or calibration is not None):
             raise click.UsageError(
                 f"--frequency and --calibration are for a bag; {recording} is none"

@@ -116,15 +116,18 @@ class PacketStream:
         return self._epoch
 
     @property
+    def frequency_hz(self) -> float:
+        """Return the frequency of the modulation, 0 while that is unknown."""
+        return 0.0 if self._laser is None else self._laser[0].frequency_hz
+
+    @property
     def profile_rate_hz(self) -> float:
         """Return the profiles per second of the modulation, 0 while that is unknown.
 
         Until the stream has shown how many periods make a profile, it is one.
         """
-        if self._laser is None:
-            return 0.0
         every = 0 if self._reconstructor is None else self._reconstructor.periods_per_profile
-        return self._laser[0].frequency_hz / (every or self._settings.periods_per_profile or 1)
+        return self.frequency_hz / (every or self._settings.periods_per_profile or 1)
 
     @property
     def processed_until_ns(self) -> int | None:

@@ -16,6 +16,7 @@ from eschorty_ros.core.reconstruction import (
     pass_lag,
     place,
     take_off_lag,
+    without_modulation,
 )
 from eschorty_ros.core.storage import Points
 from eschorty_ros.live.calibration_capture import Capture
@@ -46,6 +47,7 @@ class ScanReport:
     points_outside: int
     points_over_limit: int
     profiles_expected: int
+    frequency_hz: float
     pass_lag: PassLag | None = None
 
     @property
@@ -79,13 +81,8 @@ class ScanReport:
         return "; ".join(notes)
 
     def _cause_of_empty(self) -> str:
-        if not self.events:
-            return "no points: no events came; look at the camera, its lens cap and the laser"
-        if not self.points_outside:
-            return (
-                f"no points: nothing blinks with the laser in {self.events} events; look at the "
-                "laser's frequency, at the focus and at what the line falls on"
-            )
+        if not (self.events and self.points_outside):
+            return f"no points: {without_modulation(self.events, self.frequency_hz)}"
         return (
             f"no points: all {self.points_outside} are outside start to stop; check that the "
             "stamps of camera and stage are of the same clock"
@@ -274,6 +271,7 @@ class Pipeline:
             buffer.points_outside,
             buffer.points_over_limit,
             self._coverage.profiles(self.stream.profile_rate_hz),
+            self.stream.frequency_hz,
             lag,
         )
 

@@ -72,7 +72,13 @@ def test_points_outside_the_limits_are_counted():
     [
         (5, 100, 0, 3, ""),
         (0, 0, 0, 0, "no points: no events came"),
-        (0, 100, 0, 0, "no points: nothing blinks with the laser in 100 events"),
+        (
+            0,
+            100,
+            0,
+            0,
+            "no points: hardly any of 100 events follow the laser's modulation at 70 Hz",
+        ),
         (0, 100, 0, 3, "no points: all 3 are outside start to stop"),
         (0, 100, 7, 3, "7 points had no stage position"),
     ],
@@ -81,7 +87,7 @@ def test_a_scan_without_points_has_the_reason(points, events, without, outside, 
     buffer = ScanBuffer("a", 0.0, 1.0)
     if points:
         buffer.add(placed([0.5] * points, [T0_NS] * points, range(points)))
-    report = ScanReport(buffer.assemble(), events, 1, 0, 0, without, outside, 0, 0)
+    report = ScanReport(buffer.assemble(), events, 1, 0, 0, without, outside, 0, 0, 70.0)
     assert report.message.startswith(begins)
     assert bool(report.message) == bool(begins)
 

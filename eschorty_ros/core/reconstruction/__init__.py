@@ -16,6 +16,7 @@ from eschorty_ros.core.reconstruction.profiles import (
     stage_offset_m,
 )
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
+from eschorty_ros.core.reconstruction.recording_warnings import without_modulation
 from eschorty_ros.core.reconstruction.region import region_window
 from eschorty_ros.core.reconstruction.settings import NOISE_FILTERS, Settings
 from eschorty_ros.core.reconstruction.warm_up import warm_up
@@ -41,4 +42,5 @@ __all__ = [
     "stage_speed_mm_s",
     "take_off_lag",
     "warm_up",
+    "without_modulation",
 ]

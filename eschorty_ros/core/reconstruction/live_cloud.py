@@ -19,7 +19,7 @@ def _live_dtype(scan_dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 LIVE_DTYPE = _live_dtype(POINT_DTYPE)
-"""Point of a live cloud: metres, events used, metres, ns since the header's stamp, column.
+"""Point of a live cloud: metres, events used, metres, ns since the stamp, column, flags.
 
 The points of an assembled scan (``POINT_DTYPE``) have ``t`` in seconds as float64: a uint32 of
 nanoseconds ends at 4.29 s, shorter than most scans.

@@ -51,7 +51,7 @@ def recording_warnings(
     """
     found = recording.scan.faults if recording.scan is not None else []
     if span_us is None:
-        return [*found, "no points: no events came; look at the camera, its lens cap and the laser"]
+        return [*found, f"no points: {without_modulation(0, 0.0)}"]
     reader = RawReader(recording.events_path)
     stated_hz, shown_hz = recording.modulation.frequency_hz, _frequency_hz(recording, reader)
     found += _geometry(recording, reader)
@@ -74,7 +74,18 @@ def recording_warnings(
         )
     if without_stage or (found and len(points)):
         return found
-    return [*found, *_few_points(settings, counters, points, shown_hz is not None)]
+    dark = without_modulation(counters["events"], stated_hz)
+    return [*found, *_few_points(settings, counters, points, dark, shown_hz is not None)]
+
+
+def without_modulation(events: int, frequency_hz: float) -> str:
+    """Return the cause of few points where the laser's modulation is not in the events."""
+    if not events:
+        return "no events came; look at the camera, its lens cap and the laser"
+    return (
+        f"hardly any of {events:,} events follow the laser's modulation at {frequency_hz:g} Hz; "
+        "look at its frequency, at the focus and at what the line falls on"
+    )
 
 
 def _geometry(recording: Recording, reader: RawReader) -> list[str]:
@@ -107,9 +118,13 @@ def _frequency_hz(recording: Recording, reader: RawReader) -> float | None:
 
 
 def _few_points(
-    settings: Settings, counters: Mapping[str, int], points: Points, blinking: bool
+    settings: Settings,
+    counters: Mapping[str, int],
+    points: Points,
+    dark: str,
+    modulated: bool,
 ) -> list[str]:
-    """Return the largest loss where it left few points or none."""
+    """Return the largest loss where it left few points or none, ``dark`` where there is none."""
     if 2 * counters["events_gated"] > counters["events"]:
         # The reconstructor has a line for it.
         return []
@@ -124,10 +139,5 @@ def _few_points(
             return []
     if len(points) and count <= _FEW * len(points):
         return []
-    if not (blinking and count):
-        return [
-            f"{len(points):,} points: nothing blinks with the laser in "
-            f"{counters['events']:,} events; look at the laser's frequency, at the focus and at "
-            "what the line falls on"
-        ]
-    return [f"{len(points):,} points: {count:,} {words.format(settings)}"]
+    cause = f"{count:,} {words.format(settings)}" if modulated and count else dark
+    return [f"{len(points):,} points: {cause}"]

@@ -123,11 +123,15 @@ class Settings:
         "neighbours further off in rows are not averaged, unless rows scatter as much",
     )  # fmt: skip
     isolation_gate_px: float = _number(
-        12.0, 0.0, 720.0, "px", "a weak point needs a neighbouring column this near in rows"
-    )
+        12.0, 0.0, 720.0, "px",
+        "a point with fewer events than isolation_events needs a neighbouring column this near in "
+        "rows",
+    )  # fmt: skip
     isolation_events: int = _number(
-        10, 0, 1000, "events", "points with fewer events than this are weak"
-    )
+        10, 0, 1000, "events",
+        "points with fewer need a neighbour, see isolation_gate_px; with less than half of the "
+        "profile's mean, too, they have the flag few_events",
+    )  # fmt: skip
     reflectance: str = _choice(
         "off", SWITCH, "relative reflectance of every point, as two more fields of the cloud"
     )
@@ -158,15 +162,19 @@ class Settings:
         "nothing is",
     )  # fmt: skip
     sigma_factor: float = _number(
-        SIGMA_FACTOR, 0.0, 10.0, "", "factor on s/sqrt(N) in the row's standard deviation"
-    )
+        SIGMA_FACTOR, 0.0, 10.0, "",
+        "factor on s/sqrt(N) in a row's standard deviation, times a constant of the centroid; the "
+        "scatter of the stream's rows scales the result",
+    )  # fmt: skip
     sigma_floor_px: float = _number(
         SIGMA_FLOOR_PX, 0.0, 10.0, "px",
-        "part of a column's standard deviation that more events do not reduce",
+        "part of a row's standard deviation that more events do not reduce; multiplied and scaled "
+        "as with sigma_factor",
     )  # fmt: skip
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
-        "part of it that the columns of a moving line share, as pixels remember where it was",
+        "part of a row's standard deviation that the columns of a moving line share, as pixels "
+        "remember where it was",
     )  # fmt: skip
     detail: str = _choice(
         "auto", ("auto", "off"),

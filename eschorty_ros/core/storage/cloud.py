@@ -34,7 +34,7 @@ POINT_DTYPE = np.dtype(
 
 MIXED, SENSOR_EDGE, FEW_EVENTS = 1, 2, 4
 FLAGS = {"mixed": MIXED, "sensor_edge": SENSOR_EDGE, "few_events": FEW_EVENTS}
-"""Bits of a point's flags: the line is on two surfaces, cut by the sensor's edge, or weak."""
+"""Bits of a point's flags: the line is on two surfaces, cut by the edge, or of few events."""
 
 REFLECTANCE_DTYPE = np.dtype(
     [*POINT_DTYPE.descr, ("reflectance", "<f4"), ("reflectance_sigma", "<f4")]

@@ -36,6 +36,11 @@ TRUTH_FILE = "truth.csv"
 SCAN_FILE = "scan.yaml"
 SETTINGS_FILE = "settings.yaml"
 MARKS_FILE = "marks.csv"
+RAW_ALONE = (
+    f"a .raw alone goes into a folder as {EVENTS_FILE}, beside {LASER_FILE}, {STAGE_FILE} and "
+    f"{CALIBRATION_FILE} (docs/python.md)"
+)
+"""What to do with a file that is no recording."""
 
 STAGE_DTYPE = np.dtype([("t_us", "<i8"), ("position_mm", "<f8")])
 TRUTH_DTYPE = np.dtype([("t_us", "<i8"), ("column", "<u2"), ("range_mm", "<f8")])
@@ -149,7 +154,7 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     """
     folder = file_path("path", path)
     if not folder.is_dir():
-        raise FormatError(f"{folder} is not a folder; give a recording folder")
+        raise FormatError(f"{folder} is not a folder; give a recording folder; {RAW_ALONE}")
     for name in (EVENTS_FILE, STAGE_FILE, LASER_FILE, CALIBRATION_FILE):
         if not (folder / name).is_file():
             raise FormatError(f"{folder / name} is missing; add it to the recording")

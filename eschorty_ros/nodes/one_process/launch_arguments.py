@@ -55,7 +55,12 @@ _DEVICES = (
     Argument("pixels", "paper", "event pixels of an emulated camera",
              ("paper", "ideal", "noisy", "narrow")),
     Argument("effects", "none", "effects of an emulated world, such as ambient=0.5,occlusion=1"),
-    Argument("frequency", "70.0", "laser modulation, Hz, 16 to 20000: one profile per period"),
+    Argument(
+        "frequency",
+        "70.0",
+        "laser modulation, Hz, 16 to 20000; one profile per period, or per several where one has "
+        "too few events",
+    ),
 )  # fmt: skip
 _FILE = Argument(
     "parameters",

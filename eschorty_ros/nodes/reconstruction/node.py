@@ -106,10 +106,22 @@ class ReconstructionNode(Node):
         self._camera_roi.follow(self.parameters.settings(Settings), self.calibration.model())
         self._calibrator = self._made_calibrator()
         self._make_interfaces()
+        self.get_logger().info(self._sources())
         if self.parameters["auto_calibrate"]:
             names = ("distances", "method", "capture_time")
             self._auto = AutoCalibration(self, *(self.parameters[name] for name in names))
         self._worker.start()
+
+    def _sources(self) -> str:
+        """Return what the points are made from."""
+        events, odom, laser = map(
+            self.resolve_topic_name, ("camera/events", "stage/odom", "laser/state")
+        )
+        modulation = f"{self._override.frequency_hz:g} Hz" if self._override else laser
+        return (
+            f"calibration {self.calibration.name}, modulation {modulation}, trigger source "
+            f"{self.parameters['trigger_source']}, events {events}, stage {odom}"
+        )
 
     def _made_calibrator(self) -> Calibrator:
         values = self.parameters

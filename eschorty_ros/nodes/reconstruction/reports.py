@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 from rclpy.node import Node
@@ -16,6 +17,9 @@ from eschorty_ros.nodes.ros import diagnostics
 from eschorty_ros.nodes.ros.border import saturated
 from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
+PACKETS_EXPECTED_S = 5.0
+"""Time from the node's start after which a camera without packets is a warning."""
+
 
 class Reports:
     """State and diagnostics of a pipeline that another thread runs; numbers may differ in time.
@@ -28,6 +32,7 @@ class Reports:
     def __init__(self, node: Node, pipeline: Pipeline, jobs: JobQueue) -> None:
         self.faults = 0
         self.packet_ages = StampAges("camera")
+        self._begun_s = time.monotonic()
         self._node = node
         self._pipeline = pipeline
         self._jobs = jobs
@@ -91,4 +96,7 @@ class Reports:
             return diagnostics.WARN, "packets or points were lost", values
         if warnings := stream.warnings:
             return diagnostics.WARN, "; ".join(warnings), values
-        return diagnostics.OK, "reconstructing" if stream.packets else "no packets yet", values
+        if not stream.packets:
+            late = time.monotonic() > self._begun_s + PACKETS_EXPECTED_S
+            return diagnostics.WARN if late else diagnostics.OK, "no packets yet", values
+        return diagnostics.OK, "reconstructing", values

@@ -47,7 +47,7 @@ def test_a_dark_recording_says_so(tmp_path):
     dark = simulate_recording(tmp_path, Plane(2900.0), NARROW, stop_mm=40.0, seed=2)
     found = reconstruct_recording(dark)
     assert len(found.points) == 0
-    assert "nothing blinks with the laser" in found.warnings[-1]
+    assert "events follow the laser's modulation at 70 Hz" in found.warnings[-1]
 
 
 @pytest.mark.parametrize(

@@ -35,3 +35,11 @@ def test_a_warning_of_the_reconstruction_is_the_line_of_the_diagnostics(lost):
         assert "its readout lost events" in line
     else:
         assert (level, line) == (diagnostics.OK, "reconstructing")
+
+
+def test_no_packets_is_a_warning_after_some_seconds(monkeypatch):
+    pipeline = Pipeline(load_calibration("config_3"), Settings(), 1.0, 0.1, 10.0)
+    reports = Reports(SimpleNamespace(create_publisher=lambda *_: None), pipeline, JobQueue(1))
+    assert reports.diagnose()[:2] == (diagnostics.OK, "no packets yet")
+    monkeypatch.setattr("eschorty_ros.nodes.reconstruction.reports.PACKETS_EXPECTED_S", 0.0)
+    assert reports.diagnose()[:2] == (diagnostics.WARN, "no packets yet")
