@@ -354,9 +354,10 @@ class Reconstructor:
             return found
         unmodulated, points = counts["columns_unmodulated"], counts["points"]
         share = unmodulated / max(points + unmodulated, 1)
-        # Background of dark columns has fewer events than a line.
+        # Background of dark columns, beside those of a line, has fewer events than these.
         line = counts["events_binned"] - counts["events_unmodulated"]
         dark = 2 * counts["events_unmodulated"] * points < line * unmodulated
+        dark &= unmodulated < 10 * points
         if share > _UNMODULATED_SHARE and not dark:
             found.append(
                 f"the events of {unmodulated} columns ({share:.0%} of those with enough) do not "
