@@ -531,9 +531,9 @@ def _write(rows, smoothing, few, delay_us, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, gate, blink, footprint, known = memory[:6]
-    scatter, smoothing = memory.scatter, memory.smoothing
-    light, rows, row_counts = memory.light, memory.rows, memory.row_counts
+    columns, estimator, gate = memory.columns, memory.estimator, memory.gate
+    blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
+    smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
     if gate.choices.size > 0:
         _learn_gate(columns, state.half, gate)
         gated = _use_late(columns, gate)
@@ -554,11 +554,11 @@ def _close(memory, state, counters):
     _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
-    _mark_unusual(rows, smoothing, light.lit_share)
+    _mark_unusual(rows, smoothing, memory.light.lit_share)
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):
         # Later windows begin with what is known now.
-        _restart_from(known, footprint)
+        _restart_from(memory.known, footprint)
     if learns:
         uncertain, truncated = rows.uncertain[0], rows.truncated[0]
         _learn(footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.rows)
@@ -570,7 +570,7 @@ def _close(memory, state, counters):
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)
     few = _few_events(rows, smoothing.isolation_events)
-    delay_us = _delay_us(rows, memory.delay, light)
+    delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)
     points = np.int64(state.rows - before)
