@@ -26,17 +26,33 @@ PER_NARROWER = np.sqrt(3.0)
 _PER_WIDER = 2.0 / np.sqrt(3.0)
 
 
-class Course(NamedTuple):
-    """Mean row and width of the recent profiles by block, and the variances that follow from them.
+class BlockSums(NamedTuple):
+    """Sums over the points of a profile by block: rows, widths, variances of rows, and points."""
 
-    The first and the last block are outside the sensor. ``now`` has the sums of a profile's rows,
-    widths, variances of rows and points, ``recent`` the recent means and the number of profiles. A
-    line that moves is off by the standard deviation ``common_px`` at most: the variance ``moved2``;
-    ``passing2`` is that of an edge that it passes.
+    row: NDArray[np.float64]
+    width: NDArray[np.float64]
+    sigma2: NDArray[np.float64]
+    points: NDArray[np.float64]
+
+
+class BlockMeans(NamedTuple):
+    """Mean row and width of recent profiles by block, and the number of these profiles."""
+
+    row: NDArray[np.float64]
+    width: NDArray[np.float64]
+    profiles: NDArray[np.float64]
+
+
+class Course(NamedTuple):
+    """Sums of a profile and means of the recent ones, and the variances that follow from them.
+
+    The first and the last block are outside the sensor. A line that moves is off by the standard
+    deviation ``common_px`` at most: the variance ``moved2``; ``passing2`` is that of an edge that
+    it passes.
     """
 
-    now: NDArray[np.float64]
-    recent: NDArray[np.float64]
+    now: BlockSums
+    recent: BlockMeans
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
     common_px: float
@@ -49,7 +65,8 @@ def empty_course(columns: int, common_px: float, windowed: bool) -> Course:
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK) + 2
-    now, recent, (moved2, passing2) = (np.zeros((n, blocks)) for n in (4, 3, 2))
+    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
+    moved2, passing2 = np.zeros((2, blocks))
     return Course(now, recent, moved2, passing2, common_px, windowed)
 
 
@@ -60,17 +77,17 @@ def _follow(course, known, usual, width_variance):
     A line that has its ``usual`` width again, where it is ``known``, has passed the edge.
     """
     now, recent = course.now, course.recent
-    for block in range(1, now.shape[1] - 1):
+    for block in range(1, now.points.size - 1):
         near = slice(block - 1, block + 2)
-        points, profiles = now[3, near].sum(), recent[2, block]
+        points, profiles = now.points[near].sum(), recent.profiles[block]
         course.moved2[block], course.passing2[block] = course.common_px**2, 0.0
         if points == 0.0 or not course.windowed:
             continue
-        row, width = now[0, near].sum() / points, now[1, near].sum() / points
-        moved = row - recent[0, block] if profiles > 0.0 else np.inf
-        moved2 = moved * moved - now[2, near].sum() / (points * points)
-        narrower = min(recent[1, block], usual) - width
-        wider = width - max(recent[1, block], usual)
+        row, width = now.row[near].sum() / points, now.width[near].sum() / points
+        moved = row - recent.row[block] if profiles > 0.0 else np.inf
+        moved2 = moved * moved - now.sigma2[near].sum() / (points * points)
+        narrower = min(recent.width[block], usual) - width
+        wider = width - max(recent.width[block], usual)
         shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
         passing2 = shift * shift - PER_NARROWER**2 * width_variance / points
         course.moved2[block] = min(max(moved2, 0.0), course.common_px**2)
@@ -78,6 +95,6 @@ def _follow(course, known, usual, width_variance):
         profiles = min(profiles + 1.0, _PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)
-        recent[0, block] += weight * (row - recent[0, block])
-        recent[1, block] += weight * (width - recent[1, block])
-        recent[2, block] = profiles
+        recent.row[block] += weight * (row - recent.row[block])
+        recent.width[block] += weight * (width - recent.width[block])
+        recent.profiles[block] = profiles

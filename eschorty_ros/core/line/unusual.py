@@ -8,12 +8,12 @@ crosses changes, that on a dark surface stays.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.course import PER_NARROWER, Course, _follow, empty_course
 from eschorty_ros.core.line.scatter import BLOCK
 
@@ -47,41 +47,41 @@ _BESIDE = BLOCK + BLOCK // 2
 _MARKED = 2.5
 
 
+class UsualWidths(NamedTuple):
+    """Points by width, and medians of the ``width`` and of the ``difference`` of near widths."""
+
+    number: NDArray[np.float64]
+    median: Any
+
+
 class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
-    ``number`` has the points by width and ``below`` their sums; ``state`` the median width and the
-    median difference of widths near each other. ``smoothed`` holds those of a profile,
-    ``at_rest`` less what their way adds, and ``before`` widths and rows of the last one. The
-    ``course`` has what changes.
+    ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
+    ``at_rest`` less what their way adds, ``last`` and ``last_row`` widths and rows of the last one.
+    The ``course`` has what changes.
     """
 
-    number: NDArray[np.float64]
+    usual: UsualWidths
     below: NDArray[np.float64]
-    state: NDArray[np.float64]
-    before: NDArray[np.float64]
     smoothed: NDArray[np.float64]
     at_rest: NDArray[np.float64]
+    last: NDArray[np.float64]
+    last_row: NDArray[np.float64]
     course: Course
 
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, at_rest = np.full((2, returns, columns), np.nan)
-    return Widths(
-        number=np.zeros(_BINS),
-        below=np.zeros(_BINS + 1),
-        state=np.zeros(2),
-        before=np.full((2, returns, columns), np.nan),
-        smoothed=smoothed,
-        at_rest=at_rest,
-        course=empty_course(columns, common_px, windowed),
-    )
+    smoothed, at_rest, last, last_row = np.full((4, returns, columns), np.nan)
+    course = empty_course(columns, common_px, windowed)
+    below = np.zeros(_BINS + 1)
+    return Widths(empty_usual_widths(), below, smoothed, at_rest, last, last_row, course)
 
 
-def empty_known_widths() -> NDArray[np.float64]:
-    """Return room for the ``number`` and ``state`` of widths."""
-    return np.zeros(_BINS + 2)
+def empty_usual_widths() -> UsualWidths:
+    """Return no usual widths."""
+    return UsualWidths(np.zeros(_BINS), record("width", "difference", value=0.0))
 
 
 @kernel
@@ -92,17 +92,18 @@ def _bin(width):
 @kernel
 def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles."""
-    points = _PROFILES_KNOWN * widths.smoothed.shape[1]
-    known[:_BINS] = widths.number * (points / max(widths.number.sum(), 1.0))
-    known[_BINS:] = widths.state
+    points, usual = _PROFILES_KNOWN * widths.smoothed.shape[1], widths.usual
+    known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
+    known.median.difference = usual.median.difference
 
 
 @kernel
 def _restart_widths(widths, known):
     """Forget all widths but the ``known`` ones, zeros where there are none."""
-    widths.number[:], widths.state[:] = known[:_BINS], known[_BINS:]
-    widths.before[:] = np.nan
-    widths.course.recent[:] = 0.0
+    usual, recent = widths.usual, widths.course.recent
+    usual.number[:], usual.median.difference = known.number, known.median.difference
+    widths.last[:], widths.last_row[:] = np.nan, np.nan
+    recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
     _update(widths, widths.smoothed.shape[1])
 
 
@@ -127,7 +128,7 @@ def _unusual_variance(width, usual):
 @kernel
 def _update(widths, columns):
     """Bring the sums and the median up to date, and halve what is remembered when it is much."""
-    number, below = widths.number, widths.below
+    number, below = widths.usual.number, widths.below
     if below[_BINS] > _PROFILES_KEPT * columns:
         number *= 0.5
     total = 0.0
@@ -137,7 +138,7 @@ def _update(widths, columns):
     median = 0
     while median < _BINS - 1 and 2.0 * below[median + 1] < total:
         median += 1
-    widths.state[0] = (median + 0.5) / _PER_ROW
+    widths.usual.median.width = (median + 0.5) / _PER_ROW
 
 
 @kernel
@@ -180,13 +181,13 @@ def _follow_line(rows, smoothing, lit_share):
     Weak points show no width.
     """
     row, widths = smoothing.row, smoothing.widths
-    now, at_rest, last_row = widths.course.now, widths.at_rest, widths.before[1]
+    now, at_rest, median = widths.course.now, widths.at_rest, widths.usual.median
     returns, columns = row.shape
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual = widths.state[0] if known else np.inf
+    usual = median.width if known else np.inf
     for k in range(returns):
-        _take_off_way(widths.smoothed[k], row[k], last_row[k], usual, lit_share, at_rest[k])
-    for block in range(1, now.shape[1] - 1):
+        _take_off_way(widths.smoothed[k], row[k], widths.last_row[k], usual, lit_share, at_rest[k])
+    for block in range(1, now.points.size - 1):
         total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
             weak = rows.truncated[0, c] | (rows.events[0, c] < smoothing.isolation_events)
@@ -195,9 +196,10 @@ def _follow_line(rows, smoothing, lit_share):
                 width += at_rest[0, c]
                 sigma2 += rows.sigma2[0, c]
                 points += 1.0
-        now[0, block], now[1, block], now[2, block], now[3, block] = total, width, sigma2, points
-    sigma = _SIGMA_PER_MEDIAN * widths.state[1]
-    _follow(widths.course, known, widths.state[0], WIDTH_COLUMNS * sigma * sigma)
+        now.row[block], now.width[block] = total, width
+        now.sigma2[block], now.points[block] = sigma2, points
+    sigma = _SIGMA_PER_MEDIAN * median.difference
+    _follow(widths.course, known, median.width, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel(_nrt=False)
@@ -206,15 +208,15 @@ def _mark_unusual(rows, smoothing, lit_share):
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
     _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
-    smoothed, before, state = widths.smoothed, widths.before, widths.state
+    smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual, median, sigma = state[0], state[1], _SIGMA_PER_MEDIAN * state[1]
+    usual, median = widths.usual.median.width, widths.usual.median.difference
+    sigma = _SIGMA_PER_MEDIAN * median
     pairs = widths.below[_BINS] + 1.0
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
-            width, last_width, last_row = widths.at_rest[k, c], before[0, k, c], before[1, k, c]
-            way = row[k, c] - last_row
+            width, way = widths.at_rest[k, c], row[k, c] - last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
             sigma2[k, c] += widths.course.moved2[c // BLOCK + 1]
             rows.mixed[k, c] = False
@@ -233,8 +235,8 @@ def _mark_unusual(rows, smoothing, lit_share):
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, unusual2)
             sigma2[k, c] += more2
-            if not abs(width - last_width) > _STEADY * sigma:
-                widths.number[_bin(width)] += weight
+            if not abs(width - last[k, c]) > _STEADY * sigma:
+                widths.usual.number[_bin(width)] += weight
             if c >= _APART and not np.isnan(smoothed[k, c - _APART]):
                 difference = abs(smoothed[k, c] - smoothed[k, c - _APART])
                 if median == 0.0:
@@ -244,6 +246,6 @@ def _mark_unusual(rows, smoothing, lit_share):
                 median *= 1.0 + (step if difference > median else -step)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            before[0, k, c], before[1, k, c] = widths.at_rest[k, c], row[k, c]
-    state[1] = median
+            last[k, c], last_row[k, c] = widths.at_rest[k, c], row[k, c]
+    widths.usual.median.difference = median
     _update(widths, columns)

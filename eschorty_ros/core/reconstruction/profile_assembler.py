@@ -72,10 +72,11 @@ from eschorty_ros.core.line.smoothing import (
     empty_smoothing,
 )
 from eschorty_ros.core.line.unusual import (
+    UsualWidths,
     _keep_widths,
     _mark_unusual,
     _restart_widths,
-    empty_known_widths,
+    empty_usual_widths,
 )
 from eschorty_ros.core.line.window import FRACTION, ROW_LAST
 from eschorty_ros.core.modulation import Modulation
@@ -173,7 +174,7 @@ class _Memory(NamedTuple):
     blink: Blink
     footprint: Footprint
     known: Footprint
-    known_widths: NDArray[np.float64]
+    known_widths: UsualWidths
     scatter: Scatter
     smoothing: Smoothing
     light: Light
@@ -252,7 +253,8 @@ class ProfileAssembler:
         known["computations"] = known["cut_computations"] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
-        self._memory.known_widths[:] = 0.0
+        self._memory.known_widths.number[:] = 0.0
+        self._memory.known_widths.median["difference"] = 0.0
         _begin_window(self._memory, self._state)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
@@ -420,7 +422,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
-        known_widths=empty_known_widths(),
+        known_widths=empty_usual_widths(),
         scatter=empty_scatter(model.columns, _factor_max(settings)),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
@@ -565,7 +567,7 @@ def _close(memory, state, counters):
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
-            smoothing.widths.number[:] = 0.0
+            smoothing.widths.usual.number[:] = 0.0
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)
