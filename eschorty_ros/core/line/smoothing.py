@@ -26,14 +26,15 @@ class Averages(NamedTuple):
     """Sums over each point and its neighbours by half width, shape (half widths, returns, columns).
 
     They are those of the neighbours' differences from the point's row and of the points ``used``.
-    ``squares`` are a profile's squared errors of prediction, and ``before`` the sums of variances
-    and of spreads over the columns before each.
+    ``squares`` are a profile's squared errors of prediction, ``sigma2_before`` and
+    ``variance_before`` the sums of variances and of spreads over the columns before each.
     """
 
     difference: NDArray[np.float64]
     used: NDArray[np.float64]
     squares: NDArray[np.float64]
-    before: NDArray[np.float64]
+    sigma2_before: NDArray[np.float64]
+    variance_before: NDArray[np.float64]
 
 
 class Smoothing(NamedTuple):
@@ -77,11 +78,12 @@ def empty_smoothing(
     columns, tried = shape[1], half_widths(largest)
     blocks = -(-columns // BLOCK)
     differences, averaged = np.zeros((2, tried.size, *shape))
+    sigma2_before, variance_before = np.zeros((2, columns + 1))
     row, sigma2, used, gates_px = np.zeros((4, *shape))
     return Smoothing(
         half_widths=tried,
         errors=np.zeros((tried.size, blocks + 2 * _NEAR)),
-        averages=Averages(differences, averaged, np.zeros(columns), np.zeros((2, columns + 1))),
+        averages=Averages(differences, averaged, np.zeros(columns), sigma2_before, variance_before),
         gate_px=gate_px,
         isolation_gate_px=isolation_gate_px,
         isolation_events=isolation_events,
@@ -162,18 +164,19 @@ def _add_errors(averages, level, errors):
 
 
 @kernel(_nrt=False)
-def _sum_before(rows, before):
+def _sum_before(rows, averages):
     """Fill the sums of the variances and of the spreads of all columns before each."""
     sigma2, variance = 0.0, 0.0
     for c in range(np.uintp(rows.row.shape[1])):
         found = not np.isnan(rows.row[0, c])
         sigma2 += rows.sigma2[0, c] if found else 0.0
         variance += rows.variance[0, c] if found else 0.0
-        before[0, c + np.uintp(1)], before[1, c + np.uintp(1)] = sigma2, variance
+        averages.sigma2_before[c + np.uintp(1)] = sigma2
+        averages.variance_before[c + np.uintp(1)] = variance
 
 
 @kernel(_nrt=False, forceinline=True)
-def _sums_of(rows, k, c, pairs, before):
+def _sums_of(rows, k, c, pairs, averages):
     """Return the sum of the variances of a point and its pairs of neighbours.
 
     The second value is that of the spreads of the nearest of them.
@@ -181,8 +184,8 @@ def _sums_of(rows, k, c, pairs, before):
     near = min(pairs, np.uintp(WIDTH_PAIRS))
     if rows.row.shape[0] == 1:
         end, near_end = c + pairs + np.uintp(1), c + near + np.uintp(1)
-        sigma2 = before[0, end] - before[0, c - pairs]
-        return sigma2, before[1, near_end] - before[1, c - near]
+        sigma2, variance = averages.sigma2_before, averages.variance_before
+        return sigma2[end] - sigma2[c - pairs], variance[near_end] - variance[c - near]
     sigma2, variance = rows.sigma2[k, c], rows.variance[k, c]
     for j in range(np.uintp(1), pairs + np.uintp(1)):
         for other in (c - j, c + j):
@@ -234,14 +237,14 @@ def _smooth(rows, smoothing):
                     _add_pairs(rows.row, smoothing.gates_px, k, j, level, averages)
         added = half_width
         _add_errors(averages, level, errors)
-    _sum_before(rows, averages.before)
+    _sum_before(rows, averages)
     for block in range(errors.shape[1] - 2 * _NEAR):
         level = _best(errors, block)
         first, end = np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))
         for k in range(np.uintp(returns)):
             for c in range(first, end):
                 n = used[level, k, c]
-                sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages.before)
+                sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages)
                 smoothing.sigma2[k, c], widths.smoothed[k, c] = sums
                 smoothing.row[k, c], smoothing.used[k, c] = difference[level, k, c], n
     return _divide(rows, smoothing)

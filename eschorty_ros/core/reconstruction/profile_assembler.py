@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import Decoder, EventArrays
 from eschorty_ros.core.evt3.decoder import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
@@ -178,7 +178,7 @@ class _Memory(NamedTuple):
     scatter: Scatter
     smoothing: Smoothing
     light: Light
-    delay: NDArray[np.float64]
+    delay: Any
     rows: Rows
     row_counts: NDArray[np.int64]
     output: _Output
@@ -435,7 +435,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         ),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
-        delay=np.zeros(2),
+        delay=record("time_us", "points"),
         rows=empty_rows(*shape),
         row_counts=make_row_counts(),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
@@ -466,7 +466,7 @@ def _begin_window(memory, state):
     memory.columns.rivals[:] = -1
     _forget_scatter(memory.scatter)
     memory.smoothing.errors[:] = 0.0
-    memory.delay[:] = 0.0
+    memory.delay.time_us = memory.delay.points = 0
     _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths, memory.known_widths)
     if memory.footprint.state.near_edge == 0:
