@@ -61,6 +61,13 @@ class Vector(NamedTuple):
     y: np.int64
 
 
+class _LaserTest(NamedTuple):
+    """Whether events follow the laser, and whether chance is all but excluded."""
+
+    follows: bool
+    sure: bool
+
+
 def blink(modulation: Modulation, every: int) -> Blink:
     """Return the test for profiles of ``every`` periods; none where a period is too short."""
     if modulation.period_us < PERIOD_MIN_US:
@@ -124,8 +131,8 @@ def _is_in_phase(sums):
 
 
 @kernel(_nrt=False)
-def _follows(packed, column, first, last, blink):
-    """Return true when events of rows first..last follow the laser, and true when that is sure."""
+def _laser_test(packed, column, first, last, blink):
+    """Test whether the events of rows first..last follow the laser."""
     vector = _vector(packed, column, first, last, blink)
     length2 = float(vector.x * vector.x + vector.y * vector.y)
     n = float(vector.events)
@@ -133,11 +140,11 @@ def _follows(packed, column, first, last, blink):
     rayleigh = n * square
     if square > _STRENGTH_MIN**2:
         follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
-        return follows, rayleigh > _RAYLEIGH_SURE
+        return _LaserTest(follows, rayleigh > _RAYLEIGH_SURE)
     # A line that moves while it is lit has events all the time, and a burst at both edges. What
     # passes within a part of the period has one at most.
     bursts = _has_bursts(packed, column, first, last, blink)
-    return bursts, bursts
+    return _LaserTest(bursts, bursts)
 
 
 @kernel(_nrt=True)
@@ -187,7 +194,7 @@ def _without_hot_pixels(packed, column, first, last, blink, counts):
     hot = max(2.0 * near.sum() / max(np.count_nonzero(near), 1), _HOT_EVENTS_MIN)
     left = column
     for row in range(first, last + 1):
-        if counts[row] >= hot and not _follows(packed, left, row, row, blink)[0]:
+        if counts[row] >= hot and not _laser_test(packed, left, row, row, blink).follows:
             left = _without(packed, left, row, row)
     counts[:] = 0
     return left

@@ -13,8 +13,8 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blinking import (
     Blink,
-    _follows,
     _is_in_phase,
+    _laser_test,
     _without,
     _without_hot_pixels,
 )
@@ -406,12 +406,12 @@ def _modulated(packed, column, found, half, estimator, blink, row_counts):
     events = column.events
     for _ in range(_WINDOWS_MAX):
         window = found.window
-        follows, sure = _follows(packed, column, window.first, window.last, blink)
+        test = _laser_test(packed, column, window.first, window.last, blink)
         left = _without_hot_pixels(packed, column, window.first, window.last, blink, row_counts)
         if left.events == column.events:
             # A second window is a second chance for background.
-            if follows and (sure or column.events == events):
-                return found, column, not sure or column.events < events
+            if test.follows and (test.sure or column.events == events):
+                return found, column, not test.sure or column.events < events
             left = _without(packed, column, window.first, window.last)
         column = left
         found = Returns(TOO_FEW, False, window, window)
@@ -465,7 +465,7 @@ def _stronger(packed, column, c, half, columns, estimator, blink, found):
     alone = not both.second
     if not alone and blink.step > 0:
         # A second window is a second chance for background.
-        alone = not _follows(packed, column, b.first, b.last, blink)[1]
+        alone = not _laser_test(packed, column, b.first, b.last, blink).sure
     if alone:
         columns.rivals[c] = -1
         return Returns(FOUND, False, a, a)
@@ -538,7 +538,7 @@ def _column_returns(packed, column, c, half, columns, estimator, blink, window, 
         found = _all_returns(packed, column, half, estimator, found)
         if testing and found.second:
             other = found.other
-            if not _follows(packed, column, other.first, other.last, blink)[0]:
+            if not _laser_test(packed, column, other.first, other.last, blink).follows:
                 found = Returns(FOUND, False, found.window, found.window)
     elif _is_windowed(estimator.method):
         used = found.window.sums.events
