@@ -6,11 +6,12 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import Any
 
-from eschorty_ros.core.clocks import NS_PER_US, PulseTrain, SensorClock, StageTrack
+from eschorty_ros.core.clocks import PulseTrain, SensorClock, StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_times import (
+    GAP_NS,
     WRAP_US,
     Packet,
     first_time_high_us,
@@ -21,7 +22,6 @@ from eschorty_ros.live.packet_times import (
 from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 
-_GAP_NS = WRAP_US * NS_PER_US // 2
 # A step of the numbers that no loss explains: another stream.
 _LOST_MAX = 1_000_000
 # An announced zero and a packet's stamp agree to this; the host may be late by some of it.
@@ -261,7 +261,7 @@ class PacketStream:
             last, packet = packets[-1], self._held[0]
             if (packet.source, packet.seq) != (last.source, last.seq + 1):
                 break
-            if packet.stamp_ns - last.stamp_ns > _GAP_NS:
+            if packet.stamp_ns - last.stamp_ns > GAP_NS:
                 break
             packets.append(self._held.popleft())
         return packets
@@ -302,7 +302,7 @@ class PacketStream:
         self.packets_lost += missing
         time_us = self._reconstructor.time_us if self._reconstructor is not None else None
         # Without a number left out, the host may have stalled.
-        if packet.stamp_ns - self._last_stamp_ns > _GAP_NS and (
+        if packet.stamp_ns - self._last_stamp_ns > GAP_NS and (
             missing or skips_time(packet.data, time_us)
         ):
             self._retire()

@@ -20,6 +20,7 @@ from eschorty_ros.core.line.blinking import (
 )
 from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import (
+    HALF_MIN,
     HALF_PER_SIGMA,
     HALF_WIDTH_PER_FWHM,
     _mean,
@@ -202,7 +203,7 @@ class PeriodSums(NamedTuple):
 
 def half_width_fixed(fwhm_px: float) -> int:
     """Return the half width of the averaging window for a line of ``fwhm_px``, fixed point."""
-    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), 3 * FRACTION)
+    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), HALF_MIN)
 
 
 def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 
-_APART = 5
+APART = 5
 # Columns of a block; the differences of a block and its two neighbours count for its points. The
 # share of a profile's differences that the next keeps.
 BLOCK = 16
@@ -98,7 +98,7 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
         most = 1.0
         for c in range(np.uintp(begin), np.uintp(end)):
             most = max(most, averaged[c])
-        apart = max(_APART, int(most) // 2 + 1)
+        apart = max(APART, int(most) // 2 + 1)
         largest = max(edge_px / np.sqrt(most), _DEVIATIONS_MAX * usual)
         first, last = max(begin, apart), min(end, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -127,7 +127,7 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
 @kernel
 def _median_difference(row):
     """Return the median size of the second differences of rows, infinite where few are known."""
-    differences = np.abs(row[: -2 * _APART] - 2.0 * row[_APART:-_APART] + row[2 * _APART :])
+    differences = np.abs(row[: -2 * APART] - 2.0 * row[APART:-APART] + row[2 * APART :])
     known = differences[~np.isnan(differences)]
     return np.median(known) if known.size >= _OF_PROFILE_MIN else np.inf
 

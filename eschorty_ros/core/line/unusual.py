@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.course import PER_NARROWER, Course, _follow, empty_course
-from eschorty_ros.core.line.scatter import BLOCK
+from eschorty_ros.core.line.reflectance import ROOT_12
+from eschorty_ros.core.line.scatter import APART, BLOCK
 
 _PER_ROW = 16
 _BINS = 1 << 10
@@ -31,7 +32,6 @@ _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
 _PROFILES_KNOWN = 16
-_APART = 5
 # Neighbours on either side that a width is averaged with, and the columns of such a mean.
 WIDTH_PAIRS = 2
 WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
@@ -39,7 +39,6 @@ WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
 # deviation over that median.
 _STEP = 1.0 / 1024.0
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
-_ROOT_12 = np.sqrt(12.0)
 # Columns to either side that move as a column does.
 _BESIDE = BLOCK + BLOCK // 2
 # A point is marked when the missing or additional rows may move it by more deviations of a row
@@ -148,7 +147,7 @@ def _at_rest(width, usual, way):
     Rows that it leaves or reaches widen it by the way, hence its standard deviation by up to the
     way's over the square root of 12.
     """
-    return min(width, max(usual, width - way / _ROOT_12))
+    return min(width, max(usual, width - way / ROOT_12))
 
 
 @kernel(_nrt=False)
@@ -237,8 +236,8 @@ def _mark_unusual(rows, smoothing, lit_share):
             sigma2[k, c] += more2
             if not abs(width - last[k, c]) > _STEADY * sigma:
                 widths.usual.number[_bin(width)] += weight
-            if c >= _APART and not np.isnan(smoothed[k, c - _APART]):
-                difference = abs(smoothed[k, c] - smoothed[k, c - _APART])
+            if c >= APART and not np.isnan(smoothed[k, c - APART]):
+                difference = abs(smoothed[k, c] - smoothed[k, c - APART])
                 if median == 0.0:
                     median = difference
                 pairs += 1.0

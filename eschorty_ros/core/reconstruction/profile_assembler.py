@@ -38,7 +38,7 @@ from eschorty_ros.core.line.columns import (
     wider_columns,
 )
 from eschorty_ros.core.line.delay import Light, _delay_us, light
-from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
+from eschorty_ros.core.line.estimators import HALF_MIN, HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import (
     MEAN_ROWS,
     UNDECIDED,
@@ -78,7 +78,7 @@ from eschorty_ros.core.line.unusual import (
     _restart_widths,
     empty_usual_widths,
 )
-from eschorty_ros.core.line.window import FRACTION, ROW_LAST
+from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
 from eschorty_ros.core.modulation.phase_gate import _gate_part
@@ -99,7 +99,6 @@ on.
 # Profiles of the first window, as full of points as any, that show the usual widths.
 _KNOWN_PROFILES = 16
 _OUTPUT_PROFILES = 64
-_HALF_MIN = 3 * FRACTION
 _WIDTH_MIN_DOF = 64
 # Times the limit that a line may be wide.
 _WIDER = 4
@@ -483,7 +482,7 @@ def _adapted_half(half, sums, half_max):
         return half
     measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
     limit = half_max * (_WIDER if 3 * sums.freedom > 2 * sums.events else 1)
-    return np.int64(min(max(np.rint(0.5 * (half + measured)), _HALF_MIN), limit))
+    return np.int64(min(max(np.rint(0.5 * (half + measured)), HALF_MIN), limit))
 
 
 @kernel(_nrt=False)

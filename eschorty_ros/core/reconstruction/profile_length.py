@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.held_events import HeldEvents
+from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
@@ -20,7 +20,6 @@ EVENTS_WANTED = 16
 _BLOCK_PERIODS = 2
 _PERIODS_MIN = 4
 _BLOCK_EVENTS = 1 << 16
-_HELD_EVENTS_MAX = 1 << 22
 # Part of the columns that may have few events.
 _FEW_SHARE = 1.0 / 24.0
 # Standard deviation of the events of even profiles over their mean, and their number to know it.
@@ -81,7 +80,7 @@ class ProfileLength:
                 self._seen = end = t.size if window is None else begin + window.size
                 if self._edge_us(held, begin, end) is not None:
                     self._window = begin, end
-                elif window is None or end > _HELD_EVENTS_MAX:
+                elif window is None or end > HELD_EVENTS_MAX:
                     return 1
             first, begin = self._window
             end_us, periods = int(t[begin - 1]), 0
