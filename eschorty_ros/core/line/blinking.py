@@ -20,6 +20,7 @@ from eschorty_ros.core.line.window import (
     ROW_BITS,
     ROW_MASK,
     TIME_SHIFT,
+    _chernoff_exponent,
     _column,
     _pad,
 )
@@ -162,10 +163,8 @@ def _has_bursts(packed, column, first, last, blink):
             events[on] += 1.0
             burst[on] += np.uint32(phase) < _BURST
     expected = events * (_BURST / 2.0**32)
-    if burst[0] <= expected[0] or burst[1] <= expected[1]:
-        return False
-    improbable = burst * np.log(burst / np.maximum(expected, 1e-9)) - (burst - expected)
-    return improbable.min() > _RAYLEIGH_MIN and improbable.sum() > _RAYLEIGH_SURE
+    off, on = _chernoff_exponent(burst[0], expected[0]), _chernoff_exponent(burst[1], expected[1])
+    return min(off, on) > _RAYLEIGH_MIN and off + on > _RAYLEIGH_SURE
 
 
 @kernel(_nrt=False)

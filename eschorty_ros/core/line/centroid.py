@@ -22,7 +22,6 @@ from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import (
     HALF_MIN,
     HALF_PER_SIGMA,
-    HALF_WIDTH_PER_FWHM,
     _mean,
     _median,
     _variance,
@@ -46,6 +45,7 @@ from eschorty_ros.core.line.window import (
     AMBIGUOUS,
     FOUND,
     FRACTION,
+    HALF_WIDTH_PER_FWHM,
     ROW_BITS,
     ROW_LAST,
     TOO_FEW,

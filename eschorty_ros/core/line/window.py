@@ -30,6 +30,7 @@ PAD = np.uint32(0xFFFFFFFF)
 BLOCK = 32
 FRACTION_BITS = 6
 FRACTION = 1 << FRACTION_BITS
+HALF_WIDTH_PER_FWHM = 1.3
 FOUND, TOO_FEW, AMBIGUOUS, UNMODULATED = 0, 1, 2, 3
 
 _ITERATIONS_MAX = 5
@@ -324,6 +325,12 @@ def _exceeds_background(events, others, half, rows):
 
 
 @kernel
+def _chernoff_exponent(events, expected):
+    """Return minus the logarithm of Chernoff's bound on the chance of so many events, or more."""
+    return events * np.log(events / expected) - (events - expected) if events > expected else 0.0
+
+
+@kernel
 def _is_significant(events, others, half, rows):
     """Return true when background has ``events`` in any window of a column with low probability.
 
@@ -333,10 +340,8 @@ def _is_significant(events, others, half, rows):
     """
     width = (2 * half) / FRACTION + 1.0
     expected = (others + 1.0) * width / max(rows - 2.0 * width, width)
-    if events <= expected:
-        return False
-    improbable = events * np.log(events / expected) - (events - expected)
-    return improbable > np.log(_FALSE_SECOND * max(2.0 * rows / width, 1.0))
+    choices = max(2.0 * rows / width, 1.0)
+    return _chernoff_exponent(events, expected) > np.log(_FALSE_SECOND * choices)
 
 
 @kernel(_nrt=False)
@@ -349,12 +354,11 @@ def _box_events(packed, column, centre, half):
 def _second_return(packed, column, half, rows, events_min, a):
     """Search for the return of another surface than that of window ``a``.
 
-    It is 2 full widths at half maximum away or more (the half width of a window is 1.3 of them),
-    the box around it has at least half as many events as that around ``a``, and they are
-    significant against background.
+    It is 2 full widths at half maximum away or more, the box around it has at least half as many
+    events as that around ``a``, and they are significant against background.
     """
     alone = Returns(FOUND, False, a, a)
-    gap = half * 20 // 13
+    gap = np.int64(2.0 * half / HALF_WIDTH_PER_FWHM)
     rest = column.events - a.sums.events
     if rest < events_min or 3 * rest < a.sums.events:
         return alone
