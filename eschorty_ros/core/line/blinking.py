@@ -37,6 +37,9 @@ _SQUARE_ENOUGH = 0.6
 _RAYLEIGH_SURE = 12.0
 # Length of a burst behind an edge, of 2**32 per turn.
 _BURST = 1 << 28
+# Least exponents of Chernoff's bound for the bursts of one polarity, and for those of both.
+_BURST_MIN = 4.0
+_BURSTS_MIN = 12.0
 _HOT_EVENTS_MIN = 6
 # Lengths of the integer unit vectors, and of their sums per event.
 _UNIT = 4096.0
@@ -164,7 +167,7 @@ def _has_bursts(packed, column, first, last, blink):
             burst[on] += np.uint32(phase) < _BURST
     expected = events * (_BURST / 2.0**32)
     off, on = _chernoff_exponent(burst[0], expected[0]), _chernoff_exponent(burst[1], expected[1])
-    return min(off, on) > _RAYLEIGH_MIN and off + on > _RAYLEIGH_SURE
+    return min(off, on) > _BURST_MIN and off + on > _BURSTS_MIN
 
 
 @kernel(_nrt=False)
