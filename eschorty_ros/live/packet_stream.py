@@ -22,6 +22,8 @@ from eschorty_ros.live.packet_times import (
 from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 
+# Packets held while clock or modulation are unknown; further ones count as lost.
+_HELD_MAX = 1000
 # A step of the numbers that no loss explains: another stream.
 _LOST_MAX = 1_000_000
 # An announced zero and a packet's stamp agree to this; the host may be late by some of it.
@@ -47,7 +49,6 @@ class PacketStream:
     packet, or continues after more than half a wrap without packets.
 
     - ``packet_period_s``: Time over which the camera collects events before it sends them.
-    - ``held_max``: Packets held while clock or modulation are unknown; further ones count as lost.
 
     Public attributes:
     - ``packets``, ``packets_lost``, ``restarts``: Packets reconstructed, missing by their ``seq``,
@@ -67,7 +68,6 @@ class PacketStream:
         settings: Settings,
         clock_timeout_s: float,
         packet_period_s: float = 0.0,
-        held_max: int = 1000,
     ) -> None:
         self.calibration = calibration
         self.packets = 0
@@ -81,7 +81,6 @@ class PacketStream:
         self._settings = settings
         self._clock_timeout_s = clock_timeout_s
         self._held: deque[Packet] = deque()
-        self._held_max = held_max
         self._held_since_s: float | None = None
         self._pulses: PulseTrain | None = None
         self._epoch: SensorEpoch | None = None
@@ -225,7 +224,7 @@ class PacketStream:
         """Queue one packet that arrived at ``now_s`` of the steady clock."""
         if self._held_since_s is None:
             self._held_since_s = now_s
-        if len(self._held) < self._held_max:
+        if len(self._held) < _HELD_MAX:
             self._held.append(packet)
 
     def process(self, now_s: float) -> list[TimedProfiles]:

@@ -23,7 +23,7 @@ ROW_BITS = 10
 ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
 ROW_LAST = 1022
 POLARITY = np.uint32(1 << ROW_BITS)
-POLARITY_SHIFT = np.uint32(ROW_BITS)
+_POLARITY_SHIFT = np.uint32(ROW_BITS)
 TIME_SHIFT = np.uint32(ROW_BITS + 1)
 TIME_LIMIT_US = 1 << (31 - ROW_BITS)
 PAD = np.uint32(0xFFFFFFFF)
@@ -142,7 +142,7 @@ def _window_sums(packed, column, first, last):
             ts = np.uint32(ts + (t if inside else none))
             # The sign of the time until the light ends is 1 where it is on.
             lit = np.uint32(t - column.lit_us) >> np.uint32(31)
-            other = np.uint32(((v >> POLARITY_SHIFT) ^ lit) & one)
+            other = np.uint32(((v >> _POLARITY_SHIFT) ^ lit) & one)
             opposite = np.uint32(opposite + (other if inside else none))
         events += np.int64(both >> _ONE_BITS)
         sum_d += np.int64(both & (_ONE - np.uint32(1)))

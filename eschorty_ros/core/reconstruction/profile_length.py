@@ -14,7 +14,7 @@ from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
-PERIODS_MAX = 1000
+_PERIODS_MAX = 1000
 EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
 _BLOCK_PERIODS = 2
@@ -36,7 +36,7 @@ _LINE_CELLS_MAX = 8.0
 
 def periods_max(modulation: Modulation) -> int:
     """Return the most periods of a profile: the time within it is limited."""
-    return min(PERIODS_MAX, math.ceil(TIME_LIMIT_US / modulation.period_us) - 2)
+    return min(_PERIODS_MAX, math.ceil(TIME_LIMIT_US / modulation.period_us) - 2)
 
 
 class ProfileLength:
