@@ -116,6 +116,9 @@ class Pipeline:
       ``PacketStream`` and ``StagePlacer``.
 
     Public attributes:
+    - ``calibration``, ``model``: Those of packets processed from now on.
+    - ``stream``, ``placer``: The packet stream and the stage placement.
+    - ``profiles``, ``points``: Numbers of profiles completed and of points placed.
     - ``capture``: Receives a calibration's events and placed profiles while it is set.
     """
 

@@ -66,7 +66,7 @@ class Vector(NamedTuple):
 
 
 class _LaserTest(NamedTuple):
-    """Whether events follow the laser, and whether chance is all but excluded."""
+    """Result of a test of events: they follow the laser, and more than background ever does."""
 
     follows: bool
     sure: bool

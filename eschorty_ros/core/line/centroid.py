@@ -159,9 +159,10 @@ class Rows(NamedTuple):
     """The returns of each column, shape (returns, columns), NaN where there is none.
 
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
-    neighbours share. An ``uncertain`` one may be background that follows the laser by chance, a
-    ``mixed`` one is on two surfaces.
-    ``ambiguous`` has shape (columns,).
+    neighbours share. ``variance`` is that of the rows of its ``events``, ``mean_dt_us`` their mean
+    time since the period's edge. The sensor's edge cuts the line of a ``truncated`` row, an
+    ``uncertain`` one may be background that follows the laser by chance, a ``mixed`` one is on two
+    surfaces. ``ambiguous`` has shape (columns,).
     """
 
     windows: Windows

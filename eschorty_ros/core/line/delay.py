@@ -23,9 +23,10 @@ _DELAY_MAX_SHARE = 0.25
 
 
 class Light(NamedTuple):
-    """When a profile is lit: its middle, us after its edge, and the part of its time.
+    """When a profile is lit, and the largest delay of its events that is applied.
 
-    A larger delay than ``delay_max_us`` is none.
+    ``middle_us`` is from the first edge to the middle of the light, ``lit_share`` the share of the
+    profile's time with light. Delays larger than ``delay_max_us`` are not applied; -1 applies none.
     """
 
     middle_us: float = 0.0

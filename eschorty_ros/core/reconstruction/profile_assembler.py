@@ -443,7 +443,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
 
 
 def _first_choice(settings: Settings) -> int:
-    """Return whether a stream learns whether to take learned rows, or is of means."""
+    """Return `MEAN_ROWS` where settings fix the means, else `UNDECIDED`."""
     means = settings.centroid == "mode_mean" and settings.detail == "off"
     return MEAN_ROWS if means or settings.centroid in FULL_COLUMN_METHODS else UNDECIDED
 
