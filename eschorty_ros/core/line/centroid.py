@@ -73,8 +73,8 @@ _MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = range(4)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 # Windows of a column that are tested for the laser's modulation.
 _WINDOWS_MAX = 4
-# Share of the evidence of the last period and of the column before that counts in a column: at most
-# ten times its own is remembered.
+# Weight of each of two neighbours' evidence; 2 x 0.45 < 1, so that it sums to at most 10 times a
+# column's own.
 _VOTE = 0.45
 # A full column wider than this many times the line's variance holds background.
 _BACKGROUND_FREE = 1.5
@@ -726,7 +726,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         column = _column(columns.starts[c], n, blink.lit_us)
         known = columns.seeds[c] >= 0
         if not known:
-            # A choice of two values would make each column wait for the one before.
+            # Stored rather than selected: a select would chain each column to the one before.
             columns.seeds[c] = neighbour
         window = _NO_WINDOW
         if windowed and estimator.seeded and columns.seeds[c] >= 0:

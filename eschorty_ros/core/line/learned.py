@@ -166,7 +166,7 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
         footprint.none,
         footprint.reach,
     )
-    # A number that the compiler does not know: it adds in vectors, in place of one after the other.
+    # Read from the array, so that it is no compile-time constant: LLVM then vectorises the loops.
     middle, candidates = log.shape[1] // 2, np.uintp(likelihood.size)
     if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (rows - 1 - reach):
         begin = np.uintp((place - _SIDE) % _PLACES)

@@ -162,8 +162,8 @@ def _way(row, last_row, column):
 def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
     """Set widths less what the way of their lines since the last profile adds.
 
-    A line is lit for ``lit_share`` of the time between two profiles. A leap of few columns, to a
-    glint, is no way: it is as long as that of columns beside them at most.
+    A line is lit for ``lit_share`` of the time between two profiles. A jump confined to a few
+    columns (a glint) is not motion: the displacement is limited to that of the columns beside.
     """
     beside, last = np.intp(_BESIDE), np.intp(row.size - 1)
     for c in range(np.intp(row.size)):

@@ -187,7 +187,8 @@ class _Memory(NamedTuple):
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    With ``one_window`` the pass ends with the window of the estimate, or when enough is known.
+    With ``one_window`` the pass ends with the window of the estimate, or when the usual widths are
+    known.
     """
 
     floor_us: int
@@ -283,7 +284,7 @@ class ProfileAssembler:
 
     @property
     def window_is_over(self) -> bool:
-        """Return whether the last pass over words ended with the window, or knows enough."""
+        """Return whether the last pass ended with the window, or as the usual widths were known."""
         return bool(self._state["over"])
 
     @property
