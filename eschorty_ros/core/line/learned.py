@@ -20,26 +20,34 @@ from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
-# Places per row, counts that are told apart, candidates to either side of the first row.
+# Places per row.
 _PLACES = 8
+# Counts that are told apart; the last is that number or more.
 _COUNTS = 12
+# Candidates to either side of the first row.
 _SIDE = 2 * _PLACES
 _ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_PLACES) * np.arange(1, 4, dtype=np.uintp)
-# Steps of a log-likelihood of one, and the least in steps, so that sums fit 16 bits.
+# Steps of a log-likelihood of one.
 _LOG_ONE = 64
+# The least log-likelihood in steps, so that sums fit 16 bits.
 _LOG_MIN = -512
 # Of every so many columns one is learned from in a profile.
 _STRIDE = 4
-# Columns after which the footprint is computed again, doubled from the fourth time on. Rows found
-# with an earlier footprint are less exact, so its counts are forgotten.
+# Columns after which the footprint is computed again. Rows found with an earlier footprint are less
+# exact, so its counts are forgotten.
 _COLUMNS_MIN = 512
+# Computations after which that number doubles with each.
 _ROUNDS = 3
 _DOUBLINGS = 5
+# Each averages a place with its neighbours, which all smooth over a quarter of a row.
 _SMOOTHING_PASSES = 4
-# A prior of so many pixels at each distance, and of so many with each count.
+# A prior of so many pixels at each distance.
 _PRIOR_PIXELS = 2.0
+# A prior of so many pixels with each count.
 _PRIOR_COUNT = 0.02
+# Most moves of the candidates towards the greatest likelihood.
 _MOVES_MAX = 24
+# A row further from the smoothed one is no place to learn from.
 _OFF_LINE_PX = 1.0
 # Learned rows take twice the time of means. They pay where they scatter less than means of twice
 # the events would.

@@ -22,21 +22,25 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 
+# Columns from one to the next of those whose rows, or widths, are compared.
 APART = 5
-# Columns of a block; the differences of a block and its two neighbours count for its points. The
-# share of a profile's differences that the next keeps.
+# Columns of a block; the differences of a block and its two neighbours count for its points.
 BLOCK = 16
+# Share of a profile's differences that the next keeps.
 _KEPT = 0.5
+# Differences without which the scatter near a block is not known.
 _DIFFERENCES_MIN = 8.0
 # Differences without which the scatter of a profile is not known.
 _OF_PROFILE_MIN = 64
 # A larger second difference is an edge of the surface, but where most are as large.
 _EDGE_PX = 4.0
+# Standard deviations beyond which a difference is an edge, or a neighbour is not averaged.
 _DEVIATIONS_MAX = 3.0
+# Largest factor of a variance, and one over the least.
 FACTOR_MAX = 64.0
-# Variance of a whole pixel. Of lengths that are one of two numbers of them, the largest second
-# difference, squared.
+# Variance of a whole pixel.
 _WHOLE = 1.0 / 12.0
+# Largest square of a second difference of lengths that are one of two numbers of pixels.
 _LENGTH2_MAX = 4.0
 # Mean square of a normal distribution over that of its mean size.
 _SQUARE_PER_SIZE2 = 0.5 * np.pi

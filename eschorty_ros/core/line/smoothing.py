@@ -16,9 +16,9 @@ from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths, e
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
-# Blocks of columns on either side that choose the half width of a block together. The share of a
-# profile's errors that the next keeps.
+# Blocks of columns on either side that choose the half width of a block together.
 _NEAR = 2
+# Share of a profile's errors that the next keeps.
 _KEPT = 0.5
 
 

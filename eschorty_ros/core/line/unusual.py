@@ -18,26 +18,31 @@ from eschorty_ros.core.line.course import PER_NARROWER, Course, _follow, empty_c
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART, BLOCK
 
+# Widths that are told apart, per row and in all.
 _PER_ROW = 16
 _BINS = 1 << 10
 # A width is usual when this share of the stream's points is within one standard deviation of it: a
 # normal distribution alone leaves out 3 in 1000.
 _USUAL_SHARE = 0.02
-# Mixed ones count less, even less where the row moves. A width or row is steady when it changes by
-# so many deviations at most.
+# Weight of a point with an unusual width.
 _MIXED_WEIGHT = 0.25
+# The same where the row moves.
 _MOVING_WEIGHT = 0.05
+# A width or row is steady when it changes by so many deviations at most.
 _STEADY = 2.0 * np.sqrt(2.0)
+# Points without which no width is usual.
 _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
+# The widths that a window begins with count as so many profiles.
 _PROFILES_KNOWN = 16
-# Neighbours on either side that a width is averaged with, and the columns of such a mean.
+# Neighbours on either side that a width is averaged with.
 WIDTH_PAIRS = 2
+# Columns of such a mean.
 WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
-# Steps of the running median of differences are this share of it, larger ones at first; standard
-# deviation over that median.
+# Steps of the running median of differences are this share of it, larger ones at first.
 _STEP = 1.0 / 1024.0
+# Standard deviation over the median size of differences.
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
 # Columns to either side that move as a column does.
 _BESIDE = BLOCK + BLOCK // 2
