@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.scatter import BLOCK
-from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths, empty_widths
+from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
@@ -70,12 +70,11 @@ def empty_smoothing(
     gate_px: float,
     isolation_gate_px: float,
     isolation_events: int,
-    common_px: float,
-    windowed: bool,
-    shape: tuple[int, int],
+    widths: Widths,
 ) -> Smoothing:
-    """Return the smoothing of profiles of a ``shape``, with half widths up to the ``largest``."""
-    columns, tried = shape[1], half_widths(largest)
+    """Return the smoothing of profiles with ``widths``, by half widths up to the ``largest``."""
+    shape, tried = widths.smoothed.shape, half_widths(largest)
+    columns = shape[1]
     blocks = -(-columns // BLOCK)
     differences, averaged = np.zeros((2, tried.size, *shape))
     sigma2_before, variance_before = np.zeros((2, columns + 1))
@@ -92,7 +91,7 @@ def empty_smoothing(
         sigma2=sigma2,
         used=used,
         gates_px=gates_px,
-        widths=empty_widths(*shape, common_px, windowed),
+        widths=widths,
     )
 
 

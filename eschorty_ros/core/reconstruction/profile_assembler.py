@@ -77,6 +77,7 @@ from eschorty_ros.core.line.unusual import (
     _mark_unusual,
     _restart_widths,
     empty_usual_widths,
+    empty_widths,
 )
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
@@ -415,6 +416,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     )
     returns = 2 if settings.returns == "all" else 1
     shape = returns, model.columns
+    windowed = settings.centroid not in FULL_COLUMN_METHODS
     size, none = _OUTPUT_PROFILES * returns * model.columns, LineRows.empty()
     return _Memory(
         columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
@@ -429,9 +431,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
             float(settings.smoothing_gate_px),
             float(settings.isolation_gate_px),
             settings.isolation_events,
-            settings.sigma_common_px,
-            settings.centroid not in FULL_COLUMN_METHODS,
-            shape,
+            empty_widths(*shape, settings.sigma_common_px, windowed),
         ),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
