@@ -62,14 +62,15 @@ class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
-    ``at_rest`` less what their way adds, ``last`` and ``last_row`` widths and rows of the last one.
-    The ``course`` has what changes.
+    ``at_rest`` less what their way adds, and ``weight`` is by how much they count. ``last`` and
+    ``last_row`` are widths and rows of the last profile. The ``course`` has what changes.
     """
 
     usual: UsualWidths
     below: NDArray[np.float64]
     smoothed: NDArray[np.float64]
     at_rest: NDArray[np.float64]
+    weight: NDArray[np.float64]
     last: NDArray[np.float64]
     last_row: NDArray[np.float64]
     course: Course
@@ -77,10 +78,10 @@ class Widths(NamedTuple):
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, at_rest, last, last_row = np.full((4, returns, columns), np.nan)
+    smoothed, at_rest, weight, last, last_row = np.full((5, returns, columns), np.nan)
     course = empty_course(columns, common_px, windowed)
     below = np.zeros(_BINS + 1)
-    return Widths(empty_usual_widths(), below, smoothed, at_rest, last, last_row, course)
+    return Widths(empty_usual_widths(), below, smoothed, at_rest, weight, last, last_row, course)
 
 
 def empty_usual_widths() -> UsualWidths:
@@ -207,23 +208,20 @@ def _follow_line(rows, smoothing, lit_share):
 
 
 @kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, lit_share):
-    """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
+def _widen(rows, smoothing):
+    """Widen the variance of points that move or pass an edge, mark the mixed and weigh them all."""
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
-    _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
-    smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual, median = widths.usual.median.width, widths.usual.median.difference
-    sigma = _SIGMA_PER_MEDIAN * median
-    pairs = widths.below[_BINS] + 1.0
+    usual, sigma = widths.usual.median.width, _SIGMA_PER_MEDIAN * widths.usual.median.difference
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
-            width, way = widths.at_rest[k, c], row[k, c] - last_row[k, c]
+            width, way = widths.at_rest[k, c], row[k, c] - widths.last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
             sigma2[k, c] += widths.course.moved2[c // BLOCK + 1]
             rows.mixed[k, c] = False
+            widths.weight[k, c] = 0.0
             weak = rows.events[k, c] < smoothing.isolation_events
             if np.isnan(width) or rows.truncated[k, c] or weak:
                 continue
@@ -238,9 +236,23 @@ def _mark_unusual(rows, smoothing, lit_share):
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, unusual2)
+            widths.weight[k, c] = weight
             sigma2[k, c] += more2
-            if not abs(width - last[k, c]) > _STEADY * sigma:
-                widths.usual.number[_bin(width)] += weight
+
+
+@kernel(_nrt=False)
+def _add_widths(row, widths):
+    """Add the widths of a profile to those of the stream, and keep them with the ``row``."""
+    returns, columns = row.shape
+    smoothed, at_rest, last = widths.smoothed, widths.at_rest, widths.last
+    median, pairs = widths.usual.median.difference, widths.below[_BINS] + 1.0
+    sigma = _SIGMA_PER_MEDIAN * median
+    for k in range(returns):
+        for c in range(columns):
+            if widths.weight[k, c] == 0.0:
+                continue
+            if not abs(at_rest[k, c] - last[k, c]) > _STEADY * sigma:
+                widths.usual.number[_bin(at_rest[k, c])] += widths.weight[k, c]
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 difference = abs(smoothed[k, c] - smoothed[k, c - APART])
                 if median == 0.0:
@@ -250,6 +262,14 @@ def _mark_unusual(rows, smoothing, lit_share):
                 median *= 1.0 + (step if difference > median else -step)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            last[k, c], last_row[k, c] = widths.at_rest[k, c], row[k, c]
+            last[k, c], widths.last_row[k, c] = at_rest[k, c], row[k, c]
     widths.usual.median.difference = median
     _update(widths, columns)
+
+
+@kernel(_nrt=False)
+def _mark_unusual(rows, smoothing, lit_share):
+    """Widen and mark the points of a profile by unusual widths, and update what is usual."""
+    _follow_line(rows, smoothing, lit_share)
+    _widen(rows, smoothing)
+    _add_widths(smoothing.row, smoothing.widths)
