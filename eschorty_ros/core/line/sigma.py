@@ -8,7 +8,7 @@ with s the standard deviation of the N rows used and s0 that of the line itself.
 small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
 from the mismatch of the pixels' thresholds, which more events of the same pixels do not reduce. The
 last term is for events that are not the line's, which scatter independently. The other part is
-what neighbouring columns share (`course`).
+what neighbouring columns share (`line_history`).
 
 The constants are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
 1000 Hz. In a stream the columns' own part is scaled by the scatter of near columns (`scatter`), so

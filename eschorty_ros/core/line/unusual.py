@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.course import PER_NARROWER, Course, _follow, empty_course
+from eschorty_ros.core.line.line_history import PER_NARROWER, Course, _follow, empty_course
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART, BLOCK
 
