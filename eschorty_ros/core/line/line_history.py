@@ -43,7 +43,7 @@ class BlockMeans(NamedTuple):
     profiles: NDArray[np.float64]
 
 
-class Course(NamedTuple):
+class LineHistory(NamedTuple):
     """Sums of a profile and means of the recent ones, and the variances that follow from them.
 
     The first and the last block are outside the sensor. A line that moves is off by the standard
@@ -59,29 +59,29 @@ class Course(NamedTuple):
     windowed: bool
 
 
-def empty_course(columns: int, common_px: float, windowed: bool) -> Course:
-    """Return the course of a line before its first profile.
+def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory:
+    """Return the history of a line before its first profile.
 
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
     moved2, passing2 = np.zeros((2, blocks))
-    return Course(now, recent, moved2, passing2, common_px, windowed)
+    return LineHistory(now, recent, moved2, passing2, common_px, windowed)
 
 
 @kernel(_nrt=False)
-def _follow(course, known, usual, width_variance):
+def _compare_with_recent(history, known, usual, width_variance):
     """Compare the sums of a profile with recent profiles, and add them.
 
     A line that has its ``usual`` width again, where it is ``known``, has passed the edge.
     """
-    now, recent = course.now, course.recent
+    now, recent = history.now, history.recent
     for block in range(1, now.points.size - 1):
         near = slice(block - 1, block + 2)
         points, profiles = now.points[near].sum(), recent.profiles[block]
-        course.moved2[block], course.passing2[block] = course.common_px**2, 0.0
-        if points == 0.0 or not course.windowed:
+        history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
+        if points == 0.0 or not history.windowed:
             continue
         row, width = now.row[near].sum() / points, now.width[near].sum() / points
         moved = row - recent.row[block] if profiles > 0.0 else np.inf
@@ -90,8 +90,8 @@ def _follow(course, known, usual, width_variance):
         wider = width - max(recent.width[block], usual)
         shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
         passing2 = shift * shift - PER_NARROWER**2 * width_variance / points
-        course.moved2[block] = min(max(moved2, 0.0), course.common_px**2)
-        course.passing2[block] = max(passing2, 0.0)
+        history.moved2[block] = min(max(moved2, 0.0), history.common_px**2)
+        history.passing2[block] = max(passing2, 0.0)
         profiles = min(profiles + 1.0, _PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)

@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.line_history import PER_NARROWER, Course, _follow, empty_course
+from eschorty_ros.core.line.line_history import (
+    PER_NARROWER,
+    LineHistory,
+    _compare_with_recent,
+    empty_history,
+)
 from eschorty_ros.core.line.reflectance import ROOT_12
 from eschorty_ros.core.line.scatter import APART, BLOCK
 
@@ -63,7 +68,7 @@ class Widths(NamedTuple):
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
     ``at_rest`` less what their way adds, and ``weight`` is by how much they count. ``last`` and
-    ``last_row`` are widths and rows of the last profile. The ``course`` has what changes.
+    ``last_row`` are widths and rows of the last profile. The ``history`` has what changes.
     """
 
     usual: UsualWidths
@@ -73,15 +78,15 @@ class Widths(NamedTuple):
     weight: NDArray[np.float64]
     last: NDArray[np.float64]
     last_row: NDArray[np.float64]
-    course: Course
+    history: LineHistory
 
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
     smoothed, at_rest, weight, last, last_row = np.full((5, returns, columns), np.nan)
-    course = empty_course(columns, common_px, windowed)
+    history = empty_history(columns, common_px, windowed)
     below = np.zeros(_BINS + 1)
-    return Widths(empty_usual_widths(), below, smoothed, at_rest, weight, last, last_row, course)
+    return Widths(empty_usual_widths(), below, smoothed, at_rest, weight, last, last_row, history)
 
 
 def empty_usual_widths() -> UsualWidths:
@@ -105,7 +110,7 @@ def _keep_widths(widths, known):
 @kernel
 def _restart_widths(widths, known):
     """Forget all widths but the ``known`` ones, zeros where there are none."""
-    usual, recent = widths.usual, widths.course.recent
+    usual, recent = widths.usual, widths.history.recent
     usual.number[:], usual.median.difference = known.number, known.median.difference
     widths.last[:], widths.last_row[:] = np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
@@ -181,12 +186,12 @@ def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
 
 @kernel(_nrt=False)
 def _follow_line(rows, smoothing, lit_share):
-    """Take what their way adds off the widths of a profile's points, and follow the line's course.
+    """Take motion off the widths of a profile's points, and compare it with recent profiles.
 
     Weak points show no width.
     """
     row, widths = smoothing.row, smoothing.widths
-    now, at_rest, median = widths.course.now, widths.at_rest, widths.usual.median
+    now, at_rest, median = widths.history.now, widths.at_rest, widths.usual.median
     returns, columns = row.shape
     known = widths.below[_BINS] >= _POINTS_MIN
     usual = median.width if known else np.inf
@@ -204,7 +209,7 @@ def _follow_line(rows, smoothing, lit_share):
         now.row[block], now.width[block] = total, width
         now.sigma2[block], now.points[block] = sigma2, points
     sigma = _SIGMA_PER_MEDIAN * median.difference
-    _follow(widths.course, known, median.width, WIDTH_COLUMNS * sigma * sigma)
+    _compare_with_recent(widths.history, known, median.width, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel(_nrt=False)
@@ -219,13 +224,13 @@ def _widen(rows, smoothing):
         for c in range(columns):
             width, way = widths.at_rest[k, c], row[k, c] - widths.last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
-            sigma2[k, c] += widths.course.moved2[c // BLOCK + 1]
+            sigma2[k, c] += widths.history.moved2[c // BLOCK + 1]
             rows.mixed[k, c] = False
             widths.weight[k, c] = 0.0
             weak = rows.events[k, c] < smoothing.isolation_events
             if np.isnan(width) or rows.truncated[k, c] or weak:
                 continue
-            weight, more2 = 1.0, widths.course.passing2[c // BLOCK + 1]
+            weight, more2 = 1.0, widths.history.passing2[c // BLOCK + 1]
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
