@@ -67,14 +67,14 @@ class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
-    ``at_rest`` less what their way adds, and ``weight`` is by how much they count. ``last`` and
+    ``static_width`` less what motion adds, and ``weight`` is by how much they count. ``last`` and
     ``last_row`` are widths and rows of the last profile. The ``history`` has what changes.
     """
 
     usual: UsualWidths
     below: NDArray[np.float64]
     smoothed: NDArray[np.float64]
-    at_rest: NDArray[np.float64]
+    static_width: NDArray[np.float64]
     weight: NDArray[np.float64]
     last: NDArray[np.float64]
     last_row: NDArray[np.float64]
@@ -83,10 +83,12 @@ class Widths(NamedTuple):
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, at_rest, weight, last, last_row = np.full((5, returns, columns), np.nan)
+    smoothed, static_width, weight, last, last_row = np.full((5, returns, columns), np.nan)
     history = empty_history(columns, common_px, windowed)
     below = np.zeros(_BINS + 1)
-    return Widths(empty_usual_widths(), below, smoothed, at_rest, weight, last, last_row, history)
+    return Widths(
+        empty_usual_widths(), below, smoothed, static_width, weight, last, last_row, history
+    )
 
 
 def empty_usual_widths() -> UsualWidths:
@@ -152,26 +154,26 @@ def _update(widths, columns):
 
 
 @kernel
-def _at_rest(width, usual, way):
-    """Return the width of a line less what its ``way`` while it is lit may add.
+def _static_width(width, usual, displacement):
+    """Return the width of a line less what its ``displacement`` while it is lit may add.
 
-    Rows that it leaves or reaches widen it by the way, hence its standard deviation by up to the
-    way's over the square root of 12.
+    Rows that it leaves or reaches widen it by the displacement, hence its standard deviation by up
+    to that over the square root of 12.
     """
-    return min(width, max(usual, width - way / ROOT_12))
+    return min(width, max(usual, width - displacement / ROOT_12))
 
 
 @kernel(_nrt=False)
-def _way(row, last_row, column):
+def _displacement(row, last_row, column):
     """Return how far the line has moved in a column since the last profile; 0 if not known."""
     c = np.uintp(column)
-    way = abs(row[c] - last_row[c])
-    return 0.0 if np.isnan(way) else way
+    displacement = abs(row[c] - last_row[c])
+    return 0.0 if np.isnan(displacement) else displacement
 
 
 @kernel(_nrt=False)
-def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
-    """Set widths less what the way of their lines since the last profile adds.
+def _without_motion(smoothed, row, last_row, usual, lit_share, static_width):
+    """Set widths less what the displacement of their lines since the last profile adds.
 
     A line is lit for ``lit_share`` of the time between two profiles. A jump confined to a few
     columns (a glint) is not motion: the displacement is limited to that of the columns beside.
@@ -179,9 +181,9 @@ def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
     beside, last = np.intp(_BESIDE), np.intp(row.size - 1)
     for c in range(np.intp(row.size)):
         before, after = max(c - beside, np.intp(0)), min(c + beside, last)
-        near = max(_way(row, last_row, before), _way(row, last_row, after))
-        way = min(_way(row, last_row, c), near)
-        at_rest[c] = _at_rest(smoothed[c], usual, lit_share * way)
+        near = max(_displacement(row, last_row, before), _displacement(row, last_row, after))
+        displacement = min(_displacement(row, last_row, c), near)
+        static_width[c] = _static_width(smoothed[c], usual, lit_share * displacement)
 
 
 @kernel(_nrt=False)
@@ -191,19 +193,21 @@ def _follow_line(rows, smoothing, lit_share):
     Weak points show no width.
     """
     row, widths = smoothing.row, smoothing.widths
-    now, at_rest, median = widths.history.now, widths.at_rest, widths.usual.median
+    now, static_width, median = widths.history.now, widths.static_width, widths.usual.median
     returns, columns = row.shape
     known = widths.below[_BINS] >= _POINTS_MIN
     usual = median.width if known else np.inf
     for k in range(returns):
-        _take_off_way(widths.smoothed[k], row[k], widths.last_row[k], usual, lit_share, at_rest[k])
+        _without_motion(
+            widths.smoothed[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
+        )
     for block in range(1, now.points.size - 1):
         total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
         for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
             weak = rows.truncated[0, c] | (rows.events[0, c] < smoothing.isolation_events)
             if not (weak | np.isnan(row[0, c])):
                 total += row[0, c]
-                width += at_rest[0, c]
+                width += static_width[0, c]
                 sigma2 += rows.sigma2[0, c]
                 points += 1.0
         now.row[block], now.width[block] = total, width
@@ -222,7 +226,7 @@ def _widen(rows, smoothing):
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
-            width, way = widths.at_rest[k, c], row[k, c] - widths.last_row[k, c]
+            width, displacement = widths.static_width[k, c], row[k, c] - widths.last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
             sigma2[k, c] += widths.history.moved2[c // BLOCK + 1]
             rows.mixed[k, c] = False
@@ -236,7 +240,7 @@ def _widen(rows, smoothing):
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths, width, reach):
-                steady = not way * way > _STEADY**2 * own2
+                steady = not displacement * displacement > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
@@ -249,15 +253,15 @@ def _widen(rows, smoothing):
 def _add_widths(row, widths):
     """Add the widths of a profile to those of the stream, and keep them with the ``row``."""
     returns, columns = row.shape
-    smoothed, at_rest, last = widths.smoothed, widths.at_rest, widths.last
+    smoothed, static_width, last = widths.smoothed, widths.static_width, widths.last
     median, pairs = widths.usual.median.difference, widths.below[_BINS] + 1.0
     sigma = _SIGMA_PER_MEDIAN * median
     for k in range(returns):
         for c in range(columns):
             if widths.weight[k, c] == 0.0:
                 continue
-            if not abs(at_rest[k, c] - last[k, c]) > _STEADY * sigma:
-                widths.usual.number[_bin(at_rest[k, c])] += widths.weight[k, c]
+            if not abs(static_width[k, c] - last[k, c]) > _STEADY * sigma:
+                widths.usual.number[_bin(static_width[k, c])] += widths.weight[k, c]
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 difference = abs(smoothed[k, c] - smoothed[k, c - APART])
                 if median == 0.0:
@@ -267,7 +271,7 @@ def _add_widths(row, widths):
                 median *= 1.0 + (step if difference > median else -step)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            last[k, c], widths.last_row[k, c] = at_rest[k, c], row[k, c]
+            last[k, c], widths.last_row[k, c] = static_width[k, c], row[k, c]
     widths.usual.median.difference = median
     _update(widths, columns)
 
