@@ -164,7 +164,7 @@ def _levels(rows, begin, end, laser_edges):
 
 
 @kernel(_nrt=False)
-def _locking2(sums, block, levels):
+def _pixel_locking_variance(sums, block, levels):
     """Return the variance that rows near a block share as the line's ends are whole pixels.
 
     A row is the mean of two ends for each of the levels, so that an end scatters by two of its
@@ -193,7 +193,7 @@ def _scale(rows, scatter, smoothing):
         measured = ratio >= 0.0
         begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
-        locking2 = _locking2(sums, block, levels) if measured else 0.0
+        locking2 = _pixel_locking_variance(sums, block, levels) if measured else 0.0
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         for k in range(returns):
