@@ -140,16 +140,16 @@ class Estimator(NamedTuple):
 class Windows(NamedTuple):
     """Sums over the window of each return, shape (returns, columns), and what replaces its mean.
 
-    Rows are relative to the ``first`` one of the window. ``held`` are the events of the column, in
-    the window or not. ``row`` replaces the mean, and ``sigma2`` and ``common2`` the variances where
-    they are known; NaN where nothing does.
+    Rows are relative to the ``first`` one of the window. ``column_events`` are in the window or
+    not. ``row`` replaces the mean, and ``sigma2`` and ``common2`` the variances where they are
+    known; NaN where nothing does.
     """
 
     first: NDArray[np.int64]
     d: NDArray[np.int64]
     d2: NDArray[np.int64]
     time_us: NDArray[np.int64]
-    held: NDArray[np.int64]
+    column_events: NDArray[np.int64]
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
     common2: NDArray[np.float64]
@@ -593,7 +593,7 @@ def _refine(packed, column, at, window, line_variance, estimator, footprint, row
 
 
 @kernel(_nrt=False, forceinline=True)
-def _put(at, window, held, uncertain, out):
+def _put(at, window, column_events, uncertain, out):
     """Write the sums of a return of a column."""
     windows, sums = out.windows, window.sums
     out.events[at] = sums.events
@@ -602,7 +602,7 @@ def _put(at, window, held, uncertain, out):
     windows.d[at] = sums.d
     windows.d2[at] = sums.d2
     windows.time_us[at] = sums.time_us
-    windows.held[at] = held
+    windows.column_events[at] = column_events
 
 
 @kernel(_nrt=False)
@@ -679,11 +679,11 @@ def _rows_of_windows(out, line_variance, estimator, refined):
 
 @kernel(_nrt=False)
 def _pooled(out, estimator):
-    """Return the pooled squares of the rows used, their degrees of freedom and events held.
+    """Return the pooled squares of the rows used, their degrees of freedom and the events.
 
     Lines that are cut, and full columns with background, do not have the width of a line.
     """
-    squares, freedom, held = 0.0, np.int64(0), np.int64(0)
+    squares, freedom, events = 0.0, np.int64(0), np.int64(0)
     most = _BACKGROUND_FREE * estimator.line_variance
     windowed = _is_windowed(estimator.method)
     for k in range(out.row.shape[0]):
@@ -693,8 +693,8 @@ def _pooled(out, estimator):
                 used = out.events[k, c] - 1
                 squares += out.variance[k, c] * used
                 freedom += used
-                held += out.windows.held[k, c] if k == 0 else 0
-    return squares, freedom, held
+                events += out.windows.column_events[k, c] if k == 0 else 0
+    return squares, freedom, events
 
 
 @kernel(_nrt=False)
