@@ -131,7 +131,7 @@ class Estimator(NamedTuple):
     returns: int
     seeded: bool
     events_min: int
-    rows: int
+    sensor_rows: int
     half_max: int
     line_variance: float
     error_model: ErrorModel
@@ -323,7 +323,7 @@ def estimate(
         returns=returns_code,
         seeded=False,
         events_min=events_min,
-        rows=height,
+        sensor_rows=height,
         half_max=half_width_fixed(line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * float(line_width_px) ** 2,
         error_model=error_model(method, sigma_factor, sigma_floor_px),
@@ -393,7 +393,9 @@ def _search(packed, column, half, estimator):
     if found.status == AMBIGUOUS:
         line += found.other.sums.events
     others = column.events - line
-    if events < estimator.events_min or not _exceeds_background(line, others, half, estimator.rows):
+    if events < estimator.events_min or not _exceeds_background(
+        line, others, half, estimator.sensor_rows
+    ):
         return Returns(TOO_FEW, False, found.window, found.other)
     return found
 
@@ -434,7 +436,9 @@ def _all_returns(packed, column, half, estimator, found):
         return found
     if found.status == AMBIGUOUS:
         return Returns(FOUND, True, found.window, found.other)
-    return _second_return(packed, column, half, estimator.rows, estimator.events_min, found.window)
+    return _second_return(
+        packed, column, half, estimator.sensor_rows, estimator.events_min, found.window
+    )
 
 
 @kernel(_nrt=False)
@@ -496,9 +500,9 @@ def _reported(returns, found):
 
 
 @kernel
-def _is_cut(window, rows):
+def _is_cut(window, sensor_rows):
     """Return true when a window reaches the first or last row of the sensor."""
-    return window.first == 0 or window.last >= rows - 1.0
+    return window.first == 0 or window.last >= sensor_rows - 1.0
 
 
 @kernel
@@ -514,7 +518,7 @@ def _is_clear(window, column, estimator, blink):
     return (
         events >= estimator.events_min
         and _is_alone(events, column.events)
-        and not _is_cut(window, estimator.rows)
+        and not _is_cut(window, estimator.sensor_rows)
         and estimator.returns == _STRONGEST
         and (blink.step == 0 or _is_in_phase(window.sums))
     )
@@ -566,23 +570,23 @@ def _refine(packed, column, at, window, line_variance, estimator, footprint, row
     ``at`` is the place of the return: its number and its column.
     """
     c = at[1]
-    rows, method = estimator.rows, estimator.method
+    sensor_rows, method = estimator.sensor_rows, estimator.method
     events, d = window.sums.events, window.sums.d
     row, variance = _mean(events, window.first, d), _variance(events, d, window.sums.d2)
-    cut = _is_windowed(method) and _is_cut(window, rows)
+    cut = _is_windowed(method) and _is_cut(window, sensor_rows)
     best, learned = row, -1.0
     takes, trying = footprint.state.choice == LEARNED_ROWS, footprint.state.trying > 0
     if _learns(footprint):
-        _sample(packed, column, c, row, rows, footprint, row_counts)
+        _sample(packed, column, c, row, sensor_rows, footprint, row_counts)
     if cut or trying or takes:
-        best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
+        best, learned = _learned_row(packed, column, row, sensor_rows, footprint, row_counts)
     if method == _MEDIAN:
         windows.row[at] = _median(packed, column, row_counts)
     near = events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if trying and near and not cut:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
-        windows.row[at] = min(max(best, -0.5), rows - 0.5)
+        windows.row[at] = min(max(best, -0.5), sensor_rows - 0.5)
         windows.sigma2[at] = learned
         bias = 0.0
         if footprint.state.cut_computations > 0:
@@ -629,19 +633,21 @@ def _mean_times(time_us, events, mean_dt_us):
 @kernel(_nrt=False)
 def _own_variances(variance, row, events, line_variance, estimator, sigma2):
     """Set the variances of rows that are the columns' own."""
-    rows, model = estimator.rows, estimator.error_model
+    sensor_rows, model = estimator.sensor_rows, estimator.error_model
     for c in range(np.uintp(row.size)):
         n = max(events[c], 1)
-        sigma2[c] = _own_variance(variance[c], line_variance, n, row[c], rows, model)
+        sigma2[c] = _own_variance(variance[c], line_variance, n, row[c], sensor_rows, model)
 
 
 @kernel(_nrt=False)
-def _cut_lines(variance, row, line_variance, rows, truncated, common2):
+def _cut_lines(variance, row, line_variance, sensor_rows, truncated, common2):
     """Mark lines that the sensor's edge cuts; their shared variance covers the bias."""
     for c in range(np.uintp(row.size)):
         # Background widens a column without moving the line to the edge.
         line = min(variance[c], _BACKGROUND_FREE * line_variance)
-        common2[c] = line if min(row[c], rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
+        common2[c] = (
+            line if min(row[c], sensor_rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
+        )
     for c in range(np.uintp(row.size)):
         truncated[c] = common2[c] > 0.0
         common2[c] *= _HALF_BIAS2
@@ -670,7 +676,9 @@ def _rows_of_windows(out, line_variance, estimator, refined):
         if is_median:
             _replace(windows.row[k], row)
         _own_variances(variance, row, events, line_variance, estimator, sigma2)
-        _cut_lines(variance, row, line_variance, estimator.rows, out.truncated[k], out.common2[k])
+        _cut_lines(
+            variance, row, line_variance, estimator.sensor_rows, out.truncated[k], out.common2[k]
+        )
         if refined and not is_median:
             _replace(windows.row[k], row)
             _replace(windows.sigma2[k], sigma2)
@@ -766,7 +774,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
                 out.windows,
             )  # fmt: skip
             refined = True
-            near_edge |= windowed and _is_cut(window, estimator.rows)
+            near_edge |= windowed and _is_cut(window, estimator.sensor_rows)
             window, other = other, window
     footprint.state.near_edge = near_edge
     _rows_of_windows(out, line_variance, estimator, refined)

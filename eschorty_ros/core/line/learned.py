@@ -141,7 +141,7 @@ def _count_rows(packed, column, low, high, counts):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _sample(packed, column, c, row, rows, footprint, counts):
+def _sample(packed, column, c, row, sensor_rows, footprint, counts):
     """Keep the events by row of column ``c`` to learn from, when its turn has come.
 
     ``counts`` is zeroed scratch, one per row.
@@ -151,7 +151,7 @@ def _sample(packed, column, c, row, rows, footprint, counts):
         return
     centre = np.int64(np.rint(row))
     first = max(centre - footprint.reach, np.int64(0))
-    last = min(centre + footprint.reach, rows - 1)
+    last = min(centre + footprint.reach, sensor_rows - 1)
     _count_rows(packed, column, first, last, counts)
     footprint.first_row[slot] = first
     for at in range(first, last + 1):
@@ -166,7 +166,7 @@ def _events_in(counts, row):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _log_likelihoods(footprint, place, low, high, counts, rows):
+def _log_likelihoods(footprint, place, low, high, counts, sensor_rows):
     """Fill the log-likelihoods of the places around ``place``; return the best one's offset."""
     likelihood, log, none, reach = (
         footprint.likelihood,
@@ -176,7 +176,7 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
     )
     # Read from the array, so that it is no compile-time constant: LLVM then vectorises the loops.
     middle, candidates = log.shape[1] // 2, np.uintp(likelihood.size)
-    if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (rows - 1 - reach):
+    if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (sensor_rows - 1 - reach):
         begin = np.uintp((place - _SIDE) % _PLACES)
         for m in range(candidates):
             likelihood[m] = footprint.empty[begin + m]
@@ -184,7 +184,9 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
         for m in range(2 * _SIDE):
             at = place - _SIDE + m
             total = np.int64(0)
-            for row in range(max(at // _PLACES - reach, 0), min(at // _PLACES + reach + 2, rows)):
+            for row in range(
+                max(at // _PLACES - reach, 0), min(at // _PLACES + reach + 2, sensor_rows)
+            ):
                 if abs(at - _PLACES * row) <= _PLACES * reach:
                     total += none[middle + at - _PLACES * row]
             likelihood[m] = total
@@ -219,7 +221,7 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _learned_row(packed, column, row, rows, footprint, counts):
+def _learned_row(packed, column, row, sensor_rows, footprint, counts):
     """Return the row of a line near ``row`` and its variance; 0 and -1 before any is learned.
 
     ``counts`` is zeroed scratch, one per row.
@@ -230,15 +232,15 @@ def _learned_row(packed, column, row, rows, footprint, counts):
     reach = footprint.reach
     centre = np.int64(np.rint(row))
     margin = reach + _MOVES_MAX
-    span = max(centre - margin, 0), min(centre + margin, rows - 1)
+    span = max(centre - margin, 0), min(centre + margin, sensor_rows - 1)
     all_low, all_high = _count_rows(packed, column, span[0], span[1], counts)
     for _ in range(_MOVES_MAX):
         low = max(-((_PLACES * reach - place) // _PLACES), all_low)
         high = min((place + _PLACES * reach) // _PLACES, all_high)
-        best = _log_likelihoods(footprint, place, low, high, counts, rows)
+        best = _log_likelihoods(footprint, place, low, high, counts, sensor_rows)
         if abs(best) <= _SIDE - 2:
             break
-        place = np.int64(min(max(place + best, -_PLACES), _PLACES * rows))
+        place = np.int64(min(max(place + best, -_PLACES), _PLACES * sensor_rows))
     likelihood = footprint.likelihood
     peak = likelihood[_SIDE + best]
     total, first, second = 0.0, 0.0, 0.0
@@ -261,7 +263,7 @@ def _learned_row(packed, column, row, rows, footprint, counts):
 
 
 @kernel
-def _learn(footprint, row, smoothed, uncertain, truncated, rows):
+def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
     Columns in which the sensor's edge cuts the line count where they are the majority.
@@ -278,7 +280,7 @@ def _learn(footprint, row, smoothed, uncertain, truncated, rows):
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
             continue
-        last = min(first + 2 * footprint.reach, rows - 1)
+        last = min(first + 2 * footprint.reach, sensor_rows - 1)
         begin = middle + np.int64(np.rint(_PLACES * (first - smoothed[c])))
         for at in range(np.uintp(last + 1 - first)):
             place = begin + np.int64(_PLACES * at)

@@ -405,7 +405,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         returns=returns_code,
         seeded=True,
         events_min=settings.events_min,
-        rows=model.rows,
+        sensor_rows=model.rows,
         half_max=half_width_fixed(settings.line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * settings.line_width_px**2,
         error_model=error_model(
@@ -563,7 +563,9 @@ def _close(memory, state, counters):
         _restart_from(memory.known, footprint)
     if learns:
         uncertain, truncated = rows.uncertain[0], rows.truncated[0]
-        _learn(footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.rows)
+        _learn(
+            footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.sensor_rows
+        )
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
@@ -604,8 +606,9 @@ def _fill(events, first, limit_us, memory, state, counters):
         counters.events_before_first_edge += i - first
         return i
     state.status = _FILLED
-    columns, rows, gate = memory.columns, memory.estimator.rows, memory.gate.state
-    appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
+    columns, gate = memory.columns, memory.gate.state
+    sensor_rows = memory.estimator.sensor_rows
+    appended = _append(events, first, limit_us, state.edge_us, columns, sensor_rows, gate)
     state.full = appended.full
     if not appended.full:
         _count(appended.next - first, appended.outside, columns.refused, state, counters)
