@@ -97,7 +97,7 @@ def empty_usual_widths() -> UsualWidths:
 
 
 @kernel
-def _bin(width):
+def _width_bin(width):
     return min(np.int64(width * _PER_ROW), _BINS - 1)
 
 
@@ -121,7 +121,7 @@ def _restart_widths(widths, known):
 
 @kernel(_nrt=False)
 def _is_usual(widths, width, reach):
-    place = _bin(width)
+    place = _width_bin(width)
     low, high = max(place - reach, 0), min(place + reach + 1, _BINS)
     return widths.below[high] - widths.below[low] >= _USUAL_SHARE * widths.below[_BINS]
 
@@ -261,7 +261,7 @@ def _add_widths(row, widths):
             if widths.weight[k, c] == 0.0:
                 continue
             if not abs(static_width[k, c] - last[k, c]) > _STEADY * sigma:
-                widths.usual.number[_bin(static_width[k, c])] += widths.weight[k, c]
+                widths.usual.number[_width_bin(static_width[k, c])] += widths.weight[k, c]
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
                 difference = abs(smoothed[k, c] - smoothed[k, c - APART])
                 if median == 0.0:
