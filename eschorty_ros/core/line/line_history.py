@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
 
 # Most that a moving line is behind, as the pixels of the simulation remember: 0.035 to 0.067 px.
 SIGMA_COMMON_PX = 0.04
@@ -64,7 +64,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
 
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
-    blocks = -(-columns // BLOCK) + 2
+    blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
     moved2, passing2 = np.zeros((2, blocks))
     return LineHistory(now, recent, moved2, passing2, common_px, windowed)

@@ -25,7 +25,7 @@ from eschorty_ros.core.base.kernel import kernel
 # Columns from one to the next of those whose rows, or widths, are compared.
 APART = 5
 # Columns of a block; the differences of a block and its two neighbours count for its points.
-BLOCK = 16
+BLOCK_COLUMNS = 16
 # Share of a profile's differences that the next keeps.
 _KEPT = 0.5
 # Differences without which the scatter near a block is not known.
@@ -74,7 +74,7 @@ class Scatter(NamedTuple):
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
-    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK) + 2))
+    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK_COLUMNS) + 2))
     return Scatter(Differences(*own), Differences(*smoothed), factor_max, np.ones(columns))
 
 
@@ -98,7 +98,7 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
     columns = row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
     for block in range(1, sums.number.size - 1):
-        begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         most = 1.0
         for c in range(np.uintp(begin), np.uintp(end)):
             most = max(most, averaged[c])
@@ -191,7 +191,7 @@ def _scale(rows, scatter, smoothing):
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
-        begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
         locking2 = _pixel_locking_variance(sums, block, levels) if measured else 0.0
         ratio = ratio if measured else 1.0
@@ -218,5 +218,7 @@ def _scale_smoothed(rows, scatter, smoothing):
         ratio = _ratio(sums, block, scatter.factor_max)
         factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
         for k in range(returns):
-            for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
+            for c in range(
+                np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
+            ):
                 sigma2[k, c] = rows.common2[k, c] + factor * sigma2[k, c]

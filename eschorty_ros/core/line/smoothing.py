@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
 from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths
 
 # Columns to either side in which a weak point needs a neighbour.
@@ -75,7 +75,7 @@ def empty_smoothing(
     """Return the smoothing of profiles with ``widths``, by half widths up to the ``largest``."""
     shape, tried = widths.smoothed.shape, half_widths(largest)
     columns = shape[1]
-    blocks = -(-columns // BLOCK)
+    blocks = -(-columns // BLOCK_COLUMNS)
     differences, averaged = np.zeros((2, tried.size, *shape))
     sigma2_before, variance_before = np.zeros((2, columns + 1))
     row, sigma2, used, gates_px = np.zeros((4, *shape))
@@ -157,7 +157,9 @@ def _add_errors(averages, level, errors):
             squares[c] = error * error
         for block in range(errors.shape[1] - 2 * _NEAR):
             total = 0.0
-            for c in range(np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))):
+            for c in range(
+                np.uintp(block * BLOCK_COLUMNS), np.uintp(min((block + 1) * BLOCK_COLUMNS, columns))
+            ):
                 total += squares[c]
             errors[level, block + _NEAR] += total
 
@@ -239,7 +241,10 @@ def _smooth(rows, smoothing):
     _sum_before(rows, averages)
     for block in range(errors.shape[1] - 2 * _NEAR):
         level = _best(errors, block)
-        first, end = np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))
+        first, end = (
+            np.uintp(block * BLOCK_COLUMNS),
+            np.uintp(min((block + 1) * BLOCK_COLUMNS, columns)),
+        )
         for k in range(np.uintp(returns)):
             for c in range(first, end):
                 n = used[level, k, c]

@@ -21,7 +21,7 @@ from eschorty_ros.core.line.line_history import (
     empty_history,
 )
 from eschorty_ros.core.line.reflectance import ROOT_12
-from eschorty_ros.core.line.scatter import APART, BLOCK
+from eschorty_ros.core.line.scatter import APART, BLOCK_COLUMNS
 
 # Widths that are told apart, per row and in all.
 _PER_ROW = 16
@@ -50,7 +50,7 @@ _STEP = 1.0 / 1024.0
 # Standard deviation over the median size of differences.
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
 # Columns to either side that move as a column does.
-_BESIDE = BLOCK + BLOCK // 2
+_BESIDE = BLOCK_COLUMNS + BLOCK_COLUMNS // 2
 # A point is marked when the missing or additional rows may move it by more deviations of a row
 # that is not smoothed.
 _MARKED = 2.5
@@ -203,7 +203,9 @@ def _follow_line(rows, smoothing, lit_share):
         )
     for block in range(1, now.points.size - 1):
         total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
-        for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
+        for c in range(
+            np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
+        ):
             weak = rows.truncated[0, c] | (rows.events[0, c] < smoothing.isolation_events)
             if not (weak | np.isnan(row[0, c])):
                 total += row[0, c]
@@ -228,13 +230,13 @@ def _widen(rows, smoothing):
         for c in range(columns):
             width, displacement = widths.static_width[k, c], row[k, c] - widths.last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
-            sigma2[k, c] += widths.history.moved2[c // BLOCK + 1]
+            sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
             rows.mixed[k, c] = False
             widths.weight[k, c] = 0.0
             weak = rows.events[k, c] < smoothing.isolation_events
             if np.isnan(width) or rows.truncated[k, c] or weak:
                 continue
-            weight, more2 = 1.0, widths.history.passing2[c // BLOCK + 1]
+            weight, more2 = 1.0, widths.history.passing2[c // BLOCK_COLUMNS + 1]
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
