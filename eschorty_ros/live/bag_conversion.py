@@ -15,7 +15,7 @@ from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, Forma
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.base.schema import validate
 from eschorty_ros.core.base.yaml_file import parse_yaml
-from eschorty_ros.core.clocks import NS_PER_US, POSITION_LIMIT_MM, PulseTrain, StageTrack
+from eschorty_ros.core.clocks import NS_PER_US, POSITION_LIMIT_MM, StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Settings
@@ -30,17 +30,15 @@ from eschorty_ros.live.bag_files import (
     TRIGGER,
     BagReader,
     BagWriter,
-    ns,
     stamp,
 )
+from eschorty_ros.live.device_messages import MM_PER_M, laser_settings, ns, pulse_train
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import Packet, check_span
 from eschorty_ros.live.recorded_packets import timed_packets
 from eschorty_ros.live.scan_recorder import ScanRecorder
 
 _SCAN, _SETTINGS = "eschorty_scan", "eschorty_settings"
-_MM_PER_M = 1e3
-_OUTPUT_ON = 1
 _DISK_S = 600.0
 
 Progress = Callable[[float], Any]
@@ -134,11 +132,10 @@ def _latched(source: BagReader, stream: PacketStream, laser: bool) -> None:
         fields = message.fields
         if message.kind == CLOCK:
             stream.announce_zero(ns(fields.header.stamp) - ns(fields.time_ref))
-        elif message.kind == TRIGGER and fields.interval and fields.count:
-            ends = fields.first * _MM_PER_M, fields.interval * _MM_PER_M
-            stream.set_pulses(PulseTrain(*ends, int(fields.count)))
+        elif message.kind == TRIGGER:
+            stream.set_pulses(pulse_train(fields))
         elif message.kind == LASER and stream.waits_for == "modulation":
-            stream.set_laser(*_laser(fields)[:2])
+            stream.set_laser(*laser_settings(fields)[:2])
 
 
 def _play(source: BagReader, stream: PacketStream, recorder: ScanRecorder, laser: bool) -> None:
@@ -147,11 +144,11 @@ def _play(source: BagReader, stream: PacketStream, recorder: ScanRecorder, laser
     for message in source.messages(*kinds):
         fields = message.fields
         if message.kind == ODOMETRY:
-            t_ns, position_mm = ns(fields.header.stamp), fields.pose.pose.position.y * _MM_PER_M
+            t_ns, position_mm = ns(fields.header.stamp), fields.pose.pose.position.y * MM_PER_M
             track.append(t_ns // NS_PER_US, position_mm)
             recorder.stage(t_ns, position_mm)
         elif message.kind == LASER:
-            stream.set_laser(*_laser(fields))
+            stream.set_laser(*laser_settings(fields))
         else:
             if fields.encoding != "evt3":
                 raise FormatError(
@@ -163,13 +160,6 @@ def _play(source: BagReader, stream: PacketStream, recorder: ScanRecorder, laser
             stream.process(message.t_ns * 1e-9)
             stream.fit_edges(track)
     stream.fit_edges(track, now=True)
-
-
-def _laser(state: Any) -> tuple[Modulation, int | None, int | None]:
-    """Return modulation, an edge's time and the time since which the laser is on, ns."""
-    modulation = Modulation(float(state.frequency), float(state.duty), str(state.waveform))
-    on = state.output == _OUTPUT_ON
-    return modulation, ns(state.phase_epoch) or None, ns(state.output_since) if on else None
 
 
 def recording_to_bag(
@@ -232,7 +222,7 @@ def _write(recording: Recording, target: BagWriter, progress: Progress | None) -
         nonlocal row
         while row < len(rows) and rows["t_us"][row] <= until_us:
             t_ns = zero_ns + int(rows["t_us"][row]) * NS_PER_US
-            position = {"position": {"y": float(rows["position_mm"][row]) / _MM_PER_M}}
+            position = {"position": {"y": float(rows["position_mm"][row]) / MM_PER_M}}
             target.write(
                 ODOMETRY, t_ns, header={"stamp": stamp(t_ns), "frame_id": "eschorty_base"},
                 child_frame_id="eschorty_stage",

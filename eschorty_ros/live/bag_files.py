@@ -223,8 +223,3 @@ def stamp(t_ns: int) -> dict[str, int]:
     """Return the fields of a ROS time."""
     sec, nanosec = divmod(t_ns, 1_000_000_000)
     return {"sec": sec, "nanosec": nanosec}
-
-
-def ns(time: Any) -> int:
-    """Return the ns of a ROS time."""
-    return int(time.sec) * 1_000_000_000 + int(time.nanosec)

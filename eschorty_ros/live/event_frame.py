@@ -9,17 +9,16 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import Decoder
 
+# Age at which the brightness is 1/e.
+_TAU_US = 30_000
+
 
 class EventFrame:
-    """Image whose brightness is exp(-age of the pixel's newest event / ``tau_us``).
+    """Image whose brightness decays exponentially with the age of the pixel's newest event."""
 
-    - ``tau_us``: Age at which the brightness is 1/e.
-    """
-
-    def __init__(self, columns: int, rows: int, tau_us: float = 30_000.0) -> None:
+    def __init__(self, columns: int, rows: int) -> None:
         self._decoder = Decoder(columns, rows)
         self._newest_us = np.full((rows, columns), -(1 << 62), dtype=np.int64)
-        self._tau_us = tau_us
 
     def push(self, data: Any) -> None:
         """Decode the next bytes of the EVT3 stream, which may start anywhere."""
@@ -32,7 +31,7 @@ class EventFrame:
         if now_us is None:
             return np.zeros(self._newest_us.shape, dtype=np.uint8)
         image = np.zeros(self._newest_us.shape, dtype=np.uint8)
-        recent = now_us - self._newest_us < round(8 * self._tau_us)
+        recent = now_us - self._newest_us < 8 * _TAU_US
         age_us = (now_us - self._newest_us[recent]).astype(np.float64)
-        image[recent] = np.rint(255.0 * np.exp(-np.maximum(age_us, 0.0) / self._tau_us))
+        image[recent] = np.rint(255.0 * np.exp(-np.maximum(age_us, 0.0) / _TAU_US))
         return image

@@ -6,11 +6,12 @@ from collections import Counter, deque
 from dataclasses import replace
 from typing import Any
 
-from eschorty_ros.core.clocks import NS_PER_US, PulseTrain, SensorClock, StageTrack
+from eschorty_ros.core.clocks import PulseTrain, SensorClock, StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
 from eschorty_ros.live.packet_times import (
+    GAP_NS,
     WRAP_US,
     Packet,
     first_time_high_us,
@@ -21,7 +22,8 @@ from eschorty_ros.live.packet_times import (
 from eschorty_ros.live.scan_recorder import ScanRecorder
 from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 
-_GAP_NS = WRAP_US * NS_PER_US // 2
+# Packets held while clock or modulation are unknown; further ones count as lost.
+_HELD_MAX = 1000
 # A step of the numbers that no loss explains: another stream.
 _LOST_MAX = 1_000_000
 # An announced zero and a packet's stamp agree to this; the host may be late by some of it.
@@ -47,7 +49,6 @@ class PacketStream:
     packet, or continues after more than half a wrap without packets.
 
     - ``packet_period_s``: Time over which the camera collects events before it sends them.
-    - ``held_max``: Packets held while clock or modulation are unknown; further ones count as lost.
 
     Public attributes:
     - ``packets``, ``packets_lost``, ``restarts``: Packets reconstructed, missing by their ``seq``,
@@ -67,7 +68,6 @@ class PacketStream:
         settings: Settings,
         clock_timeout_s: float,
         packet_period_s: float = 0.0,
-        held_max: int = 1000,
     ) -> None:
         self.calibration = calibration
         self.packets = 0
@@ -81,7 +81,6 @@ class PacketStream:
         self._settings = settings
         self._clock_timeout_s = clock_timeout_s
         self._held: deque[Packet] = deque()
-        self._held_max = held_max
         self._held_since_s: float | None = None
         self._pulses: PulseTrain | None = None
         self._epoch: SensorEpoch | None = None
@@ -228,7 +227,7 @@ class PacketStream:
         """Queue one packet that arrived at ``now_s`` of the steady clock."""
         if self._held_since_s is None:
             self._held_since_s = now_s
-        if len(self._held) < self._held_max:
+        if len(self._held) < _HELD_MAX:
             self._held.append(packet)
 
     def process(self, now_s: float) -> list[TimedProfiles]:
@@ -264,7 +263,7 @@ class PacketStream:
             last, packet = packets[-1], self._held[0]
             if (packet.source, packet.seq) != (last.source, last.seq + 1):
                 break
-            if packet.stamp_ns - last.stamp_ns > _GAP_NS:
+            if packet.stamp_ns - last.stamp_ns > GAP_NS:
                 break
             packets.append(self._held.popleft())
         return packets
@@ -305,7 +304,7 @@ class PacketStream:
         self.packets_lost += missing
         time_us = self._reconstructor.time_us if self._reconstructor is not None else None
         # Without a number left out, the host may have stalled.
-        if packet.stamp_ns - self._last_stamp_ns > _GAP_NS and (
+        if packet.stamp_ns - self._last_stamp_ns > GAP_NS and (
             missing or skips_time(packet.data, time_us)
         ):
             self._retire()

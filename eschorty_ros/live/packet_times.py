@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 
 from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.evt3 import begin_time, time_span_us
 from eschorty_ros.core.evt3 import words as w3
 
 WRAP_US = 1 << 24
+# A decoder follows the 24-bit time over gaps of less than half a wrap.
+GAP_NS = WRAP_US * NS_PER_US // 2
 # A stream without losses skips less of its own time than this between two packets.
 _STEP_US = 100_000
 # A packet at most this many numbers back that is stamped no later was overtaken in transit.

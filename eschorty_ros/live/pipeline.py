@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import sub
+from typing import NamedTuple
 
 import numpy as np
 
@@ -94,6 +96,16 @@ def _share(part: int, whole: int) -> float:
     return min(part / whole, 1.0) if whole > 0 else float(part >= whole)
 
 
+class _Counts(NamedTuple):
+    """Counts of which a scan reports the difference between its begin and its end."""
+
+    events: int
+    packets: int
+    packets_lost: int
+    events_dropped: int
+    points_without_stage: int
+
+
 class Pipeline:
     """Runs packet stream, stage placement and scan buffer; used by one thread.
 
@@ -101,6 +113,9 @@ class Pipeline:
       ``PacketStream`` and ``StagePlacer``.
 
     Public attributes:
+    - ``calibration``, ``model``: Those of packets processed from now on.
+    - ``stream``, ``placer``: The packet stream and the stage placement.
+    - ``profiles``, ``points``: Numbers of profiles completed and of points placed.
     - ``capture``: Receives a calibration's events and placed profiles while it is set.
     """
 
@@ -124,7 +139,7 @@ class Pipeline:
         self._buffer: ScanBuffer | None = None
         self._recorder: ScanRecorder | None = None
         self._coverage = SweepCoverage(0.0, 0.0)
-        self._losses_at_begin: tuple[int, ...] = (0,) * 5
+        self._counts_at_begin = _Counts(0, 0, 0, 0, 0)
 
     @property
     def scan_id(self) -> str:
@@ -216,7 +231,7 @@ class Pipeline:
             for t_us, position_mm in zip(*self.placer.track.samples_from(since_us), strict=True):
                 recorder.stage(int(t_us) * NS_PER_US, float(position_mm))
         self.stream.begin_scan(recorder)
-        self._losses_at_begin = self._losses()
+        self._counts_at_begin = self._counts()
 
     def set_capture(self, capture: Capture | None) -> None:
         """Start to feed a calibration's capture, or stop with ``None``.
@@ -258,21 +273,15 @@ class Pipeline:
         if lag is not None:
             take_off_lag(*where, self.calibration.stage_direction, lag.lag_us)
         self.end_recording(scan.points)
-        events, packets, lost, dropped, without = (
-            now - before for now, before in zip(self._losses(), self._losses_at_begin, strict=True)
-        )
+        counts = _Counts(*map(sub, self._counts(), self._counts_at_begin))
         return ScanReport(
             scan,
-            events,
-            packets,
-            lost,
-            dropped,
-            without,
-            buffer.points_outside,
-            buffer.points_over_limit,
-            self._coverage.profiles(self.stream.profile_rate_hz),
-            self.stream.frequency_hz,
-            lag,
+            **counts._asdict(),
+            points_outside=buffer.points_outside,
+            points_over_limit=buffer.points_over_limit,
+            profiles_expected=self._coverage.profiles(self.stream.profile_rate_hz),
+            frequency_hz=self.stream.frequency_hz,
+            pass_lag=lag,
         )
 
     def end_recording(self, points: Points | None, reason: str = "") -> None:
@@ -310,12 +319,12 @@ class Pipeline:
             part.sensor,
         )
 
-    def _losses(self) -> tuple[int, ...]:
+    def _counts(self) -> _Counts:
         counters = self.stream.counters
-        return (
-            counters["events"],
-            self.stream.packets,
-            self.stream.packets_lost,
-            counters["events_dropped"],
-            self.placer.points_without_stage,
+        return _Counts(
+            events=counters["events"],
+            packets=self.stream.packets,
+            packets_lost=self.stream.packets_lost,
+            events_dropped=counters["events_dropped"],
+            points_without_stage=self.placer.points_without_stage,
         )

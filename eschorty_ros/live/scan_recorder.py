@@ -22,13 +22,11 @@ from eschorty_ros.core.reconstruction import Reconstructor
 from eschorty_ros.core.storage import Points, ScanLog
 from eschorty_ros.core.storage.recording import STAGE_DTYPE
 from eschorty_ros.core.storage.recording_writer import RecordingWriter, make_recording_folder
-from eschorty_ros.live.packet_times import WRAP_US, Packet
+from eschorty_ros.live.packet_times import GAP_NS, WRAP_US, Packet
 from eschorty_ros.live.sensor_epoch import SensorEpoch
 
 QUEUE_BYTES = 256 << 20
 """Memory of the packets that wait for the disk: seconds of the camera's highest rate."""
-# A decoder follows the 24-bit time over gaps of less than half a wrap.
-_GAP_NS = WRAP_US * NS_PER_US // 2
 _OTHER_STREAM = "camera, modulation or settings were changed during the scan"
 
 Job = Callable[[], None]
@@ -107,7 +105,7 @@ class ScanRecorder:
             self._queue(self._begin)
         elif run != self._run[:2] or run[0].modulation != self._modulation:
             self._stream_ended = _OTHER_STREAM
-        elif self._missing and packet.stamp_ns - self._last_ns > _GAP_NS:
+        elif self._missing and packet.stamp_ns - self._last_ns > GAP_NS:
             self._stream_ended = "a gap was longer than 8 s"
         self._lost += lost
         self._missing += lost

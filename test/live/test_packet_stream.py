@@ -11,6 +11,7 @@ from eschorty_ros.core.evt3 import words as w3
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.live import packet_stream
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import (
     WRAP_US,
@@ -114,8 +115,9 @@ def test_events_that_the_sensor_lost_are_a_warning():
     assert "reports 1 times that its readout lost events" in subject.warnings[0]
 
 
-def test_held_packets_are_bounded_and_the_rest_counts_as_lost():
-    subject = PacketStream(CALIBRATION, Settings(), clock_timeout_s=1.0, held_max=2)
+def test_held_packets_are_bounded_and_the_rest_counts_as_lost(monkeypatch):
+    monkeypatch.setattr(packet_stream, "_HELD_MAX", 2)
+    subject = PacketStream(CALIBRATION, Settings(), clock_timeout_s=1.0)
     items = packets(line(), size=20_000)
     for packet in items[:6]:
         subject.add(packet, 0.0)

@@ -93,8 +93,8 @@ def _file_digest(path: str) -> str:
     return hashlib.blake2b(Path(path).read_bytes(), digest_size=16).hexdigest()
 
 
-def record(*names: str, value: int = 0, numbers: NDArray[np.int64] | None = None) -> Any:
-    """Return a record of int64 fields, all ``value``, that kernels change as attributes.
+def record(*names: str, value: float = 0, numbers: NDArray[np.int64] | None = None) -> Any:
+    """Return a record of fields, all ``value`` with its type, that kernels change as attributes.
 
     It is a view of ``numbers`` where they are given.
 
@@ -103,7 +103,5 @@ def record(*names: str, value: int = 0, numbers: NDArray[np.int64] | None = None
     >>> print(state)
     (3, 0)
     """
-    dtype = np.dtype([(name, np.int64) for name in names])
-    if numbers is None:
-        numbers = np.full(len(names), value, np.int64)
-    return numbers.view(dtype)[0]
+    values = np.full(len(names), value) if numbers is None else numbers
+    return values.view([(name, values.dtype) for name in names])[0]

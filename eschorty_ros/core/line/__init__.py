@@ -9,15 +9,15 @@ from eschorty_ros.core.line.centroid import (
     check_method,
     estimate,
 )
-from eschorty_ros.core.line.course import SIGMA_COMMON_PX
-from eschorty_ros.core.line.estimators import FWHM_PER_SIGMA, HALF_WIDTH_PER_FWHM
+from eschorty_ros.core.line.estimators import FWHM_PER_SIGMA
+from eschorty_ros.core.line.line_history import SIGMA_COMMON_PX
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
 from eschorty_ros.core.line.sigma import (
     METHOD_ERRORS,
     SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
 )
-from eschorty_ros.core.line.window import TIME_LIMIT_US
+from eschorty_ros.core.line.window import HALF_WIDTH_PER_FWHM, TIME_LIMIT_US
 
 __all__ = [
     "CENTROIDS",

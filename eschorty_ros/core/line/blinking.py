@@ -20,6 +20,7 @@ from eschorty_ros.core.line.window import (
     ROW_BITS,
     ROW_MASK,
     TIME_SHIFT,
+    _chernoff_exponent,
     _column,
     _pad,
 )
@@ -36,6 +37,9 @@ _SQUARE_ENOUGH = 0.6
 _RAYLEIGH_SURE = 12.0
 # Length of a burst behind an edge, of 2**32 per turn.
 _BURST = 1 << 28
+# Least exponents of Chernoff's bound for the bursts of one polarity, and for those of both.
+_BURST_MIN = 4.0
+_BURSTS_MIN = 12.0
 _HOT_EVENTS_MIN = 6
 # Lengths of the integer unit vectors, and of their sums per event.
 _UNIT = 4096.0
@@ -59,6 +63,13 @@ class Vector(NamedTuple):
     events: np.int64
     x: np.int64
     y: np.int64
+
+
+class _LaserTest(NamedTuple):
+    """Result of a test of events: they follow the laser, and more than background ever does."""
+
+    follows: bool
+    sure: bool
 
 
 def blink(modulation: Modulation, every: int) -> Blink:
@@ -124,8 +135,8 @@ def _is_in_phase(sums):
 
 
 @kernel(_nrt=False)
-def _follows(packed, column, first, last, blink):
-    """Return true when events of rows first..last follow the laser, and true when that is sure."""
+def _laser_test(packed, column, first, last, blink):
+    """Test whether the events of rows first..last follow the laser."""
     vector = _vector(packed, column, first, last, blink)
     length2 = float(vector.x * vector.x + vector.y * vector.y)
     n = float(vector.events)
@@ -133,11 +144,11 @@ def _follows(packed, column, first, last, blink):
     rayleigh = n * square
     if square > _STRENGTH_MIN**2:
         follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
-        return follows, rayleigh > _RAYLEIGH_SURE
+        return _LaserTest(follows, rayleigh > _RAYLEIGH_SURE)
     # A line that moves while it is lit has events all the time, and a burst at both edges. What
     # passes within a part of the period has one at most.
     bursts = _has_bursts(packed, column, first, last, blink)
-    return bursts, bursts
+    return _LaserTest(bursts, bursts)
 
 
 @kernel(_nrt=True)
@@ -155,10 +166,8 @@ def _has_bursts(packed, column, first, last, blink):
             events[on] += 1.0
             burst[on] += np.uint32(phase) < _BURST
     expected = events * (_BURST / 2.0**32)
-    if burst[0] <= expected[0] or burst[1] <= expected[1]:
-        return False
-    improbable = burst * np.log(burst / np.maximum(expected, 1e-9)) - (burst - expected)
-    return improbable.min() > _RAYLEIGH_MIN and improbable.sum() > _RAYLEIGH_SURE
+    off, on = _chernoff_exponent(burst[0], expected[0]), _chernoff_exponent(burst[1], expected[1])
+    return min(off, on) > _BURST_MIN and off + on > _BURSTS_MIN
 
 
 @kernel(_nrt=False)
@@ -187,7 +196,7 @@ def _without_hot_pixels(packed, column, first, last, blink, counts):
     hot = max(2.0 * near.sum() / max(np.count_nonzero(near), 1), _HOT_EVENTS_MIN)
     left = column
     for row in range(first, last + 1):
-        if counts[row] >= hot and not _follows(packed, left, row, row, blink)[0]:
+        if counts[row] >= hot and not _laser_test(packed, left, row, row, blink).follows:
             left = _without(packed, left, row, row)
     counts[:] = 0
     return left

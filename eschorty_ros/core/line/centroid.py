@@ -13,15 +13,15 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.blinking import (
     Blink,
-    _follows,
     _is_in_phase,
+    _laser_test,
     _without,
     _without_hot_pixels,
 )
 from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import (
+    HALF_MIN,
     HALF_PER_SIGMA,
-    HALF_WIDTH_PER_FWHM,
     _mean,
     _median,
     _variance,
@@ -45,6 +45,7 @@ from eschorty_ros.core.line.window import (
     AMBIGUOUS,
     FOUND,
     FRACTION,
+    HALF_WIDTH_PER_FWHM,
     ROW_BITS,
     ROW_LAST,
     TOO_FEW,
@@ -72,8 +73,8 @@ _MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = range(4)
 _STRONGEST, _FIRST, _LAST, _ALL = range(4)
 # Windows of a column that are tested for the laser's modulation.
 _WINDOWS_MAX = 4
-# Share of the evidence of the last period and of the column before that counts in a column: at most
-# ten times its own is remembered.
+# Weight of each of two neighbours' evidence; 2 x 0.45 < 1, so that it sums to at most 10 times a
+# column's own.
 _VOTE = 0.45
 # A full column wider than this many times the line's variance holds background.
 _BACKGROUND_FREE = 1.5
@@ -130,7 +131,7 @@ class Estimator(NamedTuple):
     returns: int
     seeded: bool
     events_min: int
-    rows: int
+    sensor_rows: int
     half_max: int
     line_variance: float
     error_model: ErrorModel
@@ -139,16 +140,16 @@ class Estimator(NamedTuple):
 class Windows(NamedTuple):
     """Sums over the window of each return, shape (returns, columns), and what replaces its mean.
 
-    Rows are relative to the ``first`` one of the window. ``held`` are the events of the column, in
-    the window or not. ``row`` replaces the mean, and ``sigma2`` and ``common2`` the variances where
-    they are known; NaN where nothing does.
+    Rows are relative to the ``first`` one of the window. ``column_events`` are in the window or
+    not. ``row`` replaces the mean, and ``sigma2`` and ``common2`` the variances where they are
+    known; NaN where nothing does.
     """
 
     first: NDArray[np.int64]
     d: NDArray[np.int64]
     d2: NDArray[np.int64]
     time_us: NDArray[np.int64]
-    held: NDArray[np.int64]
+    column_events: NDArray[np.int64]
     row: NDArray[np.float64]
     sigma2: NDArray[np.float64]
     common2: NDArray[np.float64]
@@ -158,9 +159,10 @@ class Rows(NamedTuple):
     """The returns of each column, shape (returns, columns), NaN where there is none.
 
     The variance of a row is ``sigma2``, which is the column's own, plus ``common2``, which
-    neighbours share. An ``uncertain`` one may be background that follows the laser by chance, a
-    ``mixed`` one is on two surfaces.
-    ``ambiguous`` has shape (columns,).
+    neighbours share. ``variance`` is that of the rows of its ``events``, ``mean_dt_us`` their mean
+    time since the period's edge. The sensor's edge cuts the line of a ``truncated`` row, an
+    ``uncertain`` one may be background that follows the laser by chance, a ``mixed`` one is on two
+    surfaces. ``ambiguous`` has shape (columns,).
     """
 
     windows: Windows
@@ -202,7 +204,7 @@ class PeriodSums(NamedTuple):
 
 def half_width_fixed(fwhm_px: float) -> int:
     """Return the half width of the averaging window for a line of ``fwhm_px``, fixed point."""
-    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), 3 * FRACTION)
+    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), HALF_MIN)
 
 
 def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
@@ -321,7 +323,7 @@ def estimate(
         returns=returns_code,
         seeded=False,
         events_min=events_min,
-        rows=height,
+        sensor_rows=height,
         half_max=half_width_fixed(line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * float(line_width_px) ** 2,
         error_model=error_model(method, sigma_factor, sigma_floor_px),
@@ -391,7 +393,9 @@ def _search(packed, column, half, estimator):
     if found.status == AMBIGUOUS:
         line += found.other.sums.events
     others = column.events - line
-    if events < estimator.events_min or not _exceeds_background(line, others, half, estimator.rows):
+    if events < estimator.events_min or not _exceeds_background(
+        line, others, half, estimator.sensor_rows
+    ):
         return Returns(TOO_FEW, False, found.window, found.other)
     return found
 
@@ -406,12 +410,12 @@ def _modulated(packed, column, found, half, estimator, blink, row_counts):
     events = column.events
     for _ in range(_WINDOWS_MAX):
         window = found.window
-        follows, sure = _follows(packed, column, window.first, window.last, blink)
+        test = _laser_test(packed, column, window.first, window.last, blink)
         left = _without_hot_pixels(packed, column, window.first, window.last, blink, row_counts)
         if left.events == column.events:
             # A second window is a second chance for background.
-            if follows and (sure or column.events == events):
-                return found, column, not sure or column.events < events
+            if test.follows and (test.sure or column.events == events):
+                return found, column, not test.sure or column.events < events
             left = _without(packed, column, window.first, window.last)
         column = left
         found = Returns(TOO_FEW, False, window, window)
@@ -432,7 +436,9 @@ def _all_returns(packed, column, half, estimator, found):
         return found
     if found.status == AMBIGUOUS:
         return Returns(FOUND, True, found.window, found.other)
-    return _second_return(packed, column, half, estimator.rows, estimator.events_min, found.window)
+    return _second_return(
+        packed, column, half, estimator.sensor_rows, estimator.events_min, found.window
+    )
 
 
 @kernel(_nrt=False)
@@ -465,7 +471,7 @@ def _stronger(packed, column, c, half, columns, estimator, blink, found):
     alone = not both.second
     if not alone and blink.step > 0:
         # A second window is a second chance for background.
-        alone = not _follows(packed, column, b.first, b.last, blink)[1]
+        alone = not _laser_test(packed, column, b.first, b.last, blink).sure
     if alone:
         columns.rivals[c] = -1
         return Returns(FOUND, False, a, a)
@@ -494,9 +500,9 @@ def _reported(returns, found):
 
 
 @kernel
-def _is_cut(window, rows):
+def _is_cut(window, sensor_rows):
     """Return true when a window reaches the first or last row of the sensor."""
-    return window.first == 0 or window.last >= rows - 1.0
+    return window.first == 0 or window.last >= sensor_rows - 1.0
 
 
 @kernel
@@ -512,7 +518,7 @@ def _is_clear(window, column, estimator, blink):
     return (
         events >= estimator.events_min
         and _is_alone(events, column.events)
-        and not _is_cut(window, estimator.rows)
+        and not _is_cut(window, estimator.sensor_rows)
         and estimator.returns == _STRONGEST
         and (blink.step == 0 or _is_in_phase(window.sums))
     )
@@ -538,7 +544,7 @@ def _column_returns(packed, column, c, half, columns, estimator, blink, window, 
         found = _all_returns(packed, column, half, estimator, found)
         if testing and found.second:
             other = found.other
-            if not _follows(packed, column, other.first, other.last, blink)[0]:
+            if not _laser_test(packed, column, other.first, other.last, blink).follows:
                 found = Returns(FOUND, False, found.window, found.window)
     elif _is_windowed(estimator.method):
         used = found.window.sums.events
@@ -564,23 +570,23 @@ def _refine(packed, column, at, window, line_variance, estimator, footprint, row
     ``at`` is the place of the return: its number and its column.
     """
     c = at[1]
-    rows, method = estimator.rows, estimator.method
+    sensor_rows, method = estimator.sensor_rows, estimator.method
     events, d = window.sums.events, window.sums.d
     row, variance = _mean(events, window.first, d), _variance(events, d, window.sums.d2)
-    cut = _is_windowed(method) and _is_cut(window, rows)
+    cut = _is_windowed(method) and _is_cut(window, sensor_rows)
     best, learned = row, -1.0
     takes, trying = footprint.state.choice == LEARNED_ROWS, footprint.state.trying > 0
     if _learns(footprint):
-        _sample(packed, column, c, row, rows, footprint, row_counts)
+        _sample(packed, column, c, row, sensor_rows, footprint, row_counts)
     if cut or trying or takes:
-        best, learned = _learned_row(packed, column, row, rows, footprint, row_counts)
+        best, learned = _learned_row(packed, column, row, sensor_rows, footprint, row_counts)
     if method == _MEDIAN:
         windows.row[at] = _median(packed, column, row_counts)
     near = events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if trying and near and not cut:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
-        windows.row[at] = min(max(best, -0.5), rows - 0.5)
+        windows.row[at] = min(max(best, -0.5), sensor_rows - 0.5)
         windows.sigma2[at] = learned
         bias = 0.0
         if footprint.state.cut_computations > 0:
@@ -591,7 +597,7 @@ def _refine(packed, column, at, window, line_variance, estimator, footprint, row
 
 
 @kernel(_nrt=False, forceinline=True)
-def _put(at, window, held, uncertain, out):
+def _put(at, window, column_events, uncertain, out):
     """Write the sums of a return of a column."""
     windows, sums = out.windows, window.sums
     out.events[at] = sums.events
@@ -600,7 +606,7 @@ def _put(at, window, held, uncertain, out):
     windows.d[at] = sums.d
     windows.d2[at] = sums.d2
     windows.time_us[at] = sums.time_us
-    windows.held[at] = held
+    windows.column_events[at] = column_events
 
 
 @kernel(_nrt=False)
@@ -627,19 +633,21 @@ def _mean_times(time_us, events, mean_dt_us):
 @kernel(_nrt=False)
 def _own_variances(variance, row, events, line_variance, estimator, sigma2):
     """Set the variances of rows that are the columns' own."""
-    rows, model = estimator.rows, estimator.error_model
+    sensor_rows, model = estimator.sensor_rows, estimator.error_model
     for c in range(np.uintp(row.size)):
         n = max(events[c], 1)
-        sigma2[c] = _own_variance(variance[c], line_variance, n, row[c], rows, model)
+        sigma2[c] = _own_variance(variance[c], line_variance, n, row[c], sensor_rows, model)
 
 
 @kernel(_nrt=False)
-def _cut_lines(variance, row, line_variance, rows, truncated, common2):
+def _cut_lines(variance, row, line_variance, sensor_rows, truncated, common2):
     """Mark lines that the sensor's edge cuts; their shared variance covers the bias."""
     for c in range(np.uintp(row.size)):
         # Background widens a column without moving the line to the edge.
         line = min(variance[c], _BACKGROUND_FREE * line_variance)
-        common2[c] = line if min(row[c], rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
+        common2[c] = (
+            line if min(row[c], sensor_rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
+        )
     for c in range(np.uintp(row.size)):
         truncated[c] = common2[c] > 0.0
         common2[c] *= _HALF_BIAS2
@@ -668,7 +676,9 @@ def _rows_of_windows(out, line_variance, estimator, refined):
         if is_median:
             _replace(windows.row[k], row)
         _own_variances(variance, row, events, line_variance, estimator, sigma2)
-        _cut_lines(variance, row, line_variance, estimator.rows, out.truncated[k], out.common2[k])
+        _cut_lines(
+            variance, row, line_variance, estimator.sensor_rows, out.truncated[k], out.common2[k]
+        )
         if refined and not is_median:
             _replace(windows.row[k], row)
             _replace(windows.sigma2[k], sigma2)
@@ -677,11 +687,11 @@ def _rows_of_windows(out, line_variance, estimator, refined):
 
 @kernel(_nrt=False)
 def _pooled(out, estimator):
-    """Return the pooled squares of the rows used, their degrees of freedom and events held.
+    """Return the pooled squares of the rows used, their degrees of freedom and the events.
 
     Lines that are cut, and full columns with background, do not have the width of a line.
     """
-    squares, freedom, held = 0.0, np.int64(0), np.int64(0)
+    squares, freedom, events = 0.0, np.int64(0), np.int64(0)
     most = _BACKGROUND_FREE * estimator.line_variance
     windowed = _is_windowed(estimator.method)
     for k in range(out.row.shape[0]):
@@ -691,8 +701,8 @@ def _pooled(out, estimator):
                 used = out.events[k, c] - 1
                 squares += out.variance[k, c] * used
                 freedom += used
-                held += out.windows.held[k, c] if k == 0 else 0
-    return squares, freedom, held
+                events += out.windows.column_events[k, c] if k == 0 else 0
+    return squares, freedom, events
 
 
 @kernel(_nrt=False)
@@ -724,7 +734,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         column = _column(columns.starts[c], n, blink.lit_us)
         known = columns.seeds[c] >= 0
         if not known:
-            # A choice of two values would make each column wait for the one before.
+            # Stored rather than selected: a select would chain each column to the one before.
             columns.seeds[c] = neighbour
         window = _NO_WINDOW
         if windowed and estimator.seeded and columns.seeds[c] >= 0:
@@ -764,7 +774,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
                 out.windows,
             )  # fmt: skip
             refined = True
-            near_edge |= windowed and _is_cut(window, estimator.rows)
+            near_edge |= windowed and _is_cut(window, estimator.sensor_rows)
             window, other = other, window
     footprint.state.near_edge = near_edge
     _rows_of_windows(out, line_variance, estimator, refined)

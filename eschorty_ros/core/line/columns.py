@@ -194,13 +194,13 @@ def _bins(columns, part, keeps_late, edge_us, floor_us):
 
 
 @kernel
-def _append(events, first, limit_us, edge_us, columns, rows, gate):
+def _append(events, first, limit_us, edge_us, columns, sensor_rows, gate):
     """Append the events before ``limit_us`` to `empty_columns`, or count why not."""
     t, x, y, p = events
     before = columns.counts.copy()
     _forget_refused(columns.refused)
     size = np.uintp(columns.counts.shape[0])
-    rows_end = np.uint32(rows)
+    rows_end = np.uint32(sensor_rows)
     i = np.uintp(first)
     end = np.uintp(t.size)
     outside = 0

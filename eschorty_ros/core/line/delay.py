@@ -16,16 +16,17 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.modulation import Modulation
 
 # Before so many points their mean time is not known to a sixteenth of its scatter.
-_POINTS_MIN = 256.0
+_POINTS_MIN = 256
 # A larger one, us or share of the period, is an error of the phase.
 _DELAY_MAX_US = 1000.0
 _DELAY_MAX_SHARE = 0.25
 
 
 class Light(NamedTuple):
-    """When a profile is lit: its middle, us after its edge, and the part of its time.
+    """When a profile is lit, and the largest delay of its events that is applied.
 
-    A larger delay than ``delay_max_us`` is none.
+    ``middle_us`` is from the first edge to the middle of the light, ``lit_share`` the share of the
+    profile's time with light. Delays larger than ``delay_max_us`` are not applied; -1 applies none.
     """
 
     middle_us: float = 0.0
@@ -47,7 +48,7 @@ def light(modulation: Modulation, every: int) -> Light:
 def _delay_us(rows, sums, light):
     """Add the points of a profile and return the delay of the events, us; 0 while it is unknown.
 
-    ``sums`` are the points' mean times since their edge, us, and their number.
+    ``sums`` are those of the points' mean times since their edge, us, and their number.
     """
     returns, columns = rows.row.shape
     total_us, points = np.int64(0), np.int64(0)
@@ -56,8 +57,8 @@ def _delay_us(rows, sums, light):
             found = not np.isnan(rows.row[k, c])
             total_us += rows.mean_dt_us[k, c] if found else np.int64(0)
             points += np.int64(found)
-    sums[0] += total_us
-    sums[1] += points
-    late_us = sums[0] / max(sums[1], 1.0) - light.middle_us
-    known = sums[1] >= _POINTS_MIN and abs(late_us) <= light.delay_max_us
+    sums.time_us += total_us
+    sums.points += points
+    late_us = sums.time_us / max(sums.points, 1) - light.middle_us
+    known = sums.points >= _POINTS_MIN and abs(late_us) <= light.delay_max_us
     return np.int64(np.rint(late_us)) if known else np.int64(0)

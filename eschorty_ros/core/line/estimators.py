@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.window import FRACTION, ROW_LAST, ROW_MASK
+from eschorty_ros.core.line.window import FRACTION, HALF_WIDTH_PER_FWHM, ROW_LAST, ROW_MASK
 
 FWHM_PER_SIGMA = 2.3548200450309493
-HALF_WIDTH_PER_FWHM = 1.3
+# Least half width of a window, fixed point.
+HALF_MIN = 3 * FRACTION
 # A window's half width in standard deviations of the line, fixed point.
 HALF_PER_SIGMA = HALF_WIDTH_PER_FWHM * FWHM_PER_SIGMA * FRACTION
 

@@ -20,26 +20,34 @@ from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
-# Places per row, counts that are told apart, candidates to either side of the first row.
+# Places per row.
 _PLACES = 8
+# Counts that are told apart; the last is that number or more.
 _COUNTS = 12
+# Candidates to either side of the first row.
 _SIDE = 2 * _PLACES
 _ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_PLACES) * np.arange(1, 4, dtype=np.uintp)
-# Steps of a log-likelihood of one, and the least in steps, so that sums fit 16 bits.
+# Steps of a log-likelihood of one.
 _LOG_ONE = 64
+# The least log-likelihood in steps, so that sums fit 16 bits.
 _LOG_MIN = -512
 # Of every so many columns one is learned from in a profile.
 _STRIDE = 4
-# Columns after which the footprint is computed again, doubled from the fourth time on. Rows found
-# with an earlier footprint are less exact, so its counts are forgotten.
+# Columns after which the footprint is computed again. Rows found with an earlier footprint are less
+# exact, so its counts are forgotten.
 _COLUMNS_MIN = 512
+# Computations after which that number doubles with each.
 _ROUNDS = 3
 _DOUBLINGS = 5
+# Each averages a place with its neighbours, which all smooth over a quarter of a row.
 _SMOOTHING_PASSES = 4
-# A prior of so many pixels at each distance, and of so many with each count.
+# A prior of so many pixels at each distance.
 _PRIOR_PIXELS = 2.0
+# A prior of so many pixels with each count.
 _PRIOR_COUNT = 0.02
+# Most moves of the candidates towards the greatest likelihood.
 _MOVES_MAX = 24
+# A row further from the smoothed one is no place to learn from.
 _OFF_LINE_PX = 1.0
 # Learned rows take twice the time of means. They pay where they scatter less than means of twice
 # the events would.
@@ -133,7 +141,7 @@ def _count_rows(packed, column, low, high, counts):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _sample(packed, column, c, row, rows, footprint, counts):
+def _sample(packed, column, c, row, sensor_rows, footprint, counts):
     """Keep the events by row of column ``c`` to learn from, when its turn has come.
 
     ``counts`` is zeroed scratch, one per row.
@@ -143,7 +151,7 @@ def _sample(packed, column, c, row, rows, footprint, counts):
         return
     centre = np.int64(np.rint(row))
     first = max(centre - footprint.reach, np.int64(0))
-    last = min(centre + footprint.reach, rows - 1)
+    last = min(centre + footprint.reach, sensor_rows - 1)
     _count_rows(packed, column, first, last, counts)
     footprint.first_row[slot] = first
     for at in range(first, last + 1):
@@ -158,7 +166,7 @@ def _events_in(counts, row):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _log_likelihoods(footprint, place, low, high, counts, rows):
+def _log_likelihoods(footprint, place, low, high, counts, sensor_rows):
     """Fill the log-likelihoods of the places around ``place``; return the best one's offset."""
     likelihood, log, none, reach = (
         footprint.likelihood,
@@ -166,9 +174,9 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
         footprint.none,
         footprint.reach,
     )
-    # A number that the compiler does not know: it adds in vectors, in place of one after the other.
+    # Read from the array, so that it is no compile-time constant: LLVM then vectorises the loops.
     middle, candidates = log.shape[1] // 2, np.uintp(likelihood.size)
-    if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (rows - 1 - reach):
+    if place - _SIDE >= _PLACES * reach and place + _SIDE <= _PLACES * (sensor_rows - 1 - reach):
         begin = np.uintp((place - _SIDE) % _PLACES)
         for m in range(candidates):
             likelihood[m] = footprint.empty[begin + m]
@@ -176,7 +184,9 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
         for m in range(2 * _SIDE):
             at = place - _SIDE + m
             total = np.int64(0)
-            for row in range(max(at // _PLACES - reach, 0), min(at // _PLACES + reach + 2, rows)):
+            for row in range(
+                max(at // _PLACES - reach, 0), min(at // _PLACES + reach + 2, sensor_rows)
+            ):
                 if abs(at - _PLACES * row) <= _PLACES * reach:
                     total += none[middle + at - _PLACES * row]
             likelihood[m] = total
@@ -211,7 +221,7 @@ def _log_likelihoods(footprint, place, low, high, counts, rows):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _learned_row(packed, column, row, rows, footprint, counts):
+def _learned_row(packed, column, row, sensor_rows, footprint, counts):
     """Return the row of a line near ``row`` and its variance; 0 and -1 before any is learned.
 
     ``counts`` is zeroed scratch, one per row.
@@ -222,15 +232,15 @@ def _learned_row(packed, column, row, rows, footprint, counts):
     reach = footprint.reach
     centre = np.int64(np.rint(row))
     margin = reach + _MOVES_MAX
-    span = max(centre - margin, 0), min(centre + margin, rows - 1)
+    span = max(centre - margin, 0), min(centre + margin, sensor_rows - 1)
     all_low, all_high = _count_rows(packed, column, span[0], span[1], counts)
     for _ in range(_MOVES_MAX):
         low = max(-((_PLACES * reach - place) // _PLACES), all_low)
         high = min((place + _PLACES * reach) // _PLACES, all_high)
-        best = _log_likelihoods(footprint, place, low, high, counts, rows)
+        best = _log_likelihoods(footprint, place, low, high, counts, sensor_rows)
         if abs(best) <= _SIDE - 2:
             break
-        place = np.int64(min(max(place + best, -_PLACES), _PLACES * rows))
+        place = np.int64(min(max(place + best, -_PLACES), _PLACES * sensor_rows))
     likelihood = footprint.likelihood
     peak = likelihood[_SIDE + best]
     total, first, second = 0.0, 0.0, 0.0
@@ -253,7 +263,7 @@ def _learned_row(packed, column, row, rows, footprint, counts):
 
 
 @kernel
-def _learn(footprint, row, smoothed, uncertain, truncated, rows):
+def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
     """Count the pixels of the columns kept, at their distances from the ``smoothed`` rows.
 
     Columns in which the sensor's edge cuts the line count where they are the majority.
@@ -270,7 +280,7 @@ def _learn(footprint, row, smoothed, uncertain, truncated, rows):
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
             continue
-        last = min(first + 2 * footprint.reach, rows - 1)
+        last = min(first + 2 * footprint.reach, sensor_rows - 1)
         begin = middle + np.int64(np.rint(_PLACES * (first - smoothed[c])))
         for at in range(np.uintp(last + 1 - first)):
             place = begin + np.int64(_PLACES * at)

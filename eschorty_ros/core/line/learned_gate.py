@@ -31,14 +31,15 @@ from eschorty_ros.core.modulation.phase_gate import (
 
 # The longest gate is half of the period, each further one half as long.
 _LENGTHS = 5
-# Columns that are tested for moving together, and the mean square of their sum over the sum of
-# their squares, which is 1 by chance.
+# Columns that are tested for moving together.
 _TOGETHER = 16
+# Mean square of the sum of their differences over the sum of the squares, which is 1 by chance.
 _TOGETHER_MAX = 2.0
 # Standard deviations by which a column's number of late events exceeds the usual one.
 _DEVIATIONS = 3.0
-# Events for a row, and the share of the rows that must not get less.
+# Events for a row.
 _EVENTS_MIN = 4
+# Share of the rows that a gate has to keep.
 _FOUND_MIN = 0.995
 
 

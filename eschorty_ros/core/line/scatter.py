@@ -22,21 +22,25 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 
-_APART = 5
-# Columns of a block; the differences of a block and its two neighbours count for its points. The
-# share of a profile's differences that the next keeps.
-BLOCK = 16
+# Columns from one to the next of those whose rows, or widths, are compared.
+APART = 5
+# Columns of a block; the differences of a block and its two neighbours count for its points.
+BLOCK_COLUMNS = 16
+# Share of a profile's differences that the next keeps.
 _KEPT = 0.5
+# Differences without which the scatter near a block is not known.
 _DIFFERENCES_MIN = 8.0
 # Differences without which the scatter of a profile is not known.
 _OF_PROFILE_MIN = 64
 # A larger second difference is an edge of the surface, but where most are as large.
 _EDGE_PX = 4.0
+# Standard deviations beyond which a difference is an edge, or a neighbour is not averaged.
 _DEVIATIONS_MAX = 3.0
+# Largest factor of a variance, and one over the least.
 FACTOR_MAX = 64.0
-# Variance of a whole pixel. Of lengths that are one of two numbers of them, the largest second
-# difference, squared.
+# Variance of a whole pixel.
 _WHOLE = 1.0 / 12.0
+# Largest square of a second difference of lengths that are one of two numbers of pixels.
 _LENGTH2_MAX = 4.0
 # Mean square of a normal distribution over that of its mean size.
 _SQUARE_PER_SIZE2 = 0.5 * np.pi
@@ -70,7 +74,7 @@ class Scatter(NamedTuple):
 
 def empty_scatter(columns: int, factor_max: float) -> Scatter:
     """Return no differences; the first and the last block are outside the sensor."""
-    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK) + 2))
+    own, smoothed = np.zeros((2, len(Differences._fields), -(-columns // BLOCK_COLUMNS) + 2))
     return Scatter(Differences(*own), Differences(*smoothed), factor_max, np.ones(columns))
 
 
@@ -94,11 +98,11 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
     columns = row.size
     usual = np.sqrt(sums.squares.sum() / max(sums.number.sum(), 1.0))
     for block in range(1, sums.number.size - 1):
-        begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         most = 1.0
         for c in range(np.uintp(begin), np.uintp(end)):
             most = max(most, averaged[c])
-        apart = max(_APART, int(most) // 2 + 1)
+        apart = max(APART, int(most) // 2 + 1)
         largest = max(edge_px / np.sqrt(most), _DEVIATIONS_MAX * usual)
         first, last = max(begin, apart), min(end, columns - apart)
         squares, expected, sizes, lengths2, number = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -127,7 +131,7 @@ def _add_differences(row, sigma2, variance, averaged, edge_px, sums):
 @kernel
 def _median_difference(row):
     """Return the median size of the second differences of rows, infinite where few are known."""
-    differences = np.abs(row[: -2 * _APART] - 2.0 * row[_APART:-_APART] + row[2 * _APART :])
+    differences = np.abs(row[: -2 * APART] - 2.0 * row[APART:-APART] + row[2 * APART :])
     known = differences[~np.isnan(differences)]
     return np.median(known) if known.size >= _OF_PROFILE_MIN else np.inf
 
@@ -160,7 +164,7 @@ def _levels(rows, begin, end, laser_edges):
 
 
 @kernel(_nrt=False)
-def _locking2(sums, block, levels):
+def _pixel_locking_variance(sums, block, levels):
     """Return the variance that rows near a block share as the line's ends are whole pixels.
 
     A row is the mean of two ends for each of the levels, so that an end scatters by two of its
@@ -187,9 +191,9 @@ def _scale(rows, scatter, smoothing):
     for block in range(1, sums.number.size - 1):
         ratio = _ratio(sums, block, scatter.factor_max)
         measured = ratio >= 0.0
-        begin, end = (block - 1) * BLOCK, min(block * BLOCK, columns)
+        begin, end = (block - 1) * BLOCK_COLUMNS, min(block * BLOCK_COLUMNS, columns)
         levels = _levels(rows, begin, end, scatter.laser_edges)
-        locking2 = _locking2(sums, block, levels) if measured else 0.0
+        locking2 = _pixel_locking_variance(sums, block, levels) if measured else 0.0
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
         for k in range(returns):
@@ -214,5 +218,7 @@ def _scale_smoothed(rows, scatter, smoothing):
         ratio = _ratio(sums, block, scatter.factor_max)
         factor = min(ratio, scatter.factor_max) if ratio >= 0.0 else 1.0
         for k in range(returns):
-            for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
+            for c in range(
+                np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
+            ):
                 sigma2[k, c] = rows.common2[k, c] + factor * sigma2[k, c]

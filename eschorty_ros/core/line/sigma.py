@@ -8,7 +8,7 @@ with s the standard deviation of the N rows used and s0 that of the line itself.
 small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
 from the mismatch of the pixels' thresholds, which more events of the same pixels do not reduce. The
 last term is for events that are not the line's, which scatter independently. The other part is
-what neighbouring columns share (`course`).
+what neighbouring columns share (`line_history`).
 
 The constants are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
 1000 Hz. In a stream the columns' own part is scaled by the scatter of near columns (`scatter`), so
@@ -67,19 +67,19 @@ def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> Erro
 
 
 @kernel(forceinline=True)
-def _background(excess, count, row, rows):
+def _background(excess, count, row, sensor_rows):
     """Return the number of background events, evenly spread, behind ``excess`` variance.
 
     The second value is the share of their mean square distance that is common to all, as most of
     them are on one side of a line away from the sensor's middle.
     """
-    offset = 0.5 * (rows - 1.0) - row
-    square = rows * rows / 12.0 + offset * offset
+    offset = 0.5 * (sensor_rows - 1.0) - row
+    square = sensor_rows * sensor_rows / 12.0 + offset * offset
     return excess * count / square, offset * offset / square
 
 
 @kernel(forceinline=True)
-def _own_variance(variance, line_variance, count, row, rows, model):
+def _own_variance(variance, line_variance, count, row, sensor_rows, model):
     """Return the variance of one column's row, px squared, without what its neighbours share.
 
     Variance in excess of ``line_variance`` comes from background events, which scatter
@@ -89,7 +89,7 @@ def _own_variance(variance, line_variance, count, row, rows, model):
     sigma2 = model.factor**2 * min(variance, line_variance) / count + floor2
     # No branch: whether a line is wider than expected is a matter of chance.
     excess = max(variance - line_variance, 0.0)
-    events, shared = _background(excess, count, row, rows)
+    events, shared = _background(excess, count, row, sensor_rows)
     coherent = 1.0 + max(events - 1.0, 0.0) * shared
     if model.median:
         # A background event moves the median by half the distance of two of the line's events.

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK
-from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths, empty_widths
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
+from eschorty_ros.core.line.unusual import WIDTH_COLUMNS, WIDTH_PAIRS, Widths
 
 # Columns to either side in which a weak point needs a neighbour.
 _ISOLATION_REACH = 2
-# Blocks of columns on either side that choose the half width of a block together. The share of a
-# profile's errors that the next keeps.
+# Blocks of columns on either side that choose the half width of a block together.
 _NEAR = 2
+# Share of a profile's errors that the next keeps.
 _KEPT = 0.5
 
 
@@ -26,14 +26,15 @@ class Averages(NamedTuple):
     """Sums over each point and its neighbours by half width, shape (half widths, returns, columns).
 
     They are those of the neighbours' differences from the point's row and of the points ``used``.
-    ``squares`` are a profile's squared errors of prediction, and ``before`` the sums of variances
-    and of spreads over the columns before each.
+    ``squares`` are a profile's squared errors of prediction, ``sigma2_before`` and
+    ``variance_before`` the sums of variances and of spreads over the columns before each.
     """
 
     difference: NDArray[np.float64]
     used: NDArray[np.float64]
     squares: NDArray[np.float64]
-    before: NDArray[np.float64]
+    sigma2_before: NDArray[np.float64]
+    variance_before: NDArray[np.float64]
 
 
 class Smoothing(NamedTuple):
@@ -69,19 +70,19 @@ def empty_smoothing(
     gate_px: float,
     isolation_gate_px: float,
     isolation_events: int,
-    common_px: float,
-    windowed: bool,
-    shape: tuple[int, int],
+    widths: Widths,
 ) -> Smoothing:
-    """Return the smoothing of profiles of a ``shape``, with half widths up to the ``largest``."""
-    columns, tried = shape[1], half_widths(largest)
-    blocks = -(-columns // BLOCK)
+    """Return the smoothing of profiles with ``widths``, by half widths up to the ``largest``."""
+    shape, tried = widths.smoothed.shape, half_widths(largest)
+    columns = shape[1]
+    blocks = -(-columns // BLOCK_COLUMNS)
     differences, averaged = np.zeros((2, tried.size, *shape))
+    sigma2_before, variance_before = np.zeros((2, columns + 1))
     row, sigma2, used, gates_px = np.zeros((4, *shape))
     return Smoothing(
         half_widths=tried,
         errors=np.zeros((tried.size, blocks + 2 * _NEAR)),
-        averages=Averages(differences, averaged, np.zeros(columns), np.zeros((2, columns + 1))),
+        averages=Averages(differences, averaged, np.zeros(columns), sigma2_before, variance_before),
         gate_px=gate_px,
         isolation_gate_px=isolation_gate_px,
         isolation_events=isolation_events,
@@ -90,7 +91,7 @@ def empty_smoothing(
         sigma2=sigma2,
         used=used,
         gates_px=gates_px,
-        widths=empty_widths(*shape, common_px, windowed),
+        widths=widths,
     )
 
 
@@ -156,24 +157,27 @@ def _add_errors(averages, level, errors):
             squares[c] = error * error
         for block in range(errors.shape[1] - 2 * _NEAR):
             total = 0.0
-            for c in range(np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))):
+            for c in range(
+                np.uintp(block * BLOCK_COLUMNS), np.uintp(min((block + 1) * BLOCK_COLUMNS, columns))
+            ):
                 total += squares[c]
             errors[level, block + _NEAR] += total
 
 
 @kernel(_nrt=False)
-def _sum_before(rows, before):
+def _sum_before(rows, averages):
     """Fill the sums of the variances and of the spreads of all columns before each."""
     sigma2, variance = 0.0, 0.0
     for c in range(np.uintp(rows.row.shape[1])):
         found = not np.isnan(rows.row[0, c])
         sigma2 += rows.sigma2[0, c] if found else 0.0
         variance += rows.variance[0, c] if found else 0.0
-        before[0, c + np.uintp(1)], before[1, c + np.uintp(1)] = sigma2, variance
+        averages.sigma2_before[c + np.uintp(1)] = sigma2
+        averages.variance_before[c + np.uintp(1)] = variance
 
 
 @kernel(_nrt=False, forceinline=True)
-def _sums_of(rows, k, c, pairs, before):
+def _sums_of(rows, k, c, pairs, averages):
     """Return the sum of the variances of a point and its pairs of neighbours.
 
     The second value is that of the spreads of the nearest of them.
@@ -181,8 +185,8 @@ def _sums_of(rows, k, c, pairs, before):
     near = min(pairs, np.uintp(WIDTH_PAIRS))
     if rows.row.shape[0] == 1:
         end, near_end = c + pairs + np.uintp(1), c + near + np.uintp(1)
-        sigma2 = before[0, end] - before[0, c - pairs]
-        return sigma2, before[1, near_end] - before[1, c - near]
+        sigma2, variance = averages.sigma2_before, averages.variance_before
+        return sigma2[end] - sigma2[c - pairs], variance[near_end] - variance[c - near]
     sigma2, variance = rows.sigma2[k, c], rows.variance[k, c]
     for j in range(np.uintp(1), pairs + np.uintp(1)):
         for other in (c - j, c + j):
@@ -234,14 +238,17 @@ def _smooth(rows, smoothing):
                     _add_pairs(rows.row, smoothing.gates_px, k, j, level, averages)
         added = half_width
         _add_errors(averages, level, errors)
-    _sum_before(rows, averages.before)
+    _sum_before(rows, averages)
     for block in range(errors.shape[1] - 2 * _NEAR):
         level = _best(errors, block)
-        first, end = np.uintp(block * BLOCK), np.uintp(min((block + 1) * BLOCK, columns))
+        first, end = (
+            np.uintp(block * BLOCK_COLUMNS),
+            np.uintp(min((block + 1) * BLOCK_COLUMNS, columns)),
+        )
         for k in range(np.uintp(returns)):
             for c in range(first, end):
                 n = used[level, k, c]
-                sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages.before)
+                sums = _sums_of(rows, k, c, np.uintp(n) // np.uintp(2), averages)
                 smoothing.sigma2[k, c], widths.smoothed[k, c] = sums
                 smoothing.row[k, c], smoothing.used[k, c] = difference[level, k, c], n
     return _divide(rows, smoothing)

@@ -8,107 +8,120 @@ crosses changes, that on a dark surface stays.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.course import PER_NARROWER, Course, _follow, empty_course
-from eschorty_ros.core.line.scatter import BLOCK
+from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.line_history import (
+    PER_NARROWER,
+    LineHistory,
+    _compare_with_recent,
+    empty_history,
+)
+from eschorty_ros.core.line.reflectance import ROOT_12
+from eschorty_ros.core.line.scatter import APART, BLOCK_COLUMNS
 
+# Widths that are told apart, per row and in all.
 _PER_ROW = 16
 _BINS = 1 << 10
 # A width is usual when this share of the stream's points is within one standard deviation of it: a
 # normal distribution alone leaves out 3 in 1000.
 _USUAL_SHARE = 0.02
-# Mixed ones count less, even less where the row moves. A width or row is steady when it changes by
-# so many deviations at most.
+# Weight of a point with an unusual width.
 _MIXED_WEIGHT = 0.25
+# The same where the row moves.
 _MOVING_WEIGHT = 0.05
+# A width or row is steady when it changes by so many deviations at most.
 _STEADY = 2.0 * np.sqrt(2.0)
+# Points without which no width is usual.
 _POINTS_MIN = 512.0
 # Points that are remembered, in profiles of all columns.
 _PROFILES_KEPT = 256
+# The widths that a window begins with count as so many profiles.
 _PROFILES_KNOWN = 16
-_APART = 5
-# Neighbours on either side that a width is averaged with, and the columns of such a mean.
+# Neighbours on either side that a width is averaged with.
 WIDTH_PAIRS = 2
+# Columns of such a mean.
 WIDTH_COLUMNS = 2.0 * WIDTH_PAIRS + 1.0
-# Steps of the running median of differences are this share of it, larger ones at first; standard
-# deviation over that median.
+# Steps of the running median of differences are this share of it, larger ones at first.
 _STEP = 1.0 / 1024.0
+# Standard deviation over the median size of differences.
 _SIGMA_PER_MEDIAN = 1.0 / 0.954
-_ROOT_12 = np.sqrt(12.0)
 # Columns to either side that move as a column does.
-_BESIDE = BLOCK + BLOCK // 2
+_BESIDE = BLOCK_COLUMNS + BLOCK_COLUMNS // 2
 # A point is marked when the missing or additional rows may move it by more deviations of a row
 # that is not smoothed.
 _MARKED = 2.5
 
 
+class UsualWidths(NamedTuple):
+    """Points by width, and medians of the ``width`` and of the ``difference`` of near widths."""
+
+    number: NDArray[np.float64]
+    median: Any
+
+
 class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
-    ``number`` has the points by width and ``below`` their sums; ``state`` the median width and the
-    median difference of widths near each other. ``smoothed`` holds those of a profile,
-    ``at_rest`` less what their way adds, and ``before`` widths and rows of the last one. The
-    ``course`` has what changes.
+    ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
+    ``static_width`` less what motion adds, and ``weight`` is by how much they count. ``last`` and
+    ``last_row`` are widths and rows of the last profile. The ``history`` has what changes.
     """
 
-    number: NDArray[np.float64]
+    usual: UsualWidths
     below: NDArray[np.float64]
-    state: NDArray[np.float64]
-    before: NDArray[np.float64]
     smoothed: NDArray[np.float64]
-    at_rest: NDArray[np.float64]
-    course: Course
+    static_width: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    last: NDArray[np.float64]
+    last_row: NDArray[np.float64]
+    history: LineHistory
 
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, at_rest = np.full((2, returns, columns), np.nan)
+    smoothed, static_width, weight, last, last_row = np.full((5, returns, columns), np.nan)
+    history = empty_history(columns, common_px, windowed)
+    below = np.zeros(_BINS + 1)
     return Widths(
-        number=np.zeros(_BINS),
-        below=np.zeros(_BINS + 1),
-        state=np.zeros(2),
-        before=np.full((2, returns, columns), np.nan),
-        smoothed=smoothed,
-        at_rest=at_rest,
-        course=empty_course(columns, common_px, windowed),
+        empty_usual_widths(), below, smoothed, static_width, weight, last, last_row, history
     )
 
 
-def empty_known_widths() -> NDArray[np.float64]:
-    """Return room for the ``number`` and ``state`` of widths."""
-    return np.zeros(_BINS + 2)
+def empty_usual_widths() -> UsualWidths:
+    """Return no usual widths."""
+    return UsualWidths(np.zeros(_BINS), record("width", "difference", value=0.0))
 
 
 @kernel
-def _bin(width):
+def _width_bin(width):
     return min(np.int64(width * _PER_ROW), _BINS - 1)
 
 
 @kernel
 def _keep_widths(widths, known):
     """Keep the usual widths as ``known`` ones, which count as many profiles."""
-    points = _PROFILES_KNOWN * widths.smoothed.shape[1]
-    known[:_BINS] = widths.number * (points / max(widths.number.sum(), 1.0))
-    known[_BINS:] = widths.state
+    points, usual = _PROFILES_KNOWN * widths.smoothed.shape[1], widths.usual
+    known.number[:] = usual.number * (points / max(usual.number.sum(), 1.0))
+    known.median.difference = usual.median.difference
 
 
 @kernel
 def _restart_widths(widths, known):
     """Forget all widths but the ``known`` ones, zeros where there are none."""
-    widths.number[:], widths.state[:] = known[:_BINS], known[_BINS:]
-    widths.before[:] = np.nan
-    widths.course.recent[:] = 0.0
+    usual, recent = widths.usual, widths.history.recent
+    usual.number[:], usual.median.difference = known.number, known.median.difference
+    widths.last[:], widths.last_row[:] = np.nan, np.nan
+    recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
     _update(widths, widths.smoothed.shape[1])
 
 
 @kernel(_nrt=False)
 def _is_usual(widths, width, reach):
-    place = _bin(width)
+    place = _width_bin(width)
     low, high = max(place - reach, 0), min(place + reach + 1, _BINS)
     return widths.below[high] - widths.below[low] >= _USUAL_SHARE * widths.below[_BINS]
 
@@ -127,7 +140,7 @@ def _unusual_variance(width, usual):
 @kernel
 def _update(widths, columns):
     """Bring the sums and the median up to date, and halve what is remembered when it is much."""
-    number, below = widths.number, widths.below
+    number, below = widths.usual.number, widths.below
     if below[_BINS] > _PROFILES_KEPT * columns:
         number *= 0.5
     total = 0.0
@@ -137,106 +150,122 @@ def _update(widths, columns):
     median = 0
     while median < _BINS - 1 and 2.0 * below[median + 1] < total:
         median += 1
-    widths.state[0] = (median + 0.5) / _PER_ROW
+    widths.usual.median.width = (median + 0.5) / _PER_ROW
 
 
 @kernel
-def _at_rest(width, usual, way):
-    """Return the width of a line less what its ``way`` while it is lit may add.
+def _static_width(width, usual, displacement):
+    """Return the width of a line less what its ``displacement`` while it is lit may add.
 
-    Rows that it leaves or reaches widen it by the way, hence its standard deviation by up to the
-    way's over the square root of 12.
+    Rows that it leaves or reaches widen it by the displacement, hence its standard deviation by up
+    to that over the square root of 12.
     """
-    return min(width, max(usual, width - way / _ROOT_12))
+    return min(width, max(usual, width - displacement / ROOT_12))
 
 
 @kernel(_nrt=False)
-def _way(row, last_row, column):
+def _displacement(row, last_row, column):
     """Return how far the line has moved in a column since the last profile; 0 if not known."""
     c = np.uintp(column)
-    way = abs(row[c] - last_row[c])
-    return 0.0 if np.isnan(way) else way
+    displacement = abs(row[c] - last_row[c])
+    return 0.0 if np.isnan(displacement) else displacement
 
 
 @kernel(_nrt=False)
-def _take_off_way(smoothed, row, last_row, usual, lit_share, at_rest):
-    """Set widths less what the way of their lines since the last profile adds.
+def _without_motion(smoothed, row, last_row, usual, lit_share, static_width):
+    """Set widths less what the displacement of their lines since the last profile adds.
 
-    A line is lit for ``lit_share`` of the time between two profiles. A leap of few columns, to a
-    glint, is no way: it is as long as that of columns beside them at most.
+    A line is lit for ``lit_share`` of the time between two profiles. A jump confined to a few
+    columns (a glint) is not motion: the displacement is limited to that of the columns beside.
     """
     beside, last = np.intp(_BESIDE), np.intp(row.size - 1)
     for c in range(np.intp(row.size)):
         before, after = max(c - beside, np.intp(0)), min(c + beside, last)
-        near = max(_way(row, last_row, before), _way(row, last_row, after))
-        way = min(_way(row, last_row, c), near)
-        at_rest[c] = _at_rest(smoothed[c], usual, lit_share * way)
+        near = max(_displacement(row, last_row, before), _displacement(row, last_row, after))
+        displacement = min(_displacement(row, last_row, c), near)
+        static_width[c] = _static_width(smoothed[c], usual, lit_share * displacement)
 
 
 @kernel(_nrt=False)
 def _follow_line(rows, smoothing, lit_share):
-    """Take what their way adds off the widths of a profile's points, and follow the line's course.
+    """Take motion off the widths of a profile's points, and compare it with recent profiles.
 
     Weak points show no width.
     """
     row, widths = smoothing.row, smoothing.widths
-    now, at_rest, last_row = widths.course.now, widths.at_rest, widths.before[1]
+    now, static_width, median = widths.history.now, widths.static_width, widths.usual.median
     returns, columns = row.shape
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual = widths.state[0] if known else np.inf
+    usual = median.width if known else np.inf
     for k in range(returns):
-        _take_off_way(widths.smoothed[k], row[k], last_row[k], usual, lit_share, at_rest[k])
-    for block in range(1, now.shape[1] - 1):
+        _without_motion(
+            widths.smoothed[k], row[k], widths.last_row[k], usual, lit_share, static_width[k]
+        )
+    for block in range(1, now.points.size - 1):
         total, width, sigma2, points = 0.0, 0.0, 0.0, 0.0
-        for c in range(np.uintp((block - 1) * BLOCK), np.uintp(min(block * BLOCK, columns))):
+        for c in range(
+            np.uintp((block - 1) * BLOCK_COLUMNS), np.uintp(min(block * BLOCK_COLUMNS, columns))
+        ):
             weak = rows.truncated[0, c] | (rows.events[0, c] < smoothing.isolation_events)
             if not (weak | np.isnan(row[0, c])):
                 total += row[0, c]
-                width += at_rest[0, c]
+                width += static_width[0, c]
                 sigma2 += rows.sigma2[0, c]
                 points += 1.0
-        now[0, block], now[1, block], now[2, block], now[3, block] = total, width, sigma2, points
-    sigma = _SIGMA_PER_MEDIAN * widths.state[1]
-    _follow(widths.course, known, widths.state[0], WIDTH_COLUMNS * sigma * sigma)
+        now.row[block], now.width[block] = total, width
+        now.sigma2[block], now.points[block] = sigma2, points
+    sigma = _SIGMA_PER_MEDIAN * median.difference
+    _compare_with_recent(widths.history, known, median.width, WIDTH_COLUMNS * sigma * sigma)
 
 
 @kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, lit_share):
-    """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
+def _widen(rows, smoothing):
+    """Widen the variance of points that move or pass an edge, mark the mixed and weigh them all."""
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
-    _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
-    smoothed, before, state = widths.smoothed, widths.before, widths.state
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual, median, sigma = state[0], state[1], _SIGMA_PER_MEDIAN * state[1]
-    pairs = widths.below[_BINS] + 1.0
+    usual, sigma = widths.usual.median.width, _SIGMA_PER_MEDIAN * widths.usual.median.difference
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
-            width, last_width, last_row = widths.at_rest[k, c], before[0, k, c], before[1, k, c]
-            way = row[k, c] - last_row
+            width, displacement = widths.static_width[k, c], row[k, c] - widths.last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
-            sigma2[k, c] += widths.course.moved2[c // BLOCK + 1]
+            sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
             rows.mixed[k, c] = False
+            widths.weight[k, c] = 0.0
             weak = rows.events[k, c] < smoothing.isolation_events
             if np.isnan(width) or rows.truncated[k, c] or weak:
                 continue
-            weight, more2 = 1.0, widths.course.passing2[c // BLOCK + 1]
+            weight, more2 = 1.0, widths.history.passing2[c // BLOCK_COLUMNS + 1]
             if smoothing.used[k, c] != averaged:
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
             if known and not _is_usual(widths, width, reach):
-                steady = not way * way > _STEADY**2 * own2
+                steady = not displacement * displacement > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, unusual2)
+            widths.weight[k, c] = weight
             sigma2[k, c] += more2
-            if not abs(width - last_width) > _STEADY * sigma:
-                widths.number[_bin(width)] += weight
-            if c >= _APART and not np.isnan(smoothed[k, c - _APART]):
-                difference = abs(smoothed[k, c] - smoothed[k, c - _APART])
+
+
+@kernel(_nrt=False)
+def _add_widths(row, widths):
+    """Add the widths of a profile to those of the stream, and keep them with the ``row``."""
+    returns, columns = row.shape
+    smoothed, static_width, last = widths.smoothed, widths.static_width, widths.last
+    median, pairs = widths.usual.median.difference, widths.below[_BINS] + 1.0
+    sigma = _SIGMA_PER_MEDIAN * median
+    for k in range(returns):
+        for c in range(columns):
+            if widths.weight[k, c] == 0.0:
+                continue
+            if not abs(static_width[k, c] - last[k, c]) > _STEADY * sigma:
+                widths.usual.number[_width_bin(static_width[k, c])] += widths.weight[k, c]
+            if c >= APART and not np.isnan(smoothed[k, c - APART]):
+                difference = abs(smoothed[k, c] - smoothed[k, c - APART])
                 if median == 0.0:
                     median = difference
                 pairs += 1.0
@@ -244,6 +273,14 @@ def _mark_unusual(rows, smoothing, lit_share):
                 median *= 1.0 + (step if difference > median else -step)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            before[0, k, c], before[1, k, c] = widths.at_rest[k, c], row[k, c]
-    state[1] = median
+            last[k, c], widths.last_row[k, c] = static_width[k, c], row[k, c]
+    widths.usual.median.difference = median
     _update(widths, columns)
+
+
+@kernel(_nrt=False)
+def _mark_unusual(rows, smoothing, lit_share):
+    """Widen and mark the points of a profile by unusual widths, and update what is usual."""
+    _follow_line(rows, smoothing, lit_share)
+    _widen(rows, smoothing)
+    _add_widths(smoothing.row, smoothing.widths)

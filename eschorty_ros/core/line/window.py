@@ -23,13 +23,14 @@ ROW_BITS = 10
 ROW_MASK = np.uint32((1 << ROW_BITS) - 1)
 ROW_LAST = 1022
 POLARITY = np.uint32(1 << ROW_BITS)
-POLARITY_SHIFT = np.uint32(ROW_BITS)
+_POLARITY_SHIFT = np.uint32(ROW_BITS)
 TIME_SHIFT = np.uint32(ROW_BITS + 1)
 TIME_LIMIT_US = 1 << (31 - ROW_BITS)
 PAD = np.uint32(0xFFFFFFFF)
 BLOCK = 32
 FRACTION_BITS = 6
 FRACTION = 1 << FRACTION_BITS
+HALF_WIDTH_PER_FWHM = 1.3
 FOUND, TOO_FEW, AMBIGUOUS, UNMODULATED = 0, 1, 2, 3
 
 _ITERATIONS_MAX = 5
@@ -141,7 +142,7 @@ def _window_sums(packed, column, first, last):
             ts = np.uint32(ts + (t if inside else none))
             # The sign of the time until the light ends is 1 where it is on.
             lit = np.uint32(t - column.lit_us) >> np.uint32(31)
-            other = np.uint32(((v >> POLARITY_SHIFT) ^ lit) & one)
+            other = np.uint32(((v >> _POLARITY_SHIFT) ^ lit) & one)
             opposite = np.uint32(opposite + (other if inside else none))
         events += np.int64(both >> _ONE_BITS)
         sum_d += np.int64(both & (_ONE - np.uint32(1)))
@@ -310,21 +311,27 @@ def _densest_window(packed, column, half):
 
 
 @kernel
-def _exceeds_background(events, others, half, rows):
+def _exceeds_background(events, others, half, sensor_rows):
     """Return true when a window has more ``events`` than background of the others' density.
 
     The background is uniform; the excess has to exceed 4 standard deviations.
     """
     width = (2 * half) / FRACTION + 1.0
-    if width >= rows:
+    if width >= sensor_rows:
         return True
-    expected = others * width / (rows - width)
+    expected = others * width / (sensor_rows - width)
     excess = events - expected
     return excess > 0.0 and excess * excess > 16.0 * expected
 
 
 @kernel
-def _is_significant(events, others, half, rows):
+def _chernoff_exponent(events, expected):
+    """Return minus the logarithm of Chernoff's bound on the chance of so many events, or more."""
+    return events * np.log(events / expected) - (events - expected) if events > expected else 0.0
+
+
+@kernel
+def _is_significant(events, others, half, sensor_rows):
     """Return true when background has ``events`` in any window of a column with low probability.
 
     The probability is Chernoff's bound on the Poisson tail, times the number of windows that the
@@ -332,11 +339,9 @@ def _is_significant(events, others, half, rows):
     one more, in case there are none.
     """
     width = (2 * half) / FRACTION + 1.0
-    expected = (others + 1.0) * width / max(rows - 2.0 * width, width)
-    if events <= expected:
-        return False
-    improbable = events * np.log(events / expected) - (events - expected)
-    return improbable > np.log(_FALSE_SECOND * max(2.0 * rows / width, 1.0))
+    expected = (others + 1.0) * width / max(sensor_rows - 2.0 * width, width)
+    choices = max(2.0 * sensor_rows / width, 1.0)
+    return _chernoff_exponent(events, expected) > np.log(_FALSE_SECOND * choices)
 
 
 @kernel(_nrt=False)
@@ -346,15 +351,14 @@ def _box_events(packed, column, centre, half):
 
 
 @kernel(_nrt=False)
-def _second_return(packed, column, half, rows, events_min, a):
+def _second_return(packed, column, half, sensor_rows, events_min, a):
     """Search for the return of another surface than that of window ``a``.
 
-    It is 2 full widths at half maximum away or more (the half width of a window is 1.3 of them),
-    the box around it has at least half as many events as that around ``a``, and they are
-    significant against background.
+    It is 2 full widths at half maximum away or more, the box around it has at least half as many
+    events as that around ``a``, and they are significant against background.
     """
     alone = Returns(FOUND, False, a, a)
-    gap = half * 20 // 13
+    gap = np.int64(2.0 * half / HALF_WIDTH_PER_FWHM)
     rest = column.events - a.sums.events
     if rest < events_min or 3 * rest < a.sums.events:
         return alone
@@ -376,4 +380,4 @@ def _second_return(packed, column, half, rows, events_min, a):
     if a.sums.events < events_min or b.sums.events < events_min:
         return alone
     others = column.events - a.sums.events - b.sums.events
-    return Returns(FOUND, _is_significant(b.sums.events, others, half, rows), a, b)
+    return Returns(FOUND, _is_significant(b.sums.events, others, half, sensor_rows), a, b)

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 _CAPACITY = 1 << 19
 _DTYPES = (np.int64, np.uint16, np.uint16, np.uint8)
 
+HELD_EVENTS_MAX = 1 << 22
+"""Events that wait for a phase, or for the periods of a profile, at most."""
+
 EventArrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Times in us (int64), columns (uint16), rows (uint16) and polarities (uint8)."""
 

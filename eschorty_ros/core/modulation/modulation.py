@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number
+from eschorty_ros.core.base.numbers import TIME_LIMIT, integer, number, short
 
 WAVEFORMS = ("square", "sine", "pulse")
 FREQUENCY_MIN_HZ = 16.0
@@ -60,7 +60,7 @@ class Modulation:
             integer("on_edge_us", self.on_edge_us, -TIME_LIMIT, TIME_LIMIT)
         if self.waveform not in WAVEFORMS:
             raise ArgumentError(
-                f"waveform is {self.waveform!r}; choose one of {', '.join(WAVEFORMS)}"
+                f"waveform is {short(self.waveform)}; choose one of {', '.join(WAVEFORMS)}"
             )
 
     @property

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.modulation.edges import EdgeSchedule
-from eschorty_ros.core.modulation.held_events import HeldEvents
+from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
 from eschorty_ros.core.modulation.modulation import Modulation
 from eschorty_ros.core.modulation.phase_estimate import (
     PhaseEstimate,
@@ -15,9 +15,8 @@ from eschorty_ros.core.modulation.phase_estimate import (
 )
 
 END_OF_STREAM_US = 1 << 61
-_HELD_EVENTS_MAX = 1 << 22
 # Length of a block: 100 ppm are then at most 0.3 % of a period up to 2 kHz, and 3 % at 20 kHz.
-BLOCK_PERIODS = 32
+_BLOCK_PERIODS = 32
 BLOCK_US = 16_000
 _EVENTS_MIN = 128
 _EVENTS_ENOUGH = 2048
@@ -64,7 +63,7 @@ class PhaseLock:
         self.missing = False
         self.refused = 0
         self._modulation = modulation
-        self._block = max(BLOCK_PERIODS, round(BLOCK_US / modulation.period_us))
+        self._block = max(_BLOCK_PERIODS, round(BLOCK_US / modulation.period_us))
         self._block_end_us: int | None = None
         self._difference: float | None = None
         self._corrections = 0
@@ -110,7 +109,7 @@ class PhaseLock:
             if estimate.found:
                 return self._anchor(estimate, first_us)
             held.refused = end
-            if end > _HELD_EVENTS_MAX:
+            if end > HELD_EVENTS_MAX:
                 self.refused += end
                 held.drop(end)
                 if len(held) == 0:

@@ -34,7 +34,7 @@ _TIME_AT = LIVE_DTYPE.fields["t"][1] // _WORD.itemsize  # type: ignore[index]
 
 
 def live_points(points: NDArray[Any], t_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[Any]:
-    """Return an assembled scan's points in the layout of a live cloud, ``t`` from ``stamp_ns``.
+    """Return placed points in the layout of a live cloud, ``t`` from ``stamp_ns``.
 
     - ``points``: POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,); their ``t`` is not used.
     - ``t_ns``: int64, shape (n,), within ``LIVE_SPAN_NS`` after ``stamp_ns``.

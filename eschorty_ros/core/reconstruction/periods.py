@@ -17,7 +17,7 @@ from eschorty_ros.core.reconstruction.windows import WindowAssembler
 
 PASS_WORDS = 1 << 19
 """Words that one thread decodes in a pass."""
-# Edges are computed so far ahead of them.
+# Edges are computed this far ahead of the newest event.
 _AHEAD_US = 100_000
 
 

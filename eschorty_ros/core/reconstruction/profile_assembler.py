@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import Decoder, EventArrays
 from eschorty_ros.core.evt3.decoder import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
@@ -38,7 +38,7 @@ from eschorty_ros.core.line.columns import (
     wider_columns,
 )
 from eschorty_ros.core.line.delay import Light, _delay_us, light
-from eschorty_ros.core.line.estimators import HALF_PER_SIGMA
+from eschorty_ros.core.line.estimators import HALF_MIN, HALF_PER_SIGMA
 from eschorty_ros.core.line.learned import (
     MEAN_ROWS,
     UNDECIDED,
@@ -72,12 +72,14 @@ from eschorty_ros.core.line.smoothing import (
     empty_smoothing,
 )
 from eschorty_ros.core.line.unusual import (
+    UsualWidths,
     _keep_widths,
     _mark_unusual,
     _restart_widths,
-    empty_known_widths,
+    empty_usual_widths,
+    empty_widths,
 )
-from eschorty_ros.core.line.window import FRACTION, ROW_LAST
+from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
 from eschorty_ros.core.modulation.phase_gate import _gate_part
@@ -98,7 +100,6 @@ on.
 # Profiles of the first window, as full of points as any, that show the usual widths.
 _KNOWN_PROFILES = 16
 _OUTPUT_PROFILES = 64
-_HALF_MIN = 3 * FRACTION
 _WIDTH_MIN_DOF = 64
 # Times the limit that a line may be wide.
 _WIDER = 4
@@ -173,11 +174,11 @@ class _Memory(NamedTuple):
     blink: Blink
     footprint: Footprint
     known: Footprint
-    known_widths: NDArray[np.float64]
+    known_widths: UsualWidths
     scatter: Scatter
     smoothing: Smoothing
     light: Light
-    delay: NDArray[np.float64]
+    delay: Any
     rows: Rows
     row_counts: NDArray[np.int64]
     output: _Output
@@ -187,7 +188,8 @@ class _Memory(NamedTuple):
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
-    With ``one_window`` the pass ends with the window of the estimate, or when enough is known.
+    With ``one_window`` the pass ends with the window of the estimate, or when the usual widths are
+    known.
     """
 
     floor_us: int
@@ -252,7 +254,8 @@ class ProfileAssembler:
         known["computations"] = known["cut_computations"] = 0
         self._memory.footprint.state["near_edge"] = 0
         self._state["points"] = self._state["points_most"] = self._state["known_half"] = 0
-        self._memory.known_widths[:] = 0.0
+        self._memory.known_widths.number[:] = 0.0
+        self._memory.known_widths.median["difference"] = 0.0
         _begin_window(self._memory, self._state)
 
     def begin_window(self, edges: Edges, edge: int, before: ProfileAssembler) -> None:
@@ -282,7 +285,7 @@ class ProfileAssembler:
 
     @property
     def window_is_over(self) -> bool:
-        """Return whether the last pass over words ended with the window, or knows enough."""
+        """Return whether the last pass ended with the window, or as the usual widths were known."""
         return bool(self._state["over"])
 
     @property
@@ -402,7 +405,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         returns=returns_code,
         seeded=True,
         events_min=settings.events_min,
-        rows=model.rows,
+        sensor_rows=model.rows,
         half_max=half_width_fixed(settings.line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * settings.line_width_px**2,
         error_model=error_model(
@@ -413,6 +416,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
     )
     returns = 2 if settings.returns == "all" else 1
     shape = returns, model.columns
+    windowed = settings.centroid not in FULL_COLUMN_METHODS
     size, none = _OUTPUT_PROFILES * returns * model.columns, LineRows.empty()
     return _Memory(
         columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
@@ -420,20 +424,18 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
         blink=Blink(),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
-        known_widths=empty_known_widths(),
+        known_widths=empty_usual_widths(),
         scatter=empty_scatter(model.columns, _factor_max(settings)),
         smoothing=empty_smoothing(
             settings.smoothing_half_width,
             float(settings.smoothing_gate_px),
             float(settings.isolation_gate_px),
             settings.isolation_events,
-            settings.sigma_common_px,
-            settings.centroid not in FULL_COLUMN_METHODS,
-            shape,
+            empty_widths(*shape, settings.sigma_common_px, windowed),
         ),
         light=Light(),
         gate=make_gate(Modulation(70.0), 0),
-        delay=np.zeros(2),
+        delay=record("time_us", "points"),
         rows=empty_rows(*shape),
         row_counts=make_row_counts(),
         output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
@@ -442,7 +444,7 @@ def _allocate(settings: Settings, model: RangeModel) -> _Memory:
 
 
 def _first_choice(settings: Settings) -> int:
-    """Return whether a stream learns whether to take learned rows, or is of means."""
+    """Return `MEAN_ROWS` where settings fix the means, else `UNDECIDED`."""
     means = settings.centroid == "mode_mean" and settings.detail == "off"
     return MEAN_ROWS if means or settings.centroid in FULL_COLUMN_METHODS else UNDECIDED
 
@@ -464,7 +466,7 @@ def _begin_window(memory, state):
     memory.columns.rivals[:] = -1
     _forget_scatter(memory.scatter)
     memory.smoothing.errors[:] = 0.0
-    memory.delay[:] = 0.0
+    memory.delay.time_us = memory.delay.points = 0
     _forget_gate(memory.gate)
     _restart_widths(memory.smoothing.widths, memory.known_widths)
     if memory.footprint.state.near_edge == 0:
@@ -481,7 +483,7 @@ def _adapted_half(half, sums, half_max):
         return half
     measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
     limit = half_max * (_WIDER if 3 * sums.freedom > 2 * sums.events else 1)
-    return np.int64(min(max(np.rint(0.5 * (half + measured)), _HALF_MIN), limit))
+    return np.int64(min(max(np.rint(0.5 * (half + measured)), HALF_MIN), limit))
 
 
 @kernel(_nrt=False)
@@ -531,9 +533,9 @@ def _write(rows, smoothing, few, delay_us, state, output):
 @kernel
 def _close(memory, state, counters):
     """Turn the open period into rows."""
-    columns, estimator, gate, blink, footprint, known = memory[:6]
-    scatter, smoothing = memory.scatter, memory.smoothing
-    light, rows, row_counts = memory.light, memory.rows, memory.row_counts
+    columns, estimator, gate = memory.columns, memory.estimator, memory.gate
+    blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
+    smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
     if gate.choices.size > 0:
         _learn_gate(columns, state.half, gate)
         gated = _use_late(columns, gate)
@@ -554,23 +556,25 @@ def _close(memory, state, counters):
     _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
-    _mark_unusual(rows, smoothing, light.lit_share)
+    _mark_unusual(rows, smoothing, memory.light.lit_share)
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):
         # Later windows begin with what is known now.
-        _restart_from(known, footprint)
+        _restart_from(memory.known, footprint)
     if learns:
         uncertain, truncated = rows.uncertain[0], rows.truncated[0]
-        _learn(footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.rows)
+        _learn(
+            footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.sensor_rows
+        )
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
-            smoothing.widths.number[:] = 0.0
+            smoothing.widths.usual.number[:] = 0.0
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)
     few = _few_events(rows, smoothing.isolation_events)
-    delay_us = _delay_us(rows, memory.delay, light)
+    delay_us = _delay_us(rows, memory.delay, memory.light)
     before = state.rows
     _write(rows, smoothing, few, delay_us, state, memory.output)
     points = np.int64(state.rows - before)
@@ -602,8 +606,9 @@ def _fill(events, first, limit_us, memory, state, counters):
         counters.events_before_first_edge += i - first
         return i
     state.status = _FILLED
-    columns, rows, gate = memory.columns, memory.estimator.rows, memory.gate.state
-    appended = _append(events, first, limit_us, state.edge_us, columns, rows, gate)
+    columns, gate = memory.columns, memory.gate.state
+    sensor_rows = memory.estimator.sensor_rows
+    appended = _append(events, first, limit_us, state.edge_us, columns, sensor_rows, gate)
     state.full = appended.full
     if not appended.full:
         _count(appended.next - first, appended.outside, columns.refused, state, counters)

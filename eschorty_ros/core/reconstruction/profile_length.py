@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 from eschorty_ros.core.base.arrays import Array
 from eschorty_ros.core.line import TIME_LIMIT_US
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.held_events import HeldEvents
+from eschorty_ros.core.modulation.held_events import HELD_EVENTS_MAX, HeldEvents
 from eschorty_ros.core.modulation.phase_estimate import estimate_phase, estimation_window
 from eschorty_ros.core.modulation.phase_lock import BLOCK_US
 
-PERIODS_MAX = 1000
+_PERIODS_MAX = 1000
 EVENTS_WANTED = 16
 """Events per column and profile that a point should have."""
 _BLOCK_PERIODS = 2
 _PERIODS_MIN = 4
 _BLOCK_EVENTS = 1 << 16
-_HELD_EVENTS_MAX = 1 << 22
 # Part of the columns that may have few events.
 _FEW_SHARE = 1.0 / 24.0
 # Standard deviation of the events of even profiles over their mean, and their number to know it.
@@ -37,7 +36,7 @@ _LINE_CELLS_MAX = 8.0
 
 def periods_max(modulation: Modulation) -> int:
     """Return the most periods of a profile: the time within it is limited."""
-    return min(PERIODS_MAX, math.ceil(TIME_LIMIT_US / modulation.period_us) - 2)
+    return min(_PERIODS_MAX, math.ceil(TIME_LIMIT_US / modulation.period_us) - 2)
 
 
 class ProfileLength:
@@ -81,7 +80,7 @@ class ProfileLength:
                 self._seen = end = t.size if window is None else begin + window.size
                 if self._edge_us(held, begin, end) is not None:
                     self._window = begin, end
-                elif window is None or end > _HELD_EVENTS_MAX:
+                elif window is None or end > HELD_EVENTS_MAX:
                     return 1
             first, begin = self._window
             end_us, periods = int(t[begin - 1]), 0

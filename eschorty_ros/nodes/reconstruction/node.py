@@ -25,6 +25,7 @@ from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.live.calibration_capture import Capture
+from eschorty_ros.live.device_messages import laser_settings, pulse_train
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline
@@ -35,11 +36,7 @@ from eschorty_ros.nodes.reconstruction.active_calibration import ActiveCalibrati
 from eschorty_ros.nodes.reconstruction.auto_calibration import AutoCalibration
 from eschorty_ros.nodes.reconstruction.calibrator import Calibrator
 from eschorty_ros.nodes.reconstruction.camera_roi import CameraRoi
-from eschorty_ros.nodes.reconstruction.inputs import (
-    laser_settings,
-    packet_from_message,
-    pulse_train,
-)
+from eschorty_ros.nodes.reconstruction.inputs import packet_from_message
 from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
 from eschorty_ros.nodes.reconstruction.parameters import TABLE, modulation_override
 from eschorty_ros.nodes.reconstruction.reports import Reports

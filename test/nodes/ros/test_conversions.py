@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.reconstruction import LIVE_DTYPE, live_points
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
-from eschorty_ros.nodes.reconstruction.inputs import laser_settings
+from eschorty_ros.live.device_messages import laser_settings
 from eschorty_ros.nodes.ros import transforms
 from eschorty_ros.nodes.ros.cloud_messages import (
     cloud_message,

@@ -1,0 +1,42 @@
+"""Messages of laser and stage, live or from a bag, as the arguments of a packet stream."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from eschorty_ros.core.base.numbers import number
+from eschorty_ros.core.clocks import PulseTrain
+from eschorty_ros.core.modulation import Modulation
+
+MM_PER_M = 1e3
+_OUTPUT_ON = 1
+_INTERVAL_M = 1e-6, 1.0
+
+
+def ns(time: Any) -> int:
+    """Return the ns of a ROS time."""
+    return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+
+
+def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
+    """Return the modulation of a ``LaserState``, its epoch and since when the laser is on, ns.
+
+    The modulation is without ``on_edge_us``, which needs the camera's clock. The epoch is the ROS
+    time of one rising edge, ``None`` when ``phase_epoch`` is zero, which means unknown; the last
+    is ``None`` while the laser is off. Raises ``ArgumentError`` when frequency, duty or waveform
+    is out of range.
+    """
+    modulation = Modulation(float(state.frequency), float(state.duty), str(state.waveform))
+    on = state.output == _OUTPUT_ON
+    return modulation, ns(state.phase_epoch) or None, ns(state.output_since) if on else None
+
+
+def pulse_train(trigger: Any) -> PulseTrain | None:
+    """Return the stage's pulses that a ``PositionTrigger`` describes, ``None`` without pulses.
+
+    Raises ``ArgumentError`` when a position is not finite or the interval is not one of a stage.
+    """
+    if not trigger.interval or not trigger.count:
+        return None
+    interval_mm = number("interval", trigger.interval, *_INTERVAL_M) * MM_PER_M
+    return PulseTrain(float(trigger.first) * MM_PER_M, interval_mm, int(trigger.count))
