@@ -505,6 +505,7 @@ NOT_FOR_USERS = {
     "reconstruction.recorded_settings", "reconstruction.region_window",
     "storage.finite_points", "storage.height_map",
     "reconstruction.PassLag", "reconstruction.pass_lag", "reconstruction.take_off_lag",
+    "reconstruction.without_modulation",
     "reconstruction.stage_offset_m", "reconstruction.stage_speed_mm_s", "reconstruction.warm_up",
     # Parts of the streaming pipeline.
     "clocks.ClockLine", "clocks.EdgeClock", "clocks.LowerEnvelope", "clocks.MotionPlan",
