@@ -67,15 +67,14 @@ class Widths(NamedTuple):
     """Widths (standard deviations of the rows) of a stream's smoothed points.
 
     ``below`` has the sums of the points by width. ``smoothed`` holds the widths of a profile,
-    ``static_width`` less what motion adds, and ``weight`` is by how much they count. ``last`` and
-    ``last_row`` are widths and rows of the last profile. The ``history`` has what changes.
+    ``static_width`` less what motion adds, ``last`` and ``last_row`` widths and rows of the last
+    one. The ``history`` has what changes.
     """
 
     usual: UsualWidths
     below: NDArray[np.float64]
     smoothed: NDArray[np.float64]
     static_width: NDArray[np.float64]
-    weight: NDArray[np.float64]
     last: NDArray[np.float64]
     last_row: NDArray[np.float64]
     history: LineHistory
@@ -83,12 +82,10 @@ class Widths(NamedTuple):
 
 def empty_widths(returns: int, columns: int, common_px: float, windowed: bool) -> Widths:
     """Return no widths."""
-    smoothed, static_width, weight, last, last_row = np.full((5, returns, columns), np.nan)
+    smoothed, static_width, last, last_row = np.full((4, returns, columns), np.nan)
     history = empty_history(columns, common_px, windowed)
     below = np.zeros(_BINS + 1)
-    return Widths(
-        empty_usual_widths(), below, smoothed, static_width, weight, last, last_row, history
-    )
+    return Widths(empty_usual_widths(), below, smoothed, static_width, last, last_row, history)
 
 
 def empty_usual_widths() -> UsualWidths:
@@ -218,21 +215,35 @@ def _follow_line(rows, smoothing, lit_share):
     _compare_with_recent(widths.history, known, median.width, WIDTH_COLUMNS * sigma * sigma)
 
 
+@kernel
+def _moved_median(median, value, values):
+    """Return the running median of so many ``values``, moved towards the last one."""
+    step = max(1.0 / values, _STEP)
+    if median == 0.0:
+        return (1.0 - step) * value
+    # Both products, so that each column waits less for the one before.
+    above, below = (1.0 + step) * median, (1.0 - step) * median
+    return above if value > median else below
+
+
 @kernel(_nrt=False)
-def _widen(rows, smoothing):
-    """Widen the variance of points that move or pass an edge, mark the mixed and weigh them all."""
+def _mark_unusual(rows, smoothing, lit_share):
+    """Widen the variance of points that move or pass an edge, and mark the mixed ones."""
     row, sigma2, widths = smoothing.row, smoothing.sigma2, smoothing.widths
+    _follow_line(rows, smoothing, lit_share)
     returns, columns = row.shape
+    smoothed, last, last_row = widths.smoothed, widths.last, widths.last_row
     known = widths.below[_BINS] >= _POINTS_MIN
-    usual, sigma = widths.usual.median.width, _SIGMA_PER_MEDIAN * widths.usual.median.difference
+    usual, median = widths.usual.median.width, widths.usual.median.difference
+    sigma = _SIGMA_PER_MEDIAN * median
+    pairs = widths.below[_BINS] + 1.0
     averaged, reach = 0.0, np.int64(1)
     for k in range(returns):
         for c in range(columns):
-            width, displacement = widths.static_width[k, c], row[k, c] - widths.last_row[k, c]
+            width, displacement = widths.static_width[k, c], row[k, c] - last_row[k, c]
             own2 = sigma2[k, c] - rows.common2[k, c]
             sigma2[k, c] += widths.history.moved2[c // BLOCK_COLUMNS + 1]
             rows.mixed[k, c] = False
-            widths.weight[k, c] = 0.0
             weak = rows.events[k, c] < smoothing.isolation_events
             if np.isnan(width) or rows.truncated[k, c] or weak:
                 continue
@@ -247,40 +258,14 @@ def _widen(rows, smoothing):
                 unusual2 = _unusual_variance(width, usual)
                 rows.mixed[k, c] = unusual2 > _MARKED**2 * rows.sigma2[k, c]
                 more2 = max(more2, unusual2)
-            widths.weight[k, c] = weight
             sigma2[k, c] += more2
-
-
-@kernel(_nrt=False)
-def _add_widths(row, widths):
-    """Add the widths of a profile to those of the stream, and keep them with the ``row``."""
-    returns, columns = row.shape
-    smoothed, static_width, last = widths.smoothed, widths.static_width, widths.last
-    median, pairs = widths.usual.median.difference, widths.below[_BINS] + 1.0
-    sigma = _SIGMA_PER_MEDIAN * median
-    for k in range(returns):
-        for c in range(columns):
-            if widths.weight[k, c] == 0.0:
-                continue
-            if not abs(static_width[k, c] - last[k, c]) > _STEADY * sigma:
-                widths.usual.number[_width_bin(static_width[k, c])] += widths.weight[k, c]
+            if not abs(width - last[k, c]) > _STEADY * sigma:
+                widths.usual.number[_width_bin(width)] += weight
             if c >= APART and not np.isnan(smoothed[k, c - APART]):
-                difference = abs(smoothed[k, c] - smoothed[k, c - APART])
-                if median == 0.0:
-                    median = difference
                 pairs += 1.0
-                step = max(1.0 / pairs, _STEP)
-                median *= 1.0 + (step if difference > median else -step)
+                median = _moved_median(median, abs(smoothed[k, c] - smoothed[k, c - APART]), pairs)
     for k in range(returns):
         for c in range(np.uintp(columns)):
-            last[k, c], widths.last_row[k, c] = static_width[k, c], row[k, c]
+            last[k, c], last_row[k, c] = widths.static_width[k, c], row[k, c]
     widths.usual.median.difference = median
     _update(widths, columns)
-
-
-@kernel(_nrt=False)
-def _mark_unusual(rows, smoothing, lit_share):
-    """Widen and mark the points of a profile by unusual widths, and update what is usual."""
-    _follow_line(rows, smoothing, lit_share)
-    _widen(rows, smoothing)
-    _add_widths(smoothing.row, smoothing.widths)
