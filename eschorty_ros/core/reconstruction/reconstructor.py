@@ -30,9 +30,11 @@ from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 _PIECE_WORDS = 1 << 16
 # Few words more than a block of the phase lock needs events.
 _BLOCK_WORDS = 1 << 13
-# Most pieces with edges that are kept until ``take_stage_edges`` is called.
 _STAGE_EDGES_MAX = 1024
-# A larger share of unmodulated columns means a wrong frequency or slow pixels, not moving objects.
+"""Most pieces with edges that are kept until ``take_stage_edges`` is called."""
+
+
+# More columns whose events do not follow the laser are not those of things that move.
 _UNMODULATED_SHARE = 0.1
 
 
@@ -111,7 +113,7 @@ class Reconstructor:
         self._compensator: StepCompensator | None = None
         self._counts = Counter(
             events=0, events_filtered=0, points=0, points_beyond_pole=0, points_outside_roi=0,
-            points_flagged=0, columns_compensated=0, stage_edges_dropped=0,
+            points_flagged=0, columns_compensated=0,
         )  # fmt: skip
         self._watermark_us = -TIME_LIMIT
         self._periods_before = 0
@@ -218,8 +220,6 @@ class Reconstructor:
             self._periods.lock.schedule.add_triggers(triggers.t[triggers.edge == 1])
         elif source == "stage" and len(self._stage_edges) < _STAGE_EDGES_MAX:
             self._stage_edges.append((triggers.t.copy(), triggers.edge.copy()))
-        elif source == "stage":
-            self._counts["stage_edges_dropped"] += len(triggers)
 
     def _filtered(self, events: Events) -> Events:
         if self._filter is None:
@@ -409,9 +409,8 @@ class Reconstructor:
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
         laser.
         ``points_flagged`` are some of ``points``, or with ``keep`` good left out.
-        ``periods_closed`` had events, ``periods_empty`` none. ``stage_edges_dropped`` came while
-        too many waited for ``take_stage_edges``. ``sensor_drop_words`` and ``decoder_*`` come from
-        the decoder.
+        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
+        ``decoder_*`` come from the decoder.
         """
         counts = Counter(self._counts)
         counts.update(self._periods.counters)

@@ -20,7 +20,6 @@ from eschorty_ros.core.reconstruction import (
     place,
     place_link,
     profile_assembler,
-    reconstructor,
     region_window,
     windows,
 )
@@ -197,19 +196,6 @@ def test_triggers_that_begin_after_the_phase_was_estimated_are_not_moved(first):
     assert a.counters == b.counters
     late = np.unique(whole.edge_us[whole.edge_us >= edges[0]])
     np.testing.assert_array_equal(late, edges[: late.size])
-
-
-def test_stage_edges_that_are_not_taken_are_counted(monkeypatch):
-    monkeypatch.setattr(reconstructor, "_STAGE_EDGES_MAX", 2)
-    edges = 9_000 + 20_000 * np.arange(10)
-    data = encoded(lines(periods=16, columns=60), edges)
-    _, subject = reconstruct(
-        data, settings=Settings(trigger_source="stage"), cuts=range(0, len(data), 2048)
-    )
-    kept_us, kinds = subject.take_stage_edges()
-    assert 0 < len(kept_us) < len(edges)
-    assert kinds.all()
-    assert subject.counters["stage_edges_dropped"] == len(edges) - len(kept_us)
 
 
 @pytest.mark.parametrize("every", [2, 3, 7])
