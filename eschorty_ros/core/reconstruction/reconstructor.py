@@ -30,11 +30,9 @@ from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 _PIECE_WORDS = 1 << 16
 # Few words more than a block of the phase lock needs events.
 _BLOCK_WORDS = 1 << 13
+# Most pieces with edges that are kept until ``take_stage_edges`` is called. Nothing offline does.
 _STAGE_EDGES_MAX = 1024
-"""Most pieces with edges that are kept until ``take_stage_edges`` is called."""
-
-
-# More columns whose events do not follow the laser are not those of things that move.
+# A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
 
 
