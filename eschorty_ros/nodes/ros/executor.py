@@ -318,6 +318,8 @@ class Spinning:
             # It refers to the callbacks of its nodes where no garbage collector looks.
             for node in self.executor.get_nodes():
                 self.executor.remove_node(node)
+            # Its tasks that wait hold their nodes, too.
+            self.executor = None
 
     def _spin(self) -> None:
         # Without a limit rclpy 9.1's EventsExecutor never waits.
