@@ -50,6 +50,11 @@ def flat_mm(stage_mm, column):
     return 1300.0 + 0.0 * stage_mm
 
 
+def blurred_step_mm(stage_mm, column):
+    """Return a step of 2 mm as a line of some millimetres shows it, a slope of 7 mm."""
+    return 1300.0 + np.clip((stage_mm - 310.0) / 3.5, -1.0, 1.0)
+
+
 def scan(lag_us: float, passes: int = 2, surface=surface_mm, origin_us: int = 5_000_000):
     """Return points that show the surface of ``lag_us`` ago, with the stage and their ranges."""
     period_us = 14_000
@@ -84,8 +89,8 @@ def test_the_lag_of_two_passes_is_found_and_taken_off(lag_us, surface):
 
 @pytest.mark.parametrize(
     "options",
-    [{"passes": 1}, {"surface": flat_mm}, {"lag_us": 0.0}],
-    ids=["one pass", "no slope", "no lag"],
+    [{"passes": 1}, {"surface": flat_mm}, {"surface": blurred_step_mm}, {"lag_us": 0.0}],
+    ids=["one pass", "no slope", "a step", "no lag"],
 )
 def test_a_lag_that_nothing_shows_is_none(options):
     assert pass_lag(*scan(**{"lag_us": 2000.0, **options})) is None
