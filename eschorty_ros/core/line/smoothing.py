@@ -157,9 +157,8 @@ def _add_errors(averages, level, errors):
             squares[c] = error * error
         for block in range(errors.shape[1] - 2 * _NEAR):
             total = 0.0
-            for c in range(
-                np.uintp(block * BLOCK_COLUMNS), np.uintp(min((block + 1) * BLOCK_COLUMNS, columns))
-            ):
+            end = min((block + 1) * BLOCK_COLUMNS, columns)
+            for c in range(np.uintp(block * BLOCK_COLUMNS), np.uintp(end)):
                 total += squares[c]
             errors[level, block + _NEAR] += total
 
@@ -241,10 +240,8 @@ def _smooth(rows, smoothing):
     _sum_before(rows, averages)
     for block in range(errors.shape[1] - 2 * _NEAR):
         level = _best(errors, block)
-        first, end = (
-            np.uintp(block * BLOCK_COLUMNS),
-            np.uintp(min((block + 1) * BLOCK_COLUMNS, columns)),
-        )
+        first = np.uintp(block * BLOCK_COLUMNS)
+        end = np.uintp(min((block + 1) * BLOCK_COLUMNS, columns))
         for k in range(np.uintp(returns)):
             for c in range(first, end):
                 n = used[level, k, c]
