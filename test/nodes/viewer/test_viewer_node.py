@@ -10,11 +10,11 @@ import rclpy
 from eschorty_ros.action import Scan
 from eschorty_ros.msg import LaserState
 from rclpy.action import ActionServer, CancelResponse
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.executor import Spinning
 from eschorty_ros.nodes.viewer import node as viewer_module
 from eschorty_ros.nodes.viewer.node import ViewerNode
 from eschorty_ros.viewer.scan_control import ScanValues
@@ -61,30 +61,28 @@ def world(monkeypatch):
     """A viewer that may start scans, and a way to add and remove an instrument."""
     monkeypatch.setattr(viewer_module, "_SCANNER_SILENT_S", 1.0)
     rclpy.init()
-    executor = MultiThreadedExecutor(6)
+    spinning = Spinning(6)
     values = [Parameter("allow_scan", value=True), Parameter("port", value=free_port())]
     viewer = ViewerNode(namespace="/eschorty", parameter_overrides=values)
-    executor.add_node(viewer)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
+    spinning.executor.add_node(viewer)
+    spinning.start()
 
     @contextlib.contextmanager
     def instrument(**kwargs):
         node = Instrument(**kwargs)
-        executor.add_node(node)
+        spinning.executor.add_node(node)
         try:
             yield node
         finally:
-            executor.remove_node(node)
+            spinning.executor.remove_node(node)
             node._server.destroy()
             node.destroy_node()
 
     yield viewer, instrument
     viewer.safe_state()
-    executor.shutdown()
-    rclpy.try_shutdown()
-    thread.join(5.0)
+    spinning.end()
     viewer.destroy_node()
+    rclpy.try_shutdown()
 
 
 def wait(condition, limit_s=30.0):
