@@ -88,11 +88,11 @@ reference: $(SETUP)
 	@$(ENTER) python docs/interfaces.py && python docs/policies.py
 
 # Pure parts share the cores, the longest first; then whole scans beside single nodes and devices. The
-# emulated bench runs in real time, and a computer that stalls fails a scan: what failed runs once more.
+# emulated bench runs in real time, and a computer that stalls fails a scan: what failed runs once
+# more, all of it after a test that hung.
 PURE := $(addprefix test/,experiments core live control simulation stability surfaces report viewer)
 SCANS := $(addprefix test/,cli launch nodes/scanner nodes/ros nodes/viewer nodes/test_hostile_messages.py)
 SINGLE := test $(addprefix --ignore=,$(PURE) $(SCANS))
-once_more = { (($$? == 1)) && echo "Once more:" && pytest $(1) --last-failed --last-failed-no-failures none -o cache_dir=$(BUILD)/$@; }
 ifdef TEST
 test: $(SETUP) $(BUILD)/test.stamp
 	@$(ENTER) pytest $(TEST)
@@ -101,9 +101,9 @@ test: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
 	@$(ENTER) pytest --numprocesses $(JOBS) $(PURE)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=line test-scans test-single
 
-test-scans test-single: tests = $(if $(filter %scans,$@),$(SCANS),$(SINGLE))
+test-scans test-single: run = pytest $(if $(filter %scans,$@),$(SCANS),$(SINGLE)) -o cache_dir=$(BUILD)/$@
 test-scans test-single: $(SETUP) $(BUILD)/test.stamp
-	@$(ENTER) pytest $(tests) -o cache_dir=$(BUILD)/$@ || $(call once_more,$(tests))
+	@$(ENTER) $(run) --cache-clear || { (($$? == 1)) && echo "Once more:" && $(run) --last-failed; }
 endif
 
 quick: $(SETUP) $(BUILD)/test.stamp $(BUILD)/kernels.stamp
