@@ -60,6 +60,11 @@ class SecondNodes:
             for mark in self._marks:
                 mark.check()
 
+    def end(self) -> None:
+        """Remove the marks."""
+        while self._marks:
+            self._marks.pop().remove()
+
 
 class _Mark:
     """Name of a hidden node beside a node, from which those of the same name know its state."""
@@ -88,6 +93,10 @@ class _Mark:
         )
         if before is not None:
             before.destroy_node()
+
+    def remove(self) -> None:
+        if self._shown is not None:
+            self._shown.destroy_node()
 
     def check(self) -> None:
         space = self.node.get_namespace()

@@ -32,6 +32,7 @@ Work = Callable[[], None]
 _Events: Any = getattr(_rclpy, "EventsExecutor", object)
 
 _TURN_S = 1.0
+_TASKS_S = 0.02
 _POLL_S = 0.1
 _PAUSE_S = 3e-4
 _LINE_MAX = 300
@@ -307,18 +308,16 @@ class Spinning:
         self.executor.ending = True
 
     def end(self, timeout_s: float = 1.0) -> None:
-        """Begin no more callbacks, and wait for the thread as long as that."""
+        """Begin no more callbacks, wait for the thread as long as that, drop the executor."""
         self.stop_callbacks()
         self._turn.set_result(None)
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         # It would hold the interpreter's lock for as long as the thread spins.
         if not self._thread.is_alive():
+            # Tasks that never run would keep their nodes, and so does the executor itself.
+            self.executor.spin_until_future_complete(rclpy.task.Future(), _TASKS_S)
             self.executor.shutdown(timeout_sec=timeout_s)
-            # It refers to the callbacks of its nodes where no garbage collector looks.
-            for node in self.executor.get_nodes():
-                self.executor.remove_node(node)
-            # Its tasks that wait hold their nodes, too.
             self.executor = None
 
     def _spin(self) -> None:

@@ -137,6 +137,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     where DDS does not answer any more.
     """
     nodes: list[Node] = []
+    second: SecondNodes | None = None
     spinning: Spinning | None = None
     code = 0
     deadlocked = False
@@ -148,9 +149,8 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         ending.starting = False
         spinning = Spinning(threads)
         for factory in factories:
-            node = factory()
-            nodes.append(node)
-            spinning.executor.add_node(node)
+            nodes.append(factory())
+            spinning.executor.add_node(nodes[-1])
         second = SecondNodes(nodes)
         second.wait()
         # What lives as long as the process need not be searched, which halts all threads.
@@ -184,7 +184,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         make_safe(nodes)
         if deadlocked:
             _exit_without_dds(nodes)
-        _tear_down(nodes, spinning)
+        _tear_down(nodes, second, spinning)
     return code
 
 
@@ -218,15 +218,19 @@ def _exit_without_dds(nodes: Sequence[Node]) -> None:
     os._exit(1)
 
 
-def _tear_down(nodes: list[Node], spinning: Spinning | None) -> None:
+def _tear_down(nodes: list[Node], second: SecondNodes | None, spinning: Spinning | None) -> None:
+    """Leave DDS: it does when nothing refers to a node any more, no variable either.
+
+    Until then others list the node, for 20 s where its process ends before.
+    """
     if spinning is not None:
         spinning.end()
-    for node in nodes:
-        node.destroy_node()
+    if second is not None:
+        second.end()
+    while nodes:
+        nodes.pop().destroy_node()
     rclpy.try_shutdown()
-    nodes.clear()
-    # DDS leaves when nothing refers to a node any more; until then others list it for 20 s. Threads
-    # of heartbeats end with their next look at the context.
+    # Threads of heartbeats end with their next look at the context.
     time.sleep(2.0 * CHECK_S)
     gc.unfreeze()
     gc.collect()

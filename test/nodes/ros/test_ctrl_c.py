@@ -66,8 +66,8 @@ def test_in_the_middle_of_a_sweep(tmp_path: Path) -> None:
             listed = observer.node.get_node_names
             wait_until(lambda: set(running) <= set(listed()), "the nodes")
             assert_ctrl_c_ends(running)
-            # Mostly at once. DDS forgets a node that it does not see leave after 20 s.
-            wait_until(lambda: not set(running) & set(listed()), "the end of all nodes", 30.0)
+            # DDS would forget a node that it does not see leave after 20 s.
+            wait_until(lambda: not set(running) & set(listed()), "the end of all nodes", 2.0)
         assert log.read_text().splitlines()[-1].endswith("OFF")
 
 
