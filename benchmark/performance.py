@@ -69,10 +69,10 @@ THREADS_TEXT = """
 `reconstruct_recording` as `eschorty reconstruct --jobs N` runs it, in a process of its own: the
 recording is read from the disk's cache and cut into windows of two million events, and each of N
 threads decodes windows and turns them into points, which go to a file. *Wall* is from the file to
-placed points, *CPU* has the check of the laser's frequency, too. The clouds are compared bit for
-bit. *Memory* is the most of its own that the process held (mapped pages of the files, which the
-system takes back when it needs them, are not its own), *before* what it held with everything
-imported and compiled, *points* the size of their file.
+placed points and the check of the laser's frequency. The clouds are compared bit for bit. *Memory*
+is the most of its own that the process held (mapped pages of the files, which the system takes back
+when it needs them, are not its own), *before* what it held with everything imported and compiled,
+*points* the size of their file.
 """
 THREADS = (
     "laser", "file, MB", "events", "threads", "wall, s", "CPU, s", "Mev/s", "times one thread",

@@ -6,6 +6,7 @@ import mmap
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -19,7 +20,10 @@ from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
-from eschorty_ros.core.reconstruction.recording_warnings import recording_warnings
+from eschorty_ros.core.reconstruction.recording_warnings import (
+    recording_warnings,
+    shown_frequency_hz,
+)
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
@@ -48,7 +52,7 @@ class Result:
     profile_count, events : int
     periods_per_profile : int
     seconds : float
-        Wall time of reconstruction and placing, reading of the file included.
+        Wall time from the file to placed points and warnings.
     warnings : tuple of str
         One line each.
     organized : ndarray of POINT_DTYPE, shape (profiles, columns), or None
@@ -114,7 +118,8 @@ def reconstruct_recording(
     total = recording.events_path.stat().st_size
     reader = RawReader(recording.events_path)
     done = 0
-    with ExitStack() as files:
+    with ExitStack() as files, ThreadPoolExecutor(1) as beside:
+        shown = beside.submit(shown_frequency_hz, recording) if jobs > 1 else None
         cloud = _Cloud(recording, reconstructor, folder, files)
         for chunk in reader.mapped(_WINDOWS_BYTES if jobs > 1 else _PASS_BYTES):
             _push(reconstructor, cloud.add, chunk, done, recording.marks)
@@ -132,11 +137,15 @@ def reconstruct_recording(
         profiles = replace(profiles, t_us=profiles.t_us - round(lag.lag_us))
     newest_us = reconstructor.newest_t_us
     span_us = None if newest_us is None else (origin_us, newest_us)
-    seconds = time.perf_counter() - began
     counters = reconstructor.counters
     counters["points_without_stage"] = cloud.without_stage
     used = replace(settings, periods_per_profile=reconstructor.periods_per_profile)
-    warnings = [str(line) for line in reader.warnings] + reconstructor.warnings
+    shown_hz = shown_frequency_hz(recording) if shown is None else shown.result()
+    warnings = (
+        *map(str, reader.warnings),
+        *reconstructor.warnings,
+        *recording_warnings(recording, used, counters, points, span_us, shown_hz),
+    )
     return Result(
         points,
         profiles,
@@ -144,8 +153,8 @@ def reconstruct_recording(
         cloud.profile_count,
         reconstructor.periods_per_profile,
         counters["events"],
-        seconds,
-        (*warnings, *recording_warnings(recording, used, counters, points, span_us)),
+        time.perf_counter() - began,
+        warnings,
         organized,
         lag,
     )

@@ -29,12 +29,30 @@ _LOSSES = {
 _FILTERED = "events are removed by noise_filter = {0.noise_filter}; set it to none"
 
 
+def shown_frequency_hz(recording: Recording) -> float | None:
+    """Return the frequency that the middle of the events shows, ``None`` without any."""
+    reader, estimate = RawReader(recording.events_path), FrequencyEstimate()
+    header = reader.header
+    decoder = Decoder(header.width, header.height)
+    begin = max(reader.size_bytes - header.size_bytes - _PIECE_BYTES, 0) // 4 * 2
+    done = 0
+    for chunk in reader.chunks(_CHUNK_BYTES, begin):
+        events = decoder.decode(chunk)
+        every = max(len(events) // _CHUNK_EVENTS, 1)
+        estimate.add(events.t[::every], events.p[::every])
+        done += len(chunk)
+        if done >= _PIECE_BYTES:
+            break
+    return estimate.frequency_hz(recording.modulation.frequency_hz)
+
+
 def recording_warnings(
     recording: Recording,
     settings: Settings,
     counters: Mapping[str, int],
     points: Points,
     span_us: tuple[int, int] | None,
+    shown_hz: float | None,
 ) -> list[str]:
     """Return one line for each contradiction and for the cause of a cloud with few points.
 
@@ -48,13 +66,14 @@ def recording_warnings(
         The cloud.
     span_us : tuple of int or None
         Sensor times of the first and the last event, ``None`` without events.
+    shown_hz : float or None
+        See `shown_frequency_hz`.
     """
     found = recording.scan.faults if recording.scan is not None else []
     if span_us is None:
         return [*found, f"no points: {without_modulation(0, 0.0)}"]
-    reader = RawReader(recording.events_path)
-    stated_hz, shown_hz = recording.modulation.frequency_hz, _frequency_hz(recording, reader)
-    found += _geometry(recording, reader)
+    stated_hz = recording.modulation.frequency_hz
+    found += _geometry(recording)
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
@@ -88,9 +107,9 @@ def without_modulation(events: int, frequency_hz: float) -> str:
     )
 
 
-def _geometry(recording: Recording, reader: RawReader) -> list[str]:
+def _geometry(recording: Recording) -> list[str]:
     """Compare the sensor of the events with that of the calibration."""
-    header, build = reader.header, recording.calibration
+    header, build = RawReader(recording.events_path).header, recording.calibration
     named = "geometry" in header or "width=" in header.get("format", "")
     if not named or (header.width, header.height) == (build.columns, build.rows):
         return []
@@ -99,22 +118,6 @@ def _geometry(recording: Recording, reader: RawReader) -> list[str]:
         f"{build.name} of one of {build.columns} x {build.rows}; give the calibration of this "
         "camera"
     ]
-
-
-def _frequency_hz(recording: Recording, reader: RawReader) -> float | None:
-    """Return the frequency that the middle of the events shows, ``None`` without any."""
-    header, estimate = reader.header, FrequencyEstimate()
-    decoder = Decoder(header.width, header.height)
-    begin = max(reader.size_bytes - header.size_bytes - _PIECE_BYTES, 0) // 4 * 2
-    done = 0
-    for chunk in reader.chunks(_CHUNK_BYTES, begin):
-        events = decoder.decode(chunk)
-        every = max(len(events) // _CHUNK_EVENTS, 1)
-        estimate.add(events.t[::every], events.p[::every])
-        done += len(chunk)
-        if done >= _PIECE_BYTES:
-            break
-    return estimate.frequency_hz(recording.modulation.frequency_hz)
 
 
 def _few_points(
