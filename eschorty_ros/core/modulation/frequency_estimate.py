@@ -10,8 +10,8 @@ from eschorty_ros.core.modulation.modulation import FREQUENCY_MAX_HZ, FREQUENCY_
 _BIN_US = 10
 _BINS = 200_000
 _WINDOW_US = _BINS * _BIN_US
-_LENGTH = 1 << 19
-_STEP_HZ = 1e6 / (_LENGTH * _BIN_US)
+# Least steps of the spectrum per turn over the window, so that a parabola finds a line's place.
+_STEPS = 2.5
 # Power of a line over the mean of the power between the lines.
 _LINE_MIN = 50.0
 _STRONG = 0.5
@@ -49,7 +49,7 @@ class FrequencyEstimate:
                 self._begin_us, self._counts = int(t_us[0]), np.zeros((2, _BINS), np.int64)
             size = int(np.searchsorted(t_us, self._begin_us + _WINDOW_US))
             place = (t_us[:size] - self._begin_us) // _BIN_US + polarity[:size] * np.int64(_BINS)
-            self._counts += np.bincount(place, minlength=2 * _BINS).reshape(2, _BINS)
+            np.add.at(self._counts.reshape(-1), place, 1)
             if self._counts.sum() >= self._busiest.sum():
                 self._busiest = self._counts
             t_us, polarity = t_us[size:], polarity[size:]
@@ -63,20 +63,23 @@ class FrequencyEstimate:
         the lowest one that stands out.
         """
         used = np.flatnonzero(self._busiest.any(axis=0))
-        if not used.size:
+        if used.size < _TURNS_MIN:
             return None
         span_s = float(used[-1] - used[0] + 1) * _BIN_US * 1e-6
         counts = self._busiest[:, used[0] : used[-1] + 1]
-        spectrum = np.fft.rfft(counts - counts.mean(axis=1, keepdims=True), _LENGTH, axis=1)
+        length = 1 << int(np.ceil(np.log2(_STEPS * counts.shape[1])))
+        step_hz = 1e6 / (length * _BIN_US)
+        spectrum = np.fft.rfft(counts - counts.mean(axis=1, keepdims=True), length, axis=1)
         power = (np.abs(spectrum) ** 2).sum(axis=0)
-        low, high = round(0.9 * FREQUENCY_MIN_HZ / _STEP_HZ), round(FREQUENCY_MAX_HZ / _STEP_HZ)
+        low = max(round(0.9 * FREQUENCY_MIN_HZ / step_hz), 1)
+        high = round(FREQUENCY_MAX_HZ / step_hz)
         strongest = float(power[low:high].max())
         if strongest < _LINE_MIN * float(np.median(power[low:high])):
             return None
 
         def strong(frequency_hz: float) -> bool:
             reach = _TURNS_MAX / span_s
-            first, last = ((frequency_hz + side * reach) / _STEP_HZ for side in (-1, 1))
+            first, last = ((frequency_hz + side * reach) / step_hz for side in (-1, 1))
             near = power[int(first) : int(last) + 2]
             return bool(near.max(initial=0.0) >= _STRONG * strongest)
 
@@ -84,7 +87,7 @@ class FrequencyEstimate:
         while power[peak + 1] > power[peak]:
             peak += 1
         before, at, after = np.log(power[peak - 1 : peak + 2])
-        found_hz = float(peak + 0.5 * (before - after) / (before - 2.0 * at + after)) * _STEP_HZ
+        found_hz = float(peak + 0.5 * (before - after) / (before - 2.0 * at + after)) * step_hz
         if found_hz * span_s < _TURNS_MIN:
             return None
         apart_hz = abs(expected_hz - found_hz)

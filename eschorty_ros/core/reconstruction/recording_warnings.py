@@ -11,9 +11,9 @@ from eschorty_ros.core.storage import Points, Recording
 from eschorty_ros.core.storage.raw_file import RawReader
 
 _PIECE_BYTES = 1 << 23
-# Counting has a cost for each chunk, too, and so many events of one show what all do.
-_CHUNK_BYTES = 1 << 20
-_CHUNK_EVENTS = 1 << 16
+# So many events of a chunk show what all do.
+_CHUNK_BYTES = 1 << 19
+_CHUNK_EVENTS = 1 << 15
 _FEW = 10
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
