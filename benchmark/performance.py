@@ -246,8 +246,11 @@ def main() -> None:
                 recording = write_recording(Path(made) / name, modulation, data, number)
                 text += threads(recording, frequency_hz, repeats)
                 (recording / EVENTS_FILE).unlink()
-    command = [sys.executable, str(Path(__file__).with_name("live.py")), "--rate", "0.5", "1"]
-    text += f"{LIVE_TEXT}\n```text\n{subprocess.check_output(command, text=True)}```\n"
+    live = [sys.executable, str(Path(__file__).with_name("live.py"))]
+    fast = ("--frequency", "70", "--packet-ms", "1", "--rate", "5")
+    table = subprocess.check_output([*live, "--rate", "0.5", "1"], text=True)
+    row = subprocess.check_output([*live, *fast], text=True).splitlines()[-1]
+    text += f"{LIVE_TEXT}\n```text\n{table}{row}\n```\n"
     arguments.out.write_text(text)
     print(text)
 
