@@ -316,7 +316,8 @@ class Spinning:
         # It would hold the interpreter's lock for as long as the thread spins.
         if not self._thread.is_alive():
             # Tasks that never run would keep their nodes, and so does the executor itself.
-            self.executor.spin_until_future_complete(rclpy.task.Future(), _TASKS_S)
+            with contextlib.suppress(ExternalShutdownException):
+                self.executor.spin_until_future_complete(rclpy.task.Future(), _TASKS_S)
             self.executor.shutdown(timeout_sec=timeout_s)
             self.executor = None
 
