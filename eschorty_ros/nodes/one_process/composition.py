@@ -183,6 +183,7 @@ def _running(
     parameter_file: Path, factories: Iterable[Callable[[], Node]], kind: Any, action: str
 ) -> Iterator[Composition]:
     nodes: list[Node] = []
+    second: SecondNodes | None = None
     rclpy.init(
         args=[
             "--ros-args",
@@ -203,7 +204,8 @@ def _running(
         for node in nodes:
             spinning.executor.add_node(node)
         if os.environ.get("ROS_DOMAIN_ID"):
-            SecondNodes(nodes).wait()
+            second = SecondNodes(nodes)
+            second.wait()
         spinning.start()
         yield made
     finally:
@@ -213,6 +215,8 @@ def _running(
             # An ended context also ends callbacks that wait, such as homing.
             rclpy.try_shutdown()
             spinning.end(2.0)
+            if second is not None:
+                second.end()
             for node in nodes:
                 node.destroy_node()
 
