@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -137,17 +137,16 @@ def command(
             raise click.BadParameter(
                 f"{recording} is a file; give a recording's folder or a bag; {RAW_ALONE}"
             )
-        if not bag and (frequency is not None or calibration is not None):
-            raise click.UsageError(
-                f"--frequency and --calibration are for a bag; {recording} is none"
-            )
+        if not bag and (of_bags := _chosen(("frequency", "calibration", "packet_period"))):
+            option = of_bags[0].replace("_", "-")
+            raise click.UsageError(f"--{option} is for a bag; {recording} is none")
     targets = [out or _target(recording) for recording in recordings]
     if targets[0].suffix not in (".pcd", ".ply"):
         raise click.BadParameter(f"{out} ends in neither .pcd nor .ply", param_hint="--out")
     task = partial(
         reconstruct_to,
         jobs=jobs,
-        given=_given(settings),
+        given={name: settings[name] for name in _chosen(settings)},
         frequency=frequency,
         calibration=calibration,
         packet_period_ms=packet_period,
@@ -289,11 +288,10 @@ def _print(
     )
 
 
-def _given(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the options that stand on the command line."""
+def _chosen(names: Iterable[str]) -> list[str]:
+    """Return those options that stand on the command line."""
     source = click.get_current_context().get_parameter_source
-    default = click.core.ParameterSource.DEFAULT
-    return {name: value for name, value in settings.items() if source(name) is not default}
+    return [name for name in names if source(name) is not click.core.ParameterSource.DEFAULT]
 
 
 def summary(result: Result) -> dict[str, Any]:

@@ -248,6 +248,9 @@ def test_reconstruct_offers_every_setting(recording, tmp_path):
     assert len(read_cloud(out)) > 0
     for bad in (("--centroid", "guess"), ("--events-min", 0), ("--out", tmp_path / "cloud.xyz")):
         assert run("reconstruct", recording, *bad).exit_code == 2, bad
+    for of_bags in (("--frequency", 70), ("--calibration", "config_3"), ("--packet-period", 4)):
+        refused = run("reconstruct", recording, *of_bags)
+        assert (refused.exit_code, f"{of_bags[0]} is for a bag" in refused.output) == (2, True)
 
 
 def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):
