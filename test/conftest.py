@@ -1,6 +1,15 @@
-"""Every test process talks in a ROS domain of its own, on this host only."""
+"""Every test process talks in a ROS domain of its own, on this host only, and ends."""
 
+import faulthandler
 import os
+import sys
 
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+_END_S = 60.0
+
+
+def pytest_unconfigure() -> None:
+    """End the process, with its stacks, where a thread that a test has left would keep it."""
+    faulthandler.dump_traceback_later(_END_S, exit=True, file=sys.__stderr__)

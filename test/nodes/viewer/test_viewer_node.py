@@ -74,6 +74,8 @@ def world(monkeypatch):
         try:
             yield node
         finally:
+            # A goal that waits for it would keep the process for ever.
+            node.release.set()
             spinning.executor.remove_node(node)
             node._server.destroy()
             node.destroy_node()
