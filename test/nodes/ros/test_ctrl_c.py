@@ -12,13 +12,28 @@ from pathlib import Path
 import scan_scenarios as scenarios
 import yaml
 from benches import remote_bench
-from ros_process import NAMESPACE, NodeProcess, Observer, node_name, processes
+from ros_process import (
+    NAMESPACE,
+    NodeProcess,
+    Observer,
+    domain_environment,
+    node_name,
+    processes,
+)
 from std_msgs.msg import Header
 from waiting import wait_until
 
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.domain import free_domain
 
+# Runs a node's ``main`` and prints the threads of DDS that are left.
+ENDED = """
+import contextlib, pathlib, runpy, sys
+with contextlib.suppress(SystemExit):
+    runpy.run_module(sys.argv.pop(1), run_name="__main__")
+names = [path.read_text().strip() for path in pathlib.Path("/proc/self/task").glob("*/comm")]
+print("left:", *(name for name in names if name.startswith("dds.udp")))
+"""
 STRAY = ("Traceback", "context is", "Destroyable", "RCLError", "Exception", "not safe", "Invalid")
 
 
@@ -69,6 +84,22 @@ def test_in_the_middle_of_a_sweep(tmp_path: Path) -> None:
             # DDS would forget a node that it does not see leave after 20 s.
             wait_until(lambda: not set(running) & set(listed()), "the end of all nodes", 2.0)
         assert log.read_text().splitlines()[-1].endswith("OFF")
+
+
+def test_dds_has_ended_before_the_process() -> None:
+    node = "eschorty_ros.nodes.scanner.node", "--ros-args", "-r", f"__ns:={NAMESPACE}"
+    command = [sys.executable, "-c", ENDED, *node]
+    with Observer() as observer:
+        process = subprocess.Popen(
+            command, env=domain_environment(observer.domain), stdout=subprocess.PIPE, text=True
+        )
+        try:
+            observer.wait_for_answers("scanner")
+            process.send_signal(signal.SIGINT)
+            printed, _ = process.communicate(timeout=20.0)
+        finally:
+            process.kill()
+    assert printed.splitlines()[-1] == "left:"
 
 
 def test_all_nodes_in_one_process_scan_and_end(tmp_path: Path) -> None:
