@@ -1,9 +1,13 @@
 """What changes with the line from profile to profile, by block of columns, and moves its rows.
 
-A line whose rows are where they were has the same error in all profiles. One that moves is behind
-by a part of a row, as pixels remember where it was, in all columns alike. One that gets narrower
-for a few profiles passes an edge, and is off by half of the rows that are missing at most. Means
-over blocks show changes that are too small to be seen in a column.
+A line whose rows are where they were has the same error in all profiles. One that moves is off by
+a part of a row, as pixels remember where it was, in all columns alike. That sets the rows of ON and
+OFF events apart. As they give either kind in turn, it should take one ahead as far as the other
+behind; then the line is in the middle of the two rows, which are not so many events each. What the
+mean of all events differs from it by, is its uncertainty.
+
+A line that gets narrower for a few profiles passes an edge, and is off by half of the rows that are
+missing at most. Means over blocks show changes that are too small to be seen in a column.
 """
 
 from __future__ import annotations
@@ -15,8 +19,9 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
+from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
-# Most that a moving line is behind, as the pixels of the simulation remember: 0.035 to 0.067 px.
+# What a moving line is off by, at least, as the pixels of the simulation remember: 0.035 to 0.067.
 SIGMA_COMMON_PX = 0.04
 # Profiles whose mean a profile is compared with.
 _PROFILES = 16.0
@@ -43,16 +48,27 @@ class BlockMeans(NamedTuple):
     profiles: NDArray[np.float64]
 
 
+class PolarityMeans(NamedTuple):
+    """By block, how far rows of all events are from the middle of those of ON and OFF events.
+
+    It is the mean over recent ``columns``.
+    """
+
+    row: NDArray[np.float64]
+    columns: NDArray[np.float64]
+
+
 class LineHistory(NamedTuple):
     """Sums of a profile and means of the recent ones, and the variances that follow from them.
 
     The first and the last block are outside the sensor. A line that moves is off by the standard
-    deviation ``common_px`` at most: the variance ``moved2``; ``passing2`` is that of an edge that
-    it passes.
+    deviation ``common_px``, or by what the rows of its ``polarities`` show, at most: the variance
+    ``moved2``; ``passing2`` is that of an edge that it passes.
     """
 
     now: BlockSums
     recent: BlockMeans
+    polarities: PolarityMeans
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
     common_px: float
@@ -66,8 +82,46 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
+    polarities = PolarityMeans(*np.zeros((2, blocks)))
     moved2, passing2 = np.zeros((2, blocks))
-    return LineHistory(now, recent, moved2, passing2, common_px, windowed)
+    return LineHistory(now, recent, polarities, moved2, passing2, common_px, windowed)
+
+
+@kernel(_nrt=False)
+def _polarity_rows(packed, start, seed, half):
+    """Return how far the row of a column's events is from the middle of those of ON and OFF ones.
+
+    NaN where one of the two is missing within ``half`` of the ``seed``.
+    """
+    none = np.int64(0)
+    on, off, on_rows, off_rows = none, none, none, none
+    i = np.uintp(start)
+    while packed[i] != PAD:
+        row = np.int64(packed[i] & ROW_MASK)
+        inside = abs((row << FRACTION_BITS) - seed) <= half
+        is_on = (packed[i] & POLARITY) > 0
+        on += inside & is_on
+        on_rows += row if inside & is_on else none
+        off += inside & (not is_on)
+        off_rows += row if inside & (not is_on) else none
+        i += np.uintp(1)
+    if min(on, off) == 0:
+        return np.nan
+    return (on_rows + off_rows) / (on + off) - 0.5 * (on_rows / on + off_rows / off)
+
+
+@kernel(_nrt=False)
+def _compare_polarities(columns, half, first, history):
+    """Add one column of each block whose line moves, its ``first`` one, to the polarities."""
+    mean = history.polarities
+    for block in range(1, mean.row.size - 1):
+        c = np.uintp((block - 1) * BLOCK_COLUMNS + first)
+        if history.moved2[block] == 0.0 or c >= columns.seeds.size or columns.seeds[c] < 0:
+            continue
+        row = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
+        if not np.isnan(row):
+            mean.columns[block] = min(mean.columns[block] + 1.0, _PROFILES)
+            mean.row[block] += (row - mean.row[block]) / mean.columns[block]
 
 
 @kernel(_nrt=False)
@@ -80,7 +134,9 @@ def _compare_with_recent(history, known, usual, width_variance):
     for block in range(1, now.points.size - 1):
         near = slice(block - 1, block + 2)
         points, profiles = now.points[near].sum(), recent.profiles[block]
-        history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
+        apart = history.polarities.row[near].sum() / 3.0
+        off2 = history.common_px**2 + apart * apart
+        history.moved2[block], history.passing2[block] = off2, 0.0
         if points == 0.0 or not history.windowed:
             continue
         row, width = now.row[near].sum() / points, now.width[near].sum() / points
@@ -90,7 +146,7 @@ def _compare_with_recent(history, known, usual, width_variance):
         wider = width - max(recent.width[block], usual)
         shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
         passing2 = shift * shift - PER_NARROWER**2 * width_variance / points
-        history.moved2[block] = min(max(moved2, 0.0), history.common_px**2)
+        history.moved2[block] = min(max(moved2, 0.0), off2)
         history.passing2[block] = max(passing2, 0.0)
         profiles = min(profiles + 1.0, _PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.

@@ -109,10 +109,12 @@ def _keep_widths(widths, known):
 @kernel
 def _restart_widths(widths, known):
     """Forget all widths but the ``known`` ones, zeros where there are none."""
-    usual, recent = widths.usual, widths.history.recent
+    usual, history = widths.usual, widths.history
+    recent, polarities = history.recent, history.polarities
     usual.number[:], usual.median.difference = known.number, known.median.difference
     widths.last[:], widths.last_row[:] = np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
+    polarities.row[:], polarities.columns[:], history.moved2[:] = 0.0, 0.0, 0.0
     _update(widths, widths.smoothed.shape[1])
 
 

@@ -56,7 +56,9 @@ from eschorty_ros.core.line.learned_gate import (
     make_gate,
     same_gate,
 )
+from eschorty_ros.core.line.line_history import _compare_polarities
 from eschorty_ros.core.line.scatter import (
+    BLOCK_COLUMNS,
     FACTOR_MAX,
     Scatter,
     _forget_scatter,
@@ -556,6 +558,7 @@ def _close(memory, state, counters):
     _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
+    _compare_polarities(columns, half, state.period % BLOCK_COLUMNS, smoothing.widths.history)
     _mark_unusual(rows, smoothing, memory.light.lit_share)
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):

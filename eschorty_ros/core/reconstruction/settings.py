@@ -174,7 +174,7 @@ class Settings:
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
         "part of a row's standard deviation that the columns of a moving line share, as pixels "
-        "remember where it was",
+        "remember where it was; more where rows of ON and OFF events disagree",
     )  # fmt: skip
     detail: str = _choice(
         "auto", ("auto", "off"),
