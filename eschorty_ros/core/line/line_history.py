@@ -1,10 +1,10 @@
 """What changes with the line from profile to profile, by block of columns, and moves its rows.
 
 A line whose rows are where they were has the same error in all profiles. One that moves is off by
-a part of a row, as pixels remember where it was, in all columns alike. That sets the rows of ON and
-OFF events apart. As they give either kind in turn, it should take one ahead as far as the other
-behind; then the line is in the middle of the two rows, which are not so many events each. What the
-mean of all events differs from it by, is its uncertainty.
+a part of a row, as pixels remember where it was, in all columns alike. Memory takes ON events ahead
+of the line and OFF events behind it. Where it takes both as far, the line is in the middle of their
+two rows. The mean of all events is nearer to the kind with more of them, and its distance from the
+middle is its uncertainty.
 
 A line that gets narrower for a few profiles passes an edge, and is off by half of the rows that are
 missing at most. Means over blocks show changes that are too small to be seen in a column.
