@@ -259,6 +259,8 @@ def _print(
     as_json: bool,
 ) -> None:
     """Print what is known of a cloud; the recording is named where there are several."""
+    from eschorty_ros.core.reconstruction import PassLag
+
     name = "" if recording is None else f"{recording}: "
     for warning in facts["warnings"]:
         click.echo(f"eschorty: warning: {name}{warning}", err=True)
@@ -270,7 +272,8 @@ def _print(
         click.echo(json.dumps({**first, **facts}))
     if as_json or not facts["points"]:
         return
-    sigma, lag = facts["sigma_median_m"], facts.get("pass_lag_ms")
+    sigma, lag_ms = facts["sigma_median_m"], facts.get("pass_lag_ms")
+    lag = None if lag_ms is None else PassLag(*(1e3 * ms for ms in lag_ms))
     pairs(
         str(target),
         {
@@ -280,7 +283,7 @@ def _print(
             "periods per profile": f"{facts['periods_per_profile']}",
             "points": f"{facts['points']:,}",
             "median sigma": "none" if sigma is None else f"{sigma * 1e3:.3f} mm",
-            **({} if lag is None else {"lag taken off": "{:.2f} ± {:.2f} ms".format(*lag)}),
+            **({} if lag is None else {"lag taken off": str(lag)}),
             "seconds": f"{facts['seconds']:.2f}",
             "events/s": f"{facts['events_per_second']:.3g}",
             **({} if measured is None else accuracy_rows(measured)),

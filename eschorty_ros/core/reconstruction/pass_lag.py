@@ -47,6 +47,9 @@ class PassLag(NamedTuple):
     lag_us: float
     sigma_us: float
 
+    def __str__(self) -> str:
+        return f"{1e-3 * self.lag_us:.2f} ± {1e-3 * self.sigma_us:.2f} ms"
+
 
 class _Samples(NamedTuple):
     """Points that a lag is estimated from: position and speed of the stage, block of columns."""

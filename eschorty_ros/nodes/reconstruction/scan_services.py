@@ -91,8 +91,8 @@ class ScanServices:
             ended, self._ended = self._ended, None
             report = self._pipeline.end_scan()
             if report.pass_lag is not None:
-                lag = "{:.2f} ± {:.2f} ms".format(*(1e-3 * value for value in report.pass_lag))
-                self._node.get_logger().info(f"points were {lag} behind the stage; taken off")
+                behind = f"points were {report.pass_lag} behind the stage"
+                self._node.get_logger().info(f"{behind}; taken off")
             self._publish(report.scan, self._node.get_clock().now().nanoseconds)
             ended(report)
 
