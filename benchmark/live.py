@@ -6,7 +6,8 @@ Usage: PYTHONPATH=benchmark:test/support:$PYTHONPATH python benchmark/live.py [-
 A process publishes a simulated line of 1280 columns as EventPackets, with the stage's odometry, at
 a multiple of real time into a reconstruction node that is a process of its own; this one subscribes
 to profile and points. Each row is one node's life. CPU is that of whole processes; "offline" is the
-same stream through the same code without ROS, in this process, per CPU second. Latency runs from a
+same stream through the same code without ROS, in this process, per CPU second. "MB" is the node's
+memory before the stream, after its first minute and at its end. Latency runs from a
 period's end, in the publisher's time, to its profile's arrival. "first ms" is that of the first
 profile, which waits while the first events choose the periods of a profile; median and p99 are of
 those whose period ends after the first second.
@@ -16,11 +17,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import os
 import platform
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from array import array
 from collections.abc import Iterator
@@ -41,11 +44,11 @@ SEED, RANGE_MM, COLUMNS = 1, 1320.0, 1280
 LOOP_US = 2 * 125 * 4096
 NEAR = {70.0: 70.3125}
 ODOM_US = 10_000
-DRAIN_S, SETTLED_S = 10.0, 1.0
+DRAIN_S, SETTLED_S, MINUTE_S = 10.0, 1.0, 60.0
 COLUMNS_SHOWN = {
     "Hz": "7.1f", "ms": "6.3f", "x real": "6.1f", "sent": "8.0f", "lost": "6.0f", "Mev/s": "7.1f",
     "per CPU s": "9.1f", "offline": "8.1f", "cores": "6.2f", "publisher": "9.2f", "MB": "6.0f",
-    "MB end": "6.0f", "first ms": "8.1f", "median ms": "9.1f", "p99 ms": "7.1f",
+    "1 min": "6.0f", "MB end": "6.0f", "first ms": "8.1f", "median ms": "9.1f", "p99 ms": "7.1f",
 }  # fmt: skip
 NODE = "eschorty_ros.nodes.reconstruction.node"
 
@@ -210,7 +213,11 @@ def measured(arguments: argparse.Namespace) -> tuple[float, ...]:
             command, env=environment, stdout=subprocess.PIPE, text=True
         ) as source:
             assert source.stdout is not None
+            minute_mb = [math.nan]
+            after = threading.Timer(MINUTE_S, lambda: minute_mb.append(usage.rss_mb()))
+            after.start()
             sent, begun_ns, publisher_cpu_s = map(float, source.stdout.readline().split())
+            after.cancel()
             settled_s, seen = time.monotonic(), -1
             while time.monotonic() - settled_s < 2.0:
                 time.sleep(0.1)
@@ -226,7 +233,7 @@ def measured(arguments: argparse.Namespace) -> tuple[float, ...]:
             settled_ms = latencies_ms[ends_s > SETTLED_S]
             values = (frequency_hz, packet_ms, rate, sent, state.packets_lost, mev / lasted_s,
                       mev / cpu_s, offline, cpu_s / lasted_s, publisher_cpu_s / lasted_s, rss_mb,
-                      usage.rss_mb(), latencies_ms[0],
+                      minute_mb[-1], usage.rss_mb(), latencies_ms[0],
                       *np.percentile(settled_ms, (50.0, 99.0)))  # fmt: skip
             source.kill()
     return values
