@@ -4,7 +4,8 @@ Time is int64 microseconds of the sensor's clock, first 24-bit wrap = 0.
 """
 
 from eschorty_ros.core.evt3.activity_filter import ActivityFilter
-from eschorty_ros.core.evt3.decoder import Counters, Decoder
+from eschorty_ros.core.evt3.counters import Counters
+from eschorty_ros.core.evt3.decoder import Decoder
 from eschorty_ros.core.evt3.encoder import Encoder, sort_readout
 from eschorty_ros.core.evt3.events import EVENT_DTYPE, EventArrays, Events, Triggers
 from eschorty_ros.core.evt3.time_span import BeginTime, begin_time, time_span_us

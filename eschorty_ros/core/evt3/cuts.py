@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import words as w3
-from eschorty_ros.core.evt3.decoder import _FOREVER_US, _NO_ROW, _RUNNING, Decoder, decode_into
+from eschorty_ros.core.evt3.decoder import Decoder
+from eschorty_ros.core.evt3.state_machine import _FOREVER_US, _NO_ROW, _RUNNING, decode_into
 
 BLOCK = 4096
 # Words decoded before a block, which hold the current row and time.

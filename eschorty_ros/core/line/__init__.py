@@ -1,15 +1,14 @@
 """From the events of one period to one row per column with its standard deviation."""
 
-from eschorty_ros.core.line.centroid import (
+from eschorty_ros.core.line.estimators import (
     CENTROIDS,
     FULL_COLUMN_METHODS,
+    FWHM_PER_SIGMA,
     METHODS,
     RETURNS,
-    Centroids,
     check_method,
-    estimate,
 )
-from eschorty_ros.core.line.estimators import FWHM_PER_SIGMA
+from eschorty_ros.core.line.independent_columns import Centroids, estimate
 from eschorty_ros.core.line.line_history import SIGMA_COMMON_PX
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
 from eschorty_ros.core.line.sigma import (

@@ -1,17 +1,80 @@
-"""Row of the line from the events of a window or a column: mean and median."""
+"""Estimators of a column's row: their names and settings, mean and median."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.sigma import ErrorModel
 from eschorty_ros.core.line.window import FRACTION, HALF_WIDTH_PER_FWHM, ROW_LAST, ROW_MASK
+
+METHODS = ("mode_mean", "mean", "median")
+CENTROIDS = (*METHODS, "learned")
+"""The methods, and the one that follows a stream."""
+FULL_COLUMN_METHODS = ("mean", "median")
+RETURNS = ("strongest", "first", "last", "all")
+
+# Codes are indices of the tuples above.
+_MODE_MEAN, _MEAN, _MEDIAN, _LEARNED = range(4)
+_STRONGEST, _FIRST, _LAST, _ALL = range(4)
 
 FWHM_PER_SIGMA = 2.3548200450309493
 # Least half width of a window, fixed point.
 HALF_MIN = 3 * FRACTION
 # A window's half width in standard deviations of the line, fixed point.
 HALF_PER_SIGMA = HALF_WIDTH_PER_FWHM * FWHM_PER_SIGMA * FRACTION
+
+
+class Estimator(NamedTuple):
+    """Settings of an estimator.
+
+    ``half_max`` is the half width of a window for the widest line, fixed point, and
+    ``line_variance`` the variance of its rows. With ``seeded`` the search begins at the column's
+    last row, or at its neighbour's.
+    """
+
+    method: int
+    returns: int
+    seeded: bool
+    events_min: int
+    sensor_rows: int
+    half_max: int
+    line_variance: float
+    error_model: ErrorModel
+
+
+def half_width_fixed(fwhm_px: float) -> int:
+    """Return the half width of the averaging window for a line of ``fwhm_px``, fixed point."""
+    return max(round(HALF_WIDTH_PER_FWHM * fwhm_px * FRACTION), HALF_MIN)
+
+
+def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
+    """Return the codes of a method and of the returns it reports.
+
+    Raises
+    ------
+    ArgumentError
+        When there is no such method or choice of returns, or the method does not separate returns.
+    """
+    if not isinstance(method, str) or method not in CENTROIDS:
+        raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(CENTROIDS)}")
+    if not isinstance(returns, str) or returns not in RETURNS:
+        raise ArgumentError(f"returns is {returns!r}; choose one of {', '.join(RETURNS)}")
+    if method in FULL_COLUMN_METHODS and returns != "strongest":
+        windowed = [name for name in METHODS if name not in FULL_COLUMN_METHODS]
+        raise ArgumentError(
+            f"returns is {returns!r} and {method!r} averages the full column; choose 'strongest', "
+            f"or one of {', '.join(windowed)} as centroid"
+        )
+    return CENTROIDS.index(method), RETURNS.index(returns)
+
+
+@kernel
+def _is_windowed(method):
+    return method != _MEAN and method != _MEDIAN
 
 
 @kernel(forceinline=True)

@@ -1,110 +1,44 @@
-"""Cut events into modulation periods and turn each into the rows of a profile."""
+"""Cut events into modulation periods; the end of each makes the rows of a profile."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.evt3 import Decoder, EventArrays
-from eschorty_ros.core.evt3.decoder import decode_into
+from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
-from eschorty_ros.core.line.blinking import Blink, blink
-from eschorty_ros.core.line.centroid import (
-    _LEARNED,
-    CENTROIDS,
-    FULL_COLUMN_METHODS,
-    Estimator,
-    Rows,
-    _estimate_columns,
-    _learns,
-    check_method,
-    empty_rows,
-    half_width_fixed,
-    make_row_counts,
-)
+from eschorty_ros.core.line.blinking import blink
 from eschorty_ros.core.line.columns import (
-    Columns,
     _append,
     _bin,
     _bin_all,
     _bins,
     _forget_refused,
     _needs_room,
-    empty_columns,
     wider_columns,
 )
-from eschorty_ros.core.line.delay import Light, _delay_us, light
-from eschorty_ros.core.line.estimators import HALF_MIN, HALF_PER_SIGMA
-from eschorty_ros.core.line.learned import (
-    MEAN_ROWS,
-    UNDECIDED,
-    Footprint,
-    _choose,
-    _learn,
-    _restart_from,
-    make_footprint,
-)
-from eschorty_ros.core.line.learned_gate import (
-    LearnedGate,
-    _forget_gate,
-    _learn_gate,
-    _use_late,
-    make_gate,
-    same_gate,
-)
-from eschorty_ros.core.line.line_history import _compare_polarities
-from eschorty_ros.core.line.scatter import (
-    BLOCK_COLUMNS,
-    FACTOR_MAX,
-    Scatter,
-    _forget_scatter,
-    _scale,
-    _scale_smoothed,
-    empty_scatter,
-)
-from eschorty_ros.core.line.sigma import VARIANCE_PER_WIDTH2, error_model
-from eschorty_ros.core.line.smoothing import (
-    Smoothing,
-    _reject_isolated,
-    _smooth,
-    empty_smoothing,
-)
-from eschorty_ros.core.line.unusual import (
-    UsualWidths,
-    _keep_widths,
-    _mark_unusual,
-    _restart_widths,
-    empty_usual_widths,
-    empty_widths,
-)
+from eschorty_ros.core.line.delay import Light, light
+from eschorty_ros.core.line.estimators import CENTROIDS, FULL_COLUMN_METHODS
+from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 from eschorty_ros.core.optics import RangeModel
+from eschorty_ros.core.reconstruction.profile_rows import (
+    _begin_window,
+    _close,
+    allocate,
+    first_choice,
+)
 from eschorty_ros.core.reconstruction.profiles import LineRows
-from eschorty_ros.core.reconstruction.region import region
 from eschorty_ros.core.reconstruction.settings import Settings
-from eschorty_ros.core.storage import FEW_EVENTS, MIXED, SENSOR_EDGE
 
-WINDOW_EVENTS = 1 << 21
-"""Events after which, with the next profile, the estimate of the line starts again.
-
-A window of the stream so depends on no event before it, and windows can be reconstructed at the
-same time, but for what the first one has learned by then: the footprint when rows are chosen, usual
-widths and the line's width a few profiles later. While the sensor's edge cuts a line learning goes
-on.
-"""
-# Profiles of the first window, as full of points as any, that show the usual widths.
-_KNOWN_PROFILES = 16
-_OUTPUT_PROFILES = 64
-_WIDTH_MIN_DOF = 64
-# Times the limit that a line may be wide.
-_WIDER = 4
 _COUNTERS = np.dtype(
     [
         (name, np.int64)
@@ -152,41 +86,6 @@ class Edges(NamedTuple):
     period: NDArray[np.int64]
 
 
-class _Output(NamedTuple):
-    """Rows of closed periods as in `LineRows`; arrays of equal length."""
-
-    period: NDArray[np.int64]
-    edge_us: NDArray[np.int64]
-    t_us: NDArray[np.int64]
-    column: NDArray[np.uint16]
-    row: NDArray[np.float64]
-    sigma_row: NDArray[np.float64]
-    width_px: NDArray[np.float64]
-    events: NDArray[np.uint32]
-    return_index: NDArray[np.uint8]
-    flags: NDArray[np.uint16]
-
-
-class _Memory(NamedTuple):
-    """Settings and memory of the pass from events to rows."""
-
-    columns: Columns
-    estimator: Estimator
-    gate: LearnedGate
-    blink: Blink
-    footprint: Footprint
-    known: Footprint
-    known_widths: UsualWidths
-    scatter: Scatter
-    smoothing: Smoothing
-    light: Light
-    delay: Any
-    rows: Rows
-    row_counts: NDArray[np.int64]
-    output: _Output
-    window_events: int
-
-
 class Span(NamedTuple):
     """Times of the events to assign; earlier ones count as at ``floor_us``.
 
@@ -229,10 +128,10 @@ class ProfileAssembler:
             )
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
-        self._first_choice = _first_choice(settings)
+        self._first_choice = first_choice(settings)
         self._counters = np.zeros(1, _COUNTERS)[0]
         self._state = np.zeros(1, _STATE)[0]
-        self._memory = _allocate(settings, model)
+        self._memory = allocate(settings, model)
 
     def restart(self, modulation: Modulation, every: int) -> None:
         """Drop the open period, the last rows and the line's width; gate by ``modulation``.
@@ -398,193 +297,6 @@ class ProfileAssembler:
             self._done.append(
                 LineRows(**{name: values[:n].copy() for name, values in output.items()})
             )
-
-
-def _allocate(settings: Settings, model: RangeModel) -> _Memory:
-    method_code, returns_code = check_method(settings.centroid, settings.returns)
-    estimator = Estimator(
-        method=method_code,
-        returns=returns_code,
-        seeded=True,
-        events_min=settings.events_min,
-        sensor_rows=model.rows,
-        half_max=half_width_fixed(settings.line_width_px),
-        line_variance=VARIANCE_PER_WIDTH2 * settings.line_width_px**2,
-        error_model=error_model(
-            settings.centroid,
-            settings.sigma_factor,
-            settings.sigma_floor_px,
-        ),
-    )
-    returns = 2 if settings.returns == "all" else 1
-    shape = returns, model.columns
-    windowed = settings.centroid not in FULL_COLUMN_METHODS
-    size, none = _OUTPUT_PROFILES * returns * model.columns, LineRows.empty()
-    return _Memory(
-        columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
-        estimator=estimator,
-        blink=Blink(),
-        footprint=make_footprint(estimator.half_max, model.columns),
-        known=make_footprint(estimator.half_max, model.columns),
-        known_widths=empty_usual_widths(),
-        scatter=empty_scatter(model.columns, _factor_max(settings)),
-        smoothing=empty_smoothing(
-            settings.smoothing_half_width,
-            float(settings.smoothing_gate_px),
-            float(settings.isolation_gate_px),
-            settings.isolation_events,
-            empty_widths(*shape, settings.sigma_common_px, windowed),
-        ),
-        light=Light(),
-        gate=make_gate(Modulation(70.0), 0),
-        delay=record("time_us", "points"),
-        rows=empty_rows(*shape),
-        row_counts=make_row_counts(),
-        output=_Output(*(np.empty(size, getattr(none, name).dtype) for name in _Output._fields)),
-        window_events=WINDOW_EVENTS,
-    )
-
-
-def _first_choice(settings: Settings) -> int:
-    """Return `MEAN_ROWS` where settings fix the means, else `UNDECIDED`."""
-    means = settings.centroid == "mode_mean" and settings.detail == "off"
-    return MEAN_ROWS if means or settings.centroid in FULL_COLUMN_METHODS else UNDECIDED
-
-
-def _factor_max(settings: Settings) -> float:
-    """Return the largest factor of a variance by the scatter of rows."""
-    if settings.centroid in FULL_COLUMN_METHODS:
-        return 0.0
-    # The scatter that the compensation of reflectance steps removes does not widen sigma.
-    return 1.0 if settings.reflectance_compensation == "on" else FACTOR_MAX
-
-
-@kernel
-def _begin_window(memory, state):
-    """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
-    state.window = 0
-    state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
-    memory.columns.seeds[:] = -1
-    memory.columns.rivals[:] = -1
-    _forget_scatter(memory.scatter)
-    memory.smoothing.errors[:] = 0.0
-    memory.delay.time_us = memory.delay.points = 0
-    _forget_gate(memory.gate)
-    _restart_widths(memory.smoothing.widths, memory.known_widths)
-    if memory.footprint.state.near_edge == 0:
-        _restart_from(memory.footprint, memory.known)
-
-
-@kernel
-def _adapted_half(half, sums, half_max):
-    """Return the half width for the next period: 1.3 x the width of this one's rows, averaged.
-
-    It exceeds the limit where most events of the columns are in the windows, hence the line's.
-    """
-    if sums.freedom < _WIDTH_MIN_DOF:
-        return half
-    measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
-    limit = half_max * (_WIDER if 3 * sums.freedom > 2 * sums.events else 1)
-    return np.int64(min(max(np.rint(0.5 * (half + measured)), HALF_MIN), limit))
-
-
-@kernel(_nrt=False)
-def _few_events(rows, most):
-    """Return the number below which a point's events are few: half of the mean, up to ``most``."""
-    total, points = 0.0, 0
-    returns, columns = rows.row.shape
-    for k in range(returns):
-        for c in range(columns):
-            if not np.isnan(rows.row[k, c]):
-                total += rows.events[k, c]
-                points += 1
-    return min(0.5 * total / max(points, 1), float(most))
-
-
-@kernel(_nrt=False)
-def _write(rows, smoothing, few, delay_us, state, output):
-    """Write the period's rows behind ``state.rows``, by column, nearest return first."""
-    returns, columns = rows.row.shape
-    period, edge_us = state.period, state.edge_us
-    first = end = np.uintp(state.rows)
-    for c in range(np.uintp(columns)):
-        index = 0
-        for k in range(np.uintp(returns)):
-            # Overwritten by the next point where there is none here.
-            output.column[end], output.flags[end], output.return_index[end] = c, k, index
-            found = not np.isnan(rows.row[k, c])
-            index += found
-            end += np.uintp(found)
-    for i in range(first, end):
-        at = np.uintp(output.flags[i]), np.uintp(output.column[i])
-        output.period[i] = period
-        output.edge_us[i] = edge_us
-        output.t_us[i] = edge_us + rows.mean_dt_us[at] - delay_us
-        output.row[i] = smoothing.row[at]
-        output.sigma_row[i] = np.sqrt(smoothing.sigma2[at])
-        output.width_px[i] = np.sqrt(rows.variance[at])
-        output.events[i] = rows.events[at]
-        output.flags[i] = (
-            (MIXED if rows.mixed[at] else 0)
-            | (SENSOR_EDGE if rows.truncated[at] else 0)
-            | (FEW_EVENTS if rows.events[at] < few else 0)
-        )
-    state.rows = end
-
-
-@kernel
-def _close(memory, state, counters):
-    """Turn the open period into rows."""
-    columns, estimator, gate = memory.columns, memory.estimator, memory.gate
-    blink, footprint, scatter = memory.blink, memory.footprint, memory.scatter
-    smoothing, rows, row_counts = memory.smoothing, memory.rows, memory.row_counts
-    if gate.choices.size > 0:
-        _learn_gate(columns, state.half, gate)
-        gated = _use_late(columns, gate)
-        counters.events_binned -= gated
-        counters.events_gated += gated
-    learns, late = _learns(footprint), state.window >= memory.window_events
-    half = state.half
-    sums = _estimate_columns(columns, state.half, estimator, blink, footprint, rows, row_counts)
-    state.half = _adapted_half(state.half, sums, estimator.half_max)
-    counters.profiles_too_wide += state.half > estimator.half_max
-    counters.periods_closed += 1
-    counters.columns_too_few_events += sums.too_few_events
-    counters.columns_ambiguous += sums.ambiguous
-    counters.columns_two_returns += sums.two_returns
-    counters.columns_unmodulated += sums.unmodulated
-    counters.events_unmodulated += sums.events_unmodulated
-    counters.columns_isolated += _reject_isolated(rows, smoothing)
-    _scale(rows, scatter, smoothing)
-    counters.columns_smoothed += _smooth(rows, smoothing)
-    _scale_smoothed(rows, scatter, smoothing)
-    _compare_polarities(columns, half, state.period % BLOCK_COLUMNS, smoothing.widths.history)
-    _mark_unusual(rows, smoothing, memory.light.lit_share)
-    enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
-    if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):
-        # Later windows begin with what is known now.
-        _restart_from(memory.known, footprint)
-    if learns:
-        uncertain, truncated = rows.uncertain[0], rows.truncated[0]
-        _learn(
-            footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.sensor_rows
-        )
-    if state.known_half == 0:
-        if half >= estimator.half_max and state.half > half:
-            # Its window cuts a line that is wider than expected.
-            smoothing.widths.usual.number[:] = 0.0
-        if enough and footprint.state.choice != UNDECIDED:
-            state.known_half = state.half
-            _keep_widths(smoothing.widths, memory.known_widths)
-    few = _few_events(rows, smoothing.isolation_events)
-    delay_us = _delay_us(rows, memory.delay, memory.light)
-    before = state.rows
-    _write(rows, smoothing, few, delay_us, state, memory.output)
-    points = np.int64(state.rows - before)
-    state.points += points
-    state.points_most = max(state.points_most, points)
-    if late and state.known_half > 0:
-        _begin_window(memory, state)
 
 
 @kernel

@@ -15,7 +15,7 @@ from eschorty_ros.core.evt3.cuts import Cut, next_cut
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.held_events import EventArrays
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.core.reconstruction import profile_assembler
+from eschorty_ros.core.reconstruction import profile_rows
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -132,7 +132,7 @@ class WindowAssembler:
             found = next_cut(words, cut, edges.t_us, left, probe)
             if found is None:
                 break
-            cut, left = found, profile_assembler.WINDOW_EVENTS
+            cut, left = found, profile_rows.WINDOW_EVENTS
             if len(running) >= self._jobs + _WAITING:
                 going = self._accept(running.popleft(), going)
             assembler = self._idle.popleft()

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from streams import RECORDING_SHARES, recording_like_words, words_of
 
 from eschorty_ros.core import evt3
-from eschorty_ros.core.evt3.decoder import _decode_stored, _trigger_arrays
 from eschorty_ros.core.evt3.events import event_arrays
+from eschorty_ros.core.evt3.state_machine import _decode_stored, _trigger_arrays
 from eschorty_ros.core.storage.raw_file import RawReader
 
 RECORDING = Path(__file__).parents[4] / "shared/data/evt3_gen41_sample.raw"

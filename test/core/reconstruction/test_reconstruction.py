@@ -19,7 +19,7 @@ from eschorty_ros.core.reconstruction import (
     add_stage,
     place,
     place_link,
-    profile_assembler,
+    profile_rows,
     region_window,
     windows,
 )
@@ -105,7 +105,7 @@ def test_any_split_gives_the_same_points_and_counts(case):
 @pytest.mark.parametrize("case", [*SPLIT_CASES, "returns", "compensation"])
 def test_threads_give_the_same_points_and_counts(case, monkeypatch):
     """With windows of a few periods each, so that there are many, in a stream with faults too."""
-    monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 20_000)
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 20_000)
     rng = np.random.default_rng(SEED)
     more = {"returns": {"returns": "all"}, "compensation": {"reflectance_compensation": "on"}}
     stream, modulation, settings = SPLIT_CASES.get(case, SPLIT_CASES["edge"])
@@ -124,7 +124,7 @@ def test_threads_give_the_same_points_and_counts(case, monkeypatch):
 
 def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monkeypatch):
     """Chosen after 7 profiles of 60, with windows of a dozen; half of the events are lost."""
-    monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 400_000)
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 400_000)
     camera = Camera(periods=60)
     events = camera.line(wavy)
     kept = camera.rng.random(events[0].size) < 0.5
@@ -144,7 +144,7 @@ def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monk
 
 def test_windows_are_found_without_decoding_what_is_before_them(monkeypatch):
     """None is assembled by itself, behind the one before it."""
-    monkeypatch.setattr(profile_assembler, "WINDOW_EVENTS", 30_000)
+    monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 30_000)
     monkeypatch.delattr(windows.WindowAssembler, "_go_on")
     stream, modulation, settings = SPLIT_CASES["edge"]
     parallel = Reconstructor(CALIBRATION, modulation, settings, 2)

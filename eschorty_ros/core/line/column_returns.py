@@ -1,0 +1,213 @@
+"""The returns of a column: the windows of its events that are the line, on one surface or two."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.blinking import _is_in_phase, _laser_test, _without, _without_hot_pixels
+from eschorty_ros.core.line.estimators import _LAST, _STRONGEST, _is_windowed
+from eschorty_ros.core.line.window import (
+    AMBIGUOUS,
+    FOUND,
+    TOO_FEW,
+    UNMODULATED,
+    Returns,
+    _densest_window,
+    _exceeds_background,
+    _full_column,
+    _second_return,
+)
+
+# Windows of a column that are tested for the laser's modulation.
+_WINDOWS_MAX = 4
+# Weight of each of two neighbours' evidence; 2 x 0.45 < 1, so that it sums to at most 10 times a
+# column's own.
+_VOTE = 0.45
+
+
+class _ColumnReturns(NamedTuple):
+    """Returns of a column and its events that follow the laser; ``uncertain`` ones may not."""
+
+    found: Returns
+    events: np.int64
+    uncertain: bool
+
+
+@kernel(_nrt=False)
+def _search(packed, column, half, estimator):
+    """Search a column for the window of its line."""
+    if not _is_windowed(estimator.method):
+        window = _full_column(packed, column)
+        status = FOUND if column.events >= estimator.events_min else TOO_FEW
+        return Returns(status, False, window, window)
+    found = _densest_window(packed, column, half)
+    events = found.window.sums.events
+    line = events
+    if found.status == AMBIGUOUS:
+        line += found.other.sums.events
+    others = column.events - line
+    if events < estimator.events_min or not _exceeds_background(
+        line, others, half, estimator.sensor_rows
+    ):
+        return Returns(TOO_FEW, False, found.window, found.other)
+    return found
+
+
+@kernel(_nrt=False)
+def _modulated(packed, column, found, half, estimator, blink, row_counts):
+    """Return the window of events that follow the laser, and the column without other windows.
+
+    The last value is true when the window may be background all the same. The status is
+    ``UNMODULATED`` when no window of the column follows it.
+    """
+    events = column.events
+    for _ in range(_WINDOWS_MAX):
+        window = found.window
+        test = _laser_test(packed, column, window.first, window.last, blink)
+        left = _without_hot_pixels(packed, column, window.first, window.last, blink, row_counts)
+        if left.events == column.events:
+            # A second window is a second chance for background.
+            if test.follows and (test.sure or column.events == events):
+                return found, column, not test.sure or column.events < events
+            left = _without(packed, column, window.first, window.last)
+        column = left
+        found = Returns(TOO_FEW, False, window, window)
+        if column.events >= estimator.events_min:
+            found = _search(packed, column, half, estimator)
+        if found.status == TOO_FEW:
+            break
+    return Returns(UNMODULATED, False, found.window, found.window), column, True
+
+
+@kernel(_nrt=False)
+def _all_returns(packed, column, half, estimator, found):
+    """Search for a second return beside the one that was found.
+
+    Two equally strong ones are no ambiguity here, as both can be reported.
+    """
+    if found.status == TOO_FEW:
+        return found
+    if found.status == AMBIGUOUS:
+        return Returns(FOUND, True, found.window, found.other)
+    return _second_return(
+        packed, column, half, estimator.sensor_rows, estimator.events_min, found.window
+    )
+
+
+@kernel(_nrt=False)
+def _vote(columns, c, a, b, half):
+    """Return by how many events neighbours have window ``a`` stronger than its rival ``b``.
+
+    They are the same column in the last period and the column before, where the windows continue
+    their two lines.
+    """
+    evidence = 0.0
+    for other in (c, c - 1):
+        if other < 0 or columns.rivals[other] < 0:
+            continue
+        first, second = columns.seeds[other], columns.rivals[other]
+        if max(abs(a.centre - first), abs(b.centre - second)) <= half:
+            evidence += _VOTE * columns.evidence[other]
+        elif max(abs(a.centre - second), abs(b.centre - first)) <= half:
+            evidence -= _VOTE * columns.evidence[other]
+    return evidence
+
+
+@kernel(_nrt=False)
+def _stronger(packed, column, c, half, columns, estimator, blink, found):
+    """Return the stronger one of a column's two returns; in a stream its neighbours vote.
+
+    Boxes of dense events are full in the middle of every line; complete windows tell them apart.
+    """
+    both = _all_returns(packed, column, half, estimator, found)
+    a, b = both.window, both.other
+    alone = not both.second
+    if not alone and blink.step > 0:
+        # A second window is a second chance for background.
+        alone = not _laser_test(packed, column, b.first, b.last, blink).sure
+    if alone:
+        columns.rivals[c] = -1
+        return Returns(FOUND, False, a, a)
+    evidence = float(a.sums.events - b.sums.events)
+    if estimator.seeded:
+        evidence += _vote(columns, c, a, b, half)
+    columns.rivals[c] = -1
+    # Of two complete windows with as many events the one with the denser middle is the line.
+    if evidence == 0.0 and found.status == AMBIGUOUS:
+        return Returns(AMBIGUOUS, True, a, b)
+    if evidence < 0.0:
+        a, b = b, a
+    columns.rivals[c] = b.centre
+    columns.evidence[c] = abs(evidence)
+    return Returns(FOUND, False, a, a)
+
+
+@kernel
+def _reported(returns, found):
+    """Return the windows to report, nearest (least row) first; the same twice when it is one."""
+    a, b = found.window, found.other
+    if not found.second or returns == _STRONGEST:
+        return a, a
+    near, far = (a, b) if a.centre < b.centre else (b, a)
+    return (far, near) if returns == _LAST else (near, far)
+
+
+@kernel
+def _is_cut(window, sensor_rows):
+    """Return true when a window reaches the first or last row of the sensor."""
+    return window.first == 0 or window.last >= sensor_rows - 1.0
+
+
+@kernel
+def _is_alone(used, events):
+    """Return true when a window has so many of the events that no other is nearly as strong."""
+    return 3 * used > 2 * events
+
+
+@kernel
+def _is_clear(window, column, estimator, blink):
+    """Return true when a window needs no search for others and no further test of its events."""
+    events = window.sums.events
+    return (
+        events >= estimator.events_min
+        and _is_alone(events, column.events)
+        and not _is_cut(window, estimator.sensor_rows)
+        and estimator.returns == _STRONGEST
+        and (blink.step == 0 or _is_in_phase(window.sums))
+    )
+
+
+@kernel(_nrt=False)
+def _column_returns(packed, column, c, half, columns, estimator, blink, window, row_counts):
+    """Search a column for its returns; ``window`` is that around its last row, if it has one."""
+    testing = _is_windowed(estimator.method) and blink.step > 0
+    uncertain = False
+    found = Returns(FOUND, False, window, window)
+    if window.sums.events < estimator.events_min or 2 * window.sums.events <= column.events:
+        found = _search(packed, column, half, estimator)
+    if testing and not (
+        found.status == TOO_FEW or (found.status == FOUND and _is_in_phase(found.window.sums))
+    ):
+        found, column, uncertain = _modulated(
+            packed, column, found, half, estimator, blink, row_counts
+        )
+        if found.status == UNMODULATED:
+            return _ColumnReturns(found, column.events, True)
+    if estimator.returns != _STRONGEST:
+        found = _all_returns(packed, column, half, estimator, found)
+        if testing and found.second:
+            other = found.other
+            if not _laser_test(packed, column, other.first, other.last, blink).follows:
+                found = Returns(FOUND, False, found.window, found.window)
+    elif _is_windowed(estimator.method):
+        used = found.window.sums.events
+        if found.status == AMBIGUOUS or (
+            found.status == FOUND and not _is_alone(used, column.events)
+        ):
+            found = _stronger(packed, column, c, half, columns, estimator, blink, found)
+        else:
+            columns.rivals[c] = -1
+    return _ColumnReturns(found, column.events, uncertain)
