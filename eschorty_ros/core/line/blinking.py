@@ -97,7 +97,7 @@ def _sine(phase):
 
 
 @kernel(_nrt=False)
-def _vector(packed, column, first, last, blink):
+def _vector(column, first, last, blink):
     """Return the sum of unit vectors over the events of rows first..last."""
     base = np.uint32(first)
     span = np.uint32(last - first)
@@ -111,7 +111,7 @@ def _vector(packed, column, first, last, blink):
         end = min(begin + CHUNK, padded)
         n, sum_x, sum_y = none, none, none
         for i in range(begin, end):
-            v = packed[i]
+            v = column.packed[i]
             inside = np.uint32((v & ROW_MASK) - base) <= span
             back = none if v & POLARITY else duty
             phase = np.uint32(np.uint32((v >> TIME_SHIFT) * step) - back)
@@ -135,9 +135,9 @@ def _is_in_phase(sums):
 
 
 @kernel(_nrt=False)
-def _laser_test(packed, column, first, last, blink):
+def _laser_test(column, first, last, blink):
     """Test whether the events of rows first..last follow the laser."""
-    vector = _vector(packed, column, first, last, blink)
+    vector = _vector(column, first, last, blink)
     length2 = float(vector.x * vector.x + vector.y * vector.y)
     n = float(vector.events)
     square = length2 / (n * n * _UNIT * _UNIT)
@@ -147,19 +147,19 @@ def _laser_test(packed, column, first, last, blink):
         return _LaserTest(follows, rayleigh > _RAYLEIGH_SURE)
     # A line that moves while it is lit has events all the time, and a burst at both edges. What
     # passes within a part of the period has one at most.
-    bursts = _has_bursts(packed, column, first, last, blink)
+    bursts = _has_bursts(column, first, last, blink)
     return _LaserTest(bursts, bursts)
 
 
 @kernel(_nrt=True)
-def _has_bursts(packed, column, first, last, blink):
+def _has_bursts(column, first, last, blink):
     """Return true when many ON events are close behind a rising edge and OFF ones a falling one.
 
     Chernoff's bound limits the probability that background has them.
     """
     burst, events = np.zeros(2), np.zeros(2)
     for i in range(column.start, column.start + column.events):
-        v = packed[i]
+        v = column.packed[i]
         if first <= np.int64(v & ROW_MASK) <= last:
             on = np.int64(v & POLARITY) >> ROW_BITS
             phase = np.uint32((v >> TIME_SHIFT) * blink.step) - (0 if on else blink.duty)
@@ -171,32 +171,32 @@ def _has_bursts(packed, column, first, last, blink):
 
 
 @kernel(_nrt=False)
-def _without(packed, column, first, last):
+def _without(column, first, last):
     """Remove the events of rows first..last from a column and return what is left."""
     n = np.int64(0)
     for i in range(column.start, column.start + column.events):
-        row = np.int64(packed[i] & ROW_MASK)
+        row = np.int64(column.packed[i] & ROW_MASK)
         if not first <= row <= last:
-            packed[column.start + n] = packed[i]
+            column.packed[column.start + n] = column.packed[i]
             n += 1
-    _pad(packed, column.start + n)
-    return _column(column.start, n, column.lit_us)
+    _pad(column.packed, column.start + n)
+    return _column(column.packed, column.start, n, column.lit_us)
 
 
 @kernel(_nrt=True)
-def _without_hot_pixels(packed, column, first, last, blink, counts):
+def _without_hot_pixels(column, first, last, blink, counts):
     """Remove from a column the pixels of rows first..last that fire without the laser.
 
     Those have more than twice the events of an average pixel there. ``counts`` is zeroed scratch,
     one per row.
     """
     for i in range(column.start, column.start + column.events):
-        counts[packed[i] & ROW_MASK] += 1
+        counts[column.packed[i] & ROW_MASK] += 1
     near = counts[first : last + 1]
     hot = max(2.0 * near.sum() / max(np.count_nonzero(near), 1), _HOT_EVENTS_MIN)
     left = column
     for row in range(first, last + 1):
-        if counts[row] >= hot and not _laser_test(packed, left, row, row, blink).follows:
-            left = _without(packed, left, row, row)
+        if counts[row] >= hot and not _laser_test(left, row, row, blink).follows:
+            left = _without(left, row, row)
     counts[:] = 0
     return left

@@ -128,7 +128,7 @@ def _learns(footprint):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _refine(packed, column, at, window, line_variance, estimator, footprint, row_counts, windows):
+def _refine(column, at, window, line_variance, estimator, footprint, row_counts, windows):
     """Set the row of a window's line that a learned footprint or the median gives.
 
     ``at`` is the place of the return: its number and its column.
@@ -141,11 +141,11 @@ def _refine(packed, column, at, window, line_variance, estimator, footprint, row
     best, learned = row, -1.0
     takes, trying = footprint.state.choice == LEARNED_ROWS, footprint.state.trying > 0
     if _learns(footprint):
-        _sample(packed, column, c, row, sensor_rows, footprint, row_counts)
+        _sample(column, c, row, sensor_rows, footprint, row_counts)
     if cut or trying or takes:
-        best, learned = _learned_row(packed, column, row, sensor_rows, footprint, row_counts)
+        best, learned = _learned_row(column, row, sensor_rows, footprint, row_counts)
     if method == _MEDIAN:
-        windows.row[at] = _median(packed, column, row_counts)
+        windows.row[at] = _median(column, row_counts)
     near = events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
     if trying and near and not cut:
         footprint.trial[c] = best - row
@@ -295,27 +295,25 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         if n < estimator.events_min:
             few += n > 0
             continue
-        column = _column(columns.starts[c], n, blink.lit_us)
+        column = _column(packed, columns.starts[c], n, blink.lit_us)
         known = columns.seeds[c] >= 0
         if not known:
             # Stored rather than selected: a select would chain each column to the one before.
             columns.seeds[c] = neighbour
         window = _NO_WINDOW
         if windowed and estimator.seeded and columns.seeds[c] >= 0:
-            window = _mean_shift(packed, column, columns.seeds[c], half, 0, ROW_LAST)
+            window = _mean_shift(column, columns.seeds[c], half, 0, ROW_LAST)
             if _is_clear(window, column, estimator, blink):
                 columns.rivals[c] = -1
                 columns.seeds[c] = neighbour = window.centre
                 _put((0, c), window, n, False, out)
                 if not plain:
                     _refine(
-                        packed, column, (0, c), window, line_variance, estimator, footprint,
+                        column, (0, c), window, line_variance, estimator, footprint,
                         row_counts, out.windows,
                     )  # fmt: skip
                 continue
-        searched = _column_returns(
-            packed, column, c, half, columns, estimator, blink, window, row_counts
-        )
+        searched = _column_returns(column, c, half, columns, estimator, blink, window, row_counts)
         found = searched.found
         if found.status == UNMODULATED:
             unmodulated += 1
@@ -330,11 +328,11 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         columns.seeds[c] = neighbour = found.window.centre
         two += found.second
         window, other = _reported(estimator.returns, found)
-        left = _column(columns.starts[c], searched.events, blink.lit_us)
+        left = _column(packed, columns.starts[c], searched.events, blink.lit_us)
         for k in range(2 if found.second and estimator.returns == _ALL else 1):
             _put((k, c), window, n, searched.uncertain, out)
             _refine(
-                packed, left, (k, c), window, line_variance, estimator, footprint, row_counts,
+                left, (k, c), window, line_variance, estimator, footprint, row_counts,
                 out.windows,
             )  # fmt: skip
             refined = True

@@ -37,13 +37,13 @@ class _ColumnReturns(NamedTuple):
 
 
 @kernel(_nrt=False)
-def _search(packed, column, half, estimator):
+def _search(column, half, estimator):
     """Search a column for the window of its line."""
     if not _is_windowed(estimator.method):
-        window = _full_column(packed, column)
+        window = _full_column(column)
         status = FOUND if column.events >= estimator.events_min else TOO_FEW
         return Returns(status, False, window, window)
-    found = _densest_window(packed, column, half)
+    found = _densest_window(column, half)
     events = found.window.sums.events
     line = events
     if found.status == AMBIGUOUS:
@@ -57,7 +57,7 @@ def _search(packed, column, half, estimator):
 
 
 @kernel(_nrt=False)
-def _modulated(packed, column, found, half, estimator, blink, row_counts):
+def _modulated(column, found, half, estimator, blink, row_counts):
     """Return the window of events that follow the laser, and the column without other windows.
 
     The last value is true when the window may be background all the same. The status is
@@ -66,24 +66,24 @@ def _modulated(packed, column, found, half, estimator, blink, row_counts):
     events = column.events
     for _ in range(_WINDOWS_MAX):
         window = found.window
-        test = _laser_test(packed, column, window.first, window.last, blink)
-        left = _without_hot_pixels(packed, column, window.first, window.last, blink, row_counts)
+        test = _laser_test(column, window.first, window.last, blink)
+        left = _without_hot_pixels(column, window.first, window.last, blink, row_counts)
         if left.events == column.events:
             # A second window is a second chance for background.
             if test.follows and (test.sure or column.events == events):
                 return found, column, not test.sure or column.events < events
-            left = _without(packed, column, window.first, window.last)
+            left = _without(column, window.first, window.last)
         column = left
         found = Returns(TOO_FEW, False, window, window)
         if column.events >= estimator.events_min:
-            found = _search(packed, column, half, estimator)
+            found = _search(column, half, estimator)
         if found.status == TOO_FEW:
             break
     return Returns(UNMODULATED, False, found.window, found.window), column, True
 
 
 @kernel(_nrt=False)
-def _all_returns(packed, column, half, estimator, found):
+def _all_returns(column, half, estimator, found):
     """Search for a second return beside the one that was found.
 
     Two equally strong ones are no ambiguity here, as both can be reported.
@@ -92,9 +92,7 @@ def _all_returns(packed, column, half, estimator, found):
         return found
     if found.status == AMBIGUOUS:
         return Returns(FOUND, True, found.window, found.other)
-    return _second_return(
-        packed, column, half, estimator.sensor_rows, estimator.events_min, found.window
-    )
+    return _second_return(column, half, estimator.sensor_rows, estimator.events_min, found.window)
 
 
 @kernel(_nrt=False)
@@ -117,17 +115,17 @@ def _vote(columns, c, a, b, half):
 
 
 @kernel(_nrt=False)
-def _stronger(packed, column, c, half, columns, estimator, blink, found):
+def _stronger(column, c, half, columns, estimator, blink, found):
     """Return the stronger one of a column's two returns; in a stream its neighbours vote.
 
     Boxes of dense events are full in the middle of every line; complete windows tell them apart.
     """
-    both = _all_returns(packed, column, half, estimator, found)
+    both = _all_returns(column, half, estimator, found)
     a, b = both.window, both.other
     alone = not both.second
     if not alone and blink.step > 0:
         # A second window is a second chance for background.
-        alone = not _laser_test(packed, column, b.first, b.last, blink).sure
+        alone = not _laser_test(column, b.first, b.last, blink).sure
     if alone:
         columns.rivals[c] = -1
         return Returns(FOUND, False, a, a)
@@ -181,33 +179,31 @@ def _is_clear(window, column, estimator, blink):
 
 
 @kernel(_nrt=False)
-def _column_returns(packed, column, c, half, columns, estimator, blink, window, row_counts):
+def _column_returns(column, c, half, columns, estimator, blink, window, row_counts):
     """Search a column for its returns; ``window`` is that around its last row, if it has one."""
     testing = _is_windowed(estimator.method) and blink.step > 0
     uncertain = False
     found = Returns(FOUND, False, window, window)
     if window.sums.events < estimator.events_min or 2 * window.sums.events <= column.events:
-        found = _search(packed, column, half, estimator)
+        found = _search(column, half, estimator)
     if testing and not (
         found.status == TOO_FEW or (found.status == FOUND and _is_in_phase(found.window.sums))
     ):
-        found, column, uncertain = _modulated(
-            packed, column, found, half, estimator, blink, row_counts
-        )
+        found, column, uncertain = _modulated(column, found, half, estimator, blink, row_counts)
         if found.status == UNMODULATED:
             return _ColumnReturns(found, column.events, True)
     if estimator.returns != _STRONGEST:
-        found = _all_returns(packed, column, half, estimator, found)
+        found = _all_returns(column, half, estimator, found)
         if testing and found.second:
             other = found.other
-            if not _laser_test(packed, column, other.first, other.last, blink).follows:
+            if not _laser_test(column, other.first, other.last, blink).follows:
                 found = Returns(FOUND, False, found.window, found.window)
     elif _is_windowed(estimator.method):
         used = found.window.sums.events
         if found.status == AMBIGUOUS or (
             found.status == FOUND and not _is_alone(used, column.events)
         ):
-            found = _stronger(packed, column, c, half, columns, estimator, blink, found)
+            found = _stronger(column, c, half, columns, estimator, blink, found)
         else:
             columns.rivals[c] = -1
     return _ColumnReturns(found, column.events, uncertain)

@@ -91,13 +91,13 @@ def _variance(events, d, d2):
 
 
 @kernel(_nrt=False)
-def _median(packed, column, counts):
+def _median(column, counts):
     """Return the middle row, or the mean of the two middle rows; ``counts`` is zeroed scratch."""
     n = column.events
     low = np.int64(ROW_LAST)
     high = np.int64(0)
     for i in range(column.start, column.start + n):
-        row = np.int64(packed[i] & ROW_MASK)
+        row = np.int64(column.packed[i] & ROW_MASK)
         counts[row] += 1
         low = min(low, row)
         high = max(high, row)

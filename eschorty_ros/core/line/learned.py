@@ -129,11 +129,11 @@ def _restart_from(footprint, known):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _count_rows(packed, column, low, high, counts):
+def _count_rows(column, low, high, counts):
     """Count the events of rows low..high into ``counts``; return the first and last row of any."""
     first, last = high + 1, low - 1
     for i in range(np.uintp(column.start), np.uintp(column.start + column.events)):
-        row = np.int64(packed[i] & ROW_MASK)
+        row = np.int64(column.packed[i] & ROW_MASK)
         if low <= row <= high:
             counts[np.uintp(row)] += 1
             first, last = min(first, row), max(last, row)
@@ -141,7 +141,7 @@ def _count_rows(packed, column, low, high, counts):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _sample(packed, column, c, row, sensor_rows, footprint, counts):
+def _sample(column, c, row, sensor_rows, footprint, counts):
     """Keep the events by row of column ``c`` to learn from, when its turn has come.
 
     ``counts`` is zeroed scratch, one per row.
@@ -152,7 +152,7 @@ def _sample(packed, column, c, row, sensor_rows, footprint, counts):
     centre = np.int64(np.rint(row))
     first = max(centre - footprint.reach, np.int64(0))
     last = min(centre + footprint.reach, sensor_rows - 1)
-    _count_rows(packed, column, first, last, counts)
+    _count_rows(column, first, last, counts)
     footprint.first_row[slot] = first
     for at in range(first, last + 1):
         footprint.rows_seen[slot, at - first] = min(counts[at], _COUNTS - 1)
@@ -221,7 +221,7 @@ def _log_likelihoods(footprint, place, low, high, counts, sensor_rows):
 
 
 @kernel(_nrt=False, forceinline=True)
-def _learned_row(packed, column, row, sensor_rows, footprint, counts):
+def _learned_row(column, row, sensor_rows, footprint, counts):
     """Return the row of a line near ``row`` and its variance; 0 and -1 before any is learned.
 
     ``counts`` is zeroed scratch, one per row.
@@ -233,7 +233,7 @@ def _learned_row(packed, column, row, sensor_rows, footprint, counts):
     centre = np.int64(np.rint(row))
     margin = reach + _MOVES_MAX
     span = max(centre - margin, 0), min(centre + margin, sensor_rows - 1)
-    all_low, all_high = _count_rows(packed, column, span[0], span[1], counts)
+    all_low, all_high = _count_rows(column, span[0], span[1], counts)
     for _ in range(_MOVES_MAX):
         low = max(-((_PLACES * reach - place) // _PLACES), all_low)
         high = min((place + _PLACES * reach) // _PLACES, all_high)

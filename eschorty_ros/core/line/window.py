@@ -16,6 +16,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
 
@@ -46,11 +47,12 @@ _FALSE_SECOND = 1000.0
 
 
 class Column(NamedTuple):
-    """Place of one column in the packed events: ``events`` from ``start`` on, padded to blocks.
+    """One column of the ``packed`` events: its ``events`` from ``start`` on, padded to blocks.
 
     The laser is on for the first ``lit_us`` of the period.
     """
 
+    packed: NDArray[np.uint32]
     start: np.int64
     events: np.int64
     blocks: np.int64
@@ -107,13 +109,13 @@ def _pad(packed, end):
 
 
 @kernel
-def _column(start, events, lit_us):
-    """Return the place of a column, which has been padded."""
-    return Column(start, events, (events + BLOCK - 1) // BLOCK, lit_us)
+def _column(packed, start, events, lit_us):
+    """Return a column, which has been padded."""
+    return Column(packed, start, events, (events + BLOCK - 1) // BLOCK, lit_us)
 
 
 @kernel(_nrt=False, forceinline=True)
-def _window_sums(packed, column, first, last):
+def _window_sums(column, first, last):
     """Return the sums over rows first..last.
 
     The number of events and the sum of d share one register lane: a chunk's sum of d stays below
@@ -133,7 +135,7 @@ def _window_sums(packed, column, first, last):
         end = min(begin + CHUNK, padded)
         both, d2, ts, opposite = none, none, none, none
         for i in range(begin, end):
-            v = packed[i]
+            v = column.packed[i]
             d = np.uint32((v & ROW_MASK) - base)
             t = v >> TIME_SHIFT
             inside = d <= span
@@ -154,7 +156,7 @@ def _window_sums(packed, column, first, last):
 
 
 @kernel(_nrt=False)
-def _window_events(packed, column, first, last):
+def _window_events(column, first, last):
     """Return the number of events in rows first..last."""
     base = np.uint32(first)
     span = np.uint32(last - first)
@@ -165,7 +167,7 @@ def _window_events(packed, column, first, last):
         end = min(begin + CHUNK, padded)
         inside = np.uint32(0)
         for i in range(begin, end):
-            d = np.uint32((packed[i] & ROW_MASK) - base)
+            d = np.uint32((column.packed[i] & ROW_MASK) - base)
             inside = np.uint32(inside + np.uint32(d <= span))
         events += np.int64(inside)
         begin = end
@@ -181,14 +183,14 @@ def _limits(centre, half, first, last):
 
 
 @kernel(_nrt=False)
-def _full_column(packed, column):
+def _full_column(column):
     """Return the window over all rows; its centre is not computed and set to -1."""
-    sums = _window_sums(packed, column, 0, ROW_LAST)
+    sums = _window_sums(column, 0, ROW_LAST)
     return Window(np.int64(0), np.int64(ROW_LAST), sums, np.int64(-1))
 
 
 @kernel(_nrt=False, forceinline=True)
-def _mean_shift(packed, column, centre, half, first, last):
+def _mean_shift(column, centre, half, first, last):
     """Move a window to the mean of its events, ``_ITERATIONS_MAX`` times at most.
 
     It stops when the mean moves by a sixteenth of the half width or less: in a window of three
@@ -196,7 +198,7 @@ def _mean_shift(packed, column, centre, half, first, last):
     stays within rows first..last.
     """
     low, high = _limits(centre, half, first, last)
-    sums = _window_sums(packed, column, low, high)
+    sums = _window_sums(column, low, high)
     for _ in range(_ITERATIONS_MAX - 1):
         if sums.events == 0:
             break
@@ -206,20 +208,20 @@ def _mean_shift(packed, column, centre, half, first, last):
         if step * 16 <= half:
             break
         low, high = _limits(centre, half, first, last)
-        sums = _window_sums(packed, column, low, high)
+        sums = _window_sums(column, low, high)
     return Window(low, high, sums, centre)
 
 
 @kernel(_nrt=False)
-def _densest_pairwise(packed, column, radius, avoid, gap):
+def _densest_pairwise(column, radius, avoid, gap):
     best = np.int64(0)
     lowest = np.int64(ROW_LAST)
     highest = np.int64(0)
     for i in range(column.start, column.start + column.events):
-        row = np.int64(packed[i] & ROW_MASK)
+        row = np.int64(column.packed[i] & ROW_MASK)
         if abs(row * FRACTION - avoid) < gap:
             continue
-        support = _window_events(packed, column, max(row - radius, 0), min(row + radius, ROW_LAST))
+        support = _window_events(column, max(row - radius, 0), min(row + radius, ROW_LAST))
         if support > best:
             best, lowest, highest = support, row, row
         elif support == best:
@@ -229,11 +231,11 @@ def _densest_pairwise(packed, column, radius, avoid, gap):
 
 
 @kernel(_nrt=True)
-def _densest_histogram(packed, column, radius, avoid, gap):
+def _densest_histogram(column, radius, avoid, gap):
     size = 1 << ROW_BITS
     below = np.zeros(size + 1, np.int64)
     for i in range(column.start, column.start + column.events):
-        below[(packed[i] & ROW_MASK) + np.uint32(1)] += 1
+        below[(column.packed[i] & ROW_MASK) + np.uint32(1)] += 1
     for row in range(size):
         below[row + 1] += below[row]
     best = np.int64(0)
@@ -251,15 +253,15 @@ def _densest_histogram(packed, column, radius, avoid, gap):
 
 
 @kernel(_nrt=False)
-def _densest(packed, column, half, avoid, gap):
+def _densest(column, half, avoid, gap):
     """Find the box of half the window's width, centred on an event, with most events.
 
     No box is centred on an event nearer than ``gap`` to ``avoid``.
     """
     radius = max(half >> (FRACTION_BITS + 1), 1)
     if column.events <= _PAIRWISE_MAX:
-        return _densest_pairwise(packed, column, radius, avoid, gap)
-    return _densest_histogram(packed, column, radius, avoid, gap)
+        return _densest_pairwise(column, radius, avoid, gap)
+    return _densest_histogram(column, radius, avoid, gap)
 
 
 @kernel
@@ -272,24 +274,24 @@ def _rows_nearer(centre, other):
 
 
 @kernel(_nrt=False)
-def _mean_shift_beside(packed, column, half, seed, avoid):
+def _mean_shift_beside(column, half, seed, avoid):
     """Run the mean shift from ``seed`` over the rows nearer to it than to ``avoid``."""
     first, last = _rows_nearer(seed, avoid)
-    return _mean_shift(packed, column, seed, half, first, last)
+    return _mean_shift(column, seed, half, first, last)
 
 
 @kernel(_nrt=False)
-def _resolve_tie(packed, column, half, densest, avoid):
+def _resolve_tie(column, half, densest, avoid):
     """Run the mean shift from the equally dense rows and choose without preferring a direction.
 
     The window with more events is chosen, then the one with the smaller spread. From windows that
     overlap the mean shift restarts at their common mean; two separate windows that are equal in
     both are ambiguous.
     """
-    a = _mean_shift_beside(packed, column, half, densest.lowest * FRACTION, avoid)
+    a = _mean_shift_beside(column, half, densest.lowest * FRACTION, avoid)
     if densest.lowest == densest.highest:
         return Returns(FOUND, False, a, a)
-    b = _mean_shift_beside(packed, column, half, densest.highest * FRACTION, avoid)
+    b = _mean_shift_beside(column, half, densest.highest * FRACTION, avoid)
     if a.sums.events != b.sums.events:
         return Returns(FOUND, False, a if a.sums.events > b.sums.events else b, b)
     spread_a = a.sums.events * a.sums.d2 - a.sums.d * a.sums.d
@@ -300,14 +302,14 @@ def _resolve_tie(packed, column, half, densest, avoid):
         return Returns(FOUND, False, a, b)
     if abs(a.centre - b.centre) <= 2 * half:
         middle = np.int64(np.rint((a.centre + b.centre) / 2.0))
-        return Returns(FOUND, False, _mean_shift_beside(packed, column, half, middle, avoid), b)
+        return Returns(FOUND, False, _mean_shift_beside(column, half, middle, avoid), b)
     return Returns(AMBIGUOUS, True, a, b)
 
 
 @kernel(_nrt=False)
-def _densest_window(packed, column, half):
+def _densest_window(column, half):
     """Find the densest window of a column."""
-    return _resolve_tie(packed, column, half, _densest(packed, column, half, _NOWHERE, 0), _NOWHERE)
+    return _resolve_tie(column, half, _densest(column, half, _NOWHERE, 0), _NOWHERE)
 
 
 @kernel
@@ -345,13 +347,13 @@ def _is_significant(events, others, half, sensor_rows):
 
 
 @kernel(_nrt=False)
-def _box_events(packed, column, centre, half):
+def _box_events(column, centre, half):
     low, high = _limits(centre, half >> 1, 0, ROW_LAST)
-    return _window_events(packed, column, low, high)
+    return _window_events(column, low, high)
 
 
 @kernel(_nrt=False)
-def _second_return(packed, column, half, sensor_rows, events_min, a):
+def _second_return(column, half, sensor_rows, events_min, a):
     """Search for the return of another surface than that of window ``a``.
 
     It is 2 full widths at half maximum away or more, the box around it has at least half as many
@@ -362,21 +364,21 @@ def _second_return(packed, column, half, sensor_rows, events_min, a):
     rest = column.events - a.sums.events
     if rest < events_min or 3 * rest < a.sums.events:
         return alone
-    strength = _box_events(packed, column, a.centre, half)
-    densest = _densest(packed, column, half, a.centre, gap)
+    strength = _box_events(column, a.centre, half)
+    densest = _densest(column, half, a.centre, gap)
     if 3 * densest.events < strength:
         return alone
-    second = _resolve_tie(packed, column, half, densest, a.centre)
+    second = _resolve_tie(column, half, densest, a.centre)
     b = second.window
     if second.status != FOUND or abs(a.centre - b.centre) < gap:
         return alone
-    if 2 * _box_events(packed, column, b.centre, half) < strength:
+    if 2 * _box_events(column, b.centre, half) < strength:
         return alone
     if abs(a.centre - b.centre) <= 2 * half:
         # Overlapping windows are each limited to their side of the middle.
         centre_a, centre_b = a.centre, b.centre
-        a = _mean_shift_beside(packed, column, half, centre_a, centre_b)
-        b = _mean_shift_beside(packed, column, half, centre_b, centre_a)
+        a = _mean_shift_beside(column, half, centre_a, centre_b)
+        b = _mean_shift_beside(column, half, centre_b, centre_a)
     if a.sums.events < events_min or b.sums.events < events_min:
         return alone
     others = column.events - a.sums.events - b.sums.events
