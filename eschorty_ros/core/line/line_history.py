@@ -4,7 +4,7 @@ A line whose rows are where they were has the same error in all profiles. One th
 a part of a row, as pixels remember where it was, in all columns alike. Memory takes ON events ahead
 of the line and OFF events behind it. Where it takes both as far, the line is in the middle of their
 two rows. The mean of all events is nearer to the kind with more of them, and its distance from the
-middle is its uncertainty.
+middle is its uncertainty, up to the way of the line from profile to profile.
 
 A line that gets narrower for a few profiles passes an edge, and is off by half of the rows that are
 missing at most. Means over blocks show changes that are too small to be seen in a column.
@@ -134,9 +134,7 @@ def _compare_with_recent(history, known, usual, width_variance):
     for block in range(1, now.points.size - 1):
         near = slice(block - 1, block + 2)
         points, profiles = now.points[near].sum(), recent.profiles[block]
-        apart = history.polarities.row[near].sum() / 3.0
-        off2 = history.common_px**2 + apart * apart
-        history.moved2[block], history.passing2[block] = off2, 0.0
+        history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
         if points == 0.0 or not history.windowed:
             continue
         row, width = now.row[near].sum() / points, now.width[near].sum() / points
@@ -146,11 +144,14 @@ def _compare_with_recent(history, known, usual, width_variance):
         wider = width - max(recent.width[block], usual)
         shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
         passing2 = shift * shift - PER_NARROWER**2 * width_variance / points
-        history.moved2[block] = min(max(moved2, 0.0), off2)
-        history.passing2[block] = max(passing2, 0.0)
         profiles = min(profiles + 1.0, _PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)
+        # The mean of recent rows follows the line by as much as it moves from profile to profile.
+        apart = min(abs(history.polarities.row[near].sum() / 3.0), weight * abs(moved))
+        off2 = history.common_px**2 + apart * apart
+        history.moved2[block] = min(max(moved2, 0.0), off2)
+        history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
         recent.width[block] += weight * (width - recent.width[block])
         recent.profiles[block] = profiles
