@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
+from eschorty_ros.core.line.line_history import _moves_fast
 from eschorty_ros.core.line.scatter import _median_difference
 from eschorty_ros.core.line.window import FRACTION, ROW_MASK
 
@@ -52,6 +53,8 @@ _OFF_LINE_PX = 1.0
 # Learned rows take twice the time of means. They pay where they scatter less than means of twice
 # the events would.
 _PAYS = np.sqrt(0.5)
+# Profiles that show it: the median of a profile's differences is known to some percent.
+_TRIALS = 2
 # Shares of the posterior by the logarithm below the best; less counts as none.
 _SHARES = np.exp(-np.arange(8 * _LOG_ONE) / _LOG_ONE)
 
@@ -66,8 +69,10 @@ class Footprint(NamedTuple):
 
     ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
     since, and of the ``cut_computations`` from lines that are all cut; ``near_edge`` is 1 while the
-    sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in the profile
-    of the trial, and ``choice`` what followed from it, one of the three below.
+    sensor's edge cuts a line, for which means need a footprint, too. ``trying`` is 1 in profiles of
+    the trial, ``trials`` their number so far, ``scatter`` and ``scatter_learned`` the sums of how
+    much their rows scatter, in millionths of a row. ``choice`` is what followed from it, one of the
+    three below.
     """
 
     pixels: NDArray[np.float64]
@@ -105,6 +110,9 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
             "cut_computations",
             "near_edge",
             "trying",
+            "trials",
+            "scatter",
+            "scatter_learned",
             "choice",
         ),
         reach=reach,
@@ -122,7 +130,8 @@ def _restart_from(footprint, known):
     footprint.empty[:] = known.empty
     footprint.first_row[:] = -1
     state, before = footprint.state, known.state
-    state.profiles = state.columns = state.near_edge = state.trying = 0
+    state.profiles = state.columns = state.near_edge = state.trying = state.trials = 0
+    state.scatter = state.scatter_learned = 0
     state.computations = before.computations
     state.cut_computations = before.cut_computations
     state.choice = before.choice
@@ -302,24 +311,28 @@ def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
 
 
 @kernel
-def _choose(footprint, row, late, always):
-    """Choose between learned rows and the means ``row`` by those of a profile with both.
+def _choose(footprint, row, history, late, always):
+    """Choose between learned rows and the means ``row`` by those of some profiles with both.
 
-    With ``always`` it is the learned rows. Without such a profile the means are chosen when it is
-    ``late``. Returns true when a choice was made.
+    With ``always`` it is the learned rows. It is the means where learned rows are not seen before
+    it is ``late``. Of a line that moves fast, by its ``history``, learned rows also lag less,
+    which scatter does not show. Returns true when a choice was made.
     """
     state = footprint.state
     if state.choice != UNDECIDED:
         return False
     if state.trying > 0:
-        least = _median_difference(row)
-        if least < np.inf:
-            pays = always or _median_difference(row + footprint.trial) < _PAYS * least
-            state.choice = LEARNED_ROWS if pays else MEAN_ROWS
+        means, learned = _median_difference(row), _median_difference(row + footprint.trial)
+        if means < np.inf:
+            state.scatter += np.int64(1e6 * means)
+            state.scatter_learned += np.int64(1e6 * min(learned, 1e6))
+            state.trials += 1
         footprint.trial[:] = 0.0
+    if late or state.trials == _TRIALS or (always and state.trying > 0):
+        least = (1.0 if _moves_fast(history) else _PAYS) * state.scatter
+        pays = always or state.scatter_learned < least
+        state.choice = LEARNED_ROWS if pays else MEAN_ROWS
         state.trying = 0
-    if late and state.choice == UNDECIDED:
-        state.choice = LEARNED_ROWS if always else MEAN_ROWS
     return state.choice != UNDECIDED
 
 

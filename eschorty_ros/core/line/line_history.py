@@ -25,6 +25,8 @@ from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 SIGMA_COMMON_PX = 0.04
 # Profiles whose mean a profile is compared with.
 _PROFILES = 16.0
+# A line that moves by more from profile to profile lags by more than its rows scatter less.
+_FAST_PX = 0.5
 # Most that an edge moves the row per change of the width: by half of the rows that are missing, or
 # by half of the gap in the middle of evenly lit rows.
 PER_NARROWER = np.sqrt(3.0)
@@ -61,7 +63,8 @@ class PolarityMeans(NamedTuple):
 class LineHistory(NamedTuple):
     """Sums of a profile and means of the recent ones, and the variances that follow from them.
 
-    The first and the last block are outside the sensor. A line that moves is off by the standard
+    The first and the last block are outside the sensor. The line moves by ``step_px`` from profile
+    to profile, a mean over recent ones. A line that moves is off by the standard
     deviation ``common_px``, or by what the rows of its ``polarities`` show, at most: the variance
     ``moved2``; ``passing2`` is that of an edge that it passes.
     """
@@ -69,6 +72,7 @@ class LineHistory(NamedTuple):
     now: BlockSums
     recent: BlockMeans
     polarities: PolarityMeans
+    step_px: NDArray[np.float64]
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
     common_px: float
@@ -83,8 +87,8 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
     polarities = PolarityMeans(*np.zeros((2, blocks)))
-    moved2, passing2 = np.zeros((2, blocks))
-    return LineHistory(now, recent, polarities, moved2, passing2, common_px, windowed)
+    step_px, moved2, passing2 = np.zeros((3, blocks))
+    return LineHistory(now, recent, polarities, step_px, moved2, passing2, common_px, windowed)
 
 
 @kernel(_nrt=False)
@@ -148,10 +152,22 @@ def _compare_with_recent(history, known, usual, width_variance):
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)
         # The mean of recent rows follows the line by as much as it moves from profile to profile.
-        apart = min(abs(history.polarities.row[near].sum() / 3.0), weight * abs(moved))
+        history.step_px[block] = weight * abs(moved)
+        apart = min(abs(history.polarities.row[near].sum() / 3.0), history.step_px[block])
         off2 = history.common_px**2 + apart * apart
         history.moved2[block] = min(max(moved2, 0.0), off2)
         history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
         recent.width[block] += weight * (width - recent.width[block])
         recent.profiles[block] = profiles
+
+
+@kernel(_nrt=False)
+def _moves_fast(history):
+    """Return true when most blocks with points move by more than half a row per profile."""
+    blocks, fast = 0, 0
+    for block in range(1, history.step_px.size - 1):
+        if history.now.points[block] > 0.0:
+            blocks += 1
+            fast += history.step_px[block] > _FAST_PX
+    return 2 * fast > blocks

@@ -280,10 +280,12 @@ def _close(memory, state, counters):
     _scale(rows, scatter, smoothing)
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
-    _compare_polarities(columns, half, state.period % BLOCK_COLUMNS, smoothing.widths.history)
+    history = smoothing.widths.history
+    _compare_polarities(columns, half, state.period % BLOCK_COLUMNS, history)
     _mark_unusual(rows, smoothing, memory.light.lit_share)
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
-    if _choose(footprint, rows.row[0], late and enough, estimator.method == _LEARNED):
+    always = estimator.method == _LEARNED
+    if _choose(footprint, rows.row[0], history, late and enough, always):
         # Later windows begin with what is known now.
         _restart_from(memory.known, footprint)
     if learns:

@@ -379,12 +379,11 @@ def test_the_row_of_a_line_that_the_sensors_edge_cuts_is_that_of_the_full_line(e
 
 
 def test_the_default_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_path):
-    narrow = replace(CALIBRATION, columns=320, principal_column=159.5)
-    scene, sweep = Plane(slope_column=0.1), (10.0, 30.0, 50.0)
+    scene, sweep = Plane(slope_column=0.1), (10.0, 25.0, 50.0)
     recording = simulate_recording(
-        tmp_path, scene, narrow, Modulation(70.0), *sweep, 1, parameters=preset("noisy")
+        tmp_path, scene, CALIBRATION, Modulation(70.0), *sweep, 1, parameters=preset("noisy")
     )
-    rows, error_mm = {}, {}
+    error_mm = {}
     for name, settings in (
         ("means", Settings(detail="off")),
         ("learned", Settings(centroid="learned")),
@@ -392,10 +391,13 @@ def test_the_default_takes_learned_rows_on_pixels_that_fire_by_themselves(tmp_pa
     ):
         found = reconstruct_recording(recording, settings).profiles
         stage_mm = recording.stage.position_mm(found.t_us)
-        truth_mm = true_range_mm(scene, narrow.model(), stage_mm, found.column)
-        rows[name], error_mm[name] = found.row, np.median(np.abs(found.range_mm - truth_mm))
-    np.testing.assert_array_equal(rows["chosen"], rows["learned"])
-    assert error_mm["learned"] < 0.93 * error_mm["means"], "seed 1"
+        truth_mm = true_range_mm(scene, MODEL, stage_mm, found.column)
+        # Until then the footprint is learned.
+        late = found.period >= found.period.max() - 6
+        error_mm[name] = np.median(np.abs(found.range_mm - truth_mm)[late])
+    print(error_mm)
+    assert error_mm["learned"] < 0.8 * error_mm["means"], "seed 1"
+    assert error_mm["chosen"] == pytest.approx(error_mm["learned"], rel=0.02)
 
 
 @pytest.mark.parametrize("at", [3.0, 10.0, 714.0])
@@ -419,7 +421,7 @@ def test_a_learned_footprint_reduces_the_error_where_half_of_the_events_are_lost
     # Its rows scatter more than means of twice the events would, and take twice the time.
     np.testing.assert_array_equal(chosen.row, plain.row)
     # Until then the footprint is learned.
-    plain, learned = (found.select(found.period >= 8) for found in (plain, learned))
+    plain, learned = (found.select(found.period >= 12) for found in (plain, learned))
     error = np.abs(error_px(learned))
     assert np.quantile(error, 0.6827) < 0.75 * np.quantile(np.abs(error_px(plain)), 0.6827)
     assert 0.63 < np.mean(error < learned.sigma_row) < 0.9, f"seed {camera.seed}"

@@ -10,7 +10,7 @@ from reconstructing import CALIBRATION, KNOWN, assert_same, reconstruct
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import Encoder, sort_readout
-from eschorty_ros.core.line import METHOD_ERRORS, SIGMA_COMMON_PX, SIGMA_FLOOR_PX
+from eschorty_ros.core.line import SIGMA_COMMON_PX, SIGMA_FLOOR_PX
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import (
     Profiles,
@@ -123,20 +123,21 @@ def test_threads_give_the_same_points_and_counts(case, monkeypatch):
 
 
 def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monkeypatch):
-    """Chosen after 7 profiles of 60, with windows of a dozen; half of the events are lost."""
+    """Learned in 10 profiles of 60, with windows of a dozen; half of the events are lost."""
     monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 400_000)
     camera = Camera(periods=60)
     events = camera.line(wavy)
     kept = camera.rng.random(events[0].size) < 0.5
     data = stream(tuple(values[kept] for values in events))
     modulation = Modulation(camera.frequency_hz, on_edge_us=FIRST_EDGE_US)
-    serial, a = reconstruct(data, modulation, Settings())
+    learned = Settings(centroid="learned")
+    serial, a = reconstruct(data, modulation, learned)
     means, _ = reconstruct(data, modulation, Settings(detail="off"))
-    late = serial.period > 10
+    late = serial.period > 12
     assert np.mean(serial.row[~late] == means.row[~late]) > 0.5
     assert np.mean(serial.row[late] == means.row[late]) < 0.1
     for jobs in (2, 5):
-        parallel = Reconstructor(CALIBRATION, modulation, Settings(), jobs)
+        parallel = Reconstructor(CALIBRATION, modulation, learned, jobs)
         parts = [parallel.push(data), parallel.flush()]
         assert_same(serial, Profiles.concatenate(parts))
         assert a.counters == parallel.counters
@@ -254,8 +255,7 @@ def test_one_event_and_constant_columns():
     found, _ = reconstruct(encoded(events), settings=Settings(events_min=1, isolation_events=0))
     assert found.column.tolist() == [5, 9]
     assert found.row.tolist() == [300.0, 400.0]
-    floor_px = METHOD_ERRORS["mode_mean"].floor * SIGMA_FLOOR_PX
-    expected = np.sqrt(1 / 12 + floor_px**2 + SIGMA_COMMON_PX**2)
+    expected = np.sqrt(1 / 12 + SIGMA_FLOOR_PX**2 + SIGMA_COMMON_PX**2)
     np.testing.assert_allclose(found.sigma_row, expected)
     assert found.t_us.tolist() == [2000, 3010]
 
