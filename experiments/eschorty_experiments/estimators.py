@@ -20,7 +20,7 @@ from eschorty_experiments._estimator_figures import (
     bounds_figure,
     returns_figure,
 )
-from eschorty_ros.core.line import FWHM_PER_SIGMA, METHOD_ERRORS, METHODS, estimate
+from eschorty_ros.core.line import FWHM_PER_SIGMA, METHODS, estimate
 from eschorty_ros.report.experiment import (
     DataTable,
     Effort,
@@ -180,13 +180,12 @@ def _cut(rng: np.random.Generator, columns: int) -> list[tuple[str, float, float
         offsets = np.arange(columns + 1) * CUT_EVENTS
         for method in METHODS:
             # Independent events: their mean scatters by s/sqrt(N), hence a factor of 1.
-            independent = 1.0 / METHOD_ERRORS["mode_mean"].factor
             found = estimate(
                 drawn.rows.ravel(),
                 offsets,
                 method,
                 line_width_px=CUT_FWHM_PX,
-                sigma_factor=independent,
+                sigma_factor=1.0,
             )
             error = found.row - row
             within = float(np.mean(np.abs(error) < 2.0 * found.sigma_row))

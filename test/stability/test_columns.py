@@ -9,18 +9,15 @@ from line_events import encoded
 from reconstructing import reconstruct
 
 from eschorty_ros.core.evt3 import sort_readout
-from eschorty_ros.core.line import METHOD_ERRORS, METHODS, SIGMA_FLOOR_PX, estimate
+from eschorty_ros.core.line import METHODS, SIGMA_FLOOR_PX, estimate
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import Settings
 
 SEED = 20
 
 
-def lone_sigma_px(method):
-    """Least sigma of a row without spread."""
-    return np.sqrt(1.0 / 12.0 + (METHOD_ERRORS[method].floor * SIGMA_FLOOR_PX) ** 2)
-
-
+# Least sigma of a row without spread.
+LONE_SIGMA_PX = np.sqrt(1.0 / 12.0 + SIGMA_FLOOR_PX**2)
 AVERAGES = ("mean", "mode_mean")
 every_method = pytest.mark.parametrize("method", METHODS)
 
@@ -56,7 +53,7 @@ def test_variance_of_a_narrow_line_far_from_row_0(method, sigma_px, row, measure
 def test_one_event_or_one_row_has_a_floor_in_sigma(method, row, events, measured):
     found = one_column([row] * events, method)
     assert found.row[0] == pytest.approx(row, abs=1e-9)
-    shortfall = lone_sigma_px(method) - float(found.sigma_row[0])
+    shortfall = LONE_SIGMA_PX - float(found.sigma_row[0])
     measured("sigma below sqrt(1/12 + floor^2), px", shortfall, 1e-15)
 
 

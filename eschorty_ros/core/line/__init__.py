@@ -11,11 +11,7 @@ from eschorty_ros.core.line.estimators import (
 from eschorty_ros.core.line.independent_columns import Centroids, estimate
 from eschorty_ros.core.line.line_history import SIGMA_COMMON_PX
 from eschorty_ros.core.line.reflectance import ROOT_12, events_per_row, relative_reflectance
-from eschorty_ros.core.line.sigma import (
-    METHOD_ERRORS,
-    SIGMA_FACTOR,
-    SIGMA_FLOOR_PX,
-)
+from eschorty_ros.core.line.sigma import SIGMA_FLOOR_PX
 from eschorty_ros.core.line.window import HALF_WIDTH_PER_FWHM, TIME_LIMIT_US
 
 __all__ = [
@@ -24,11 +20,9 @@ __all__ = [
     "FWHM_PER_SIGMA",
     "HALF_WIDTH_PER_FWHM",
     "METHODS",
-    "METHOD_ERRORS",
     "RETURNS",
     "ROOT_12",
     "SIGMA_COMMON_PX",
-    "SIGMA_FACTOR",
     "SIGMA_FLOOR_PX",
     "TIME_LIMIT_US",
     "Centroids",

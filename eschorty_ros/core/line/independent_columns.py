@@ -15,7 +15,6 @@ from eschorty_ros.core.line.columns import grouped_columns
 from eschorty_ros.core.line.estimators import Estimator, check_method, half_width_fixed
 from eschorty_ros.core.line.learned import make_footprint
 from eschorty_ros.core.line.sigma import (
-    SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
     VARIANCE_PER_WIDTH2,
     error_model,
@@ -62,7 +61,7 @@ def estimate(
     line_width_px: float = 20.0,
     height: int = 720,
     events_min: int = 1,
-    sigma_factor: float = SIGMA_FACTOR,
+    sigma_factor: float = 0.0,
     sigma_floor_px: float = SIGMA_FLOOR_PX,
 ) -> Centroids:
     """Return the row of the line in each column, independently of the others.

@@ -5,14 +5,15 @@ The variance of a row has two parts. The column's own is reduced by smoothing ov
     a^2 min(s^2, s0^2) / N + floor^2 + b^2 (s^2 - s0^2) / N
 
 with s the standard deviation of the N rows used and s0 that of the line itself. The first term is
-small because counts per pixel and laser edge vary far less than Poisson counts. The floor comes
-from the mismatch of the pixels' thresholds, which more events of the same pixels do not reduce. The
-last term is for events that are not the line's, which scatter independently. The other part is
-what neighbouring columns share (`line_history`).
+for events that are independent (a = 1). Those of pixels are not: counts per pixel and laser edge
+vary far less than Poisson counts. The floor comes from the mismatch of the pixels' thresholds,
+which more events of the same pixels do not reduce. The last term is for events of full columns that
+are not the line's, which scatter independently. The other part is what neighbouring columns share
+(`line_history`).
 
-The constants are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
-1000 Hz. In a stream the columns' own part is scaled by the scatter of near columns (`scatter`), so
-that only its course over the columns and the first profile depend on the constants.
+The floor and b are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
+1000 Hz. In a stream the own part of windowed estimators is scaled by the scatter of near columns
+(`scatter`), so that only the first profile depends on the floor.
 """
 
 from __future__ import annotations
@@ -22,33 +23,21 @@ from typing import NamedTuple
 from eschorty_ros.core.base.arrays import number
 from eschorty_ros.core.base.kernel import kernel
 
-SIGMA_FACTOR = 0.05
-SIGMA_FLOOR_PX = 0.28
+SIGMA_FLOOR_PX = 0.25
 _SIGMA_LIMIT = 1e6
 # Variance of a line of evenly lit rows with soft ends over its full width at half maximum squared.
 VARIANCE_PER_WIDTH2 = 1.25 / 12.0
+# The factor b of methods that use full columns.
+_BACKGROUND = {"mean": 1.35, "median": 2.2}
 
 
 class ErrorModel(NamedTuple):
-    """Coefficients of the variance of a row.
-
-    ``factor`` and ``floor`` are multiples of the settings in `METHOD_ERRORS`, and values in rows in
-    an `error_model`.
-    """
+    """Coefficients of the variance of a row: a, the floor in rows, and b."""
 
     factor: float
     floor: float
     background: float
     median: bool = False
-
-
-METHOD_ERRORS = {
-    "mode_mean": ErrorModel(0.2, 0.89, 0.4),
-    "mean": ErrorModel(0.4, 0.87, 1.35),
-    "median": ErrorModel(0.2, 1.06, 2.2, median=True),
-    # Before a footprint is learned.
-    "learned": ErrorModel(0.2, 0.89, 0.4),
-}
 
 
 def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> ErrorModel:
@@ -59,10 +48,11 @@ def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> Erro
     ArgumentError
         When a value is negative or not finite.
     """
-    own = METHOD_ERRORS[method]
-    return own._replace(
-        factor=own.factor * number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),
-        floor=own.floor * number("sigma_floor_px", sigma_floor_px, 0.0, _SIGMA_LIMIT),
+    return ErrorModel(
+        factor=number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),
+        floor=number("sigma_floor_px", sigma_floor_px, 0.0, _SIGMA_LIMIT),
+        background=_BACKGROUND.get(method, 0.0),
+        median=method == "median",
     )
 
 

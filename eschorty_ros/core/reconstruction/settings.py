@@ -12,7 +12,6 @@ from eschorty_ros.core.line import (
     FULL_COLUMN_METHODS,
     RETURNS,
     SIGMA_COMMON_PX,
-    SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
     check_method,
 )
@@ -162,14 +161,14 @@ class Settings:
         "nothing is",
     )  # fmt: skip
     sigma_factor: float = _number(
-        SIGMA_FACTOR, 0.0, 10.0, "",
-        "factor on s/sqrt(N) in a row's standard deviation, times a constant of the centroid; the "
-        "scatter of the stream's rows scales the result",
+        0.0, 0.0, 10.0, "",
+        "factor on s/sqrt(N) in a row's standard deviation, 1 for independent events; the scatter "
+        "of the stream's rows scales the result",
     )  # fmt: skip
     sigma_floor_px: float = _number(
         SIGMA_FLOOR_PX, 0.0, 10.0, "px",
-        "part of a row's standard deviation that more events do not reduce; multiplied and scaled "
-        "as with sigma_factor",
+        "part of a row's standard deviation that more events do not reduce; scaled as with "
+        "sigma_factor",
     )  # fmt: skip
     sigma_common_px: float = _number(
         SIGMA_COMMON_PX, 0.0, 10.0, "px",
@@ -179,7 +178,7 @@ class Settings:
     detail: str = _choice(
         "auto", ("auto", "off"),
         "auto: mode_mean learns the line's footprint and takes learned rows, at twice the time, "
-        "where these scatter less than means of twice the events would",
+        "where these scatter less than means of twice the events would, or the line moves fast",
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -6,9 +6,7 @@ import pytest
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.line import (
     FULL_COLUMN_METHODS,
-    METHOD_ERRORS,
     METHODS,
-    SIGMA_FACTOR,
     SIGMA_FLOOR_PX,
     estimate,
 )
@@ -57,9 +55,8 @@ def test_sigma_covers_the_bias_of_a_line_cut_by_the_sensor(method, row):
     sigma, events, columns = 8.493, 100, 1500
     rows = np.rint(rng.normal(row, sigma, (columns, 4 * events)))
     rows = np.stack([line[(line >= 0) & (line <= 719)][:events] for line in rows]).astype(int)
-    independent = 1.0 / METHOD_ERRORS["mode_mean"].factor
     offsets = np.arange(columns + 1) * events
-    found = estimate(rows.ravel(), offsets, method, line_width_px=20.0, sigma_factor=independent)
+    found = estimate(rows.ravel(), offsets, method, line_width_px=20.0, sigma_factor=1.0)
     error = found.row - row
     assert found.edge.mean() > 0.95, f"seed {SEED}"
     assert np.mean(np.abs(error) < 2 * found.sigma_row) > 0.95, f"seed {SEED}"
@@ -74,11 +71,11 @@ def test_sigma_has_a_floor_and_grows_with_events_beyond_the_line():
         error = found.row[0] - 300.0
         assert abs(error) <= 2.0 * found.sigma_row[0], background
         sigma[background] = found.sigma_row[0]
-    own = METHOD_ERRORS["mean"]
-    floor2 = (own.floor * SIGMA_FLOOR_PX) ** 2
-    spread2 = (own.factor * SIGMA_FACTOR) ** 2 * line.var(ddof=1) / line.size
-    assert sigma[0] == pytest.approx(np.sqrt(floor2 + spread2), rel=1e-12)
+    assert sigma[0] == pytest.approx(SIGMA_FLOOR_PX, rel=1e-12)
     assert sigma[0] < sigma[1] < sigma[3]
+    independent = estimate(line, [0, line.size], "mean", sigma_factor=1.0)
+    expected = np.sqrt(SIGMA_FLOOR_PX**2 + line.var(ddof=1) / line.size)
+    assert independent.sigma_row[0] == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("offsets", [[0, 1], [0, 3], [1, 2], [0, 2, 1, 2]])
