@@ -21,7 +21,7 @@ BLOCK = 4096
 # Words decoded before a block, which hold the current row and time.
 _LEAD = 4 * BLOCK
 _BASE_LEAD = 256
-# Words are counted in 16 bits of a 32-bit lane with their place in the block above.
+# A word's payload is in the low bits of a lane, its place in the block above.
 _PAYLOAD = np.uint32(0xFFF)
 _PLACE = np.uint32(12)
 

@@ -126,12 +126,14 @@ def _vector(column, first, last, blink):
 
 
 @kernel
-def _is_in_phase(sums):
+def _is_in_phase(sums, blink):
     """Return true when 9 of 10 events of a window are between their edge and the other one.
 
-    Only from 16 events on, which background reaches less often than a vector strength of a half.
+    Only from 16 events on, which background reaches less often than a vector strength of a half,
+    and where a profile has one period.
     """
-    return sums.events >= 16 and 10 * sums.out_of_phase <= sums.events
+    few = sums.events < 16 or 10 * sums.out_of_phase > sums.events
+    return not few and blink.lit_us > 0
 
 
 @kernel(_nrt=False)

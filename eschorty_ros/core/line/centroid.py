@@ -140,14 +140,14 @@ def _refine(column, at, window, line_variance, estimator, footprint, row_counts,
     cut = _is_windowed(method) and _is_cut(window, sensor_rows)
     best, learned = row, -1.0
     takes, trying = footprint.state.choice == LEARNED_ROWS, footprint.state.trying > 0
-    if _learns(footprint):
+    if _learns(footprint) and at[0] == 0:
         _sample(column, c, row, sensor_rows, footprint, row_counts)
     if cut or trying or takes:
         best, learned = _learned_row(column, row, sensor_rows, footprint, row_counts)
     if method == _MEDIAN:
         windows.row[at] = _median(column, row_counts)
     near = events * (best - row) ** 2 <= _LEARNED_OFF**2 * line_variance
-    if trying and near and not cut:
+    if trying and near and not cut and at[0] == 0:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
         windows.row[at] = min(max(best, -0.5), sensor_rows - 0.5)
@@ -294,6 +294,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0
+            columns.rivals[c] = -1
             continue
         column = _column(packed, columns.starts[c], n, blink.lit_us)
         known = columns.seeds[c] >= 0

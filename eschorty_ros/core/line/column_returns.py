@@ -174,7 +174,7 @@ def _is_clear(window, column, estimator, blink):
         and _is_alone(events, column.events)
         and not _is_cut(window, estimator.sensor_rows)
         and estimator.returns == _STRONGEST
-        and (blink.step == 0 or _is_in_phase(window.sums))
+        and (blink.step == 0 or _is_in_phase(window.sums, blink))
     )
 
 
@@ -186,11 +186,11 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
     found = Returns(FOUND, False, window, window)
     if window.sums.events < estimator.events_min or 2 * window.sums.events <= column.events:
         found = _search(column, half, estimator)
-    if testing and not (
-        found.status == TOO_FEW or (found.status == FOUND and _is_in_phase(found.window.sums))
-    ):
+    in_phase = found.status == FOUND and _is_in_phase(found.window.sums, blink)
+    if testing and found.status != TOO_FEW and not in_phase:
         found, column, uncertain = _modulated(column, found, half, estimator, blink, row_counts)
         if found.status == UNMODULATED:
+            columns.rivals[c] = -1
             return _ColumnReturns(found, column.events, True)
     if estimator.returns != _STRONGEST:
         found = _all_returns(column, half, estimator, found)

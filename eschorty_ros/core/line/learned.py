@@ -27,11 +27,13 @@ _PLACES = 8
 _COUNTS = 12
 # Candidates to either side of the first row.
 _SIDE = 2 * _PLACES
+# Before every row of a line on the sensor.
+_NOT_SAMPLED = -(1 << 20)
 _ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_PLACES) * np.arange(1, 4, dtype=np.uintp)
 # Steps of a log-likelihood of one.
 _LOG_ONE = 64
-# The least log-likelihood in steps, so that sums fit 16 bits.
-_LOG_MIN = -512
+# The least log-likelihood of a row in steps, and the least of all rows, which fits 16 bits.
+_LOG_MIN, _LOG_SUM_MIN = -512, -(1 << 15)
 # Of every so many columns one is learned from in a profile.
 _STRIDE = 4
 # Columns after which the footprint is computed again. Rows found with an earlier footprint are less
@@ -64,8 +66,9 @@ class Footprint(NamedTuple):
 
     ``log[k]`` is relative to that of no event but for ``log[0]``; ``empty`` is the sum of
     ``log[0]`` over all rows, by the line's place in its row and on over all candidates.
-    ``rows_seen`` holds the events of the sampled columns' rows from ``first_row`` on, which is -1
-    where there is none. ``trial`` is by how much the learned rows of a profile differ from means.
+    ``rows_seen`` holds the events of the sampled columns' rows from ``first_row`` on, which may be
+    before the sensor's, and is `_NOT_SAMPLED` where there is none. ``trial`` is by how much the
+    learned rows of a profile differ from means.
 
     ``state`` has the number of ``profiles``, of ``computations`` and of the ``columns`` counted
     since, and of the ``cut_computations`` from lines that are all cut; ``near_edge`` is 1 while the
@@ -101,7 +104,7 @@ def make_footprint(half_max: int, columns: int, choice: int = MEAN_ROWS) -> Foot
         empty=np.zeros(_PLACES + 2 * _SIDE, np.int16),
         likelihood=np.zeros(2 * _SIDE, np.int16),
         rows_seen=np.zeros((columns // _STRIDE + 1, 2 * reach + 1), np.uint8),
-        first_row=np.full(columns // _STRIDE + 1, -1, np.int64),
+        first_row=np.full(columns // _STRIDE + 1, _NOT_SAMPLED),
         trial=np.zeros(columns),
         state=record(
             "profiles",
@@ -128,7 +131,7 @@ def _restart_from(footprint, known):
     footprint.log[:] = known.log
     footprint.none[:] = known.none
     footprint.empty[:] = known.empty
-    footprint.first_row[:] = -1
+    footprint.first_row[:] = _NOT_SAMPLED
     state, before = footprint.state, known.state
     state.profiles = state.columns = state.near_edge = state.trying = state.trials = 0
     state.scatter = state.scatter_learned = 0
@@ -158,13 +161,12 @@ def _sample(column, c, row, sensor_rows, footprint, counts):
     slot = c // _STRIDE
     if (c - footprint.state.profiles) % _STRIDE != 0 or slot >= footprint.first_row.size:
         return
-    centre = np.int64(np.rint(row))
-    first = max(centre - footprint.reach, np.int64(0))
-    last = min(centre + footprint.reach, sensor_rows - 1)
+    begin = np.int64(np.rint(row)) - footprint.reach
+    first, last = max(begin, 0), min(begin + 2 * footprint.reach, sensor_rows - 1)
     _count_rows(column, first, last, counts)
-    footprint.first_row[slot] = first
+    footprint.first_row[slot] = begin
     for at in range(first, last + 1):
-        footprint.rows_seen[slot, at - first] = min(counts[at], _COUNTS - 1)
+        footprint.rows_seen[slot, at - begin] = min(counts[at], _COUNTS - 1)
     counts[first : last + 1] = 0
 
 
@@ -240,14 +242,14 @@ def _learned_row(column, row, sensor_rows, footprint, counts):
     place = np.int64(np.rint(_PLACES * row))
     reach = footprint.reach
     centre = np.int64(np.rint(row))
-    margin = reach + _MOVES_MAX
+    margin = reach + 2 * _MOVES_MAX
     span = max(centre - margin, 0), min(centre + margin, sensor_rows - 1)
     all_low, all_high = _count_rows(column, span[0], span[1], counts)
-    for _ in range(_MOVES_MAX):
+    for turn in range(_MOVES_MAX):
         low = max(-((_PLACES * reach - place) // _PLACES), all_low)
         high = min((place + _PLACES * reach) // _PLACES, all_high)
         best = _log_likelihoods(footprint, place, low, high, counts, sensor_rows)
-        if abs(best) <= _SIDE - 2:
+        if abs(best) <= _SIDE - 2 or turn == _MOVES_MAX - 1:
             break
         place = np.int64(min(max(place + best, -_PLACES), _PLACES * sensor_rows))
     likelihood = footprint.likelihood
@@ -282,16 +284,17 @@ def _learn(footprint, row, smoothed, uncertain, truncated, sensor_rows):
     pixels = footprint.pixels
     middle = pixels.shape[1] // 2
     for slot in range(footprint.first_row.size):
-        first = footprint.first_row[slot]
-        footprint.first_row[slot] = -1
+        first_row = footprint.first_row[slot]
+        footprint.first_row[slot] = _NOT_SAMPLED
         c = slot * _STRIDE + state.profiles % _STRIDE
-        if first < 0 or c >= row.size or uncertain[c] or (whole and truncated[c]):
+        if first_row == _NOT_SAMPLED or c >= row.size or uncertain[c] or (whole and truncated[c]):
             continue
         if not abs(smoothed[c] - row[c]) <= _OFF_LINE_PX:
             continue
-        last = min(first + 2 * footprint.reach, sensor_rows - 1)
-        begin = middle + np.int64(np.rint(_PLACES * (first - smoothed[c])))
-        for at in range(np.uintp(last + 1 - first)):
+        first = max(-first_row, 0)
+        last = min(2 * footprint.reach, sensor_rows - 1 - first_row)
+        begin = middle + np.int64(np.rint(_PLACES * (first_row - smoothed[c])))
+        for at in range(np.uintp(first), np.uintp(last + 1)):
             place = begin + np.int64(_PLACES * at)
             if 0 <= place <= 2 * middle:
                 pixels[footprint.rows_seen[slot, at], np.uintp(place)] += 1.0
@@ -352,10 +355,11 @@ def _compute(footprint):
                 low, high = before[max(b - 1, 0)], before[min(b + 1, size - 1)]
                 shares[k, b] = 0.5 * before[b] + 0.25 * (low + high)
         shares[k] += _PRIOR_PIXELS * overall[k] + _PRIOR_COUNT
+    least = max(_LOG_MIN, _LOG_SUM_MIN // (2 * footprint.reach + 3) + 1)
     for b in range(size // 2 + 1):
         total = shares[:, b].sum()
         for k in range(_COUNTS):
-            share = max(np.rint(_LOG_ONE * np.log(shares[k, b] / total)), _LOG_MIN)
+            share = max(np.rint(_LOG_ONE * np.log(shares[k, b] / total)), least)
             if k == 0:
                 none[b] = share
             log[k, b] = share - none[b]

@@ -1,9 +1,9 @@
 """What changes with the line from profile to profile, by block of columns, and moves its rows.
 
 A line whose rows are where they were has the same error in all profiles. One that moves is off by
-a part of a row, as pixels remember where it was, in all columns alike. Memory takes ON events ahead
-of the line and OFF events behind it. Where it takes both as far, the line is in the middle of their
-two rows. The mean of all events is nearer to the kind with more of them, and its distance from the
+a part of a row, as pixels remember where it was, in all columns alike: they give ON events ahead of
+its centre and OFF events behind it. Where both are as far, the line is in the middle of their two
+rows. The mean of all events is nearer to the kind with more of them, and its distance from the
 middle is its uncertainty, up to the way of the line from profile to profile.
 
 A line that gets narrower for a few profiles passes an edge, and is off by half of the rows that are
@@ -21,11 +21,12 @@ from eschorty_ros.core.base.kernel import kernel
 from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
 from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
-# What a moving line is off by, at least, as the pixels of the simulation remember: 0.035 to 0.067.
+# Standard deviation that the rows of a moving line share, px: 0.035 to 0.067 on simulated pixels.
 SIGMA_COMMON_PX = 0.04
 # Profiles whose mean a profile is compared with.
 _PROFILES = 16.0
-# A line that moves by more from profile to profile lags by more than its rows scatter less.
+# Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
+# than what its rows scatter.
 _FAST_PX = 0.5
 # Most that an edge moves the row per change of the width: by half of the rows that are missing, or
 # by half of the gap in the middle of evenly lit rows.
@@ -64,9 +65,9 @@ class LineHistory(NamedTuple):
     """Sums of a profile and means of the recent ones, and the variances that follow from them.
 
     The first and the last block are outside the sensor. The line moves by ``step_px`` from profile
-    to profile, a mean over recent ones. A line that moves is off by the standard
-    deviation ``common_px``, or by what the rows of its ``polarities`` show, at most: the variance
-    ``moved2``; ``passing2`` is that of an edge that it passes.
+    to profile, a mean over recent ones. A line that moves is off by the standard deviation
+    ``common_px`` and by what the rows of its ``polarities`` show, at most: the variance ``moved2``;
+    ``passing2`` is that of an edge that it passes.
     """
 
     now: BlockSums
@@ -120,7 +121,7 @@ def _compare_polarities(columns, half, first, history):
     mean = history.polarities
     for block in range(1, mean.row.size - 1):
         c = np.uintp((block - 1) * BLOCK_COLUMNS + first)
-        if history.moved2[block] == 0.0 or c >= columns.seeds.size or columns.seeds[c] < 0:
+        if history.step_px[block] == 0.0 or c >= columns.seeds.size or columns.seeds[c] < 0:
             continue
         row = _polarity_rows(columns.packed, columns.starts[c], columns.seeds[c], half)
         if not np.isnan(row):
@@ -134,15 +135,16 @@ def _compare_with_recent(history, known, usual, width_variance):
 
     A line that has its ``usual`` width again, where it is ``known``, has passed the edge.
     """
-    now, recent = history.now, history.recent
+    now, recent, polarities = history.now, history.recent, history.polarities
     for block in range(1, now.points.size - 1):
         near = slice(block - 1, block + 2)
         points, profiles = now.points[near].sum(), recent.profiles[block]
         history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
+        history.step_px[block] = 0.0
         if points == 0.0 or not history.windowed:
             continue
         row, width = now.row[near].sum() / points, now.width[near].sum() / points
-        moved = row - recent.row[block] if profiles > 0.0 else np.inf
+        moved = row - recent.row[block]
         moved2 = moved * moved - now.sigma2[near].sum() / (points * points)
         narrower = min(recent.width[block], usual) - width
         wider = width - max(recent.width[block], usual)
@@ -151,11 +153,16 @@ def _compare_with_recent(history, known, usual, width_variance):
         profiles = min(profiles + 1.0, _PROFILES)
         # The first profiles, of pixels just lit, are soon forgotten.
         weight = 2.0 / (profiles + 1.0)
-        # The mean of recent rows follows the line by as much as it moves from profile to profile.
-        history.step_px[block] = weight * abs(moved)
-        apart = min(abs(history.polarities.row[near].sum() / 3.0), history.step_px[block])
-        off2 = history.common_px**2 + apart * apart
-        history.moved2[block] = min(max(moved2, 0.0), off2)
+        if profiles > 1.0:
+            # The mean of recent rows follows the line by as much as it moves from one to the next.
+            history.step_px[block] = weight * abs(moved) if moved2 > 0.0 else 0.0
+            compared = 0
+            for other in range(block - 1, block + 2):
+                compared += polarities.columns[other] > 0.0
+            apart = abs(polarities.row[near].sum()) / max(compared, 1)
+            apart = min(apart, history.step_px[block])
+            off2 = history.common_px**2 + apart * apart
+            history.moved2[block] = min(max(moved2, 0.0), off2)
         history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
         recent.width[block] += weight * (width - recent.width[block])

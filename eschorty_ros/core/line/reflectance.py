@@ -28,7 +28,7 @@ ROOT_12 = math.sqrt(12.0)
 # to rows at the two ends of the line.
 _FIXED = 0.11
 _PER_EVENT = 0.18
-_ENDS_PX = 0.41
+_ENDS_PX = math.sqrt(2.0 / 12.0)
 # No two surfaces differ by more than a factor of 1000, a retroreflector and black velvet included.
 _LOG_MAX = math.log(1e3)
 

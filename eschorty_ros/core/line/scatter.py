@@ -62,7 +62,8 @@ class Differences(NamedTuple):
 class Scatter(NamedTuple):
     """Differences of rows and of smoothed rows; variances are scaled by ``factor_max`` at most.
 
-    A profile has so many edges of the laser as ``laser_edges``.
+    A profile has so many edges of the laser as ``laser_edges``. Rows are means of one column
+    ``alone``.
     """
 
     own: Differences
@@ -150,7 +151,7 @@ def _ratio(sums, block, factor_max):
 def _levels(rows, begin, end, laser_edges):
     """Return the mean number of levels that the pixels of columns count at an edge of the laser.
 
-    The ends of two levels are two pixels, so that half of a line's length has no more.
+    Each level needs two ends of its own, so there are at most half as many as lit rows.
     """
     events, length, number = 0.0, 0.0, 0.0
     for k in range(rows.row.shape[0]):

@@ -8,12 +8,13 @@ with s the standard deviation of the N rows used and s0 that of the line itself.
 for events that are independent (a = 1). Those of pixels are not: counts per pixel and laser edge
 vary far less than Poisson counts. The floor comes from the mismatch of the pixels' thresholds,
 which more events of the same pixels do not reduce. The last term is for events of full columns that
-are not the line's, which scatter independently. The other part is what neighbouring columns share
-(`line_history`).
+are not the line's; most of them are on one side of a line away from the sensor's middle, so that a
+part of their error is common. That of the median follows from the distance of the line's events.
+The other part is what neighbouring columns share (`line_history`).
 
 The floor and b are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
 1000 Hz. In a stream the own part of windowed estimators is scaled by the scatter of near columns
-(`scatter`), so that only the first profile depends on the floor.
+(`scatter`), so that the floor matters only where few differences near a column are known.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _BACKGROUND = {"mean": 1.35, "median": 2.2}
 
 
 class ErrorModel(NamedTuple):
-    """Coefficients of the variance of a row: a, the floor in rows, and b."""
+    """Coefficients of the variance of a row, mean or ``median``: a, the floor in rows, and b."""
 
     factor: float
     floor: float
@@ -72,8 +73,8 @@ def _background(excess, count, row, sensor_rows):
 def _own_variance(variance, line_variance, count, row, sensor_rows, model):
     """Return the variance of one column's row, px squared, without what its neighbours share.
 
-    Variance in excess of ``line_variance`` comes from background events, which scatter
-    independently. Without any spread the row has the variance of its quantisation, a twelfth.
+    Variance in excess of ``line_variance`` comes from background events. Without any spread the row
+    has the variance of its quantisation, a twelfth.
     """
     floor2 = model.floor**2
     sigma2 = model.factor**2 * min(variance, line_variance) / count + floor2

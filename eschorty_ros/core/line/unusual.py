@@ -114,7 +114,8 @@ def _restart_widths(widths, known):
     usual.number[:], usual.median.difference = known.number, known.median.difference
     widths.last[:], widths.last_row[:] = np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
-    polarities.row[:], polarities.columns[:], history.moved2[:] = 0.0, 0.0, 0.0
+    polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
+    widths.below[:] = 0.0
     _update(widths, widths.smoothed.shape[1])
 
 

@@ -144,6 +144,8 @@ def _lag_left(samples: _Samples, lag_us: float) -> PassLag | None:
     The slopes of the two passes have errors of their own, so that the mean of their product is the
     square of the slope.
     """
+    if samples.block.size == 0:
+        return None
     at_mm = samples.stage_mm - lag_us * samples.speed_mm_us
     block = samples.block - samples.block.min()
     # A cell has a profile of either pass, in some two.

@@ -1,4 +1,4 @@
-"""Cut events into modulation periods; the end of each makes the rows of a profile."""
+"""Sort events into the open period, and close it at the next edge."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
-from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.evt3 import Decoder, EventArrays
 from eschorty_ros.core.evt3.state_machine import decode_into
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
@@ -39,42 +39,33 @@ from eschorty_ros.core.reconstruction.profile_rows import (
 from eschorty_ros.core.reconstruction.profiles import LineRows
 from eschorty_ros.core.reconstruction.settings import Settings
 
-_COUNTERS = np.dtype(
-    [
-        (name, np.int64)
-        for name in (
-            "events_binned",
-            "events_before_first_edge",
-            "events_outside_sensor",
-            "events_outside_roi",
-            "events_over_column_limit",
-            "events_gated",
-            "periods_closed",
-            "periods_empty",
-            "profiles_too_wide",
-            "columns_too_few_events",
-            "columns_ambiguous",
-            "columns_isolated",
-            "columns_smoothed",
-            "columns_two_returns",
-            "columns_unmodulated",
-            "events_unmodulated",
-        )
-    ]
+_COUNTERS = (
+    "events_binned",
+    "events_before_first_edge",
+    "events_outside_sensor",
+    "events_outside_roi",
+    "events_over_column_limit",
+    "events_gated",
+    "periods_closed",
+    "periods_empty",
+    "profiles_too_wide",
+    "columns_too_few_events",
+    "columns_ambiguous",
+    "columns_isolated",
+    "columns_smoothed",
+    "columns_two_returns",
+    "columns_unmodulated",
+    "events_unmodulated",
 )
 # ``part_us`` is where the part of the gate begins, ``status`` one of the three below, ``half`` the
 # half width of a window for the open period in fixed point, ``rows`` the number of rows in the
-# output, ``full`` 1 while a column needs more room, ``window`` the number of events since the
-# estimate started, ``over`` 1 where a pass ended with it. ``points`` are those since the restart,
-# ``points_most`` the most of a profile, ``known_half`` is 0 until windows begin with what is known.
-_STATE = np.dtype(
-    [
-        (name, np.int64)
-        for name in (
-            "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "over",
-            "points", "points_most", "known_half",
-        )
-    ]
+# output, ``full`` 1 while a column needs more room, ``window`` and ``profiles`` the numbers of
+# events and profiles since the estimate started, ``over`` 1 where a pass ended with it. ``points``
+# are those since the restart, ``points_most`` the most of a profile, ``known_half`` is 0 until
+# windows begin with what is known.
+_STATE = (
+    "period", "edge_us", "part_us", "status", "half", "rows", "full", "window", "profiles", "over",
+    "points", "points_most", "known_half",
 )  # fmt: skip
 _CLOSED, _EMPTY, _FILLED = 0, 1, 2
 
@@ -129,8 +120,8 @@ class ProfileAssembler:
         self._done: list[LineRows] = []
         self._gate_us = settings.phase_gate_us
         self._first_choice = first_choice(settings)
-        self._counters = np.zeros(1, _COUNTERS)[0]
-        self._state = np.zeros(1, _STATE)[0]
+        self._counters = record(*_COUNTERS)
+        self._state = record(*_STATE)
         self._memory = allocate(settings, model)
 
     def restart(self, modulation: Modulation, every: int) -> None:
@@ -175,7 +166,7 @@ class ProfileAssembler:
         )
         self._state["known_half"] = before._state["known_half"]
         self._memory.columns.counts[:] = 0
-        self._counters = np.zeros(1, _COUNTERS)[0]
+        self._counters = record(*_COUNTERS)
         self._state["rows"] = 0
         self._done = []
         self._memory.footprint.state["near_edge"] = 0
@@ -207,7 +198,7 @@ class ProfileAssembler:
     @property
     def counters(self) -> dict[str, int]:
         """Counts by name."""
-        return dict(zip(_COUNTERS.names or (), self._counters.item(), strict=True))
+        return dict(zip(_COUNTERS, self._counters.item(), strict=True))
 
     def merge(self, held: Arrays, new: Arrays, edges: Edges) -> None:
         """Assign events to periods and close the periods whose end is reached.
@@ -398,9 +389,10 @@ def _merge_words(words, progress, decoder, span, edges, memory, state, counters)
     columns, gate = memory.columns, memory.gate.state
     rows_max = memory.output.row.size - memory.rows.row.size
     i, edge = np.uint64(progress.event), progress.edge
-    takes_all = gate.step == 0 and columns.row_first.size == 0
     state.over = 0
     while True:
+        # A profile may change the gate.
+        takes_all = gate.step == 0 and columns.row_first.size == 0
         end_us = edges.t_us[edge] if edge < edges.t_us.size else span.end_us
         before = columns.counts.copy(), decoder.numbers.copy()
         _forget_refused(columns.refused)

@@ -73,10 +73,9 @@ from eschorty_ros.core.storage import FEW_EVENTS, MIXED, SENSOR_EDGE
 WINDOW_EVENTS = 1 << 21
 """Events after which, with the next profile, the estimate of the line starts again.
 
-A window of the stream so depends on no event before it, and windows can be reconstructed at the
-same time, but for what the first one has learned by then: the footprint when rows are chosen, usual
-widths and the line's width a few profiles later. While the sensor's edge cuts a line learning goes
-on.
+So a window depends on no earlier events but those that the first window has learned from: the
+footprint, the usual widths and the line's width. Windows can be reconstructed at the same time.
+While the sensor's edge cuts a line learning goes on.
 """
 # Profiles of the first window, as full of points as any, that show the usual widths.
 _KNOWN_PROFILES = 16
@@ -184,7 +183,7 @@ def _factor_max(settings: Settings) -> float:
 @kernel
 def _begin_window(memory, state):
     """Drop the last rows and the scatter; begin with widths and footprint as far as known."""
-    state.window = 0
+    state.window = state.profiles = 0
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:] = -1
@@ -281,7 +280,8 @@ def _close(memory, state, counters):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     history = smoothing.widths.history
-    _compare_polarities(columns, half, state.period % BLOCK_COLUMNS, history)
+    _compare_polarities(columns, half, state.profiles % BLOCK_COLUMNS, history)
+    state.profiles += 1
     _mark_unusual(rows, smoothing, memory.light.lit_share)
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED

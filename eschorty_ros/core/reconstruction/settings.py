@@ -178,7 +178,8 @@ class Settings:
     detail: str = _choice(
         "auto", ("auto", "off"),
         "auto: mode_mean learns the line's footprint and takes learned rows, at twice the time, "
-        "where these scatter less than means of twice the events would, or the line moves fast",
+        "where these scatter less than means of twice the events would, or, of a line that moves "
+        "fast, less than the means",
     )  # fmt: skip
 
     def __post_init__(self) -> None:

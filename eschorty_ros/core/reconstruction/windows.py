@@ -21,7 +21,7 @@ from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
 from eschorty_ros.core.reconstruction.settings import Settings
 
 JOBS_MAX = 256
-# Windows that wait for a thread, so that none waits for the rows before to be handed on.
+# Windows that wait for a thread, so that no thread waits while rows are handed on.
 _WAITING = 2
 
 
@@ -135,6 +135,8 @@ class WindowAssembler:
             cut, left = found, profile_rows.WINDOW_EVENTS
             if len(running) >= self._jobs + _WAITING:
                 going = self._accept(running.popleft(), going)
+                if not going:
+                    break
             assembler = self._idle.popleft()
             assembler.begin_window(edges, cut.edge - 1, self._open)
             running.append(self._start(cut, _copy(probe), _copy(probe), assembler))

@@ -218,6 +218,13 @@ def test_what_does_not_follow_the_laser_gives_no_points(case):
     assert reconstructor.counters["columns_unmodulated"] > 1000
 
 
+def test_what_gives_off_events_alone_is_no_line_of_a_profile_of_several_periods():
+    camera = Camera(frequency_hz=300.0, periods=210)
+    t, x, y, p = camera.moving_object(3e6)
+    found, _ = points(camera, (t, x, y, np.zeros_like(p)), periods_per_profile=3)
+    assert len(found) <= 50, f"seed {camera.seed}"
+
+
 BESIDE_A_LINE: dict[str, Callable[[Camera], Events]] = {
     "300 pixels at 20 kHz": lambda camera: camera.hot_pixels(300, 20e3),
     "2000 pixels at 2 kHz": lambda camera: camera.hot_pixels(2000, 2e3),

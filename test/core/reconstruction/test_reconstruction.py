@@ -63,7 +63,7 @@ def test_background_alone_gives_practically_no_points():
 
 def _split_cases():
     rng = np.random.default_rng(SEED)
-    events = line_events(rng, flat, frequency_hz=500.0, periods=12, columns=300, edge_us=5000)
+    events = line_events(rng, flat, frequency_hz=500.0, periods=40, columns=300, edge_us=5000)
     cut = line_events(
         rng,
         lambda k, c: np.where(4 <= k < 40, 716.0, 300.0 + 0.0 * c),
@@ -72,7 +72,12 @@ def _split_cases():
         columns=300,
         edge_us=5000,
     )
-    edges = 5000 + np.arange(12) * 2000 + rng.integers(-20, 21, 12)
+    # Events that are late scatter more over the rows.
+    slow = {"frequency_hz": 100.0, "periods": 40, "columns": 300}
+    prompt = line_events(rng, flat, **slow, edge_us=5000)
+    late = line_events(rng, flat, **slow, edge_us=8000, events=8.0, fwhm_px=60.0)
+    late = sort_readout(*map(np.concatenate, zip(prompt, late, strict=True)))
+    edges = 5000 + np.arange(40) * 2000 + rng.integers(-20, 21, 40)
     data, known = encoded(events), Modulation(500.0, on_edge_us=1000)
     return {
         "edge": (data, known, Settings()),
@@ -80,7 +85,11 @@ def _split_cases():
         "trigger": (encoded(events, np.delete(edges, [4, 5])), Modulation(500.0), Settings()),
         "filter": (data, known, Settings(noise_filter="activity")),
         "gate": (data, known, Settings(phase_gate_us=500)),
-        "learned gate": (data, known, Settings(phase_gate_us=-1)),
+        "learned gate": (
+            encoded(late),
+            Modulation(100.0, on_edge_us=5000),
+            Settings(phase_gate_us=-1),
+        ),
         "learned": (data, known, Settings(centroid="learned")),
         "cut": (encoded(cut), known, Settings()),
     }
@@ -95,6 +104,7 @@ def test_any_split_gives_the_same_points_and_counts(case):
     stream, modulation, settings = SPLIT_CASES[case]
     whole, a = reconstruct(stream, modulation, settings)
     assert len(whole) > 1000
+    assert (a.counters["events_gated"] > 0) == ("gate" in case)
     random_cuts = [rng.integers(0, len(stream), size).tolist() for size in (1, 5, 40)]
     for cuts in (*random_cuts, range(37, len(stream), 997)):
         parts, b = reconstruct(stream, modulation, settings, cuts)
@@ -144,16 +154,24 @@ def test_threads_go_on_with_the_footprint_that_the_first_window_has_learned(monk
 
 
 def test_windows_are_found_without_decoding_what_is_before_them(monkeypatch):
-    """None is assembled by itself, behind the one before it."""
+    """None but the first, which learns, is assembled by itself, behind the one before it."""
     monkeypatch.setattr(profile_rows, "WINDOW_EVENTS", 30_000)
-    monkeypatch.delattr(windows.WindowAssembler, "_go_on")
+    alone = windows.WindowAssembler._go_on
+    learns = []
+
+    def go_on(self):
+        learns.append(self._open.is_learning)
+        return alone(self)
+
+    monkeypatch.setattr(windows.WindowAssembler, "_go_on", go_on)
     stream, modulation, settings = SPLIT_CASES["edge"]
     parallel = Reconstructor(CALIBRATION, modulation, settings, 2)
     found = Profiles.concatenate(
         [parallel.push(stream[:2000]), parallel.push(stream[2000:]), parallel.flush()]
     )
     assert_same(found, reconstruct(stream, modulation, settings)[0])
-    assert parallel.counters["events"] > 2 * 30_000
+    assert parallel.counters["events"] > 4 * 30_000
+    assert learns == [True]
 
 
 def test_a_time_low_that_the_sensor_takes_back_may_end_a_piece():
