@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +25,8 @@ from eschorty_ros.live.sensor_epoch import SensorEpoch, TimedProfiles
 
 # Packets held while clock or modulation are unknown; further ones count as lost.
 _HELD_MAX = 1000
+# Packets without a TIME_HIGH, which a sensor repeats every 4 ms at least, that a decoder waits for.
+_TIMELESS_MAX = 64
 # A step of the numbers that no loss explains: another stream.
 _LOST_MAX = 1_000_000
 # An announced zero and a packet's stamp agree to this; the host may be late by some of it.
@@ -107,7 +110,9 @@ class PacketStream:
         """Return the missing input that packets are held for, ``""`` when none is missing."""
         if self._laser is None:
             return "modulation"
-        return "camera clock" if self._epoch is None else ""
+        if self._epoch is None:
+            return "camera clock"
+        return "sensor's time" if self._reconstructor is None and self._held else ""
 
     @property
     def epoch(self) -> SensorEpoch | None:
@@ -150,16 +155,17 @@ class PacketStream:
     @property
     def warnings(self) -> list[str]:
         """Return why most of the events gave no points so far, one line for each reason."""
-        return [] if self._reconstructor is None else self._reconstructor.warnings
+        reconstructor = self._reconstructor
+        return [] if reconstructor is None else reconstructor.warnings
 
     def announce_zero(self, zero_ns: int) -> None:
         """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
         epoch = self._epoch
+        self._zero_ended = False
         if epoch is not None and epoch.clock.exact and epoch.clock.zero_ns == zero_ns:
             self._epoch_used = False
             return
         self._retire()
-        self._zero_ended = False
         self._begin_epoch(SensorClock(zero_ns))
 
     def forget_zero(self) -> None:
@@ -281,7 +287,7 @@ class PacketStream:
             self._epoch = None
 
     def _ready(self, packet: Packet, now_s: float) -> bool:
-        if self._laser is None:
+        if self._laser is None or not self._is_timed():
             return False
         if self._epoch is None:
             since_s = now_s if self._held_since_s is None else self._held_since_s
@@ -289,6 +295,12 @@ class PacketStream:
                 return False
             self._begin_epoch(SensorClock())
         return True
+
+    def _is_timed(self) -> bool:
+        """Return whether the decoder has a time, or the packets held give it one."""
+        if self._reconstructor is not None or len(self._held) > _TIMELESS_MAX:
+            return True
+        return _time_high_us(self._held) is not None
 
     def _begin_epoch(self, clock: SensorClock) -> None:
         self._epoch = SensorEpoch(clock, self._expected_pulses())
@@ -310,7 +322,7 @@ class PacketStream:
             self._retire()
             self._next_seq = None
         if self._reconstructor is None:
-            self._wraps = self._missed_wraps(packet, first_time_high_us(packet.data))
+            self._wraps = self._missed_wraps(packet, _time_high_us(packets))
             self._reconstructor = Reconstructor(
                 self.calibration, self._modulation(), self._settings
             )
@@ -387,9 +399,11 @@ class PacketStream:
         """End the reconstructor: close its period, keep its counters."""
         if self._reconstructor is None:
             return
-        self._collect(self._reconstructor.flush())
-        self._retired.update(self._reconstructor.counters)
+        reconstructor = self._reconstructor
+        self._collect(reconstructor.flush())
+        # In this order, as other threads read the counters.
         self._reconstructor = None
+        self._retired.update(reconstructor.counters)
 
     def _collect(self, profiles: Profiles) -> None:
         if len(profiles):
@@ -399,6 +413,12 @@ class PacketStream:
     def _completed(self) -> list[TimedProfiles]:
         out, self._out = self._out, []
         return out
+
+
+def _time_high_us(packets: Iterable[Packet]) -> int | None:
+    """Return the time of the first TIME_HIGH of packets, ``None`` without one."""
+    times = (first_time_high_us(packet.data) for packet in packets)
+    return next((t_us for t_us in times if t_us is not None), None)
 
 
 def clock_statistics(stream: PacketStream) -> dict[str, Any]:

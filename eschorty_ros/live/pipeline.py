@@ -92,8 +92,8 @@ class ScanReport:
 
 
 def _share(part: int, whole: int) -> float:
-    """Return a share, at most 1; without a whole it is 1 of nothing expected."""
-    return min(part / whole, 1.0) if whole > 0 else float(part >= whole)
+    """Return part over whole, at most 1; 1 where the whole is 0."""
+    return min(part / whole, 1.0) if whole > 0 else 1.0
 
 
 class _Counts(NamedTuple):

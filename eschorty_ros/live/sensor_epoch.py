@@ -39,6 +39,7 @@ class SensorEpoch:
         """Expect other pulses from now on, or none."""
         if pulses != self.edges.pulses:
             self.edges = EdgeClock(pulses)
+            self.edges_missing, self._passed_mm = False, 0.0
             self.clock.adopt(None)
 
     def fit_edges(self, track: StageTrack, *, now: bool = False) -> None:

@@ -172,6 +172,28 @@ def test_a_stream_joined_late_is_brought_to_the_announced_zero(wraps):
     assert ZERO_NS + shift_us * 1000 <= times_ns(parts).min()
 
 
+def test_a_stream_joined_at_a_packet_without_a_time_high_keeps_the_announced_zero():
+    stamp_ns = ZERO_NS + 3 * WRAP_US * 1000 + 40_000_000
+    items = packets(line(), size=2000, seq=1000, stamp_ns=stamp_ns)
+    first = next(i for i, item in enumerate(items) if first_time_high_us(item.data) is None)
+    subject = announced()
+    subject.add(items[first], 0.0)
+    assert subject.process(0.0) == []
+    assert subject.waits_for == "sensor's time"
+    parts = run(subject, items[first + 1 :])
+    assert subject.announcements_refused == subject.packets_lost == 0
+    assert ZERO_NS + 3 * WRAP_US * 1000 <= times_ns(parts).min() < stamp_ns
+    assert subject.counters["decoder_events_before_time"] > 0
+
+
+def test_a_zero_announced_again_is_not_forgotten_at_the_next_scan():
+    subject = announced()
+    subject.forget_zero()
+    subject.announce_zero(ZERO_NS)
+    subject.begin_scan()
+    assert subject.epoch is not None
+
+
 def test_camera_restart_begins_anew_with_its_new_clock():
     data = line()
     subject = announced()

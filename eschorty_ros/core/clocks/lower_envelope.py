@@ -64,7 +64,7 @@ class LowerEnvelope:
             self._new_points += 1
         elif arrival_ns - points[-1][2] < (t_us - points[-1][1]) * NS_PER_US:
             points[-1] = (bin_, t_us, arrival_ns)
-        while points[0][2] < arrival_ns - self._window_ns:
+        while len(points) > 1 and points[0][2] < arrival_ns - self._window_ns:
             points.popleft()
         if self.line is None or self._new_points > len(points) * _POINTS_PER_FIT:
             self.line = self._fit()

@@ -6,6 +6,7 @@ header stops at the first two bytes that are not ``% ``.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import mmap
 import os
@@ -274,8 +275,10 @@ class RawWriter:
             while view:
                 view = view[self._file.write(view) :]
         except OSError:
-            self._file.truncate(end)
-            self._file.seek(end)
+            # The disk may be gone.
+            with contextlib.suppress(OSError):
+                self._file.truncate(end)
+                self._file.seek(end)
             raise
 
     def close(self) -> None:

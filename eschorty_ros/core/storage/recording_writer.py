@@ -147,8 +147,10 @@ class _Table:
             if self._file.write(text) != len(text):
                 raise OSError("no space left on device")
         except OSError as error:
-            self._file.truncate(end)
-            self._file.seek(end)
+            # The disk may be gone.
+            with contextlib.suppress(OSError):
+                self._file.truncate(end)
+                self._file.seek(end)
             raise FormatError(f"{self._path}: {error.strerror or error}; free some space") from None
 
     def __enter__(self) -> _Table:

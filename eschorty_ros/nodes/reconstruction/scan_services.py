@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 
 from eschorty_ros.control.heartbeat import Sender, read_heartbeat
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
+from eschorty_ros.core.base.numbers import short
 from eschorty_ros.live.pipeline import Pipeline, ScanReport
 from eschorty_ros.live.scan_buffer import AssembledScan
 from eschorty_ros.live.scan_recorder import ScanRecorder
@@ -33,6 +34,15 @@ _WORKER_S = 10.0
 _ASSEMBLE_S = 30.0
 # A recording that a disk takes longer for goes on without the client.
 _RECORD_S = 5.0
+# It is the name of a folder, and part of texts of 200 characters.
+_NAME_MAX = 100
+
+
+def _name_fault(scan_id: str) -> str:
+    """Return why a scan's identifier is no name of a folder, ``""`` when it is one."""
+    if len(scan_id) > _NAME_MAX or "/" in scan_id or scan_id in (".", ".."):
+        return f"scan_id is {short(scan_id)}; give a name of {_NAME_MAX} characters, no path"
+    return ""
 
 
 class ScanServices:
@@ -104,19 +114,25 @@ class ScanServices:
         while fault and time.monotonic() < deadline_s and self._running():
             time.sleep(0.02)
             fault = self._fault()
+        fault = fault or _name_fault(request.scan_id)
         if fault:
             response.success, response.message = False, fault
             return response
-        limits_mm = mm_from_m(request.start), mm_from_m(request.stop)
-        if self._pipeline.scan_id != request.scan_id:
-            self._recorder = self._make_recorder(request.scan_id, *limits_mm)
+        limits_mm, passes = (mm_from_m(request.start), mm_from_m(request.stop)), request.passes or 1
+        # A request is repeated when its answer is lost.
+        repeated = self._pipeline.scan_id == request.scan_id
         recorder = self._recorder
+        if not repeated:
+            recorder = self._make_recorder(request.scan_id, *limits_mm)
         if recorder is not None and (fault := recorder.made(_RECORD_S)):
             response.success, response.message = False, fault
             return response
-        passes = request.passes or 1
         begin = partial(self._pipeline.begin_scan, request.scan_id, *limits_mm, recorder, passes)
         response.success, response.message = self._in_worker(begin, _WORKER_S)
+        if response.success:
+            self._recorder = recorder
+        elif recorder is not None and not repeated:
+            recorder.end(None, response.message)
         return response
 
     def end_recording(self) -> None:
