@@ -268,6 +268,8 @@ class Evk4:
             return
         except DeviceError as error:
             self._queue.fail(error)
+        except Exception as error:
+            self._queue.fail(DeviceError(f"{NAME}: receiving it failed: {error!r}"))
 
     def _receive_once(self, failed_before: bool) -> bool:
         """Receive one transfer; returns whether it failed, raises when the camera is lost."""

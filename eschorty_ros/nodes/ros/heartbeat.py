@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -70,6 +71,8 @@ class Heartbeat:
             healthy, now_s = self._checked_health(), time.monotonic()
             text = self._schedule.check(healthy, stalls.measure(), now_s)
             if text is not None and not self._publish(text):
+                with self._lock:
+                    self._runs = False
                 return
 
     def _checked_health(self) -> bool:
@@ -83,7 +86,9 @@ class Heartbeat:
         message = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=text)
         try:
             self._publisher.publish(message)
-        except Exception:
+        except Exception as error:
             # A signal may end the context, or the node be destroyed, in between.
+            if self._node.context.ok():
+                print(f"{self._topic} not sent: {error}", file=sys.stderr, flush=True)
             return False
         return True
