@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from eschorty_ros.control.laser_interlock import LaserInterlock
 from eschorty_ros.control.laser_readback import LaserRecord, LaserStatus
@@ -25,7 +27,7 @@ class LaserSupervisor:
 
     Two watchdogs run while it is open: one checks the interlock, the other reads the generator back
     and disables the output when that is not what was requested. Commands wait for each other;
-    disabling waits for none of them, and voids those that would lead to light.
+    disabling waits for none of them, nor for a callback, and voids those that would lead to light.
 
     - ``running``: Whether the process means to go on; the output is disabled when it does not.
     - ``publish``: Called with the status after every change, in order.
@@ -49,8 +51,12 @@ class LaserSupervisor:
         self.interlock = interlock
         self._running, self._publish, self._alarm, self._log = running, publish, alarm, log
         self._readback_period_s = readback_period_s
-        # Held briefly, to publish the status, and to disable the output.
+        # Held briefly, and to disable the output.
         self._lock = threading.RLock()
+        self._depth = 0
+        # Callbacks run behind the lock: one that never returns must not keep light on.
+        self._outbox: deque[Callable[[], None]] = deque()
+        self._sending = threading.Lock()
         # Held as long as a command or a read-back takes; taken before ``_lock``, if both are.
         self._commands = threading.Lock()
         self._commanding = False
@@ -74,7 +80,7 @@ class LaserSupervisor:
 
     def open(self, laser: LaserModulator, modulation: Modulation) -> None:
         """Take over a laser: off, with this modulation; raises ``DeviceError`` when refused."""
-        with self._lock:
+        with self._locked():
             self._laser, self._record.modulation = laser, modulation
             self._record.requested, self._record.reason = LaserOutput.OFF, "off at start"
             self.interlock.note_disabled()
@@ -96,7 +102,7 @@ class LaserSupervisor:
         """Disable and release; idempotent. Raises ``DeviceError`` when it is not confirmed."""
         for watchdog in self._watchdogs:
             watchdog.stop()
-        with self._in_flight.disabling("closed"), self._lock:
+        with self._in_flight.disabling("closed"), self._locked():
             laser, self._laser = self._laser, None
             if laser is None:
                 return
@@ -132,7 +138,7 @@ class LaserSupervisor:
             raise DeviceError(f"laser refused: {fault}")
         with self._command() as (laser, ticket):
             laser.arm()
-            with self._lock:
+            with self._locked():
                 self._in_flight.refuse_void(ticket)
                 self.interlock.arm()
                 self._record.reason = "armed"
@@ -140,7 +146,7 @@ class LaserSupervisor:
     def enable(self) -> None:
         """Switch on, unless it is; raises ``DeviceError`` when it must not be, or fails."""
         with self._command() as (laser, ticket):
-            with self._lock:
+            with self._locked():
                 self._in_flight.refuse_void(ticket)
                 if self._record.requested is LaserOutput.ON:
                     return
@@ -157,7 +163,7 @@ class LaserSupervisor:
             except EschortyError as error:
                 self._disable_failed(error)
                 raise
-            with self._lock:
+            with self._locked():
                 try:
                     self._in_flight.refuse_void(ticket)
                 except VoidedError:
@@ -168,20 +174,22 @@ class LaserSupervisor:
 
     def disable(self, reason: str) -> None:
         """Disable before anything else; raises ``DeviceError`` when it is not confirmed."""
-        with self._in_flight.disabling(reason), self._lock:
+        with self._in_flight.disabling(reason), self._locked():
             laser = self._laser
             if laser is None:
                 return
+            fault: EschortyError | None = None
             try:
                 laser.disable()
             except EschortyError as error:
-                self._record.lose(error)
+                fault = error
+            self.switch_offs += self._record.requested is LaserOutput.ON
+            self.interlock.note_disabled()
+            self._record.requested, self._record.reason = LaserOutput.OFF, reason
+            if fault is not None:
+                self._record.lose(fault)
                 self.report()
-                raise DeviceError(self.unknown) from error
-            finally:
-                self.switch_offs += self._record.requested is LaserOutput.ON
-                self.interlock.note_disabled()
-                self._record.requested, self._record.reason = LaserOutput.OFF, reason
+                raise DeviceError(self.unknown) from fault
             readback: LaserReadback | None
             try:
                 readback = laser.readback()
@@ -195,30 +203,59 @@ class LaserSupervisor:
         try:
             self.disable(reason)
         except EschortyError as error:
-            self._alarm(str(error))
+            self._call(self._alarm, str(error))
             return False
-        self._log(f"laser off: {reason}")
+        self._call(self._log, f"laser off: {reason}")
         return True
 
     def report(self) -> None:
         """Publish the status as it is now."""
-        with self._lock:
+        with self._locked():
             status = self._record.status
             # A command in progress publishes its outcome at its end.
             if status is not None and not self._commanding:
-                self._publish(status)
+                self._outbox.append(partial(self._publish, status))
 
     def status(self) -> LaserStatus | None:
         """Return what is known now, ``None`` before the generator has been opened."""
-        with self._lock:
+        with self._locked():
             return self._record.status
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the lock; behind it, run the callbacks, unless another thread does so."""
+        outermost = False
+        try:
+            with self._lock:
+                self._depth += 1
+                try:
+                    yield
+                finally:
+                    self._depth -= 1
+                    outermost = self._depth == 0
+        finally:
+            if outermost:
+                self._send()
+
+    def _send(self) -> None:
+        # Looked at again behind each turn: another thread may have added to it in between.
+        while self._outbox and self._sending.acquire(blocking=False):
+            try:
+                while self._outbox:
+                    self._outbox.popleft()()
+            finally:
+                self._sending.release()
+
+    def _call(self, callback: Callable[[str], None], text: str) -> None:
+        with self._locked():
+            self._outbox.append(partial(callback, text))
 
     @contextlib.contextmanager
     def _command(self) -> Iterator[tuple[LaserModulator, int]]:
         """Wait for a turn; gives the laser and the command's ticket."""
         ticket = self._in_flight.ticket()
         with self._commands:
-            with self._lock:
+            with self._locked():
                 laser = self._laser
                 if laser is None:
                     raise DeviceError("laser refused: not open; configure it first")
@@ -226,7 +263,7 @@ class LaserSupervisor:
             try:
                 yield laser, ticket
             finally:
-                with self._lock:
+                with self._locked():
                     self._commanding = False
                     self.report()
 
@@ -239,7 +276,7 @@ class LaserSupervisor:
 
     def _disable_failed(self, error: EschortyError) -> None:
         """Disable after a command that failed, unless disabling is what made it fail."""
-        with self._lock:
+        with self._locked():
             if self._record.requested is LaserOutput.ON:
                 self.disable(str(error))
 
@@ -249,7 +286,7 @@ class LaserSupervisor:
 
     def _store(self, readback: LaserReadback) -> None:
         for text in self._record.receive(readback):
-            self._log(text)
+            self._call(self._log, text)
 
     def _watch_period_s(self) -> float:
         return WATCH_PERIOD_S if self._record.requested is LaserOutput.ON else _DARK_PERIOD_S
@@ -257,7 +294,7 @@ class LaserSupervisor:
     def _check_interlock(self) -> None:
         stall_s = self._stalls.measure()
         # Under the lock: the output may be being disabled already.
-        with self._lock:
+        with self._locked():
             if stall_s:
                 self.interlock.exclude_stall(stall_s)
             reason = self.interlock.trip_reason(self._stalls.measured_s)
@@ -282,9 +319,9 @@ class LaserSupervisor:
         except EschortyError as error:
             # Disabling may be what interrupted the read-back.
             if not self._in_flight.is_void(ticket) and self.trip(f"not read back: {error}"):
-                self._alarm(f"laser off: {error}")
+                self._call(self._alarm, f"laser off: {error}")
             return
-        with self._lock:
+        with self._locked():
             if self._in_flight.is_void(ticket):
                 return
             news = readback != self._record.readback or readback.output is not LaserOutput.OFF
@@ -298,7 +335,7 @@ class LaserSupervisor:
 
     def _fail(self, error: Exception) -> None:
         self.trip(f"watching it failed: {error!r}")
-        self._alarm(f"laser: watching it failed: {error!r}")
+        self._call(self._alarm, f"laser: watching it failed: {error!r}")
 
 
 class _Watchdog:

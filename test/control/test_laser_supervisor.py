@@ -190,3 +190,30 @@ def test_opened_again_it_is_watched_once(supervisor, laser):
         return sorted(thread.name for thread in threading.enumerate() if thread.name in once)
 
     wait_until(lambda: watching() == once, "the old one's end")
+
+
+def test_a_publisher_that_never_returns_does_not_keep_light_on(laser):
+    blocked, go = threading.Event(), threading.Event()
+    seen: list[LaserStatus] = []
+
+    def publish(status: LaserStatus) -> None:
+        seen.append(status)
+        if status.requested is LaserOutput.ON:
+            blocked.set()
+            assert go.wait(DEADLINE_S)
+
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
+    supervisor = opened(laser, interlock, publish)
+    supervisor.arm()
+    failures: list[str] = []
+    enabling = in_thread(supervisor.enable, failures)
+    assert blocked.wait(DEADLINE_S)
+    disabling = in_thread(lambda: supervisor.disable("switched off by request"), failures)
+    disabling.join(DEADLINE_S)
+    assert not disabling.is_alive()
+    assert not laser.lit
+    go.set()
+    enabling.join()
+    # What was reported meanwhile follows, in order.
+    assert seen[-1].reason == "switched off by request"
+    supervisor.close()

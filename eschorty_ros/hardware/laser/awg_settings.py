@@ -58,7 +58,7 @@ class AwgSettings:
         "s",
         range=(0.0, GRANT_MAX_S),
     )
-    usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 2.0))
+    usb_timeout: float = _field(0.2, "longest wait for one USB transfer", "s", range=(0.01, 0.2))
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -21,6 +21,7 @@ from eschorty_ros.hardware.laser_guard.starting import start_guard
 
 _CREDENTIALS = struct.Struct("3i")
 _BACKLOG = 4
+_CONNECT_S = 2.0
 
 
 def serve(path: str) -> None:
@@ -72,8 +73,12 @@ def _listening(path: str) -> Iterator[socket.socket]:
 
 def _served(path: str) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.settimeout(_CONNECT_S)
         try:
             other.connect(path)
+        except (TimeoutError, BlockingIOError):
+            # Its backlog is full.
+            return True
         except OSError:
             return False
         return True

@@ -14,6 +14,7 @@ from eschorty_ros.core.base.errors import DeviceGoneError
 
 # The guard runs the package that runs here, wherever it lies, and searches no current folder: with
 # -P and the package's own folder on the path no longer than it takes to find the package.
+_CONNECT_S = 2.0
 _START_GUARD = (
     "import sys; sys.path.insert(0, sys.argv.pop(1)); import eschorty_ros; del sys.path[0]; "
     "from eschorty_ros.hardware.laser_guard.guard import main; main()"
@@ -76,8 +77,11 @@ class ServedGuard:
 
     def __init__(self, path: str) -> None:
         self.end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # The backlog of a service that hangs may be full.
+        self.end.settimeout(_CONNECT_S)
         try:
             self.end.connect(path)
+            self.end.settimeout(None)
         except OSError as error:
             self.end.close()
             raise DeviceGoneError(

@@ -136,7 +136,7 @@ class LaserNode(DeviceNode):
         self.get_logger().info(f"{laser.identity.model} {laser.identity.serial}: off")
 
     def start_device(self) -> None:
-        """From here on the laser may be switched on."""
+        """Disable once more; ``laser/enable`` is accepted from here on."""
         self._supervisor.disable("ready")
 
     def stop_device(self) -> None:
@@ -255,7 +255,7 @@ class LaserNode(DeviceNode):
             self.get_logger().warning(text)
 
     def _publish(self, status: LaserStatus) -> None:
-        """Publish under the supervisor's lock: stamp and state agree, and no change is lost."""
+        """Publish a status; the supervisor calls it in order, and loses none."""
         if not self.context.ok():
             return
         readback, interlock = status.readback, self._supervisor.interlock
@@ -285,7 +285,7 @@ class LaserNode(DeviceNode):
         values: dict[str, Any] = {
             "device": supervisor.device,
             "state": self.state_label,
-            "output": (status.readback.output if status else LaserOutput.OFF).name,
+            "output": (status.readback.output if status else LaserOutput.UNKNOWN).name,
             "requested": (status.requested if status else LaserOutput.OFF).name,
             "armed": interlock.armed,
             "interlock_open": interlock.contact_open,

@@ -44,11 +44,12 @@ _REASON_MAX = 240
 def make_safe(nodes: Sequence[Node]) -> None:
     """Call ``safe_state()`` of every node that has one, also after the failure of another.
 
-    It uses the drivers directly, because the ROS context may be invalid.
+    The laser's is first: other devices may take seconds. It uses the drivers directly, because the
+    ROS context may be invalid.
     """
     for node in nodes:
         _ending.add(node)
-    for node in nodes:
+    for node in sorted(nodes, key=lambda node: node.get_name() != "laser"):
         safe_state = getattr(node, "safe_state", None)
         if safe_state is None:
             continue
