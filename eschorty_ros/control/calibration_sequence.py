@@ -84,7 +84,7 @@ def run_capture(
         instrument.check_nodes()
         instrument.configure_laser(request.frequency_hz, request.duty)
         if sweep is not None:
-            instrument.move(sweep.start_mm, _APPROACH_MM_S)
+            instrument.move(sweep.start_mm, min(_APPROACH_MM_S, sweep.speed_mm_s))
         instrument.laser_on()
         instrument.watch(True)
         instrument.report("capturing")

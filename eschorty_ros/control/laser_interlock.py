@@ -104,7 +104,7 @@ class LaserInterlock:
             self._nameless.add(unnamed)
         if is_open:
             self._opened_by = source or "laser/interlock"
-        if source in self._closed_s or len(self._closed_s) < _KEPT:
+        if is_open or source in self._closed_s or len(self._closed_s) < _KEPT:
             self._closed_s[source] = None if is_open else self._now_s()
 
     def reset_contact(self, living: Collection[str] | None = None) -> str:

@@ -155,8 +155,12 @@ class PacketStream:
     @property
     def warnings(self) -> list[str]:
         """Return why most of the events gave no points so far, one line for each reason."""
-        reconstructor = self._reconstructor
-        return [] if reconstructor is None else reconstructor.warnings
+        reconstructor, wanted = self._reconstructor, self._settings.periods_per_profile
+        if reconstructor is None:
+            return []
+        used = reconstructor.settings.periods_per_profile
+        limited = f"periods_per_profile is {wanted}; {self.frequency_hz:g} Hz allows {used}"
+        return [*([limited] if used < wanted else []), *reconstructor.warnings]
 
     def announce_zero(self, zero_ns: int) -> None:
         """Set the exact clock: sensor time 0 was ROS time ``zero_ns``."""
@@ -199,7 +203,10 @@ class PacketStream:
         changed = (modulation, epoch_ns) != self._laser
         self._laser = modulation, epoch_ns
         if self._reconstructor is not None and changed:
-            self._reconstructor.set_modulation(self._modulation())
+            if self._reconstructor.settings != self._settings.allowed(modulation):
+                self._renew()
+            else:
+                self._reconstructor.set_modulation(self._modulation())
         if self._reconstructor is not None and switched_on:
             self._reconstructor.restart_phase()
         if self._recorder is not None and switched_on:
@@ -323,8 +330,9 @@ class PacketStream:
             self._next_seq = None
         if self._reconstructor is None:
             self._wraps = self._missed_wraps(packet, _time_high_us(packets))
+            modulation = self._modulation()
             self._reconstructor = Reconstructor(
-                self.calibration, self._modulation(), self._settings
+                self.calibration, modulation, self._settings.allowed(modulation)
             )
         elif missing:
             self._reconstructor.note_gap()

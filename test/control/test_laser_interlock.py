@@ -127,6 +127,8 @@ def test_every_source_must_be_closed_and_fresh_and_an_opened_one_reset(clock):
     for number in range(100):
         interlock.receive_contact(False, f"crowd {number}")
     interlock.receive_contact(True, "the last")
+    assert interlock.reset_contact() == "interlock open (the last); close it"
+    interlock.receive_contact(False, "the last")
     assert "was opened (the last)" in interlock.contact_fault()
 
 

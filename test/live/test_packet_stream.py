@@ -186,6 +186,20 @@ def test_a_stream_joined_at_a_packet_without_a_time_high_keeps_the_announced_zer
     assert subject.counters["decoder_events_before_time"] > 0
 
 
+def test_more_periods_than_a_frequency_allows_are_limited_with_a_warning():
+    subject = stream(Settings(periods_per_profile=1000))
+    subject.announce_zero(ZERO_NS)
+    subject.set_laser(Modulation(5000.0), None)
+    items = packets(line())
+    run(subject, items[:2])
+    assert not any("allows" in line for line in subject.warnings)
+    subject.set_laser(MODULATION, None)
+    run(subject, items[2:])
+    assert subject.packets_lost == 0
+    assert subject.packets == len(items)
+    assert subject.warnings[0] == "periods_per_profile is 1000; 70 Hz allows 145"
+
+
 def test_a_zero_announced_again_is_not_forgotten_at_the_next_scan():
     subject = announced()
     subject.forget_zero()

@@ -15,8 +15,8 @@ class SensorClock:
     offset and drift are the lower envelope of the packets' arrivals over a sliding window, see
     `LowerEnvelope`, until a better relation is known from trigger edges (:meth:`adopt`).
 
-    The estimate may step at an observation, never between two of them: times converted between
-    two observations are strictly monotone. When arrival or sensor time goes back (clock set,
+    The estimate may step at an observation and in `adopt`; times converted between two steps are
+    strictly monotone. When arrival or sensor time goes back (clock set,
     camera restarted) the window is dropped.
 
     - ``zero_ns``: ROS time (ns) at which the sensor's clock read zero.

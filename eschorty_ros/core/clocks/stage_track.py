@@ -1,4 +1,4 @@
-"""The stage's position as a function of sensor time."""
+"""The stage's position as a function of time, us of one clock."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def quantise_nm(position_mm: ArrayLike, name: str = "position_mm") -> NDArray[np
 
 
 class StageTrack:
-    """Stage positions over sensor time, linear between samples, never extrapolated.
+    """Stage positions over time, linear between samples, never extrapolated.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class StageTrack:
         self._extend(at_us[later], positions[later])
 
     def position_mm(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Return the stage position at sensor times.
+        """Return the stage position at times of the samples' clock.
 
         Parameters
         ----------

@@ -54,7 +54,7 @@ class PeriodCutter:
         """Counts by name."""
         return {
             "events_held": len(self._held),
-            "events_outside_phase": self.lock.refused,
+            "events_outside_phase": self.lock.refused + self._length.refused,
             "periods_empty": self.lock.schedule.periods_jumped,
             **self.lock.counters,
         }

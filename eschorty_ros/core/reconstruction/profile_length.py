@@ -42,33 +42,40 @@ def periods_max(modulation: Modulation) -> int:
 class ProfileLength:
     """Chooses the periods of a profile from the first events that follow the laser.
 
-    They are a block behind the first estimation window that is modulated, or has a line where
-    pixels are too slow to follow: the choice does not depend on how the stream is split, nor on the
-    background before the laser is on. A column counts by its pairs of events, which background has
-    few of. One period is a profile where it has half of `EVENTS_WANTED`: of Poisson counts with a
-    mean of 8, one in 24 is less than 4, the default of ``events_min``. Else, or where periods are
-    not even and more columns have less, a profile has as many periods as give `EVENTS_WANTED`, or
-    the next number with which profiles are even: pixels that follow every third period give most
-    events in two of three. Where one period is not enough in the first block, with twice as many
-    events, the next one counts, since pixels give more when the laser is switched on. Blocks
-    without light do not count. A block has `BLOCK_US`, but two periods at least; the first one ends
-    with enough events after four.
+    The events counted are those of one block. It begins behind the first estimation window that is
+    modulated, or that shows a line where pixels are too slow for the modulation: the choice does
+    not depend on how the stream is split, nor on the background before the laser is on. A column
+    counts by its pairs of events, which background has few of. One period is a profile where it has
+    half of `EVENTS_WANTED`: of Poisson counts with a mean of 8, one in 24 is less than 4, the
+    default of ``events_min``. Else, or where periods are not even and more columns have less, a
+    profile has as many periods as give `EVENTS_WANTED`, or the next number with which profiles are
+    even: pixels that follow every third period give most events in two of three. Where one period
+    is not enough in the first block, with twice as many events, the next one counts, since pixels
+    give more when the laser is switched on. Blocks without light do not count. A block has
+    `BLOCK_US`, but two periods at least; the first one ends with enough events after four.
 
     Parameters
     ----------
     modulation : Modulation
+
+    Attributes
+    ----------
+    refused : int
+        Events dropped because they waited too long for light.
     """
 
     def __init__(self, modulation: Modulation) -> None:
         self._modulation = modulation
         self._span_us = max(BLOCK_US, round(_BLOCK_PERIODS * modulation.period_us))
+        self.refused = 0
         self._seen = 0
         self._window: tuple[int, int] | None = None
 
     def choose(self, held: HeldEvents, watermark_us: int, last: bool = False) -> int:
         """Return the periods of a profile, 0 while the held events do not give them.
 
-        1 where too many events do not follow the laser, or none do and these are the ``last``.
+        1 where none follow the laser and these are the ``last``. Where too many do not, 1 if the
+        phase is known, as they can be assigned; else they are dropped.
         """
         t, period_us = held.arrays[0], self._modulation.period_us
         while True:
@@ -80,8 +87,17 @@ class ProfileLength:
                 self._seen = end = t.size if window is None else begin + window.size
                 if self._edge_us(held, begin, end) is not None:
                     self._window = begin, end
-                elif window is None or end > HELD_EVENTS_MAX:
+                elif window is None:
                     return 1
+                elif end > HELD_EVENTS_MAX:
+                    if self._modulation.on_edge_us is not None:
+                        return 1
+                    self.refused += end
+                    held.drop(end)
+                    self._seen = 0
+                    if len(held) == 0:
+                        return 0
+                    t = held.arrays[0]
             first, begin = self._window
             end_us, periods = int(t[begin - 1]), 0
             block: tuple[Array, NDArray[np.uint16]] | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from eschorty_ros.core.base.arrays import short
@@ -15,7 +15,9 @@ from eschorty_ros.core.line import (
     SIGMA_FLOOR_PX,
     check_method,
 )
+from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.phase_gate import GATE_LEARNED, GATE_MAX_US
+from eschorty_ros.core.reconstruction.profile_length import periods_max
 
 NOISE_FILTERS = ("none", "activity")
 SWITCH = ("off", "on")
@@ -211,6 +213,11 @@ class Settings:
                 "returns is 'all' and reflectance_compensation 'on', which follows one surface per "
                 "column; choose strongest, first or last"
             )
+
+    def allowed(self, modulation: Modulation) -> Settings:
+        """Return the settings with no more periods in a profile than a modulation allows."""
+        most = periods_max(modulation)
+        return self if self.periods_per_profile <= most else replace(self, periods_per_profile=most)
 
 
 def _check(name: str, value: Any, default: Any, metadata: Any) -> None:

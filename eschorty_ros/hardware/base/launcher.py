@@ -1,4 +1,4 @@
-"""The end of a process with the one that launched it."""
+"""End this process when the process that launched it ends."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class AwgLaser:
         return (self._grant_s or GRANT_MIN_S) / _RENEWALS_PER_GRANT
 
     def disable(self) -> None:
-        """Switch the output off and disarm; idempotent; ends within about 1 s in any case.
+        """Switch the output off and disarm; idempotent; ends within 2 s.
 
         Writes OUTPut OFF, lowers the levels, reads back; on a failure again after clearing the
         link, and again after opening the generator again.

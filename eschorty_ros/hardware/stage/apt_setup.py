@@ -59,9 +59,12 @@ class AptSettings:
         ports = 2 if self.controller == "kbd101" else 3
         if not 1 <= self.trigger_port <= ports:
             raise ArgumentError(f"trigger_port is {self.trigger_port}; choose 1 to {ports}")
-        if not (self.trigger_interval_mm == 0.0 or 0.01 <= self.trigger_interval_mm < math.inf):
+        # Between two pulses their line must be low for as long as it is high.
+        least_mm = max(0.01, 2e-6 * _PULSE_US * self.speed_max_mm_s)
+        if not (self.trigger_interval_mm == 0.0 or least_mm <= self.trigger_interval_mm < math.inf):
             raise ArgumentError(
-                f"trigger_interval_mm is {self.trigger_interval_mm!r}; choose 0 or 0.01 mm at least"
+                f"trigger_interval_mm is {self.trigger_interval_mm!r}; choose 0 or {least_mm:g} mm "
+                f"at least, for pulses of {_PULSE_US} us at speed_max, {self.speed_max_mm_s:g} mm/s"
             )
 
     @property

@@ -78,6 +78,8 @@ class LaserNode(DeviceNode):
     Spin it with several threads: commands take their time, heartbeats must not wait for them.
     """
 
+    SAFE_FIRST = True
+
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("laser", TABLE, self._apply, **kwargs)
         self._state = self.create_publisher(

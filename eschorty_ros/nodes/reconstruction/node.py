@@ -52,8 +52,7 @@ from eschorty_ros.nodes.ros.spin import run
 
 _STAGE_DEPTH = 2000
 _STATE_S = 0.2
-# While something waits for a time, a step follows this late; the points of a stream that has ended
-# leave with it, at their own interval. Else nothing is to be done before the next job.
+# Longest wait for a job: short while packets, points or an image wait for a time, else long.
 _WAITING_S, _IDLE_S = POINTS_INTERVAL_S, 1.0
 # Packets that have queued up are worked on in parts: all together would take 100 MB for a second.
 _JOBS_PER_STEP = 32

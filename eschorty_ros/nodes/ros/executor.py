@@ -77,8 +77,8 @@ class _InTurn:
 class _Redirecting:
     """Redirects the callbacks of an executor's nodes, also of what they create later.
 
-    An exception of a callback is counted and logged, and the node goes on. An ``EschortyError`` of
-    a timer ends it: that is a node's way to end.
+    An exception of a callback is counted and logged, and the node goes on. An ``EschortyError``
+    that a timer raises ends the process; nodes end on purpose in this way.
     """
 
     def __init__(self) -> None:

@@ -44,12 +44,12 @@ _REASON_MAX = 240
 def make_safe(nodes: Sequence[Node]) -> None:
     """Call ``safe_state()`` of every node that has one, also after the failure of another.
 
-    The laser's is first: other devices may take seconds. It uses the drivers directly, because the
-    ROS context may be invalid.
+    Those with ``SAFE_FIRST`` come first: other devices may take seconds. It uses the drivers
+    directly, because the ROS context may be invalid.
     """
     for node in nodes:
         _ending.add(node)
-    for node in sorted(nodes, key=lambda node: node.get_name() != "laser"):
+    for node in sorted(nodes, key=lambda node: not getattr(node, "SAFE_FIRST", False)):
         safe_state = getattr(node, "safe_state", None)
         if safe_state is None:
             continue
@@ -77,8 +77,8 @@ def unless_shut_down(node: Node) -> Iterator[None]:
 class _Ending:
     """The request of SIGINT, SIGTERM or SIGHUP to end.
 
-    During the start it raises ``KeyboardInterrupt``, later it is only noted: an exception in a
-    callback would leave half-made objects, and an ended context would make callbacks fail.
+    Until rclpy is initialised it raises ``KeyboardInterrupt``, later it is only noted: an exception
+    in a callback would leave half-made objects, and an ended context would make callbacks fail.
     """
 
     def __init__(self) -> None:
@@ -134,7 +134,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
     - ``args``: Command line; that of the process when omitted.
 
     Returns 0 after Ctrl-C, SIGTERM or SIGHUP; 1 when a node could not be built, another of its
-    name runs, or a callback failed (one line for an ``EschortyError``). The process ends with 1
+    name runs, or a timer raised an ``EschortyError`` (one line). The process ends with 1
     where DDS does not answer any more.
     """
     nodes: list[Node] = []
@@ -173,7 +173,7 @@ def run(*factories: Callable[[], Node], threads: int = 1, args: Sequence[str] | 
         print(f"error: {error}", file=sys.stderr, flush=True)
         code, deadlocked = 1, isinstance(error, DdsDeadlockError)
     except Exception:
-        # A callback that publishes while a node ends the context fails.
+        # A factory may fail because the context has ended.
         if rclpy.ok():
             traceback.print_exc()
             code = 1

@@ -19,6 +19,7 @@ from eschorty_ros.core.reconstruction import (
     add_stage,
     place,
     place_link,
+    profile_length,
     profile_rows,
     region_window,
     windows,
@@ -419,6 +420,22 @@ def test_a_dense_stream_gives_profiles_after_a_window_and_two_periods():
     found = reconstructor.push(encoded(lines(periods=8)))
     assert found.profile_count >= 6, f"seed {SEED}"
     assert reconstructor.periods_per_profile == 1
+
+
+def test_a_long_dark_stretch_does_not_choose_the_periods_of_a_profile(monkeypatch):
+    monkeypatch.setattr(profile_length, "HELD_EVENTS_MAX", 20_000)
+    rng = np.random.default_rng(SEED)
+    n = 100_000
+    dark = np.sort(rng.integers(0, 400_000, n)), rng.integers(0, 1280, n), rng.integers(0, 720, n)
+    line = line_events(
+        rng, flat, frequency_hz=5000.0, periods=3000, columns=300, events=1.5, edge_us=400_000
+    )
+    noise = (*dark, rng.integers(0, 2, n))
+    events = (np.concatenate(pair) for pair in zip(noise, line, strict=True))
+    found, reconstructor = reconstruct(encoded(tuple(events)), Modulation(5000.0))
+    assert reconstructor.periods_per_profile in (10, 11), f"seed {SEED}"
+    assert reconstructor.counters["events_outside_phase"] > 50_000
+    assert len(found) > 0.9 * 300 * 3000 / 11
 
 
 def test_a_flash_before_the_laser_does_not_choose_the_periods_of_a_profile():
