@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -86,9 +85,7 @@ class Heartbeat:
         message = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=text)
         try:
             self._publisher.publish(message)
-        except Exception as error:
+        except Exception:
             # A signal may end the context, or the node be destroyed, in between.
-            if self._node.context.ok():
-                print(f"{self._topic} not sent: {error}", file=sys.stderr, flush=True)
             return False
         return True
