@@ -54,8 +54,10 @@ class LaserSupervisor:
         # Held briefly, and to disable the output.
         self._lock = threading.RLock()
         self._depth = 0
-        # Callbacks run behind the lock: one that never returns must not keep light on.
+        # Callbacks run behind the lock, in the thread of what they are about: one that never
+        # returns must neither keep light on nor a watchdog from its checks.
         self._outbox: deque[Callable[[], None]] = deque()
+        self._has_news = False
         self._sending = threading.Lock()
         # Held as long as a command or a read-back takes; taken before ``_lock``, if both are.
         self._commands = threading.Lock()
@@ -214,7 +216,7 @@ class LaserSupervisor:
             status = self._record.status
             # A command in progress publishes its outcome at its end.
             if status is not None and not self._commanding:
-                self._outbox.append(partial(self._publish, status))
+                self._later(partial(self._publish, status))
 
     def status(self) -> LaserStatus | None:
         """Return what is known now, ``None`` before the generator has been opened."""
@@ -223,8 +225,8 @@ class LaserSupervisor:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the lock; behind it, run the callbacks, unless another thread does so."""
-        outermost = False
+        """Hold the lock; behind it, run callbacks if it has news, unless another thread does so."""
+        sends = False
         try:
             with self._lock:
                 self._depth += 1
@@ -232,10 +234,15 @@ class LaserSupervisor:
                     yield
                 finally:
                     self._depth -= 1
-                    outermost = self._depth == 0
+                    if self._depth == 0:
+                        sends, self._has_news = self._has_news, False
         finally:
-            if outermost:
+            if sends:
                 self._send()
+
+    def _later(self, callback: Callable[[], None]) -> None:
+        self._outbox.append(callback)
+        self._has_news = True
 
     def _send(self) -> None:
         # Looked at again behind each turn: another thread may have added to it in between.
@@ -248,7 +255,7 @@ class LaserSupervisor:
 
     def _call(self, callback: Callable[[str], None], text: str) -> None:
         with self._locked():
-            self._outbox.append(partial(callback, text))
+            self._later(partial(callback, text))
 
     @contextlib.contextmanager
     def _command(self) -> Iterator[tuple[LaserModulator, int]]:

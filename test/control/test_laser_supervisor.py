@@ -217,3 +217,22 @@ def test_a_publisher_that_never_returns_does_not_keep_light_on(laser):
     # What was reported meanwhile follows, in order.
     assert seen[-1].reason == "switched off by request"
     supervisor.close()
+
+
+def test_the_watchdog_of_a_laser_that_is_lit_runs_no_callback_of_another_thread(laser):
+    begun: list[str] = []
+
+    def publish(status: LaserStatus) -> None:
+        if status.requested is LaserOutput.ON:
+            begun.append(threading.current_thread().name)
+
+    interlock = LaserInterlock(10.0, 60.0, {CLIENT_HEARTBEAT: 60.0})
+    supervisor = opened(laser, interlock, publish)
+    supervisor.arm()
+    supervisor.enable()
+    end_s = time.monotonic() + 1.0
+    while time.monotonic() < end_s:
+        supervisor.report()
+    supervisor.close()
+    assert len(begun) > 100
+    assert "laser watchdog" not in begun
