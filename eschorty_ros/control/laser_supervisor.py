@@ -17,7 +17,7 @@ from eschorty_ros.hardware.base.stalls import StallMeter
 from eschorty_ros.hardware.laser.in_flight import CommandsInFlight, VoidedError
 
 WATCH_PERIOD_S = 0.02
-# Without light there is nothing to disable. A turn so late is no stall yet.
+# Without light there is nothing to disable.
 _DARK_PERIOD_S = 0.1
 _STOP_TIMEOUT_S = 1.0
 
@@ -89,7 +89,7 @@ class LaserSupervisor:
         laser.disable()
         laser.configure(modulation)
         self._receive(self._checked_readback(laser))
-        self._stalls = StallMeter(WATCH_PERIOD_S)
+        self._stalls = StallMeter()
         self._watchdogs = [
             _Watchdog("laser watchdog", self._check_interlock, self._watch_period_s, self._fail),
             _Watchdog(
@@ -299,7 +299,7 @@ class LaserSupervisor:
         return WATCH_PERIOD_S if self._record.requested is LaserOutput.ON else _DARK_PERIOD_S
 
     def _check_interlock(self) -> None:
-        stall_s = self._stalls.measure()
+        stall_s = self._stalls.measure(self._watch_period_s())
         # Under the lock: the output may be being disabled already.
         with self._locked():
             if stall_s:

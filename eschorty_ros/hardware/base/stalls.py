@@ -16,20 +16,17 @@ class StallMeter:
     heartbeat old at once. A watchdog excludes that time, and compares ages as of ``measured_s``: a
     stall may begin after a measurement. The end of another process is noticed by other means.
 
-    - ``period_s``: Time between two turns of the loop.
-
     Public attributes:
     - ``measured_s``: Time of the last measurement, steady clock.
     """
 
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
+    def __init__(self) -> None:
         self.measured_s = time.monotonic()
 
-    def measure(self) -> float:
-        """Return the seconds by which this turn is late, 0 when they are fewer than 0.1."""
+    def measure(self, period_s: float) -> float:
+        """Return the seconds by which a turn of this period is late, 0 when fewer than 0.1."""
         before_s, self.measured_s = self.measured_s, time.monotonic()
-        late_s = self.measured_s - before_s - self._period_s
+        late_s = self.measured_s - before_s - period_s
         return late_s if late_s >= LEAST_S else 0.0
 
 

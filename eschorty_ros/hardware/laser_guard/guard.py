@@ -67,7 +67,7 @@ class Guard:
         self._unknown = ""
         self._retrying: threading.Thread | None = None
         self._received_s = time.monotonic()
-        self._stalls = StallMeter(_TURN_S)
+        self._stalls = StallMeter()
         self._closing: Message | None = None
 
     def run(self) -> None:
@@ -83,7 +83,7 @@ class Guard:
             while self._closing is None:
                 turn_s = DARK_TURN_S if self._dark and not self._lit.is_set() else _TURN_S
                 ready = dict(poller.poll(turn_s * 1e3))
-                stall_s = self._stalls.measure()
+                stall_s = self._stalls.measure(_TURN_S)
                 self._received_s = min(self._received_s + stall_s, self._stalls.measured_s)
                 if owner in ready:
                     break

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -34,6 +35,7 @@ from eschorty_ros.nodes.ros.spin import run
 # Every change and, with light, every read-back is published, too.
 STATE_RATE_HZ = 2.0
 THREADS = 4
+_COMMANDS_MAX = THREADS - 2
 WATCHED = ("camera", "stage")
 
 DRIVER_TABLE = from_settings(AwgSettings)
@@ -94,7 +96,9 @@ class LaserNode(DeviceNode):
             log=self._log,
             readback_period_s=1.0 / self.parameters["readback_rate"],
         )
-        # Disabling must not wait for a command in progress; the supervisor orders the others.
+        # Disabling must wait neither for a command in progress nor for a thread: the supervisor
+        # orders the others, and not all threads may wait for them.
+        self._commands = threading.BoundedSemaphore(_COMMANDS_MAX)
         control = ReentrantCallbackGroup()
         self.create_service(Trigger, "laser/arm", self._on_arm, callback_group=control)
         self.create_service(SetBool, "laser/enable", self._on_enable, callback_group=control)
@@ -200,13 +204,13 @@ class LaserNode(DeviceNode):
             return False, str(error)
 
     def _arm(self) -> str:
-        self._refuse_inactive()
-        self._supervisor.arm()
+        with self._accepted():
+            self._supervisor.arm()
         return "armed"
 
     def _enable(self) -> str:
-        self._refuse_inactive()
-        self._supervisor.enable()
+        with self._accepted():
+            self._supervisor.enable()
         return "switched on by request"
 
     def _disable(self) -> str:
@@ -218,9 +222,18 @@ class LaserNode(DeviceNode):
             raise
         return reason
 
-    def _refuse_inactive(self) -> None:
+    @contextlib.contextmanager
+    def _accepted(self) -> Iterator[None]:
         if not self.active:
             raise DeviceError(f"laser refused: node is {self.state_label}; activate it first")
+        if not self._commands.acquire(blocking=False):
+            raise DeviceError(
+                f"laser refused: {_COMMANDS_MAX} commands are under way; wait for their answers"
+            )
+        try:
+            yield
+        finally:
+            self._commands.release()
 
     def _on_interlock(self, message: Bool, info: Mapping[str, Any]) -> None:
         interlock = self._supervisor.interlock

@@ -62,13 +62,13 @@ class Heartbeat:
             return not self._runs
 
     def _run(self) -> None:
-        stalls = StallMeter(CHECK_S)
+        stalls = StallMeter()
         while not self._ends():
             time.sleep(CHECK_S)
             if not self._node.context.ok():
                 return
             healthy, now_s = self._checked_health(), time.monotonic()
-            text = self._schedule.check(healthy, stalls.measure(), now_s)
+            text = self._schedule.check(healthy, stalls.measure(CHECK_S), now_s)
             if text is not None and not self._publish(text):
                 with self._lock:
                     self._runs = False

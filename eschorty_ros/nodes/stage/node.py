@@ -81,17 +81,17 @@ class StageNode(DeviceNode):
 
     def open_device(self) -> None:
         """Open the stage."""
+        stage = drivers.make(
+            "stage",
+            make_stage,
+            lambda bench: {"port": stage_port(bench)},
+            self.parameters,
+            self.now_ns,
+        )
         with self._lock:
-            self._stage = drivers.make(
-                "stage",
-                make_stage,
-                lambda bench: {"port": stage_port(bench)},
-                self.parameters,
-                self.now_ns,
-            )
-            identity, trigger = self._stage.identity, self._stage.trigger
-        self._trigger.publish(self._trigger_message(trigger))
-        self.get_logger().info(f"{identity.model} {identity.serial}")
+            self._stage = stage
+        self._trigger.publish(self._trigger_message(stage.trigger))
+        self.get_logger().info(f"{stage.identity.model} {stage.identity.serial}")
 
     def start_device(self) -> None:
         """Home unless homed, and wait for it."""

@@ -44,6 +44,20 @@ def test_disabling_does_not_wait_for_enabling(observer: Observer, laser: Delayed
     assert laser.enablings == 0
 
 
+def test_commands_that_wait_leave_a_thread_for_disabling(
+    observer: Observer, laser: DelayedLaser
+) -> None:
+    laser.delayed = "arm"
+    with ThreadPoolExecutor() as pool:
+        waiting = [pool.submit(observer.call, Trigger, "laser/arm") for _ in range(THREADS)]
+        wait_until(lambda: any(answer.done() for answer in waiting), "a refusal")
+        pool.submit(observer.call, SetBool, "laser/enable", SetBool.Request(data=False))
+        assert laser.disabled.wait(0.5 * DEADLINE_S), "disabling waits"
+        laser.go.set()
+        refusals = [answer.result().message for answer in waiting if not answer.result().success]
+    assert any("commands are under way" in refusal for refusal in refusals)
+
+
 def test_interlock_that_is_reported_open_repeatedly_switches_off_once(
     observer: Observer, laser: DelayedLaser
 ) -> None:
