@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError, CalibrationError, FormatError
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.base.schema import validate
-from eschorty_ros.core.base.yaml_file import parse_yaml
+from eschorty_ros.core.base.yaml_file import Document, parse_yaml
 from eschorty_ros.core.clocks import NS_PER_US, POSITION_LIMIT_MM, StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
@@ -72,23 +73,26 @@ def bag_to_recording(
     with BagReader(path) as source:
         _check(source, calibration, frequency_hz)
         custom = source.custom
-        chosen = _from_custom(path, custom, _SETTINGS) | (settings or {})
+        chosen = _from_custom(path, custom, _SETTINGS).data | (settings or {})
         if any(message.fields.count for message in source.messages(TRIGGER)):
             chosen.setdefault("trigger_source", "stage")
         limits = {"start_mm": -POSITION_LIMIT_MM, "stop_mm": POSITION_LIMIT_MM}
-        log = ScanLog(**{"scan_id": path.stem, **limits, **_from_custom(path, custom, _SCAN)})
+        scan = _from_custom(path, custom, _SCAN)
+        full = replace(scan, data={"scan_id": path.stem, **limits, **scan.data})
+        log = validate(ScanLog, full, FormatError)
         build = calibration or _calibration(source)
-        stream = PacketStream(build, Settings(**chosen), 0.0, packet_period_s)
+        stream = PacketStream(build, Settings.from_file(chosen, path), 0.0, packet_period_s)
         stream.announcement_expected = False
         if frequency_hz is not None:
             stream.set_laser(Modulation(frequency_hz), None)
-        _latched(source, stream, frequency_hz is None)
+        kinds = (CLOCK, TRIGGER, *([LASER] if frequency_hz is None else []))
+        _latched(source, stream, kinds)
         recorder = ScanRecorder(file_path("folder", folder), log, build, chosen, waits=True)
         if fault := recorder.made(_DISK_S):
             raise ArgumentError(fault)
         stream.begin_scan(recorder)
         try:
-            _play(source, stream, recorder, frequency_hz is None)
+            _play(source, stream, recorder, kinds)
         except BaseException:
             recorder.end(None, "the bag was not read to its end")
             recorder.wait(_DISK_S)
@@ -112,11 +116,11 @@ def _check(source: BagReader, calibration: Calibration | None, frequency_hz: flo
             raise FormatError(f"{source.path} has no {kind}; {remedy}")
 
 
-def _from_custom(path: Path, custom: dict[str, str], key: str) -> dict[str, Any]:
-    data = parse_yaml(custom.get(key, "{}").encode(), path / "metadata.yaml", FormatError).data
-    if not isinstance(data, dict):
-        raise FormatError(f"{path}: {key} is {short(data)}; remove it from metadata.yaml")
-    return data
+def _from_custom(path: Path, custom: dict[str, str], key: str) -> Document:
+    found = parse_yaml(custom.get(key, "{}").encode(), path / "metadata.yaml", FormatError)
+    if not isinstance(found.data, dict):
+        raise FormatError(f"{path}: {key} is {short(found.data)}; remove it from metadata.yaml")
+    return found
 
 
 def _calibration(source: BagReader) -> Calibration:
@@ -125,30 +129,38 @@ def _calibration(source: BagReader) -> Calibration:
     return validate(Calibration, document, CalibrationError)
 
 
-def _latched(source: BagReader, stream: PacketStream, laser: bool) -> None:
-    """Set what was latched before the bag began: its first messages."""
-    kinds = (CLOCK, TRIGGER, LASER) if laser else (CLOCK, TRIGGER)
-    for message in source.messages(*kinds):
-        fields = message.fields
-        if message.kind == CLOCK:
-            stream.announce_zero(ns(fields.header.stamp) - ns(fields.time_ref))
-        elif message.kind == TRIGGER:
-            stream.set_pulses(pulse_train(fields))
-        elif message.kind == LASER and stream.waits_for == "modulation":
-            stream.set_laser(*laser_settings(fields)[:2])
+def _latched(source: BagReader, stream: PacketStream, kinds: tuple[str, ...]) -> None:
+    """Set what was latched before the bag began: the first message of each kind."""
+    for kind in kinds:
+        if (message := next(iter(source.messages(kind)), None)) is None:
+            continue
+        if kind == LASER:
+            stream.set_laser(*laser_settings(message.fields)[:2])
+        else:
+            _set(stream, kind, message.fields)
 
 
-def _play(source: BagReader, stream: PacketStream, recorder: ScanRecorder, laser: bool) -> None:
+def _set(stream: PacketStream, kind: str, fields: Any) -> None:
+    if kind == CLOCK:
+        stream.announce_zero(ns(fields.header.stamp) - ns(fields.time_ref))
+    elif kind == TRIGGER:
+        stream.set_pulses(pulse_train(fields))
+    else:
+        stream.set_laser(*laser_settings(fields))
+
+
+def _play(
+    source: BagReader, stream: PacketStream, recorder: ScanRecorder, kinds: tuple[str, ...]
+) -> None:
     track = StageTrack()
-    kinds = (EVENTS, ODOMETRY, LASER) if laser else (EVENTS, ODOMETRY)
-    for message in source.messages(*kinds):
+    for message in source.messages(EVENTS, ODOMETRY, *kinds):
         fields = message.fields
         if message.kind == ODOMETRY:
             t_ns, position_mm = ns(fields.header.stamp), fields.pose.pose.position.y * MM_PER_M
             track.append(t_ns // NS_PER_US, position_mm)
             recorder.stage(t_ns, position_mm)
-        elif message.kind == LASER:
-            stream.set_laser(*laser_settings(fields))
+        elif message.kind in kinds:
+            _set(stream, message.kind, fields)
         else:
             if fields.encoding != "evt3":
                 raise FormatError(

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import sqlite3
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,6 +44,14 @@ def points(recording):
     return reconstruct_recording(recording).points
 
 
+def write_messages(bag, messages, custom):
+    with bag_files.BagWriter(bag, "mcap", custom) as target:
+        for message in messages:
+            names = message.fields.__dataclass_fields__.keys() - {"__msgtype__"}
+            fields = {name: getattr(message.fields, name) for name in names}
+            target.write(message.kind, message.t_ns, **fields)
+
+
 @pytest.mark.parametrize("storage", bag_files.STORAGES)
 @pytest.mark.parametrize("which", ["source", "scanned"])
 def test_a_recording_a_bag_and_back(tmp_path, request, which, storage):
@@ -68,11 +77,7 @@ def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path
         messages = list(bag.messages(*topics))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bag_files, "TOPICS", bag_files.TOPICS | topics)
-        with bag_files.BagWriter(tmp_path / "bag", "mcap", {}) as target:
-            for message in messages:
-                names = message.fields.__dataclass_fields__.keys() - {"__msgtype__"}
-                fields = {name: getattr(message.fields, name) for name in names}
-                target.write(message.kind, message.t_ns, **fields)
+        write_messages(tmp_path / "bag", messages, {})
     for options, words in (({}, "give --frequency"), ({"frequency_hz": 70.0}, "--calibration")):
         with pytest.raises(EschortyError, match=words):
             bag_to_recording(tmp_path / "bag", tmp_path / "none", **options)
@@ -89,6 +94,42 @@ def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path
     # A camera that collects events for 4 ms sends them so much later, at 50 mm/s.
     sent = points(load_recording(tmp_path / "sent"))
     assert np.median(sent["y"] - found["y"]) == pytest.approx(-2e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "words"),
+    [
+        ("eschorty_scan", "{start: 0}", "start is 0, and no such key exists"),
+        ("eschorty_scan", "{start_mm: near}", "start_mm is 'near'"),
+        ("eschorty_settings", "{method: mean}", "'method' is no setting"),
+        ("eschorty_settings", "{centroid: best}", "centroid is 'best'"),
+    ],
+)
+def test_wrong_metadata_of_a_bag_is_one_line(tmp_path, source, key, text, words):
+    recording_to_bag(source, tmp_path / "bag")
+    with bag_files.BagReader(tmp_path / "bag") as bag:
+        messages = list(bag.messages(*bag_files.TOPICS))
+    write_messages(tmp_path / "wrong", messages, {key: text})
+    with pytest.raises(EschortyError, match=words):
+        bag_to_recording(tmp_path / "wrong", tmp_path / "rec")
+
+
+def test_a_camera_that_restarts_within_a_bag_ends_the_recording(tmp_path, source):
+    recording_to_bag(source, tmp_path / "bag")
+    with bag_files.BagReader(tmp_path / "bag") as bag:
+        messages = list(bag.messages(*bag_files.TOPICS))
+    bag_to_recording(tmp_path / "bag", tmp_path / "once")
+    expected = points(load_recording(tmp_path / "once"))
+    for message in list(messages):
+        again = replace(message, t_ns=message.t_ns + 10 * 10**9, fields=deepcopy(message.fields))
+        for time in (again.fields.header.stamp, getattr(again.fields, "phase_epoch", None)):
+            if time is not None:
+                time.sec += 10
+        messages.append(again)
+    write_messages(tmp_path / "twice", messages, {})
+    lacks = bag_to_recording(tmp_path / "twice", tmp_path / "rec")
+    assert "packets are not recorded: camera, modulation or settings were changed" in lacks
+    np.testing.assert_array_equal(points(load_recording(tmp_path / "rec")), expected)
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", bytes(1000)])

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
@@ -267,15 +265,7 @@ def recorded_settings(recording: Recording) -> Settings:
     FormatError
         When the recording's settings are not those of a reconstruction.
     """
-    known = {item.name for item in fields(Settings)}
-    unknown = sorted(str(name) for name in recording.settings.keys() - known)
-    file = recording.path / SETTINGS_FILE
-    if unknown:
-        raise FormatError(f"{file}: {short(unknown[0])} is no setting; remove it")
-    try:
-        return Settings(**recording.settings)
-    except ArgumentError as error:
-        raise FormatError(f"{file}: {error}") from error
+    return Settings.from_file(recording.settings, recording.path / SETTINGS_FILE)
 
 
 def _push(

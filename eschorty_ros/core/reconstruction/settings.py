@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Self
 
 from eschorty_ros.core.base.arrays import short
-from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.line import (
     CENTROIDS,
     FULL_COLUMN_METHODS,
@@ -213,6 +215,17 @@ class Settings:
                 "returns is 'all' and reflectance_compensation 'on', which follows one surface per "
                 "column; choose strongest, first or last"
             )
+
+    @classmethod
+    def from_file(cls, values: Mapping[str, Any], file: str | os.PathLike[str]) -> Self:
+        """Return the settings that a file names; raises ``FormatError`` when there is no such."""
+        unknown = sorted(str(name) for name in values.keys() - {item.name for item in fields(cls)})
+        if unknown:
+            raise FormatError(f"{file}: {short(unknown[0])} is no setting; remove it")
+        try:
+            return cls(**values)
+        except ArgumentError as error:
+            raise FormatError(f"{file}: {error}") from error
 
     def allowed(self, modulation: Modulation) -> Settings:
         """Return the settings with no more periods in a profile than a modulation allows."""
