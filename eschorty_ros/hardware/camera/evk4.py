@@ -165,9 +165,13 @@ class Evk4:
                 session.stop_sensor()
         finally:
             thread.join(_JOIN_S)
+            # The thread may just have started another one.
             session = self._connection.session
             if session is not None:
-                session.stop_reads()
+                try:
+                    session.stop_sensor()
+                finally:
+                    session.stop_reads()
         if thread.is_alive():
             # A second thread would share its reads.
             self._hung = thread

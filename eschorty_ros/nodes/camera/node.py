@@ -21,6 +21,7 @@ from eschorty_ros.msg import LaserState
 from eschorty_ros.nodes.camera.packet_publisher import PacketPublisher
 from eschorty_ros.nodes.camera.parameters import (
     EVK4_TABLE,
+    camera_settings,
     make_camera,
     missing_bias_file,
     windows_given,
@@ -194,11 +195,12 @@ class CameraNode(DeviceNode):
 
     def _on_change(self, proposed: dict[str, Any]) -> None:
         """Set changed biases and windows; the offset read back becomes the parameter."""
-        source, windows = self._source, windows_given(proposed)
+        # All values are checked before the first is set.
+        source, settings = self._source, camera_settings(proposed)
         if source is None:
             return
-        if windows != windows_given(self.parameters):
-            source.set_windows(windows)
+        if settings.windows != windows_given(self.parameters):
+            source.set_windows(settings.windows)
         for name in BIASES:
             offset = proposed[name]
             if offset != self._biases.get(name):

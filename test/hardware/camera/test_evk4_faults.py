@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from evk4_bench import CameraBench, OnDemand
@@ -345,6 +346,32 @@ def test_shutdown_while_reconnecting() -> None:
         camera.close()
         camera.close()
         wait_until(lambda: set(threading.enumerate()) <= before, "the end of its threads")
+
+
+@pytest.mark.fault("shutdown at any time")
+def test_stop_at_the_end_of_a_search() -> None:
+    """driver: stops the sensor that it has just started again; user reads: nothing more."""
+    with CameraBench() as bench:
+        camera = bench.driver(attempts=None)
+        camera.open()
+        camera.start()
+        restarted, stopping = threading.Event(), threading.Event()
+        restart = camera._restart
+
+        def slow_restart(session: Any) -> None:
+            restarted.set()
+            assert stopping.wait(DEADLINE_S)
+            restart(session)
+
+        camera._restart = slow_restart
+        bench.model.gone = True
+        wait_until(lambda: camera.loss, "the loss")
+        bench.model.gone = False
+        assert restarted.wait(DEADLINE_S)
+        threading.Timer(0.1, stopping.set).start()
+        camera.stop()
+        assert bench.model.watch.phase is not Phase.STREAMING
+        camera.close()
 
 
 @pytest.mark.fault("shutdown at any time")

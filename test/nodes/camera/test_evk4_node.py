@@ -13,6 +13,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from eschorty_ros.msg import LaserState
 from event_camera_msgs.msg import EventPacket
 from evk4_bench import OnDemand, plug
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
 from ros_process import Observer, nodes_here, wait_until
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -217,6 +219,11 @@ def test_the_region_of_interest_changes_while_the_camera_streams(start: Start) -
     accepted, reason = run.observer.set_parameter("camera", "roi", [0, 700, 1280, 300])
     assert not accepted
     assert "leaves the sensor" in reason
+    # Together with another value that is refused.
+    both = [Parameter("roi", value=[0, 100, 1280, 300]), Parameter("bias_fo", value=56)]
+    request = SetParametersAtomically.Request(parameters=[p.to_parameter_msg() for p in both])
+    answer = run.observer.call(SetParametersAtomically, "camera/set_parameters_atomically", request)
+    assert "bias_fo is 56" in answer.result.reason
     assert run.model.settings.rows_off == rows - frozenset(range(200, 500))
     accepted, reason = run.observer.set_parameter("camera", "roi", [0, 0, 1280, 720])
     assert accepted, reason
