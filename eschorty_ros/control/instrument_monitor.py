@@ -25,7 +25,7 @@ _SAMPLES_MAX = 500_000
 
 
 @dataclass(frozen=True, slots=True)
-class LaserStatus:
+class LaserReport:
     """The output (a value of ``LaserOutput``) and modulation read back, and the output's reason."""
 
     output: int
@@ -62,7 +62,7 @@ class InstrumentMonitor:
         self._camera_present = camera_present
         self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
         self._samples_from_ns = 0
-        self.laser: LaserStatus | None = None
+        self.laser: LaserReport | None = None
         self.reconstruction: ReconstructionStatus | None = None
         self.position_mm = float("nan")
         self.at_rest = False
@@ -75,7 +75,7 @@ class InstrumentMonitor:
         names = ("reconstruction", "camera", "laser", "stage")
         self._ages = {name: StampAges(name) for name in names}
 
-    def update_laser(self, status: LaserStatus, age_s: float) -> None:
+    def update_laser(self, status: LaserReport, age_s: float) -> None:
         """Store the laser's newest status, which arrived ``age_s`` after its stamp."""
         self.laser, self._laser_s = status, time.monotonic()
         self._ages["laser"].add(age_s)

@@ -9,7 +9,7 @@ import pytest
 from eschorty_ros.control.heartbeat import place
 from eschorty_ros.control.instrument_monitor import (
     InstrumentMonitor,
-    LaserStatus,
+    LaserReport,
     ReconstructionStatus,
 )
 from eschorty_ros.control.paced_waiting import PacedWaiting
@@ -18,7 +18,7 @@ from eschorty_ros.control.scan_sequence import ScanFailure
 
 def monitor(**ages_s):
     made = InstrumentMonitor(lambda: True)
-    made.update_laser(LaserStatus(0, 70.0, 0.5, ""), ages_s.get("laser", 0.01))
+    made.update_laser(LaserReport(0, 70.0, 0.5, ""), ages_s.get("laser", 0.01))
     made.update_stage(1, 10.0, 0.0, ages_s.get("stage", 0.01))
     status = ReconstructionStatus(1, 0.0, 0, 0, "", ages_s.get("camera", 0.01))
     made.update_reconstruction(status, ages_s.get("reconstruction", 0.01))

@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 from eschorty_ros.action import MoveStage
 from eschorty_ros.control.instrument_monitor import (
     InstrumentMonitor,
-    LaserStatus,
+    LaserReport,
     ReconstructionStatus,
 )
 from eschorty_ros.control.laser_interlock import CLIENT_HEARTBEAT
@@ -387,7 +387,7 @@ def _subscribe(node: Node, monitor: InstrumentMonitor) -> None:
         laser.check(info)
         reason = check_text("reason", message.reason)
         monitor.update_laser(
-            LaserStatus(message.output, message.frequency, message.duty, reason),
+            LaserReport(message.output, message.frequency, message.duty, reason),
             age_s(node, info, ns_from_stamp(message.header.stamp)),
         )
 
