@@ -13,6 +13,7 @@ import click
 from eschorty_ros.cli.console import pairs, progress_bar, show, table
 from eschorty_ros.cli.files import OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
+from eschorty_ros.cli.options import refuse_given
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.optics import SHIPPED
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 # Targets side by side in a profile of a moving target when roll or smile is fitted.
 _BLOCKS = 8
+_OF_SOURCES = ("moving", "range_per_stage", "free", "prior", "robust", "row_sigma")
 
 
 @click.command("calibrate")
@@ -168,11 +170,19 @@ def command(
       2  wrong usage
     """  # noqa: D301
     if fake:
-        if sources or moving is not None or free or prior or robust is not None:
-            raise click.UsageError("--fake takes no SOURCE, --moving, --free, --prior or --robust")
+        if sources:
+            raise click.UsageError("--fake takes no SOURCE")
+        refuse_given(_OF_SOURCES, "is for a SOURCE; --fake takes none")
+        if distances is None:
+            refuse_given(["range_sigma"], "belongs to --distances")
         _check_out(out)
         _calibrate_simulated(_known(distances, range_sigma), nominal, as_built, method, out)
         return
+    refuse_given(["as_built"], "belongs to --fake")
+    if all(source.is_dir() for source in sources):
+        refuse_given(["row_sigma"], "is for a targets.csv")
+    if moving is None:
+        refuse_given(["range_per_stage"], "belongs to --moving")
     _check_usage(sources, out, distances, moving)
     priors = _priors(prior)
     from eschorty_ros.core.calibration import COLUMN_TERMS, Targets, calibrate, read_targets
@@ -347,7 +357,7 @@ def _calibrate_simulated(
     if outcome.calibration is None or outcome.targets is None:
         raise FitError(outcome.message)
     report = calibrate(outcome.targets, design, method, date=outcome.calibration.date)
-    _finish(report, {"targets from": "nine simulated posts", "design": nominal}, out)
+    _finish(report, {"targets from": f"{len(known)} simulated posts", "design": nominal}, out)
     shown = {f"target {entry.label}: {entry.reason}" for entry in report.rejected}
     for line in outcome.rejected:
         if line not in shown:

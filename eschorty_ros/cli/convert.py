@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from eschorty_ros.cli.console import progress_bar
-from eschorty_ros.cli.options import bag_options
+from eschorty_ros.cli.options import BAG_OPTIONS, bag_options, refuse_given
 
 STORAGES = ("mcap", "sqlite3")
 
@@ -51,11 +51,11 @@ def command(
     from eschorty_ros.live.bag_files import is_bag
 
     if is_bag(source):
+        refuse_given(["storage"], "is for a bag that is written; TARGET is a recording")
         recording_of(source, target, frequency, calibration, packet_period)
         click.echo(str(target))
         return
-    if frequency is not None or calibration is not None:
-        raise click.UsageError("--frequency and --calibration are for a bag; SOURCE is none")
+    refuse_given(BAG_OPTIONS, "is for a bag; SOURCE is none")
     recording = load_recording(source)
     with progress_bar("converting") as report:
         recording_to_bag(recording, target, storage, lambda share: report(share, ""))

@@ -69,7 +69,7 @@ def command(
     points = read_cloud(cloud)
     measured = measure(points, chosen, common_mm)
     if as_json:
-        click.echo(json.dumps(_facts(measured)))
+        click.echo(json.dumps(_finite(_facts(measured))))
     else:
         _print(measured, cloud.name)
     if out is not None:
@@ -100,6 +100,15 @@ def _facts(measured: Measured) -> dict[str, Any]:
         for number, pair in enumerate(measured.pairs, 2)
     ]
     return {"surfaces": surfaces, "pairs": pairs}
+
+
+def _finite(value: Any) -> Any:
+    """Return what JSON can hold: null instead of a number that is unknown."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _ends(surface: Surface, axis: int) -> tuple[int, int]:

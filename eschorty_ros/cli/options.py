@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import click
@@ -73,6 +73,9 @@ def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
+BAG_OPTIONS = ("frequency", "calibration", "packet_period")
+
+
 def bag_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that replace topics which a bag lacks to a command."""
     for option in (
@@ -96,6 +99,18 @@ def bag_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         command = option(command)
     return command
+
+
+def given(names: Iterable[str]) -> list[str]:
+    """Return those options of the command that runs that stand on the command line."""
+    source = click.get_current_context().get_parameter_source
+    return [name for name in names if source(name) is not click.core.ParameterSource.DEFAULT]
+
+
+def refuse_given(names: Iterable[str], reason: str) -> None:
+    """Refuse options that stand on the command line without effect as wrong usage."""
+    if without_effect := given(names):
+        raise click.UsageError(f"--{without_effect[0].replace('_', '-')} {reason}")
 
 
 def check_sweep(start_mm: float, stop_mm: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -17,7 +17,7 @@ from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals
-from eschorty_ros.cli.options import bag_options
+from eschorty_ros.cli.options import BAG_OPTIONS, bag_options, given, refuse_given
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
@@ -137,16 +137,18 @@ def command(
             raise click.BadParameter(
                 f"{recording} is a file; give a recording's folder or a bag; {RAW_ALONE}"
             )
-        if not bag and (of_bags := _chosen(("frequency", "calibration", "packet_period"))):
-            option = of_bags[0].replace("_", "-")
-            raise click.UsageError(f"--{option} is for a bag; {recording} is none")
+        if not bag:
+            refuse_given(BAG_OPTIONS, f"is for a bag; {recording} is none")
     targets = [out or _target(recording) for recording in recordings]
+    if several and len(set(targets)) < len(targets):
+        twice = next(target for target in targets if targets.count(target) > 1)
+        raise click.UsageError(f"two recordings would be written to {twice}; give them one by one")
     if targets[0].suffix not in (".pcd", ".ply"):
         raise click.BadParameter(f"{out} ends in neither .pcd nor .ply", param_hint="--out")
     task = partial(
         reconstruct_to,
         jobs=jobs,
-        given={name: settings[name] for name in _chosen(settings)},
+        given={name: settings[name] for name in given(settings)},
         frequency=frequency,
         calibration=calibration,
         packet_period_ms=packet_period,
@@ -289,12 +291,6 @@ def _print(
             **({} if measured is None else accuracy_rows(measured)),
         },
     )
-
-
-def _chosen(names: Iterable[str]) -> list[str]:
-    """Return those options that stand on the command line."""
-    source = click.get_current_context().get_parameter_source
-    return [name for name in names if source(name) is not click.core.ParameterSource.DEFAULT]
 
 
 def summary(result: Result) -> dict[str, Any]:

@@ -71,6 +71,8 @@ def command(
         raise click.UsageError(
             "give CLOUD, with --window or --browser, or --live, with --allow-scan, without it"
         )
+    if out is not None and (window or browser or live):
+        raise click.UsageError("--out is the picture; --window, --browser and --live draw none")
     if cloud is None:
         _serve_instrument(allow_scan, host, port)
     else:

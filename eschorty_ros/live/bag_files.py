@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,6 +154,7 @@ class BagWriter:
         if path.exists():
             raise ArgumentError(f"{path} exists; give the name of a new bag")
         module = _rosbags("rosbag2")
+        self._path = path
         self._store = _store()
         plugin = module.StoragePlugin[storage.upper()]
         self._writer = module.Writer(path, version=8, storage_plugin=plugin)
@@ -164,8 +166,13 @@ class BagWriter:
         self._writer.open()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._writer.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self._writer.close()
+        finally:
+            if kind is not None:
+                # Half a bag would look complete.
+                shutil.rmtree(self._path, ignore_errors=True)
 
     def write(self, kind: str, t_ns: int, **fields: Any) -> None:
         """Append a message; fields that are not given are 0 or empty."""

@@ -269,9 +269,10 @@ class Pipeline:
         self.stream.fit_edges(self.placer.track, now=True)
         scan = buffer.assemble(self._placed_again)
         where = scan.points, scan.stamp_ns // NS_PER_US, self.placer.track
-        lag = pass_lag(*where)
+        direction = self.calibration.stage_direction
+        lag = pass_lag(*where, direction)
         if lag is not None:
-            take_off_lag(*where, self.calibration.stage_direction, lag.lag_us)
+            take_off_lag(*where, direction, lag.lag_us)
         self.end_recording(scan.points)
         counts = _Counts(*map(sub, self._counts(), self._counts_at_begin))
         return ScanReport(

@@ -183,6 +183,10 @@ def test_wrong_usage_is_exit_code_2(targets_csv, tmp_path):
         ((tmp_path / "rec",), "give --distances or --moving"),
         ((tmp_path / "rec", "--distances", "1", "--moving", 5), "give --distances or --moving"),
         ((), "no SOURCE"),
+        ((targets_csv, "--as-built", "config_3"), "--as-built belongs to --fake"),
+        ((targets_csv, "--range-per-stage", 0.5), "--range-per-stage belongs to --moving"),
+        ((tmp_path / "rec", "--moving", 5, "--row-sigma", 1), "is for a targets.csv"),
+        (("--fake", "--range-sigma", 2), "--range-sigma belongs to --distances"),
     ):
         done = run(*arguments)
         assert done.exit_code == 2, done.output

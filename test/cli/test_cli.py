@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import io
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from numba.core.event import install_recorder
+from waiting import wait_until
 
 from eschorty_ros import __version__
 from eschorty_ros.cli import COMMANDS, INTERRUPTED, main
@@ -113,6 +115,8 @@ def test_help_imports_nothing_heavy():
         ("reconstruct", "/nowhere"),
         ("simulate", "--frequency", "fast", "--out", "x"),
         ("design", "--theta-prime-deg", "-7", "--far-mm", "2000"),
+        ("view", __file__, "--browser", "--out", "x.png"),
+        ("convert", __file__, "x", "--packet-period", "9"),
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments):
@@ -374,19 +378,20 @@ def test_design_shows_digits_at_any_size():
     assert row == ["30.0", "0.0", "0.0104", "0.00909", "0.0270", "11.6"]
 
 
-def test_without_a_terminal_progress_is_a_line_when_it_has_changed(monkeypatch, capsys):
+def test_without_a_terminal_progress_is_a_line_when_it_has_changed(monkeypatch):
     monkeypatch.setattr("eschorty_ros.cli.console.LINE_EVERY_S", 0.01)
-    printed = ""
+    shown = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", shown)
     with progress_bar("working") as report:
         for share, note, line in (
             (0.25, "", "working: 25%\n"),
             (1.0, "writing", "working: 99% writing\n"),
         ):
             report(share, note)
-            while not printed.endswith(line):
-                printed += capsys.readouterr().err
+            wait_until(lambda line=line: shown.getvalue().endswith(line), line)
+        printed = shown.getvalue()
         time.sleep(0.1)
-    assert not capsys.readouterr().err
+    assert shown.getvalue() == printed
 
 
 def test_design_prints_the_nominal_build_and_plots_it(tmp_path):

@@ -68,6 +68,16 @@ def test_a_recording_a_bag_and_back(tmp_path, request, which, storage):
     assert again.calibration == recording.calibration
 
 
+def test_an_interrupted_conversion_leaves_no_bag(tmp_path, source):
+    def interrupt(share):
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        recording_to_bag(source, tmp_path / "bag", progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_bag_of_another_camera_driver_needs_frequency_and_calibration(tmp_path, source):
     """Only the driver's events and an odometry, and no clock but the packets' stamps."""
     recording = replace(source, modulation=replace(source.modulation, on_edge_us=None))

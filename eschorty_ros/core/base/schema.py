@@ -42,6 +42,9 @@ class FaultsError(ArgumentError):
         self.faults = faults
         super().__init__(_first(faults))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.faults,)
+
 
 class Within(NamedTuple):
     """Bounds of a number: ``low`` and ``high`` belong to them, ``above`` and ``below`` do not.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,11 +167,15 @@ class _Columns:
         near = np.arange(max(round(column - reach), 0), round(column + reach) + 1)
         near = near[near < self.columns]
         near = near[self.lit[near]]
+        if not near.size:
+            return math.nan, math.nan
         row = self.row[near]
         kept = np.abs(row - np.median(row)) <= _ROW_JUMP_PX
         offset = (near - column) / max(reach, 1.0)
         for _ in range(3):
             count = int(kept.sum())
+            if not count:
+                return math.nan, math.nan
             design = np.vander(offset, 3 if count >= _CURVED_MIN else 1, increasing=True)
             used = design[kept]
             weights, *_ = np.linalg.lstsq(used, row[kept], rcond=None)

@@ -105,6 +105,7 @@ def _cut(
         if np.array_equal(kept, before):
             break
         part = Problem(observed.select(kept), design, names, priors, values)
+        refuse_singular(part, values)
         values = search(part, values)
         every = Problem(observed, design, names, priors, values)
         distance = every.whitened(values)

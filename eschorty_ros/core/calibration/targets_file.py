@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from eschorty_ros.core.base.arrays import file_path
-from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.base.errors import ArgumentError, FormatError
 from eschorty_ros.core.base.files import atomic_write, read_regular_file
 from eschorty_ros.core.base.numbers import short
 from eschorty_ros.core.calibration.post_matching import KnownTarget
@@ -53,7 +53,7 @@ def read_targets(
       lines that begin with ``#`` are comments.
     - ``sigma_row_px``, ``sigma_range_mm``: Standard deviations where the file gives none.
 
-    Raises ``FormatError``, which names file, line, column and value.
+    Raises ``FormatError``, which names file, line or label, column and value.
     Targets are labelled ``line N`` where the file has no label.
     """
     table = _read(file_path("path", path), TARGET_COLUMNS, ("row", "range_mm"))
@@ -67,7 +67,11 @@ def read_targets(
         _COLUMNS[name]: [line.number(name, default.get(name, math.nan)) for line in table]
         for name in _COLUMNS
     }
-    return Targets(**numbers, labels=[line.text("label") or f"line {line.at}" for line in table])
+    labels = [line.text("label") or f"line {line.at}" for line in table]
+    try:
+        return Targets(**numbers, labels=labels)
+    except ArgumentError as error:
+        raise FormatError(f"{table[0].path}: {error}") from error
 
 
 def write_targets(path: str | os.PathLike[str], targets: Targets) -> None:
@@ -99,7 +103,14 @@ def read_distances(
     Raises ``FormatError``, which names file, line, column and value.
     """
     return [
-        KnownTarget(
+        _known(line, sigma_range_mm)
+        for line in _read(file_path("path", path), DISTANCE_COLUMNS, ("range_mm",))
+    ]
+
+
+def _known(line: _Line, sigma_range_mm: float) -> KnownTarget:
+    try:
+        return KnownTarget(
             line.number("range_mm"),
             line.number("range_sigma_mm", sigma_range_mm),
             line.number("size_mm"),
@@ -107,8 +118,8 @@ def read_distances(
             line.number("row"),
             line.text("label"),
         )
-        for line in _read(file_path("path", path), DISTANCE_COLUMNS, ("range_mm",))
-    ]
+    except ArgumentError as error:
+        raise FormatError(f"{line.path} line {line.at}: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,14 +149,15 @@ class _Line:
 
 
 def _read(path: Path, known: Sequence[str], needed: Sequence[str]) -> list[_Line]:
+    reader = csv.reader(io.StringIO(_text(path)), strict=True)
     try:
         lines = [
-            (at, [cell.strip() for cell in cells])
-            for at, cells in enumerate(csv.reader(io.StringIO(_text(path))), 1)
+            (reader.line_num, [cell.strip() for cell in cells])
+            for cells in reader
             if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#")
         ]
     except csv.Error as cause:
-        raise FormatError(f"{path}: {cause}; give a CSV file") from cause
+        raise FormatError(f"{path} line {reader.line_num}: {cause}; give a CSV file") from cause
     if not lines:
         raise FormatError(f"{path}: it has no lines; begin with the header {','.join(needed)}")
     header = lines[0][1]

@@ -558,6 +558,10 @@ def _fitted_shape(
     Least squares on the middle of each reading's interval, with the plan's own values as a prior
     of 2 % in speed and 30 % in acceleration. ``None`` where the readings are too few.
     """
+    # A reading beyond the target, such as one of an overshoot, is passed at no time.
+    passing_s = plan.passing_s(positions)
+    reached = np.isfinite(passing_s)
+    positions, earliest_s, latest_s = positions[reached], earliest_s[reached], latest_s[reached]
     if positions.size < _SHAPE_READINGS_MIN or len(plan.durations_s) != 3:
         return None
     acceleration = abs(plan.accelerations_mm_s2[0])
@@ -586,8 +590,6 @@ def _fitted_shape(
         prior = (log_speed / _SPEED_SIGMA, log_acceleration / _ACCELERATION_SIGMA)
         return np.concatenate((late, prior))
 
-    start_s = float(np.median(middle - plan.passing_s(positions)))
-    if not math.isfinite(start_s):
-        return None
+    start_s = float(np.median(middle - passing_s[reached]))
     fit = least_squares(residuals, (start_s, 0.0, 0.0), diff_step=1e-5, x_scale="jac")
     return shaped(fit.x[1], fit.x[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import time
@@ -127,9 +128,9 @@ def reconstruct_recording(
         cloud.add(reconstructor.flush())
         profiles, points, organized = cloud.joined()
     origin_us = reconstructor.first_t_us or 0
-    lag = pass_lag(points, origin_us, recording.stage)
+    direction = recording.calibration.stage_direction
+    lag = pass_lag(points, origin_us, recording.stage, direction)
     if lag is not None:
-        direction = recording.calibration.stage_direction
         for part in (points,) if organized is None else (points, organized.reshape(-1)):
             take_off_lag(part, origin_us, recording.stage, direction, lag.lag_us)
         profiles = replace(profiles, t_us=profiles.t_us - round(lag.lag_us))
@@ -265,7 +266,8 @@ def recorded_settings(recording: Recording) -> Settings:
     FormatError
         When the recording's settings are not those of a reconstruction.
     """
-    return Settings.from_file(recording.settings, recording.path / SETTINGS_FILE)
+    settings = Settings.from_file(recording.settings, recording.path / SETTINGS_FILE)
+    return settings.allowed(recording.modulation)
 
 
 def _push(
@@ -289,7 +291,10 @@ def _push(
 
 
 def stage_speed_mm_s(recording: Recording) -> float:
-    """Return the stage's median speed towards +y while it cruises; 0 when it rests."""
+    """Return the stage's median speed while it cruises; 0 when it rests.
+
+    Positive where the first pass is towards +y.
+    """
     first_us, last_us = recording.stage.first_us, recording.stage.last_us
     if first_us is None or last_us is None or last_us == first_us:
         return 0.0
@@ -297,7 +302,8 @@ def stage_speed_mm_s(recording: Recording) -> float:
     with np.errstate(invalid="ignore", divide="ignore"):
         speed = np.diff(recording.stage.position_mm(t_us)) / np.diff(t_us) * 1e6
     speed = speed[np.isfinite(speed)]
-    moving = np.abs(speed) > _MOVING_SHARE * np.abs(speed).max(initial=0.0)
-    if not moving.any():
+    cruising = speed[np.abs(speed) > _MOVING_SHARE * np.abs(speed).max(initial=0.0)]
+    if not cruising.size:
         return 0.0
-    return float(np.median(speed[moving])) * recording.calibration.stage_direction[1]
+    along_mm_s = math.copysign(float(np.median(np.abs(cruising))), cruising[0])
+    return along_mm_s * recording.calibration.stage_direction[1]

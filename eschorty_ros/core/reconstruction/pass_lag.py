@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from eschorty_ros.core.clocks import StageTrack
-from eschorty_ros.core.reconstruction.profiles import add_stage
+from eschorty_ros.core.reconstruction.profiles import add_stage, stage_offset_m
 
 # Columns of a cell; bands of columns, the scatter of whose lags gives the deviation of their mean.
 _COLUMNS = 8
@@ -60,7 +60,9 @@ class _Samples(NamedTuple):
     range_mm: NDArray[np.float64]
 
 
-def pass_lag(points: NDArray[np.void], origin_us: int, track: StageTrack) -> PassLag | None:
+def pass_lag(
+    points: NDArray[np.void], origin_us: int, track: StageTrack, stage_direction: ArrayLike
+) -> PassLag | None:
     """Return how late the points of passes in both directions are.
 
     Parameters
@@ -70,6 +72,7 @@ def pass_lag(points: NDArray[np.void], origin_us: int, track: StageTrack) -> Pas
     origin_us : int
         Time of the track at which their ``t`` is 0.
     track : StageTrack
+    stage_direction : array_like, shape (3,)
 
     Returns
     -------
@@ -79,7 +82,7 @@ def pass_lag(points: NDArray[np.void], origin_us: int, track: StageTrack) -> Pas
     some = _speed_mm_us(points[:: 1 + len(points) // _POINTS_SEEN], origin_us, track)
     if np.unique(np.sign(some[_cruises(some)])).size < 2:
         return None
-    samples = _samples(points, origin_us, track)
+    samples = _samples(points, origin_us, track, stage_direction)
     lag = PassLag(0.0, np.inf)
     for _ in range(_ROUNDS):
         left = _lag_left(samples, lag.lag_us)
@@ -123,18 +126,21 @@ def _cruises(speed_mm_us: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.abs(speed_mm_us) > 0.5 * np.abs(speed_mm_us).max(initial=0.0)
 
 
-def _samples(points: NDArray[np.void], origin_us: int, track: StageTrack) -> _Samples:
+def _samples(
+    points: NDArray[np.void], origin_us: int, track: StageTrack, stage_direction: ArrayLike
+) -> _Samples:
     """Return the good points of a cruising stage, of many points those of some blocks."""
     every = 1 + len(points) // _POINTS_MAX
     used = points[(points["flags"] == 0) & (points["column"] // _COLUMNS % every == 0)]
     speed = _speed_mm_us(used, origin_us, track)
     cruising = _cruises(speed)
     used = used[cruising]
+    stage_mm = track.position_mm(_times_us(used, origin_us))
     return _Samples(
-        track.position_mm(_times_us(used, origin_us)),
+        stage_mm,
         speed[cruising],
         used["column"].astype(np.int64) // _COLUMNS,
-        used["x"] * 1e3,
+        (used["x"] - stage_offset_m(stage_mm, stage_direction)[0]) * 1e3,
     )
 
 

@@ -74,7 +74,7 @@ class ScanLog(Schema):
     scan_id: str
     start_mm: float
     stop_mm: float
-    stage_gap_s: float = 0.0
+    stage_gap_s: Annotated[float, Within(0.0, 1e9)] = 0.0
     state: Literal["recording", "ended"] = "recording"
     packets_lost: Annotated[int, Within(0)] = 0
     packets_left_out: Annotated[int, Within(0)] = 0

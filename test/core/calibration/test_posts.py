@@ -94,6 +94,17 @@ def test_hot_and_dead_pixels_and_dark_columns_do_not_matter(frame):
         assert abs(one.width_px - other.width_px) < 0.1
 
 
+def test_a_post_whose_middle_is_dark_is_none():
+    rng = np.random.default_rng(9)
+    frame = AggregateFrame(200, 720)
+    columns = np.arange(50, 91)
+    # Weak in five columns around the middle, which itself is dark.
+    for x, events in zip(columns, np.where(np.abs(columns - 70) <= 2, 15, 120), strict=True):
+        y = np.rint(rng.normal(300.0, 6.0, events if x != 70 else 0)).astype(np.uint16)
+        frame.add(SimpleNamespace(x=np.full(y.size, x, np.uint16), y=y))
+    assert find_posts(frame) == []
+
+
 def test_a_dark_frame_holds_no_posts():
     frame = AggregateFrame(1280, 720)
     assert find_posts(frame) == []

@@ -60,6 +60,8 @@ def test_distances_with_sizes_and_hints(tmp_path):
     assert (near.range_mm, near.size_mm, near.column, near.label) == (820.0, 12.7, 100.0, "near")
     assert (near.sigma_range_mm, far.label, far.hinted) == (1.0, "2050 mm", False)
     assert np.isnan(far.size_mm)
+    with pytest.raises(FormatError, match=r"line 2: range_mm is -5.0; choose a positive"):
+        read_distances(written(tmp_path, "range_mm\n-5\n"))
 
 
 @pytest.mark.parametrize(
@@ -75,6 +77,8 @@ def test_distances_with_sizes_and_hints(tmp_path):
         ("row,range_mm\n1,abc\n", "line 2: range_mm is 'abc'; write a number"),
         ("row,range_mm\n1,nan\n", "line 2: range_mm is 'nan'; write a number"),
         ("row,range_mm\n1,1e999\n", "line 2: range_mm is '1e999'"),
+        ("row,range_mm\n1,-5\n", "range_mm of target line 2 is -5; choose a positive range"),
+        ('row,range_mm,label\n1,2,"left\n3,4,\n', "line 3: unexpected end of data"),
         ("row;range_mm\n1;2\n", "column 'row;range_mm' is not known"),
         (b"\xff\xfe\x00", "not text; give a CSV file"),
     ],

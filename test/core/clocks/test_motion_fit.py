@@ -91,6 +91,10 @@ def test_other_acceleration_and_speed_are_found() -> None:
     fit, _ = sweep(Line(50.0, 1.0, 3), true)
     assert worst_um(fit, true) < 100.0
     assert fit.residual_mm < 0.02
+    # An overshoot, which the model of the motion never reaches.
+    past_ns = true.end_ns + 210_000_000
+    fit.add_reading(true.end_mm + 0.003, past_ns + 500_000, past_ns - 500_000)
+    assert worst_um(fit, true) < 100.0
 
 
 def test_wrong_readings_are_outliers_and_leave_no_error() -> None:

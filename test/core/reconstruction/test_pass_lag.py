@@ -11,6 +11,7 @@ from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import save_calibration
 from eschorty_ros.core.reconstruction import (
+    add_stage,
     pass_lag,
     reconstruct_recording,
     recorded_settings,
@@ -22,6 +23,7 @@ from eschorty_ros.core.storage import (
     write_laser_yaml,
     write_stage_csv,
 )
+from eschorty_ros.report.accuracy import stage_and_range_mm
 
 SPEED_MM_US = 300e-6
 PROFILES = 60
@@ -55,7 +57,7 @@ def blurred_step_mm(stage_mm, column):
     return 1300.0 + np.clip((stage_mm - 310.0) / 3.5, -1.0, 1.0)
 
 
-def scan(lag_us: float, passes: int = 2, surface=surface_mm, origin_us: int = 5_000_000):
+def scan(lag_us, passes=2, surface=surface_mm, origin_us=5_000_000, direction=(0.0, 1.0, 0.0)):
     """Return points that show the surface of ``lag_us`` ago, with the stage and their ranges."""
     period_us = 14_000
     stage = track(PROFILES * period_us, passes)
@@ -64,26 +66,27 @@ def scan(lag_us: float, passes: int = 2, surface=surface_mm, origin_us: int = 5_
     seen_mm = surface(stage.position_mm(t_us - round(lag_us)), column)
     points = np.zeros(t_us.size, POINT_DTYPE)
     points["x"] = (seen_mm + np.random.default_rng(3).normal(0.0, 0.2, t_us.size)) * 1e-3
-    points["y"], points["t"], points["column"] = (
-        1e-3 * stage.position_mm(t_us), (t_us - origin_us) * 1e-6, column
-    )  # fmt: skip
-    return points, origin_us, stage
+    points["t"], points["column"] = (t_us - origin_us) * 1e-6, column
+    add_stage(points, stage.position_mm(t_us), direction)
+    return points, origin_us, stage, direction
 
 
 @pytest.mark.parametrize("surface", [surface_mm, step_mm])
 @pytest.mark.parametrize("lag_us", [-2600.0, 400.0, 6000.0])
-def test_the_lag_of_two_passes_is_found_and_taken_off(lag_us, surface):
-    points, origin_us, stage = scan(lag_us, surface=surface)
-    found = pass_lag(points, origin_us, stage)
+@pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.28, 0.96, 0.0)])
+def test_the_lag_of_two_passes_is_found_and_taken_off(lag_us, surface, direction):
+    points, origin_us, stage, _ = scan(lag_us, surface=surface, direction=direction)
+    found = pass_lag(points, origin_us, stage, direction)
     assert found.lag_us == pytest.approx(lag_us, rel=0.02, abs=4.0 * found.sigma_us)
     assert found.sigma_us < 30.0
     t_s = points["t"].copy()
-    take_off_lag(points, origin_us, stage, (0.0, 1.0, 0.0), found.lag_us)
+    take_off_lag(points, origin_us, stage, direction, found.lag_us)
     np.testing.assert_allclose(t_s - points["t"], found.lag_us * 1e-6, atol=1e-6)
-    error_mm = 1e3 * points["x"] - surface(1e3 * points["y"], points["column"])
+    stage_mm, range_mm = stage_and_range_mm(points, direction)
+    error_mm = range_mm - surface(stage_mm, points["column"])
     assert abs(np.median(error_mm)) < 0.02, "seed 3"
     assert np.quantile(np.abs(error_mm), 0.6827) < 0.23
-    left = pass_lag(points, origin_us, stage)
+    left = pass_lag(points, origin_us, stage, direction)
     assert left is None or abs(left.lag_us) < 50.0
 
 
@@ -94,8 +97,8 @@ def test_the_lag_of_two_passes_is_found_and_taken_off(lag_us, surface):
 )
 def test_a_lag_that_nothing_shows_is_none(options):
     assert pass_lag(*scan(**{"lag_us": 2000.0, **options})) is None
-    points, origin_us, stage = scan(2000.0)
-    assert pass_lag(points[:0], origin_us, stage) is None
+    points, *where = scan(2000.0)
+    assert pass_lag(points[:0], *where) is None
 
 
 @pytest.mark.parametrize("organized", ["off", "on"])

@@ -1,6 +1,7 @@
 """Reflectance steps that cross the line: shift with and without compensation."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from eschorty_experiments._crossing import SPEED_MM_S, Crossing, crossing
 from independent_pixels import FIRST_EDGE_US, Camera, stream, wavy
 from reconstructing import assert_same, reconstruct
 
+from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import (
@@ -217,3 +219,11 @@ def test_recording_of_a_striped_plane_either_way(tmp_path, frequency_hz, start_m
     # What is left holds the rows' own scatter, some 0.3 px.
     left = np.sqrt(max(rms["on"] ** 2 - 0.3**2, 0.0)) / np.sqrt(rms["off"] ** 2 - 0.3**2)
     assert left < 0.55, f"seed {SEED}: {rms}"
+
+
+def test_the_speed_of_a_stage_that_goes_forth_and_back_is_that_of_one_pass():
+    stage = StageTrack()
+    t_us = np.arange(0, 2_200_001, 10_000)
+    stage.append(t_us, np.interp(t_us, [0, 1_000_000, 1_100_000, 2_100_000], [10, 60, 60, 10]))
+    recording = SimpleNamespace(stage=stage, calibration=load_calibration("config_3"))
+    assert stage_speed_mm_s(recording) == pytest.approx(50.0, rel=0.01)
