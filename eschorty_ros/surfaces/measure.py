@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eschorty_ros.core.base.arrays import Array
+from eschorty_ros.core.base.arrays import Array, number
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.surfaces.grid import STEP_SIGMAS, CloudGrid, links, organise, smoothed
 from eschorty_ros.surfaces.plane import (
@@ -115,8 +115,11 @@ def measure(
     - ``common_mm``: Standard deviation of a range error that all points of a surface share, and by
       which its two ends differ; by default `COMMON_SHARE` of the points' own sigma.
 
-    Raises ``ArgumentError`` when the cloud is no sweep, or a region has too few points.
+    Raises ``ArgumentError`` when the cloud is no sweep, a region has too few points, or
+    ``common_mm`` is no number.
     """
+    if common_mm is not None:
+        number("common_mm", common_mm, 0.0)
     grid = organise(points)
     masks = [_mask(grid, region) for region in regions] or _found(grid)
     surfaces = tuple(_surface(grid, mask, common_mm) for mask in masks)

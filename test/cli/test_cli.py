@@ -406,6 +406,14 @@ def test_design_finds_the_tilt_for_two_ranges():
     assert run("design", "--near-mm", 900, "--far-mm", 800).exit_code == 1
 
 
+def test_two_recordings_with_one_target_are_wrong_usage(tmp_path):
+    for name in ("a.mcap", "a.db3"):
+        (tmp_path / name).write_bytes(b"")
+    done = run("reconstruct", tmp_path / "a.mcap", tmp_path / "a.db3")
+    assert done.exit_code == 2
+    assert "would be written to" in done.output
+
+
 @pytest.mark.parametrize("where", ["here", "cluster"])
 def test_a_bad_recording_does_not_end_the_others(recording, tmp_path, where):
     """Two good ones around one with a broken file; the clouds of a cluster are those made here."""

@@ -1,5 +1,6 @@
 """Recording folders: what is written is read back, what is wrong is named in one line."""
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eschorty_ros.core.base.errors import ArgumentError, EschortyError, FormatError
+from eschorty_ros.core.base.schema import Fault, FaultsError
 from eschorty_ros.core.clocks import StageTrack
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import load_calibration, save_calibration
+from eschorty_ros.core.reconstruction import recorded_settings
 from eschorty_ros.core.storage import (
     TRUTH_DTYPE,
     load_recording,
@@ -125,9 +128,27 @@ def remove(name: str) -> Callable[[Path], None]:
 LASER = "frequency_hz: 70.0\nduty: 0.5\nwaveform: square\n"
 
 
+SCAN = "scan_id: a\nstart_mm: 1\nstop_mm: 2\n"
+
+
+def test_settings_beyond_what_the_laser_allows_are_used_as_the_nodes_do(folder):
+    (folder / "settings.yaml").write_text("periods_per_profile: 1000\n")
+    assert recorded_settings(load_recording(folder)).periods_per_profile == 145
+
+
+def test_faults_survive_the_way_from_another_process():
+    error = FaultsError([Fault(("start_mm",), " is 'x'; write a number")] * 2)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
 @pytest.mark.parametrize(
     ("damage", "parts"),
     [
+        (
+            edit("scan.yaml", SCAN + "stage_gap_s: 1.0e+305\n"),
+            ["scan.yaml", "stage_gap_s is 1e+305"],
+        ),
+        (edit("scan.yaml", SCAN + "stage_gap_s: -5\n"), ["scan.yaml", "stage_gap_s is -5"]),
         (remove("events.raw"), ["events.raw is missing", "add it"]),
         (remove("stage.csv"), ["stage.csv is missing"]),
         (remove("laser.yaml"), ["laser.yaml is missing"]),
