@@ -31,6 +31,7 @@ from eschorty_ros.nodes.ros.lifecycle import DeviceNode
 from eschorty_ros.nodes.ros.parameters import Param, from_settings
 from eschorty_ros.nodes.ros.peers import Publishers
 from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 # Every change and, with light, every read-back is published, too.
 STATE_RATE_HZ = 2.0
@@ -126,7 +127,7 @@ class LaserNode(DeviceNode):
                 qos.heartbeat(),
                 callback_group=heartbeats,
             )
-        self.create_timer(1.0 / STATE_RATE_HZ, self._supervisor.report, clock=self.steady_clock)
+        steady_timer(self, 1.0 / STATE_RATE_HZ, self._supervisor.report)
         diagnostics.Diagnostics(self, self._report)
 
     def open_device(self) -> None:

@@ -8,14 +8,13 @@ from typing import Any
 
 from rclpy.action import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from eschorty_ros.action import Calibrate
 from eschorty_ros.core.calibration import read_distances
 from eschorty_ros.core.optics import config_file
 from eschorty_ros.nodes.reconstruction.calibration_messages import target_message
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 
 class AutoCalibration:
@@ -33,9 +32,7 @@ class AutoCalibration:
         self._client: ActionClient[Any, Any, Any] = ActionClient(
             node, Calibrate, "calibrate", callback_group=group
         )
-        self._timer = node.create_timer(
-            0.1, self._send, group, Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self._timer = steady_timer(node, 0.1, self._send, group)
 
     def _send(self) -> None:
         if self._client.server_is_ready():

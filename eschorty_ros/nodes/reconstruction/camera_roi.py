@@ -6,14 +6,13 @@ from typing import Any
 
 from rcl_interfaces.srv import SetParameters
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.reconstruction import Settings, region_window
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 _PERIOD_S = 0.2
 
@@ -38,8 +37,7 @@ class CameraRoi:
         self._set: Window | None = None
         self._call: tuple[Window, RepeatedCall] | None = None
         if follows:
-            steady = Clock(clock_type=ClockType.STEADY_TIME)
-            node.create_timer(_PERIOD_S, self._step, group, steady)
+            steady_timer(node, _PERIOD_S, self._step, group)
 
     def follow(self, settings: Settings, model: Any) -> None:
         """Follow the region of ``settings`` with the calibration's range model."""

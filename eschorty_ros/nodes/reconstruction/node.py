@@ -14,8 +14,6 @@ from typing import Any
 
 from event_camera_msgs.msg import EventPacket
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import TimeReference
 from tf2_msgs.msg import TFMessage
@@ -49,6 +47,7 @@ from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings
 from eschorty_ros.nodes.ros.peers import LatchedState, OnePublisher, age_s
 from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 _STAGE_DEPTH = 2000
 _STATE_S = 0.2
@@ -180,8 +179,7 @@ class ReconstructionNode(Node):
             self._tf_static = self.create_publisher(TFMessage, "/tf_static", qos.latched())
             now_ns = self.get_clock().now().nanoseconds
             self._tf_static.publish(TFMessage(transforms=transforms.mounts(now_ns)))
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_STATE_S, self._reports.publish_state, short, steady)
+        steady_timer(self, _STATE_S, self._reports.publish_state, short)
         self._diagnostics = diagnostics.Diagnostics(self, self._reports.diagnose, short)
 
     def safe_state(self) -> None:

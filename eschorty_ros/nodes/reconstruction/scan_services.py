@@ -9,8 +9,6 @@ from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from std_msgs.msg import Header
 
@@ -24,6 +22,7 @@ from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import UINT32_MAX, check_text, saturated
 from eschorty_ros.nodes.ros.conversions import mm_from_m
 from eschorty_ros.nodes.ros.peers import OnePublisher, publishers_fault
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 from eschorty_ros.srv import BeginScan, EndScan
 
 _END = "reconstruction/end_scan"
@@ -91,8 +90,7 @@ class ScanServices:
         node.create_subscription(
             Header, CLIENT_HEARTBEAT, self._on_heartbeat, qos.heartbeat(), callback_group=short
         )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_CHECK_S, self._check_client, short, steady)
+        steady_timer(node, _CHECK_S, self._check_client, short)
 
     def finish(self) -> None:
         """Publish an ended scan once all its points are placed; called in the worker."""

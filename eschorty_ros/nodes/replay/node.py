@@ -14,8 +14,6 @@ import numpy as np
 import rclpy
 from event_camera_msgs.msg import EventPacket
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import TimeReference
@@ -31,6 +29,7 @@ from eschorty_ros.nodes.ros.conversions import m_from_mm, ns_from_stamp, stamp_f
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.nodes.ros.spin import run
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 from eschorty_ros.nodes.ros.transforms import BASE, OPTICAL, STAGE
 from eschorty_ros.srv import BeginScan, EndScan
 
@@ -81,7 +80,7 @@ class ReplayNode(Node):
         self._zero_ns = 0
         self._next_row = 0
         self._failure: EschortyError | None = None
-        self.create_timer(0.05, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(self, 0.05, self._watch)
         self._player.start()
 
     def destroy_node(self) -> None:

@@ -8,11 +8,10 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from eschorty_ros.nodes.ros.border import refusals
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
@@ -55,12 +54,7 @@ class Diagnostics:
         self._report = report
         self._refused = 0
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        node.create_timer(
-            1.0,
-            self.publish,
-            callback_group=callback_group,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        steady_timer(node, 1.0, self.publish, callback_group)
 
     def publish(self) -> None:
         """Publish now; also called every second."""

@@ -7,12 +7,11 @@ import traceback
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from eschorty_ros.core.base.errors import DeviceError, DeviceNotReadyError, EschortyError
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 AUTO_START = Param("auto_start", True, "configure and activate at start")
 RETRY_S = 2.0
@@ -58,12 +57,9 @@ class DeviceNode(LifecycleNode):
         self._auto_starting = False
         self._logged = ""
         self._faulted = threading.Event()
-        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._fault_leaving = self.on_request(self._leave_after_fault)
         self._start_timer = (
-            self.create_timer(_SOON_S, self._auto_start, clock=self.steady_clock)
-            if self.parameters["auto_start"]
-            else None
+            steady_timer(self, _SOON_S, self._auto_start) if self.parameters["auto_start"] else None
         )
 
     def open_device(self) -> None:
@@ -115,7 +111,7 @@ class DeviceNode(LifecycleNode):
             timer.cancel()
             callback()
 
-        timer = self.create_timer(_SOON_S, once, clock=self.steady_clock, autostart=False)
+        timer = steady_timer(self, _SOON_S, once, autostart=False)
         reset: Callable[[], None] = timer.reset
         return reset
 

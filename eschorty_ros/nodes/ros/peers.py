@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, ROSClock
-from rclpy.clock_type import ClockType
+from rclpy.clock import ROSClock
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.nodes.ros import qos
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 _SILENCE_NS = 250_000_000
 _CHECK_S = 1.0
@@ -95,8 +95,7 @@ class LatchedState:
         self._take, self._forget = take, forget
         self._publisher: bytes = b""
         self.subscription = self._subscribed()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_CHECK_S, self.check, callback_group=group, clock=steady)
+        steady_timer(node, _CHECK_S, self.check, group)
 
     def check(self) -> None:
         """Forget the state if its publisher has ended."""

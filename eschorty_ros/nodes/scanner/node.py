@@ -12,8 +12,6 @@ from typing import Any
 
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from eschorty_ros.action import Scan
@@ -36,6 +34,7 @@ from eschorty_ros.nodes.ros.conversions import m_from_mm, mm_from_m, stamp_from_
 from eschorty_ros.nodes.ros.instrument_client import ScanClient
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.spin import ends, run, unless_shut_down
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
 TABLE = (
     Param("auto_scan", False, "do one scan as soon as the other nodes are ready"),
@@ -120,9 +119,7 @@ class ScannerNode(Node):
         diagnostics.Diagnostics(self, self._report, group)
         if self.parameters["auto_scan"]:
             self._self_client = ActionClient(self, Scan, "scan", callback_group=group)
-            self._auto_timer = self.create_timer(
-                0.1, self._auto_scan, group, Clock(clock_type=ClockType.STEADY_TIME)
-            )
+            self._auto_timer = steady_timer(self, 0.1, self._auto_scan, group)
 
     def safe_state(self) -> None:
         """End a scan under way: on its way out the laser goes off and its heartbeat stops."""

@@ -11,8 +11,6 @@ import numpy as np
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
@@ -26,6 +24,7 @@ from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.ros.conversions import m_from_mm
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.spin import run, unless_shut_down
+from eschorty_ros.nodes.ros.steady_timer import steady_timer
 from eschorty_ros.viewer.growing_cloud import GrowingCloud
 from eschorty_ros.viewer.page import HOST, PORT, Page
 from eschorty_ros.viewer.scan_control import Conditions, ScanControl, ScanValues
@@ -83,13 +82,9 @@ class ViewerNode(Node):
             self.create_client(kind, f"reconstruction/{name}", callback_group=group)
             for kind, name in ((GetParameters, "get_parameters"), (SetParameters, "set_parameters"))
         )
-        self.create_timer(
-            _SHOW_S, self._show, MutuallyExclusiveCallbackGroup(),
-            Clock(clock_type=ClockType.STEADY_TIME),
-        )  # fmt: skip
+        steady_timer(self, _SHOW_S, self._show, MutuallyExclusiveCallbackGroup())
         code = f", code {self._control.code} to start scans" if self._control.allowed else ""
-        self.notice = f"page at {self.page.url}{code}"
-        self.get_logger().info(self.notice)
+        self.get_logger().info(f"page at {self.page.url}{code}")
 
     def safe_state(self) -> None:
         """Cancel a scan of the page; the scanner switches the laser off also without it."""
