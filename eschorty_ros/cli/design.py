@@ -91,27 +91,21 @@ def command(
 
     if theta_prime_deg is not None and far_mm is not None:
         raise click.UsageError("give --theta-prime-deg or --far-mm, not both")
-    sensor: dict[str, Any] = {"pixel_um": pixel_um, "columns": columns, "rows": rows}
+    given: dict[str, Any] = {
+        "focal_length_mm": focal_mm,
+        "f_number": f_number,
+        "theta_deg": theta_deg,
+        "near_mm": near_mm,
+        "b_mm": b_mm,
+        "pixel_um": pixel_um,
+        "columns": columns,
+        "rows": rows,
+    }
     if far_mm is not None:
-        build = design_for_ranges(
-            focal_length_mm=focal_mm,
-            f_number=f_number,
-            theta_deg=theta_deg,
-            near_mm=near_mm,
-            far_mm=far_mm,
-            b_mm=b_mm,
-            **sensor,
-        )
+        build = design_for_ranges(far_mm=far_mm, **given)
     else:
-        build = design(
-            focal_length_mm=focal_mm,
-            f_number=f_number,
-            theta_deg=theta_deg,
-            theta_prime_deg=-7.77 if theta_prime_deg is None else theta_prime_deg,
-            near_mm=near_mm,
-            b_mm=b_mm,
-            **sensor,
-        )
+        tilt_deg = -7.77 if theta_prime_deg is None else theta_prime_deg
+        build = design(theta_prime_deg=tilt_deg, **given)
     near, far = build.range_limits_mm
     # A pole on the sensor puts the last row at infinity.
     last = far if np.isfinite(far) else 20.0 * near

@@ -15,7 +15,7 @@ import click
 from eschorty_ros.cli.cluster import on_cluster
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
-from eschorty_ros.cli.files import OUT_FILE
+from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
 from eschorty_ros.cli.options import BAG_OPTIONS, bag_options, given, refuse_given
 from eschorty_ros.core.base.errors import EschortyError
@@ -82,7 +82,7 @@ def setting_options() -> list[click.Parameter]:
     help="Reconstruct on the cluster of this dask scheduler, one task a recording.",
 )
 @bag_options
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@json_option
 def command(
     recordings: tuple[Path, ...],
     out: Path | None,

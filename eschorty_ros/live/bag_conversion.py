@@ -33,7 +33,7 @@ from eschorty_ros.live.bag_files import (
     BagWriter,
     stamp,
 )
-from eschorty_ros.live.device_messages import MM_PER_M, laser_settings, ns, pulse_train
+from eschorty_ros.live.device_messages import MM_PER_M, laser_settings, ns_from_stamp, pulse_train
 from eschorty_ros.live.packet_stream import PacketStream
 from eschorty_ros.live.packet_times import Packet, check_span
 from eschorty_ros.live.recorded_packets import timed_packets
@@ -142,7 +142,7 @@ def _latched(source: BagReader, stream: PacketStream, kinds: tuple[str, ...]) ->
 
 def _set(stream: PacketStream, kind: str, fields: Any) -> None:
     if kind == CLOCK:
-        stream.announce_zero(ns(fields.header.stamp) - ns(fields.time_ref))
+        stream.announce_zero(ns_from_stamp(fields.header.stamp) - ns_from_stamp(fields.time_ref))
     elif kind == TRIGGER:
         stream.set_pulses(pulse_train(fields))
     else:
@@ -156,7 +156,8 @@ def _play(
     for message in source.messages(EVENTS, ODOMETRY, *kinds):
         fields = message.fields
         if message.kind == ODOMETRY:
-            t_ns, position_mm = ns(fields.header.stamp), fields.pose.pose.position.y * MM_PER_M
+            t_ns = ns_from_stamp(fields.header.stamp)
+            position_mm = fields.pose.pose.position.y * MM_PER_M
             track.append(t_ns // NS_PER_US, position_mm)
             recorder.stage(t_ns, position_mm)
         elif message.kind in kinds:
@@ -167,7 +168,8 @@ def _play(
                     f"{source.path}: encoding is {short(fields.encoding)}; record evt3"
                 )
             check_span(fields.events)
-            packet = Packet(int(fields.seq), ns(fields.header.stamp), memoryview(fields.events))
+            t_ns = ns_from_stamp(fields.header.stamp)
+            packet = Packet(int(fields.seq), t_ns, memoryview(fields.events))
             stream.add(packet, message.t_ns * 1e-9)
             stream.process(message.t_ns * 1e-9)
             stream.fit_edges(track)

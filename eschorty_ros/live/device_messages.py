@@ -13,8 +13,8 @@ _OUTPUT_ON = 1
 _INTERVAL_M = 1e-6, 1.0
 
 
-def ns(time: Any) -> int:
-    """Return the ns of a ROS time."""
+def ns_from_stamp(time: Any) -> int:
+    """Return the int64 nanoseconds of a ROS time; exact."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
 
 
@@ -28,7 +28,11 @@ def laser_settings(state: Any) -> tuple[Modulation, int | None, int | None]:
     """
     modulation = Modulation(float(state.frequency), float(state.duty), str(state.waveform))
     on = state.output == _OUTPUT_ON
-    return modulation, ns(state.phase_epoch) or None, ns(state.output_since) if on else None
+    return (
+        modulation,
+        ns_from_stamp(state.phase_epoch) or None,
+        ns_from_stamp(state.output_since) if on else None,
+    )
 
 
 def pulse_train(trigger: Any) -> PulseTrain | None:

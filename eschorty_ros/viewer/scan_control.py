@@ -6,7 +6,7 @@ import hmac
 import secrets
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from eschorty_ros.core.base.errors import ArgumentError
@@ -45,13 +45,10 @@ class Conditions:
 
     def refusal(self) -> str:
         """Return why no scan may begin, ``""`` when it may."""
-        reasons = {
-            "scanner": "no scanner is there",
-            "laser": "the laser node does not report",
-        }
-        for field in fields(self):
-            if field.name in reasons and not getattr(self, field.name):
-                return reasons[field.name]
+        if not self.scanner:
+            return "no scanner is there"
+        if not self.laser:
+            return "the laser node does not report"
         if self.interlock_open:
             return "the laser's interlock is open"
         return "a scan is running; wait for its end or cancel it" if self.scanning else ""

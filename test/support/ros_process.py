@@ -26,7 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from waiting import DEADLINE_S, wait_until
 
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros.dds import use_profile
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.nodes.ros.executor import Spinning

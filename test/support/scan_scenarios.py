@@ -18,9 +18,9 @@ from sensor_msgs.msg import PointCloud2
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.storage import POINT_DTYPE
 from eschorty_ros.emulation.awg.model import read_output_log
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.report.accuracy import lit_columns, range_error_mm
 from eschorty_ros.simulation.scenes import Steps
 

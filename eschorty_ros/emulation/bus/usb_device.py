@@ -203,9 +203,7 @@ class EmulatedUsbDevice:
 
     def power_up(self) -> None:
         """Set the state after power-up; models extend it."""
-        self.stalled.clear()
-        for pipe in self._pipes.values():
-            pipe.clear()
+        self.reset()
 
     def free(self, owner: object) -> None:
         """Drop the claims of ``owner`` and end its reads."""

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.evt3 import words as w3
 
-Words = NDArray[np.uint16]
-
 _VECTOR_BITS = 12
 
 

@@ -119,7 +119,6 @@ class AwgProfile(Schema):
     """One family of generators; the keys are those of ``config/awg_*.yaml``."""
 
     name: Text
-    maker: str
     model: str
     usb: UsbIds
     terminator: str

@@ -30,28 +30,21 @@ class CalibrationJob:
     """The known targets of the scene."""
     folder: str
     """Folder for the calibration."""
-    scene: str = "posts"
     calibration: str = "config_3"
     as_built: str = "config_3_as_built"
     """The build as designed, and that of the simulated world."""
     method: str = "joint"
     capture_s: float = 1.0
-    frequency_hz: float = 70.0
-    seed: int = 0
-    pixels: str = "paper"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
     """The action's result."""
 
-    success: bool
     message: str
     """Reason of a failure, ``""`` on success."""
     calibration: Calibration | None
-    """As read back from ``file``."""
-    file: str
-    verdicts: tuple[str, ...]
+    """As read back from its file."""
     rejected: tuple[str, ...]
     targets: Targets | None
     """The targets found, to which it was fitted."""
@@ -66,14 +59,14 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
     """
     tables = bench_parameters()
     tables["reconstruction"] |= {"calibration": job.calibration, "calibration_folder": job.folder}
-    bench = bench_options(job.scene, job.as_built, job.seed, job.pixels)
+    bench = bench_options("posts", job.as_built, 0, "paper")
     with composition(tables, (Calibrate, "calibrate"), bench) as running:
         feedback(0.0, "starting")
         goal = Calibrate.Goal(
             targets=[target_message(target) for target in job.targets],
             method=job.method,
             capture_time=job.capture_s,
-            frequency=job.frequency_hz,
+            frequency=70.0,
         )
 
         def on_feedback(message: Any) -> None:
@@ -85,11 +78,8 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
 
         ended = running.result(goal, on_feedback)
     return CalibrationResult(
-        success=bool(ended.success),
         message=str(ended.message),
         calibration=load_calibration(ended.file) if ended.success else None,
-        file=str(ended.file),
-        verdicts=tuple(ended.verdicts),
         rejected=tuple(ended.rejected),
         targets=read_targets(targets_path(Path(ended.file))) if ended.success else None,
         frame=np.frombuffer(ended.frame.data, np.uint8).reshape(

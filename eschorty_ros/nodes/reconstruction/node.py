@@ -23,7 +23,7 @@ from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import Settings, warm_up
 from eschorty_ros.core.storage import ScanLog
 from eschorty_ros.live.calibration_capture import Capture
-from eschorty_ros.live.device_messages import laser_settings, pulse_train
+from eschorty_ros.live.device_messages import laser_settings, ns_from_stamp, pulse_train
 from eschorty_ros.live.job_queue import JobQueue
 from eschorty_ros.live.packet_times import Packet
 from eschorty_ros.live.pipeline import Pipeline
@@ -41,7 +41,7 @@ from eschorty_ros.nodes.reconstruction.reports import Reports
 from eschorty_ros.nodes.reconstruction.scan_services import ScanServices
 from eschorty_ros.nodes.ros import diagnostics, qos, transforms
 from eschorty_ros.nodes.ros.border import refusals
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stage_position_mm
+from eschorty_ros.nodes.ros.conversions import stage_position_mm
 from eschorty_ros.nodes.ros.executor import ShortGroup
 from eschorty_ros.nodes.ros.heartbeat import Heartbeat
 from eschorty_ros.nodes.ros.parameters import Parameters, from_settings

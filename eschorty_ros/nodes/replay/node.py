@@ -22,10 +22,11 @@ from eschorty_ros.core.base.errors import ArgumentError, DeviceError, EschortyEr
 from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.storage import Recording, load_recording
 from eschorty_ros.core.storage.raw_file import RawReader
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.live.recorded_packets import timed_packets
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import m_from_mm, ns_from_stamp, stamp_from_ns
+from eschorty_ros.nodes.ros.conversions import m_from_mm, stamp_from_ns
 from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.repeated_call import RepeatedCall
 from eschorty_ros.nodes.ros.spin import run

@@ -21,11 +21,6 @@ def stamp_from_ns(t_ns: int) -> Time:
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
-def ns_from_stamp(stamp: Time) -> int:
-    """Return the int64 nanoseconds of a message stamp; exact."""
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-
-
 def mm_from_m(metres: float) -> float:
     """Return a length in metres in millimetres."""
     return metres * 1e3

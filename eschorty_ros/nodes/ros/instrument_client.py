@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from action_msgs.msg import GoalStatus
 from lifecycle_msgs.srv import GetState
@@ -30,13 +30,13 @@ from eschorty_ros.control.paced_waiting import PacedWaiting
 from eschorty_ros.control.scan_sequence import ScanFailure, ScanRequest, ScanSummary
 from eschorty_ros.core.base.numbers import number
 from eschorty_ros.hardware.base.protocols import LaserOutput
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import check_text
 from eschorty_ros.nodes.ros.conversions import (
     m_from_mm,
     mm_from_m,
-    ns_from_stamp,
     stage_position_mm,
 )
 from eschorty_ros.nodes.ros.executor import ShortGroup
@@ -63,8 +63,13 @@ class InstrumentClient(PacedWaiting):
 
     - ``node_timeout_s``, ``service_timeout_s``, ``events_timeout_s``: Longest wait for the nodes to
       appear, for an answer, and for the events to continue.
-    - ``services``: Further services that a sequence needs, by name.
     """
+
+    SERVICES: ClassVar[Mapping[str, Any]] = {
+        "laser/set_parameters": SetParameters,
+        "laser/arm": Trigger,
+        "laser/enable": SetBool,
+    }
 
     def __init__(
         self,
@@ -72,7 +77,6 @@ class InstrumentClient(PacedWaiting):
         node_timeout_s: float,
         service_timeout_s: float,
         events_timeout_s: float,
-        services: Mapping[str, Any] | None = None,
     ) -> None:
         self._node = node
         topic = node.resolve_topic_name("camera/events")
@@ -84,16 +88,10 @@ class InstrumentClient(PacedWaiting):
             events_timeout_s,
         )
         self._subscribed = False
-        needed = {
-            "laser/set_parameters": SetParameters,
-            "laser/arm": Trigger,
-            "laser/enable": SetBool,
-            **(services or {}),
-        }
         group = ReentrantCallbackGroup()
         self._clients = {
             name: node.create_client(kind, name, callback_group=group)
-            for name, kind in needed.items()
+            for name, kind in self.SERVICES.items()
         }
         self._states = {
             name: _LifecycleState(
@@ -317,18 +315,11 @@ class InstrumentClient(PacedWaiting):
 class ScanClient(InstrumentClient):
     """Instrument client with the reconstruction's services; arguments as its base's."""
 
-    def __init__(
-        self,
-        node: Node,
-        node_timeout_s: float,
-        service_timeout_s: float,
-        events_timeout_s: float,
-    ) -> None:
-        services = {
-            "reconstruction/begin_scan": BeginScan,
-            "reconstruction/end_scan": EndScan,
-        }
-        super().__init__(node, node_timeout_s, service_timeout_s, events_timeout_s, services)
+    SERVICES: ClassVar[Mapping[str, Any]] = {
+        **InstrumentClient.SERVICES,
+        "reconstruction/begin_scan": BeginScan,
+        "reconstruction/end_scan": EndScan,
+    }
 
     def begin_scan(self, request: ScanRequest) -> None:
         """See ``ScanInstrument``; a scan that is still open is ended and published first."""

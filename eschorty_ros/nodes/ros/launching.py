@@ -24,11 +24,11 @@ from launch_ros.substitutions import ExecutableInPackage
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.hardware.base.launcher import launched_environment
+from eschorty_ros.nodes.ros.dds import RANGE
 from launch import LaunchContext, LaunchDescription
 
 PACKAGE = "eschorty_ros"
 NAMESPACE = "eschorty"
-_DISCOVERY = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 
 def description(arguments: Sequence[Any], check: Callable[[Mapping[str, str]], Any]) -> Any:
@@ -56,8 +56,8 @@ def description(arguments: Sequence[Any], check: Callable[[Mapping[str, str]], A
         for argument in arguments
     ]
     # On this host alone unless the environment states another range.
-    range_ = EnvironmentVariable(_DISCOVERY, default_value="LOCALHOST")
-    discovery = SetEnvironmentVariable(_DISCOVERY, range_)
+    range_ = EnvironmentVariable(RANGE, default_value="LOCALHOST")
+    discovery = SetEnvironmentVariable(RANGE, range_)
     return LaunchDescription([discovery, *declared, OpaqueFunction(function=described)])
 
 

@@ -13,8 +13,8 @@ from ros_process import Observer, processes, wait_until
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.emulation.bench.devices import Bench
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.domain import free_domain
 
 MODULE = "eschorty_ros.nodes.camera.node"

@@ -21,9 +21,9 @@ from std_srvs.srv import Trigger
 
 from eschorty_ros.emulation.evk4 import Evk4Model
 from eschorty_ros.hardware.camera import evk4
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.camera.node import CameraNode
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
 BUS = "camera_node"
 

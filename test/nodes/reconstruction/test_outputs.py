@@ -9,12 +9,12 @@ from sensor_msgs.msg import PointCloud2
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import Profiles, place
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.live.scan_buffer import PlacedPoints
 from eschorty_ros.live.sensor_epoch import TimedProfiles
 from eschorty_ros.nodes.reconstruction import outputs as outputs_module
 from eschorty_ros.nodes.reconstruction.outputs import POINTS_INTERVAL_S, Outputs
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
 CALIBRATION = load_calibration("config_3")
 ZERO_NS = 1_800_000_000_000_000_000

@@ -14,9 +14,9 @@ from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 from eschorty_ros.nodes.ros.domain import free_domain
 from eschorty_ros.simulation.scenes import named
 from eschorty_ros.simulation.world import simulate_recording

@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.reconstruction import LIVE_DTYPE, live_points
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE
-from eschorty_ros.live.device_messages import laser_settings
+from eschorty_ros.live.device_messages import laser_settings, ns_from_stamp
 from eschorty_ros.nodes.ros import transforms
 from eschorty_ros.nodes.ros.cloud_messages import (
     cloud_message,
@@ -22,7 +22,7 @@ from eschorty_ros.nodes.ros.cloud_messages import (
     points_from_message,
     serialized_cloud,
 )
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp, stamp_from_ns
+from eschorty_ros.nodes.ros.conversions import stamp_from_ns
 
 
 @settings(derandomize=True, deadline=None)

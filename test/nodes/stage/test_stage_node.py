@@ -15,8 +15,8 @@ from nav_msgs.msg import Odometry
 from ros_process import NodeProcess, Observer, ros_minus_steady_ns, wait_until
 
 from eschorty_ros.emulation.bench.devices import Bench
+from eschorty_ros.live.device_messages import ns_from_stamp
 from eschorty_ros.nodes.ros import qos
-from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
 # To the far end it takes longer than any wait of these tests.
 SLOW_M_S = 0.01
