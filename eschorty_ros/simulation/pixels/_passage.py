@@ -37,25 +37,18 @@ _DECAY = np.exp(-np.arange(int(_DECAY_STEPS * _DECAY_MAX) + 1) / _DECAY_STEPS)
 
 @cache
 def noise_table(correlation_us: float) -> NDArray[np.float64]:
-    """Return the risk of a passage against the gap between signal and level.
+    """Return the risk of a passage against the gap between signal and level, shape (n, 3).
 
-    The noise is an Ornstein-Uhlenbeck process sampled every ``DECISION_US``. Its rate of
-    first passages out of equilibrium is one over the mean first-passage time
-    ``sqrt(2 pi) integral_0^g exp(z^2/2) Phi(z) dz`` (in correlation times); discrete samples act
-    like a level higher by ``0.5826 sqrt(2 dt / tau)`` (Siegmund's correction). Below a gap of 1
-    the rate joins on to ``1 - g``, exact at 0 and -1 (zeros of the Hermite polynomials).
+    Rows: the gap from ``GAP_MIN`` to ``GAP_MAX`` in steps of ``1 / GAP_STEPS``. Columns: passages
+    per us, their integral from the gap to ``GAP_MAX``, and minus the log of the probability that
+    the noise is below the gap.
 
-    Parameters
-    ----------
-    correlation_us : float
-        Time constant of the noise, positive.
-
-    Returns
-    -------
-    ndarray of float64, shape (n, 3)
-        Per gap from ``GAP_MIN`` to ``GAP_MAX`` in steps of ``1 / GAP_STEPS``: passages per us,
-        their integral from the gap to ``GAP_MAX``, and minus the log of the probability that
-        the noise is below the gap.
+    The noise is an Ornstein-Uhlenbeck process of time constant ``correlation_us`` (positive),
+    sampled every ``DECISION_US``. Its rate of first passages out of equilibrium is one over the
+    mean first-passage time ``sqrt(2 pi) integral_0^g exp(z^2/2) Phi(z) dz`` (in correlation times);
+    discrete samples act like a level higher by ``0.5826 sqrt(2 dt / tau)`` (Siegmund's correction).
+    Below a gap of 1 the rate joins on to ``1 - g``, exact at 0 and -1 (zeros of the Hermite
+    polynomials).
     """
     gap = GAP_MIN + np.arange(round((GAP_MAX - GAP_MIN) * GAP_STEPS) + 1) / GAP_STEPS
     shifted = gap + 0.5826 * math.sqrt(2.0 * DECISION_US / correlation_us)

@@ -32,11 +32,9 @@ _EARLY, _LATE = 2.5, 0.5
 def way_times() -> NDArray[np.float32]:
     """Return the time after which a signal that started from rest has gone a part of its way.
 
-    Returns
-    -------
-    ndarray of float32, shape (_LAG_STEPS + 2, _WAY_STEPS + 2)
-        In time constants of the photoreceptor. Rows: ``sqrt(tau_f / tau_p)`` from 0 to
-        ``_LAG_MAX``; columns: square root of the part, 0 to ``_WAY_MAX``.
+    In time constants of the photoreceptor, shape (_LAG_STEPS + 2, _WAY_STEPS + 2). Rows:
+    ``sqrt(tau_f / tau_p)`` from 0 to ``_LAG_MAX``; columns: square root of the part, 0 to
+    ``_WAY_MAX``.
     """
     times = np.concatenate(([0.0], np.geomspace(1e-5, 6.0, 4000)))
     parts = (np.arange(_WAY_STEPS + 2) * (_WAY_MAX / _WAY_STEPS)) ** 2
@@ -53,17 +51,11 @@ def way_times() -> NDArray[np.float32]:
 def passage_gaps(table: NDArray[np.float64], correlation_us: float) -> NDArray[np.float32]:
     """Return the gap at which a pixel passes whose signal approaches at a steady pace.
 
-    Parameters
-    ----------
-    table : ndarray of float64, shape (n, 3)
-        :func:`noise_table` of the same correlation time.
-    correlation_us : float
+    In standard deviations, shape (_PACE_STEPS + 1, _DRAW_STEPS + 1). Rows:
+    ``pace / (pace + correlation_us)`` from 0 to 1, the pace in us per standard deviation. Columns:
+    the probability not to have passed before, 0 to 1.
 
-    Returns
-    -------
-    ndarray of float32, shape (_PACE_STEPS + 1, _DRAW_STEPS + 1)
-        Standard deviations. Rows: ``pace / (pace + correlation_us)`` from 0 to 1, the pace in us
-        per standard deviation. Columns: the probability not to have passed before, 0 to 1.
+    - ``table``: :func:`noise_table` of the same correlation time.
     """
     share = np.arange(_PACE_STEPS + 1) / _PACE_STEPS
     paces_us = correlation_us * share / np.maximum(1.0 - share, 1e-6)

@@ -30,25 +30,16 @@ REFRACTORY_SCALE = -80.0
 class Biases:
     """Offsets from the factory setting, in the camera's units.
 
-    Parameters
-    ----------
-    diff_on, diff_off : int
-        More raises the ON or OFF threshold: fewer events, a narrower line.
-    fo : int
-        More widens the source follower's band: events are earlier, and more above some kHz.
-    refr : int
-        More shortens the refractory time: more events above 500 Hz.
-
-    Raises
-    ------
-    ArgumentError
-        For an offset outside ``LIMITS``.
+    Raises ``ArgumentError`` for an offset outside ``LIMITS``.
     """
 
     diff_on: int = 0
     diff_off: int = 0
+    """More raises the ON or OFF threshold: fewer events, a narrower line."""
     fo: int = 0
+    """More widens the source follower's band: events are earlier, and more above some kHz."""
     refr: int = 0
+    """More shortens the refractory time: more events above 500 Hz."""
 
     def __post_init__(self) -> None:
         for item in fields(self):

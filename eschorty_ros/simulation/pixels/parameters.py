@@ -25,62 +25,41 @@ _MAY_VANISH = frozenset(
 class PixelParameters:
     """Parameters of the pixel model; the defaults are the preset ``paper``.
 
-    Parameters
-    ----------
-    background_intensity : float
-        Relative photocurrent ``I_bg`` without the laser.
-    amplitude : float
-        Photocurrent ``A`` the line adds at its centre on a surface of reflectance 1.
-    sigma_rows : float
-        Gaussian width of the line on the sensor, rows.
-    threshold_on, threshold_off : float
-        Comparator thresholds in log intensity.
-    threshold_mismatch : float
-        Relative standard deviation of a pixel's thresholds, fixed per pixel.
-    threshold_min : float
-        Least threshold any pixel has.
-    bandwidth_hz : float
-        Photoreceptor bandwidth at ``I = 1``; proportional to ``I``.
-    follower_hz : float
-        Pole of the source follower; ``inf`` for none.
-    noise : float
-        Standard deviation of the signal behind the follower, in log intensity.
-    refractory_us : float
-    refractory_jitter : float
-        Relative standard deviation of the refractory time, drawn per event.
-    leak_hz : float
-        ON events per second of any pixel, lit or not, from its reference leaking away. The 0.1 Hz
-        of P* are left to the background activity, of which they are a part.
-    hot_fraction : float
-        Share of pixels that fire without light changes, ON and OFF alike.
-    hot_hz : float
-        Events per second of each of them.
-    latency_us, latency_jitter_us : float
-        Mean and standard deviation from crossing to readout request; never below 1 us.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
+    Raises ``ArgumentError`` for a value outside its range.
     """
 
     background_intensity: float = 1.0
+    """Relative photocurrent ``I_bg`` without the laser."""
     amplitude: float = 5.5
+    """Photocurrent ``A`` the line adds at its centre on a surface of reflectance 1."""
     sigma_rows: float = 4.1
+    """Gaussian width of the line on the sensor, rows."""
     threshold_on: float = 0.25
     threshold_off: float = 0.25
+    """Comparator thresholds in log intensity."""
     threshold_mismatch: float = 0.08
+    """Relative standard deviation of a pixel's thresholds, fixed per pixel."""
     threshold_min: float = 0.03
+    """Least threshold any pixel has."""
     bandwidth_hz: float = 1000.0
+    """Photoreceptor bandwidth at ``I = 1``; proportional to ``I``."""
     follower_hz: float = 20_000.0
+    """Pole of the source follower; ``inf`` for none."""
     noise: float = 0.04
+    """Standard deviation of the signal behind the follower, in log intensity."""
     refractory_us: float = 700.0
     refractory_jitter: float = 0.0
+    """Refractory time, and its relative standard deviation, drawn per event."""
     leak_hz: float = 0.0
+    """ON events per second of any pixel, lit or not, from its reference leaking away. The 0.1 Hz of
+    P* are left to the background activity, of which they are a part."""
     hot_fraction: float = 0.0
     hot_hz: float = 100.0
+    """Share of pixels that fire without light changes, ON and OFF alike; events per second of
+    one."""
     latency_us: float = 100.0
     latency_jitter_us: float = 30.0
+    """Mean and standard deviation from crossing to readout request; never below 1 us."""
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -89,14 +89,8 @@ class PixelArray:
     Same seed, same events, for any spacing of the calls to :meth:`run_until`. Memory is 64 bytes
     per pixel; unlit pixels cost no time.
 
-    Parameters
-    ----------
-    columns, rows : int
-        Sensor size, at most 2048 x 1024.
-    parameters : PixelParameters
-    seed : int
-    background_hz : float
-        Background activity per pixel.
+    - ``columns``, ``rows``: Sensor size, at most 2048 x 1024.
+    - ``background_hz``: Background activity per pixel.
     """
 
     def __init__(
@@ -135,16 +129,10 @@ class PixelArray:
         self._count = 0
 
     def change(self, t_us: int, parameters: PixelParameters) -> None:
-        """Use ``parameters`` from ``t_us`` on.
+        """Use ``parameters`` from ``t_us`` on, which must not fall from call to call.
 
         The light is kept until the next :meth:`relight`, hot pixels stay the same. A threshold
         that falls below the present signal of a pixel causes an event at once.
-
-        Parameters
-        ----------
-        t_us : int
-            Must not fall from call to call.
-        parameters : PixelParameters
         """
         self.run_until(t_us)
         before, rate_before = self._model, self._background.per_us
@@ -201,24 +189,16 @@ class PixelArray:
     ) -> None:
         """Place the line at ``line_row`` (rows) in ``columns`` from ``t_us`` on.
 
-        Parameters
-        ----------
-        t_us : int
-            Must not fall from call to call.
-        columns : ndarray of int64, shape (n,)
-        line_row, reflectance : ndarray of float64, shape (n,) or (n, patches)
-            A row that is NaN or a reflectance of 0 leaves the column unlit. With several patches
-            the footprint has parts on different surfaces.
-        low_row, high_row : ndarray of float64, same shape, optional
-            Rows between which a patch is lit (edges between rows, so ``y - 0.5`` to ``y + 0.5``
-            is one row); the complete footprint when left out.
-        sigma_rows : ndarray of float64, same shape, optional
-            Gaussian width of each patch, that of the parameters when left out.
+        - ``t_us``: Must not fall from call to call.
+        - ``columns``: Shape (n,).
+        - ``line_row``, ``reflectance``: Shape (n,) or (n, patches), as all that follow. A row that
+          is NaN or a reflectance of 0 leaves the column unlit. With several patches the footprint
+          has parts on different surfaces.
+        - ``low_row``, ``high_row``: Rows between which a patch is lit (edges between rows, so
+          ``y - 0.5`` to ``y + 0.5`` is one row); the complete footprint when left out.
+        - ``sigma_rows``: Gaussian width of each patch, that of the parameters when left out.
 
-        Raises
-        ------
-        ArgumentError
-            For a reflectance outside 0 to 1.
+        Raises ``ArgumentError`` for a reflectance outside 0 to 1.
         """
         if reflectance.size and not (reflectance.min() >= 0.0 and reflectance.max() <= 1.0):
             raise ArgumentError(

@@ -55,12 +55,9 @@ PRESETS = MappingProxyType(
 
 
 def preset(name: str) -> PixelParameters:
-    """Parameter set by name, one of ``PRESETS``.
+    """Return the parameter set of this name, one of ``PRESETS``.
 
-    Raises
-    ------
-    ArgumentError
-        For another name.
+    Raises ``ArgumentError`` for another name.
     """
     if name not in PRESETS:
         raise ArgumentError(f"pixels is {name!r}; choose one of {', '.join(PRESETS)}")

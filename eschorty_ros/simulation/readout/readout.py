@@ -35,19 +35,11 @@ _STATE = (
 class EventRate:
     """Limit of the event-rate control.
 
-    Parameters
-    ----------
-    events : int
-        The first so many events of every period leave the sensor; the others are dropped.
-    period_us : int
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
+    Raises ``ArgumentError`` for a value outside its range.
     """
 
     events: int
+    """The first so many events of every period leave the sensor; the others are dropped."""
     period_us: int
 
     def __post_init__(self) -> None:
@@ -61,21 +53,13 @@ class EventRate:
 class ReadoutParameters:
     """Parameters of the readout; a model, the sensor's are not published.
 
-    Parameters
-    ----------
-    row_time_us : float
-        Time the arbiter spends on one row, however many events that has.
-    waiting_max : int
-        Events that may wait for the arbiter; more are dropped.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
+    Raises ``ArgumentError`` for a value outside its range.
     """
 
     row_time_us: float = 0.5
+    """Time the arbiter spends on one row, however many events that has."""
     waiting_max: int = 1 << 17
+    """Events that may wait for the arbiter; more are dropped."""
 
     def __post_init__(self) -> None:
         if not 1e-3 <= self.row_time_us <= 1e6:
@@ -85,21 +69,15 @@ class ReadoutParameters:
 
 
 class ReadOut(NamedTuple):
-    """Events that left the sensor, and its reports.
-
-    Attributes
-    ----------
-    keys : ndarray of int64
-        Events, sorted.
-    drops_us : ndarray of int64
-        Times at which the sensor reports that its readout is full: once per ``DROP_NOTE_US``.
-    periods : ndarray of int64, shape (n, 3)
-        Periods of the rate control that had events: their end (us), events before and after it.
-    """
+    """Events that left the sensor, and its reports."""
 
     keys: NDArray[np.int64]
+    """Events, sorted."""
     drops_us: NDArray[np.int64]
+    """Times at which the sensor reports that its readout is full: once per ``DROP_NOTE_US``."""
     periods: NDArray[np.int64]
+    """Periods of the rate control that had events, shape (n, 3): their end (us), events before and
+    after the control."""
 
 
 class _Queue(NamedTuple):
@@ -132,11 +110,7 @@ class Readout:
     the event-rate control, off until :meth:`limit`. The events do not depend on the spacing of
     calls.
 
-    Parameters
-    ----------
-    rows : int
-        Height of the sensor.
-    parameters : ReadoutParameters
+    - ``rows``: Height of the sensor.
     """
 
     def __init__(self, rows: int, parameters: ReadoutParameters | None = None) -> None:
@@ -177,13 +151,10 @@ class Readout:
         state["limit_events"] = rate.events if rate else 0
 
     def read_out(self, requests: NDArray[np.int64], until_us: int) -> ReadOut:
-        """Pass on events as they are read out before ``until_us``.
+        """Return the events that are read out before ``until_us``, and the sensor's reports.
 
-        Parameters
-        ----------
-        requests : ndarray of int64
-            All event keys of :meth:`PixelArray.take` up to ``until_us`` not given before, sorted.
-        until_us : int
+        - ``requests``: All event keys of :meth:`PixelArray.take` up to ``until_us`` not given
+          before, sorted.
         """
         events_max = requests.size + int(self._state["waiting"])
         periods_max = events_max + 1 if self._state["limit_period_us"] else 0

@@ -50,21 +50,13 @@ _BUMPS = (
 class Face:
     """A face towards the sensor, upright along the laser line, nothing behind it.
 
-    Parameters
-    ----------
-    centre_mm : float
-        Range of the head's front before nose and chin, which are nearer.
-    centre_stage_mm : float
-        Stage position of the nose; the ears are 90 mm to either side.
-
-    Raises
-    ------
-    ArgumentError
-        When ``centre_mm`` is not positive.
+    Raises ``ArgumentError`` when ``centre_mm`` is not positive.
     """
 
     centre_mm: float = 1000.0
+    """Range of the head's front before nose and chin, which are nearer."""
     centre_stage_mm: float = 100.0
+    """Stage position of the nose; the ears are 90 mm to either side."""
     _recent: RecentRays = field(init=False, repr=False, compare=False, default_factory=RecentRays)
 
     def __post_init__(self) -> None:

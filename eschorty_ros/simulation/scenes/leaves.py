@@ -36,35 +36,24 @@ Value = float | Array
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One leaf, or as arrays the leaf of each ray: position of its blade, its heading and shape.
-
-    Attributes
-    ----------
-    depth_mm : float
-        Range of its level before the layer's curvature is added.
-    stage_mm, line_mm : float
-        Middle of the blade.
-    heading_stage, heading_line : float
-        Unit vector from stalk to tip.
-    length_mm, half_width_mm : float
-        Of the blade; the petiole adds a quarter to the length.
-    fullness : float
-        Below 1 the blade is widest near the stalk.
-    lobes, lobe_depth : float
-        Number of lobes on either side and the depth of their cuts, 0 to 1.
-    albedo : float
-    """
+    """One leaf, or as arrays the leaf of each ray: position of its blade, its heading and shape."""
 
     depth_mm: Value
+    """Range of its level before the layer's curvature is added."""
     stage_mm: Value
     line_mm: Value
+    """Middle of the blade."""
     heading_stage: Value
     heading_line: Value
+    """Unit vector from stalk to tip."""
     length_mm: Value
     half_width_mm: Value
+    """Of the blade; the petiole adds a quarter to the length."""
     fullness: Value
+    """Below 1 the blade is widest near the stalk."""
     lobes: Value
     lobe_depth: Value
+    """Number of lobes on either side and the depth of their cuts, 0 to 1."""
     albedo: Value
 
     @property
@@ -117,26 +106,16 @@ class Leaves:
     Leaves of one layer share its curvature, so that two of them that overlap are exactly
     ``SEPARATION_MM`` (or twice that) apart; veins stand out by up to 0.6 mm.
 
-    Parameters
-    ----------
-    centre_mm : float
-        Range of the middle layer's first level.
-    span_mm : float
-        From the nearest to the farthest layer.
-    leaves_per_layer : int
-    seed : int
-        Fixes every leaf's place, shape and reflectance.
-
-    Raises
-    ------
-    ArgumentError
-        When a number is not positive.
+    Raises ``ArgumentError`` when a number is not positive.
     """
 
     centre_mm: float = 1320.0
+    """Range of the middle layer's first level."""
     span_mm: float = 210.0
+    """From the nearest to the farthest layer."""
     leaves_per_layer: int = 7
     seed: int = 8
+    """Fixes every leaf's place, shape and reflectance."""
     leaves: tuple[Leaf, ...] = field(init=False, repr=False)
     _arrays: Leaf = field(init=False, repr=False, compare=False)
     _recent: RecentRays = field(init=False, repr=False, compare=False, default_factory=RecentRays)

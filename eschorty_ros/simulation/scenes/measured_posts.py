@@ -23,26 +23,14 @@ def measured_posts(
     bloom_px: float = 0.0,
     noise: float = 1.0,
 ) -> Targets:
-    """Return measurements of posts at these ranges, with their errors.
+    """Return measurements of posts, with Gaussian errors of rows, ranges, widths and spacings.
 
-    Parameters
-    ----------
-    truth : RangeModel
-        The true instrument.
-    range_mm : ndarray of float64, shape (n,)
-        Measured ranges; the true ones differ by `SIGMA_RANGE_MM`.
-    rng : Generator
-    size_mm, spacing_mm : array_like, scalar or shape (n,)
-        Sizes of the posts, distances of two marks on them; NaN for none.
-    bloom_px : float
-        Columns by which light widens every post.
-    noise : float
-        Share of the errors that is drawn; the stated sigmas stay.
-
-    Returns
-    -------
-    Targets
-        Errors of rows, ranges, widths and spacings are Gaussian.
+    - ``truth``: The true instrument.
+    - ``range_mm``: Measured ranges, shape (n,); the true ones differ by ``SIGMA_RANGE_MM``.
+    - ``size_mm``, ``spacing_mm``: Sizes of the posts, distances of two marks on them, one for all
+      or shape (n,); NaN for none.
+    - ``bloom_px``: Columns by which light widens every post.
+    - ``noise``: Share of the errors that is drawn; the stated sigmas stay.
     """
     count = range_mm.size
     true_mm = range_mm + noise * rng.normal(0.0, SIGMA_RANGE_MM, count)

@@ -19,18 +19,10 @@ class Mesh(UniformReflectance):
 
     Open3D casts in float32: hits are accurate to about 1 um at 1 m.
 
-    Parameters
-    ----------
-    vertices_m : array_like, shape (n, 3)
-    triangles : array_like, shape (m, 3)
-        Vertex indices.
+    - ``vertices_m``: Shape (n, 3).
+    - ``triangles``: Vertex indices, shape (m, 3).
 
-    Raises
-    ------
-    FormatError
-        When there is no triangle.
-    EschortyError
-        When Open3D is not installed.
+    Raises ``FormatError`` when there is no triangle, and ``EschortyError`` without Open3D.
     """
 
     def __init__(self, vertices_m: ArrayLike, triangles: ArrayLike, name: str = "mesh") -> None:

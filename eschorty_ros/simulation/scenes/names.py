@@ -40,14 +40,9 @@ def named(name_or_mesh_path: str | Path, model: RangeModel | None = None) -> Sce
     With ``model``, a named scene that this build does not see whole is moved into its range. A mesh
     is in metres in ``eschorty_base`` (x = range); any format Open3D reads.
 
-    Raises
-    ------
-    ArgumentError
-        When the argument is neither a name nor an existing file.
-    FormatError
-        When the file has no triangles.
-    EschortyError
-        When Open3D, needed for meshes, is not installed.
+    Raises ``ArgumentError`` when the argument is neither a name nor an existing file,
+    ``FormatError`` when the file has no triangles, and ``EschortyError`` when Open3D, needed for
+    meshes, is not installed.
     """
     builder = _BUILDERS.get(str(name_or_mesh_path))
     if builder is not None:

@@ -10,17 +10,9 @@ from eschorty_ros.core.base.errors import EschortyError
 
 
 def load_open3d(purpose: str) -> ModuleType:
-    """Import ``open3d``.
+    """Return the module ``open3d``; the message of an error names ``purpose``, which needs it.
 
-    Parameters
-    ----------
-    purpose : str
-        What needs it, for the message.
-
-    Raises
-    ------
-    EschortyError
-        When it does not import.
+    Raises ``EschortyError`` when it does not import.
     """
     with contextlib.suppress(ImportError, OSError):
         # Open3D links libusb-1.0, which a bare machine lacks; this package contains one.

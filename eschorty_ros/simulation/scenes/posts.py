@@ -22,24 +22,16 @@ _FAN_SLOPE = 0.0287
 
 @dataclass(frozen=True, slots=True)
 class Post:
-    """One post along the stage direction, as long as any sweep.
-
-    Parameters
-    ----------
-    range_mm : float
-        Of its front.
-    line_mm : float
-        Position of its middle along the laser line (z).
-    size_mm : float
-        Width of a flat post, diameter of a round one.
-    round : bool
-        A cylinder instead of a flat strip that faces the sensor.
-    """
+    """One post along the stage direction, as long as any sweep."""
 
     range_mm: float
+    """Range of its front."""
     line_mm: float
+    """Position of its middle along the laser line (z)."""
     size_mm: float
+    """Width of a flat post, diameter of a round one."""
     round: bool = False
+    """A cylinder instead of a flat strip that faces the sensor."""
 
     def __post_init__(self) -> None:
         for name in ("range_mm", "size_mm"):
@@ -88,10 +80,7 @@ def bench(ranges_mm: Sequence[float] = RANGES_MM) -> tuple[Post, ...]:
     Slim and wide posts alternate, so that blooming is not taken for a size; the nearest are slim,
     because a wide one would fill its share.
 
-    Raises
-    ------
-    ArgumentError
-        For more posts than fit side by side.
+    Raises ``ArgumentError`` for more posts than fit side by side.
     """
     if len(ranges_mm) > len(RANGES_MM):
         raise ArgumentError(
@@ -107,18 +96,12 @@ def bench(ranges_mm: Sequence[float] = RANGES_MM) -> tuple[Post, ...]:
 
 @dataclass(frozen=True)
 class Posts(UniformReflectance):
-    """Posts with nothing behind them, or with a flat backdrop.
-
-    Parameters
-    ----------
-    posts : sequence of Post
-        In any order; the nearest one in a column is seen.
-    backdrop_mm : float, optional
-        Range of the backdrop.
-    """
+    """Posts with nothing behind them, or with a flat backdrop."""
 
     posts: Sequence[Post] = field(default_factory=bench)
+    """In any order; the nearest one in a column is seen."""
     backdrop_mm: float | None = None
+    """Range of the backdrop."""
 
     def __post_init__(self) -> None:
         if not self.posts:

@@ -22,21 +22,11 @@ class Scene(Protocol):
     """A surface the laser sheet can hit."""
 
     def range_mm(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:
-        """Return the range of the first hit of every ray.
+        """Return the range (mm) of every ray's first hit, shape (n, m); NaN where there is none.
 
-        Parameters
-        ----------
-        stage_mm : array_like, shape (n,)
-            Stage positions, mm.
-        columns : array_like, shape (m,)
-            Sensor columns.
-        model : RangeModel
-            Gives the ray origin (``b_mm``) and the slope of each column.
-
-        Returns
-        -------
-        ndarray of float64, shape (n, m)
-            mm; NaN where the ray hits nothing.
+        - ``stage_mm``: Shape (n,).
+        - ``columns``: Shape (m,).
+        - ``model``: Gives the ray origin (``b_mm``) and the slope of each column.
         """
 
     def reflectance(self, stage_mm: ArrayLike, columns: ArrayLike, model: RangeModel) -> Array:

@@ -29,15 +29,7 @@ class _Patches(NamedTuple):
 
 
 class DrawnLine:
-    """The line as drawn on the pixels.
-
-    Parameters
-    ----------
-    scene : Scene
-    calibration : Calibration
-    pixels : PixelArray
-    effects : Effects
-    """
+    """The line as drawn on the pixels."""
 
     def __init__(
         self, scene: Scene, calibration: Calibration, pixels: PixelArray, effects: Effects

@@ -23,37 +23,25 @@ _Beside = Annotated[float, Within(-1000.0, 1000.0)]
 class Effects(Schema):
     """Effects of the simulated world; the defaults leave all of them out.
 
-    Parameters
-    ----------
-    ambient : float
-        Ambient light on the pixels, as a multiple of the line's peak on a white surface. Contrast
-        falls; shot noise keeps its size in log intensity, but the bandwidth grows with the light
-        and with it the number of background events.
-    falloff_mm : float, optional
-        The line is as bright as without this effect at this range, and falls with the square.
-    defocus_mm : float
-        Distance of the plane in focus from the laser sheet.
-    ghost, ghost_mm : float
-        A second sheet by reflection, so much of the first one's light and so far beside it in the
-        direction of the stage: about 3.8 rows per mm at 1.3 m, and out of focus.
-    occlusion : int
-        1 hides from the camera what is behind other parts of the scene.
-    row_time_us : float
-        Time the readout spends on one row: :class:`ReadoutParameters`.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
+    Raises ``ArgumentError`` for a value outside its range.
     """
 
     ambient: Annotated[float, Within(0.0, 1000.0)] = 0.0
+    """Ambient light on the pixels, as a multiple of the line's peak on a white surface. Contrast
+    falls; shot noise keeps its size in log intensity, but the bandwidth grows with the light and
+    with it the number of background events."""
     falloff_mm: Annotated[float, Within(above=0.0, high=1e6)] | None = None
+    """The line is as bright as without this effect at this range, and falls with the square."""
     defocus_mm: _Beside = 0.0
+    """Distance of the plane in focus from the laser sheet."""
     ghost: Annotated[float, Within(0.0, 1.0)] = 0.0
     ghost_mm: _Beside = 0.0
+    """A second sheet by reflection, so much of the first one's light and so far beside it in the
+    direction of the stage: about 3.8 rows per mm at 1.3 m, and out of focus."""
     occlusion: Annotated[int, Within(0, 1)] = 0
+    """1 hides from the camera what is behind other parts of the scene."""
     row_time_us: Annotated[float, Within(1e-3, 1e6)] = ReadoutParameters().row_time_us
+    """Time the readout spends on one row: :class:`ReadoutParameters`."""
 
     def _conflicts(self) -> Iterator[tuple[str, str]]:
         if self.ghost and not self.ghost_mm:
@@ -63,10 +51,7 @@ class Effects(Schema):
     def parse(text: str) -> Effects:
         """Return the effects of a text such as ``ambient=0.5,occlusion=1``, or ``none``.
 
-        Raises
-        ------
-        ArgumentError
-            For an unknown effect or a value outside its range.
+        Raises ``ArgumentError`` for an unknown effect or a value outside its range.
         """
         yaml = "{}" if text == "none" else "{" + text.replace("=", ": ") + "}"
         return validate(Effects, parse_yaml(yaml.encode(), "effects", ArgumentError), ArgumentError)

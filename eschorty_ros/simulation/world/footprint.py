@@ -22,25 +22,20 @@ _REFLECTANCE_JUMP = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """The line on the scene at one stage position.
-
-    Attributes
-    ----------
-    row, reflectance : float64, shape (columns,)
-        Row of the middle of the line and reflectance there; NaN where it hits nothing.
-    split : int64, shape (n,)
-        Columns across whose footprint an edge runs.
-    patch_row, patch_reflectance, low_row, high_row : float64, shape (n, 2)
-        The two patches of each of these columns, arguments of :meth:`PixelArray.relight`.
-    """
+    """The line on the scene at one stage position."""
 
     row: Array
     reflectance: Array
+    """Row of the middle of the line and reflectance there, shape (columns,); NaN where it hits
+    nothing."""
     split: NDArray[np.int64]
+    """Columns across whose footprint an edge runs, shape (n,)."""
     patch_row: Array
     patch_reflectance: Array
     low_row: Array
     high_row: Array
+    """The two patches of each of these columns, shape (n, 2), arguments of
+    :meth:`PixelArray.relight`."""
 
 
 def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float) -> Footprint:
@@ -50,13 +45,7 @@ def footprint(scene: Scene, model: RangeModel, stage_mm: float, half_rows: float
     sheet. Only a jump of range or reflectance makes a second patch; for a smooth surface the range
     in the middle of the line is used.
 
-    Parameters
-    ----------
-    scene : Scene
-    model : RangeModel
-    stage_mm : float
-    half_rows : float
-        Rows from the line's centre to where it fades.
+    - ``half_rows``: Rows from the line's centre to where it fades.
     """
     columns = np.arange(model.columns)
     at_middle = scene.range_mm(np.array([stage_mm]), columns, model)

@@ -15,25 +15,17 @@ from eschorty_ros.simulation.world.timeline import LaserTimeline
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineEvents:
-    """Events of :func:`simulate_line`, ordered by time.
-
-    Attributes
-    ----------
-    t : int64, shape (n,)
-        Microseconds.
-    x, y : uint16, shape (n,)
-        Column and row.
-    p : uint8, shape (n,)
-        1 for ON, 0 for OFF.
-    truth_row : float64, shape (columns,)
-        Row of the line's centre.
-    """
+    """Events of :func:`simulate_line`, ordered by time, shape (n,)."""
 
     t: NDArray[np.int64]
+    """Microseconds."""
     x: NDArray[np.uint16]
     y: NDArray[np.uint16]
+    """Column and row."""
     p: NDArray[np.uint8]
+    """1 for ON, 0 for OFF."""
     truth_row: NDArray[np.float64]
+    """Row of the line's centre, shape (columns,)."""
 
     def __len__(self) -> int:
         return self.t.size
@@ -55,35 +47,22 @@ def simulate_line(
 ) -> LineEvents:
     """Return the events of a resting line; no two columns share noise or thresholds.
 
-    Parameters
-    ----------
-    parameters : PixelParameters
-    modulation : Modulation
-        ``on_edge_us`` left out means a rising edge at 0. The line is dark before time 0.
-    duration_us : int
-        Simulated time.
-    columns : int
-        Independent repetitions, at most 2048.
-    line_row : float or array_like, shape (columns,)
-        Row of the line's centre.
-    reflectance : float or array_like, shape (columns,)
-        0 to 1.
-    edge_offset_rows : float or array_like, shape (columns,), optional
-        Position of a reflectance step in the footprint: rows more than this above ``line_row`` (at
-        higher row numbers) have ``reflectance_above``. The row of the edge has a mixture.
-    reflectance_above : float or array_like, shape (columns,), optional
-        0 to 1; given if and only if ``edge_offset_rows`` is.
-    background_hz : float
-        Background events per pixel and second.
-    seed : int
-        Same seed, same events.
-    rows : int
-        Height of the sensor, at most 1024.
+    The line is dark before time 0. ``line_row``, ``edge_offset_rows`` and reflectances are one
+    number or of shape (columns,).
 
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range.
+    - ``modulation``: ``on_edge_us`` left out means a rising edge at 0.
+    - ``columns``: Independent repetitions, at most 2048.
+    - ``line_row``: Row of the line's centre.
+    - ``reflectance``, ``reflectance_above``: 0 to 1; the latter given if and only if
+      ``edge_offset_rows`` is.
+    - ``edge_offset_rows``: Position of a reflectance step in the footprint: rows more than this
+      above ``line_row`` (at higher row numbers) have ``reflectance_above``. The row of the edge has
+      a mixture.
+    - ``background_hz``: Background events per pixel and second.
+    - ``seed``: Same seed, same events.
+    - ``rows``: Height of the sensor, at most 1024.
+
+    Raises ``ArgumentError`` for a value outside its range.
     """
     if not duration_us > 0:
         raise ArgumentError(f"duration_us is {duration_us!r}; choose a positive time")

@@ -60,37 +60,18 @@ def simulate_recording(
     """Scan ``scene`` from ``start_mm`` to ``stop_mm`` and write the recording folder.
 
     Sensor time starts at 0 in the dark; the laser comes on at 50 ms with a rising edge, the stage
-    starts 50 ms later, and both leads are repeated at the end.
+    starts 50 ms later, and both leads are repeated at the end. Returns the folder as
+    :func:`load_recording` reads it.
 
-    Parameters
-    ----------
-    out_dir : path
-        Made when missing; files of an older recording in it are replaced.
-    scene : Scene
-    calibration : Calibration
-    modulation : Modulation, optional
-        70 Hz, duty 0.5 when left out; its ``on_edge_us`` is set here.
-    start_mm, stop_mm, speed_mm_s : float
-        The stage's trapezoidal move at 2000 mm/s^2; it may run either way.
-    seed : int
-        Same seed, same bytes.
-    background_hz : float
-        Background events per pixel and second.
-    parameters : PixelParameters, optional
-    effects : Effects, optional
-        None by default.
-    progress : callable, optional
-        Called with the microseconds done and in total.
+    - ``out_dir``: Made when missing; files of an older recording in it are replaced.
+    - ``modulation``: 70 Hz, duty 0.5 when left out; its ``on_edge_us`` is set here.
+    - ``start_mm``, ``stop_mm``, ``speed_mm_s``: The stage's trapezoidal move at 2000 mm/s^2; it may
+      run either way.
+    - ``seed``: Same seed, same bytes.
+    - ``background_hz``: Background events per pixel and second.
+    - ``progress``: Called with the microseconds done and in total.
 
-    Returns
-    -------
-    Recording
-        The folder as :func:`load_recording` reads it.
-
-    Raises
-    ------
-    ArgumentError
-        For a value outside its range or a folder that cannot be written.
+    Raises ``ArgumentError`` for a value outside its range or a folder that cannot be written.
     """
     wave = replace(modulation or Modulation(70.0), on_edge_us=LASER_ON_US)
     move = plan_move(

@@ -24,22 +24,14 @@ SINE_STEPS = 12
 class Gate:
     """A wave as exact integer edges with constant light between them.
 
-    Parameters
-    ----------
-    modulation : Modulation
-        ``on_edge_us`` must be known; edges agree with :meth:`Modulation.edge_us`. A sine is
-        rendered in ``SINE_STEPS`` steps per flank, fewer where they would be below 1 us.
-    clock_rate : Fraction
-        Sensor time that passes per unit of the modulation's own time.
-
-    Raises
-    ------
-    ArgumentError
-        For an unknown edge.
+    Raises ``ArgumentError`` for an unknown edge.
     """
 
     modulation: Modulation
+    """``on_edge_us`` must be known; edges agree with :meth:`Modulation.edge_us`. A sine is rendered
+    in ``SINE_STEPS`` steps per flank, fewer where they would be below 1 us."""
     clock_rate: Fraction = Fraction(1)
+    """Sensor time that passes per unit of the modulation's own time."""
     _period: tuple[int, int] = field(init=False, repr=False, compare=False)
     _duty: tuple[int, int] = field(init=False, repr=False, compare=False)
     _origin_us: int = field(init=False, repr=False, compare=False)
@@ -166,10 +158,7 @@ class LaserTimeline:
     ) -> None:
         """Switch from ``t_us`` on; replaces settings of later times.
 
-        Raises
-        ------
-        ArgumentError
-            When ``on`` without a modulation, or without its edge.
+        Raises ``ArgumentError`` when ``on`` comes without a modulation, or without its edge.
         """
         if on and modulation is None:
             raise ArgumentError("the laser is on without a modulation; give one")
@@ -242,14 +231,8 @@ class StageTimeline:
 
 @dataclass(frozen=True, slots=True)
 class SensorControl:
-    """Settings of the sensor; the defaults are its factory's.
-
-    Parameters
-    ----------
-    biases : Biases
-    event_rate : EventRate or None
-        Limit of the event-rate control, ``None`` when it is off.
-    """
+    """Settings of the sensor; the defaults are its factory's."""
 
     biases: Biases = field(default_factory=Biases)
     event_rate: EventRate | None = None
+    """Limit of the event-rate control, ``None`` when it is off."""

@@ -16,13 +16,7 @@ _AT_ONCE = 256
 
 
 class TruthLog:
-    """Lit phases of a scene that is swept.
-
-    Parameters
-    ----------
-    scene : Scene
-    model : RangeModel
-    """
+    """Lit phases of a scene that is swept."""
 
     def __init__(self, scene: Scene, model: RangeModel) -> None:
         self._scene = scene

@@ -53,25 +53,14 @@ class World:
     The bytes depend on scene, calibration, parameters, seed and the settings of laser and stage,
     not on the spacing of calls to :meth:`advance`.
 
-    Parameters
-    ----------
-    scene : Scene
-    calibration : Calibration
-    parameters : PixelParameters
-        Pixels under the factory's biases.
-    seed : int
-        Fixes thresholds, jitter and background.
-    background_hz : float
-        Background events per pixel and second.
-    readout : ReadoutParameters, optional
-        Replaces that of ``effects``.
-    effects : Effects, optional
-        None by default.
+    - ``parameters``: Pixels under the factory's biases.
+    - ``seed``: Fixes thresholds, jitter and background.
+    - ``background_hz``: Background events per pixel and second.
+    - ``readout``: Replaces that of ``effects``.
 
-    Attributes
-    ----------
-    trigger_input : EdgeSource or None
-        Source of edges at the camera's trigger input; called once for every piece of time.
+    Public attributes:
+    - ``trigger_input``: Source of edges at the camera's trigger input; called once for every piece
+      of time.
     """
 
     def __init__(
@@ -136,10 +125,8 @@ class World:
         Replaces settings of later times. ``clock_rate`` is the sensor time that passes per
         unit of the generator's time.
 
-        Raises
-        ------
-        ArgumentError
-            When ``t_us`` has been simulated already, or the modulation's edge is unknown.
+        Raises ``ArgumentError`` when ``t_us`` has been simulated already, or the modulation's edge
+        is unknown.
         """
         self._refuse_past("t_us", t_us)
         self._laser.set(t_us, on, modulation, clock_rate)
@@ -156,10 +143,7 @@ class World:
         The plan holds from its own start on, or from ``from_us``; before the first plan the
         stage rests at 0 mm. ``clock_rate`` is the sensor time that passes per unit of the plan's.
 
-        Raises
-        ------
-        ArgumentError
-            When that time has been simulated already.
+        Raises ``ArgumentError`` when that time has been simulated already.
         """
         since_zero = (plan.start_ns - zero_ns) * clock_rate / 1000
         start_us = math.ceil(since_zero) if from_us is None else from_us
@@ -169,10 +153,7 @@ class World:
     def set_sensor(self, t_us: int, control: SensorControl) -> None:
         """Run the sensor under ``control`` from ``t_us`` on; replaces settings of later times.
 
-        Raises
-        ------
-        ArgumentError
-            When ``t_us`` has been simulated already.
+        Raises ``ArgumentError`` when ``t_us`` has been simulated already.
         """
         self._refuse_past("t_us", t_us)
         self._controls.add(t_us, control)
@@ -188,10 +169,7 @@ class World:
     def advance(self, until_us: int) -> bytes:
         """Return the EVT3 bytes of all events read out up to ``until_us`` since the last call.
 
-        Raises
-        ------
-        ArgumentError
-            When ``until_us`` has been simulated already.
+        Raises ``ArgumentError`` when ``until_us`` has been simulated already.
         """
         self._refuse_past("until_us", until_us)
         parts = []
