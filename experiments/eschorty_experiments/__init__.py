@@ -27,10 +27,7 @@ NAMES: tuple[str, ...] = (
 def load(name: str) -> Experiment:
     """Return an experiment by name.
 
-    Raises
-    ------
-    ArgumentError
-        When there is none of that name.
+    Raises ``ArgumentError`` when there is none of that name.
     """
     if name not in NAMES:
         raise ArgumentError(f"experiment is {name!r}; choose one of {', '.join(NAMES)}")

@@ -27,29 +27,19 @@ _FAR_ROWS = 200.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossing:
-    """Simulated stream of a flat target with a step, and its truth.
-
-    Attributes
-    ----------
-    data : bytes
-        EVT3, rising edges at multiples of the period.
-    modulation : Modulation
-    calibration : Calibration
-        Of a sensor with as many columns as were simulated.
-    line_row : float64, shape (columns,)
-        Row of the line's centre.
-    offset_rows : float64, shape (profiles, columns)
-        Position of the step: rows above the line's centre.
-    target : bool, shape (columns,)
-        Columns on the step; the others are on the uniform board.
-    """
+    """Simulated stream of a flat target with a step, and its truth."""
 
     data: bytes
+    """EVT3, rising edges at multiples of the period."""
     modulation: Modulation
     calibration: Calibration
+    """Of a sensor with as many columns as were simulated."""
     line_row: NDArray[np.float64]
+    """Row of the line's centre, shape (columns,)."""
     offset_rows: NDArray[np.float64]
+    """Position of the step: rows above the line's centre, shape (profiles, columns)."""
     target: NDArray[np.bool_]
+    """Columns on the step, shape (columns,); the others are on the uniform board."""
 
     def reconstruct(self, **settings: float | str) -> tuple[Profiles, dict[str, int]]:
         """Return points and counters of the stream, reconstructed with ``settings``."""
@@ -82,21 +72,12 @@ def crossing(
     The stage moves towards +y, so the surface ahead is below the line's centre (at lower rows).
     Every profile is simulated at rest with the step at its position then, on pixels of its own.
 
-    Parameters
-    ----------
-    parameters : PixelParameters
-    frequency_hz : float
-    before, after : array_like, scalar or shape (columns,)
-        Reflectance of the first surface and of the one that follows.
-    columns : int
-        Columns on the step; ``BOARD_COLUMNS`` more are on the board.
-    margin_rows : float
-        Distance from the line's centre at which the step begins and ends.
-    slanted : bool
-        Spread the step's position over the columns by its way between profiles; otherwise it is at
-        the centre of all columns at once in the middle profile.
-    background_hz : float
-    seed : int
+    - ``before``, ``after``: Reflectance of the first surface and of the one that follows, one or
+      shape (columns,).
+    - ``columns``: Columns on the step; ``BOARD_COLUMNS`` more are on the board.
+    - ``margin_rows``: Distance from the line's centre at which the step begins and ends.
+    - ``slanted``: Spread the step's position over the columns by its way between profiles;
+      otherwise it is at the centre of all columns at once in the middle profile.
     """
     step = rows_per_profile(frequency_hz)
     reach = int(np.ceil(margin_rows / step)) + 1

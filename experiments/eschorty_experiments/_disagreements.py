@@ -10,14 +10,7 @@ from eschorty_ros.report.experiment import DataTable
 def disagreements(made: dict[str, Design]) -> DataTable:
     """Return the printed statements with right value and reason.
 
-    Parameters
-    ----------
-    made : dict
-        The four builds of Table 1 by name.
-
-    Returns
-    -------
-    DataTable
+    - ``made``: The four builds of Table 1 by name.
     """
     return DataTable(
         ["where", "printed", "from_the_equations", "why"],

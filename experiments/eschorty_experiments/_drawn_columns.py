@@ -14,22 +14,15 @@ ROWS = 720
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """Columns with the same number of events each.
-
-    Attributes
-    ----------
-    truth : float64, shape (columns,)
-        Row of the line.
-    rows : int64, shape (columns, events)
-    fwhm_px : float
-    signal : float
-        Events of the line per column, in the mean.
-    """
+    """Columns with the same number of events each."""
 
     truth: NDArray[np.float64]
+    """Row of the line, shape (columns,)."""
     rows: NDArray[np.int64]
+    """Rows of the events, shape (columns, events)."""
     fwhm_px: float
     signal: float
+    """Events of the line per column, in the mean."""
 
     @property
     def bound_px(self) -> float:
@@ -57,21 +50,12 @@ def draw(
 ) -> Drawn:
     """Draw columns of ``events`` events.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    columns : int
-    fwhm_px : float
-    events : int
-        Of the line and its background, per column.
-    background : float
-        Share of them that is uniform over the sensor.
-    second : float
-        Events of a second line, as a multiple of the first's, in addition.
-    apart_px : float
-        Distance of the second line, towards higher rows.
-    centre : float, optional
-        Row of every line, anywhere in 200 to 400 otherwise. Events off the sensor are drawn again.
+    - ``events``: Of the line and its background, per column.
+    - ``background``: Share of them that is uniform over the sensor.
+    - ``second``: Events of a second line, as a multiple of the first's, in addition.
+    - ``apart_px``: Distance of the second line, towards higher rows.
+    - ``centre``: Row of every line, anywhere in 200 to 400 otherwise. Events off the sensor are
+      drawn again.
     """
     truth = rng.uniform(200.0, 400.0, columns) if centre is None else np.full(columns, centre)
     sigma = fwhm_px / FWHM_PER_SIGMA

@@ -29,28 +29,19 @@ VEINLESS_MM = 0.05
 
 @dataclass(frozen=True, slots=True)
 class LevelStep:
-    """Two neighbouring levels.
-
-    Attributes
-    ----------
-    near, far : int
-        Numbers of the levels.
-    step_mm : float
-        Difference of their mean ranges.
-    scatter_mm : float
-        Root mean square of their standard deviations.
-    d_prime : float
-        ``step_mm / scatter_mm``: separation of the two by single points.
-    points : int
-        Points of the smaller one.
-    """
+    """Two neighbouring levels."""
 
     near: int
     far: int
+    """Numbers of the levels."""
     step_mm: float
+    """Difference of their mean ranges."""
     scatter_mm: float
+    """Root mean square of their standard deviations."""
     d_prime: float
+    """``step_mm / scatter_mm``: separation of the two by single points."""
     points: int
+    """Points of the smaller one."""
 
 
 def level_residuals(
@@ -58,19 +49,10 @@ def level_residuals(
 ) -> NDArray[np.float64]:
     """Return level of the middle layer and range relative to it, for points well inside a blade.
 
-    Parameters
-    ----------
-    leaves : Leaves
-    result : Result
-        A scan of ``leaves``.
-    model : RangeModel
-    pitch_mm : float
-        Stage travel per period.
+    Shape (n, 2): level (0, 1, 2), and range minus curvature minus the first level's range, mm.
 
-    Returns
-    -------
-    ndarray of float64, shape (n, 2)
-        Level (0, 1, 2) and range minus curvature minus the first level's range, mm.
+    - ``result``: A scan of ``leaves``.
+    - ``pitch_mm``: Stage travel per period.
     """
     points = result.points
     stage_mm, range_mm = stage_and_range_mm(points)

@@ -19,23 +19,15 @@ _HALVINGS = 60
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """One frequency of one preset.
-
-    Attributes
-    ----------
-    frequency_hz : float
-    rate_hz : float
-        Events per second and column.
-    widths_px : ndarray of int64, shape (columns,)
-        Full width at half maximum of each column.
-    rows_hz : ndarray of float64, shape (ROWS,)
-        Events per second and column in each row.
-    """
+    """One frequency of one preset."""
 
     frequency_hz: float
     rate_hz: float
+    """Events per second and column."""
     widths_px: NDArray[np.int64]
+    """Full width at half maximum of each column, shape (columns,)."""
     rows_hz: NDArray[np.float64]
+    """Events per second and column in each row, shape (ROWS,)."""
 
     @property
     def width_px(self) -> float:
@@ -71,20 +63,11 @@ def measure(
 def swing(parameters: PixelParameters, frequency_hz: float, contrast: float) -> float:
     """Return the steady peak-to-peak log swing of a pixel under a square wave of duty 1/2.
 
-    The photoreceptor's relative rate falls from ``u_dark`` to ``u_bright`` during each lit half
-    and returns during the dark one; the source follower then attenuates as one pole.
+    The photoreceptor's relative rate falls from ``u_dark`` to ``u_bright`` during each lit half and
+    returns during the dark one; the source follower then attenuates as one pole. The swing is
+    ``ln(u_dark / u_bright) / sqrt(1 + (f / f_sf)^2)``.
 
-    Parameters
-    ----------
-    parameters : PixelParameters
-    frequency_hz : float
-    contrast : float
-        Photocurrent the lit line adds at the pixel.
-
-    Returns
-    -------
-    float
-        ``ln(u_dark / u_bright) / sqrt(1 + (f / f_sf)^2)``.
+    - ``contrast``: Photocurrent the lit line adds at the pixel.
     """
     dark = parameters.background_intensity
     bright = dark + contrast
@@ -118,15 +101,7 @@ def closed_form_width(parameters: PixelParameters, frequency_hz: float) -> float
 def full_width_half_maximum(counts: NDArray[np.integer]) -> int:
     """Return the rows from first to last bin with half of the three highest bins' mean or more.
 
-    Parameters
-    ----------
-    counts : ndarray of integers, shape (rows,)
-        Events per row.
-
-    Returns
-    -------
-    int
-        Both ends counted; 0 without events.
+    Both ends count; 0 without events. ``counts`` are the events per row, shape (rows,).
     """
     level = 0.5 * float(np.sort(counts)[-3:].mean())
     if level == 0.0:

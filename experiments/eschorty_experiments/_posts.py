@@ -20,57 +20,34 @@ MARGIN_ROWS = 15.0
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Magnification as a straight line in row.
-
-    Attributes
-    ----------
-    slope : float
-        Per px; ``1 / k'`` by Eq. 1.
-    zero_row : float
-        Row of magnification 0; ``-b'`` by Eq. 1.
-    """
+    """Magnification as a straight line in row."""
 
     slope: float
+    """Per px; ``1 / k'`` by Eq. 1."""
     zero_row: float
+    """Row of magnification 0; ``-b'`` by Eq. 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posts:
-    """Posts of one build; arrays of shape (POSTS,).
-
-    Attributes
-    ----------
-    range_mm, row : ndarray
-        Known range; measured row.
-    magnification : ndarray
-        From the columns a post covers and its size.
-    fit : CalibrationFit
-        k' and b' from rows and ranges, k and b at their design values.
-    line : Line
-        Through the magnifications; independent of ``fit``.
-    """
+    """Posts of one build; arrays of shape (POSTS,)."""
 
     range_mm: Array
     row: Array
+    """Known range; measured row."""
     magnification: Array
+    """From the columns a post covers and its size."""
     fit: CalibrationFit
+    """k' and b' from rows and ranges, k and b at their design values."""
     line: Line
+    """Through the magnifications; independent of ``fit``."""
 
 
 def measure_posts(build: Design, nominal: Design, rng: np.random.Generator) -> Posts:
     """Place posts evenly in range, measure their rows and widths with noise, calibrate.
 
-    Parameters
-    ----------
-    build : Design
-        The instrument as built.
-    nominal : Design
-        The source of the fit's fixed k and b.
-    rng : Generator
-
-    Returns
-    -------
-    Posts
+    - ``build``: The instrument as built.
+    - ``nominal``: The source of the fit's fixed k and b.
     """
     model = build.model
     near, far = model.range_mm([MARGIN_ROWS, model.rows - 1 - MARGIN_ROWS])

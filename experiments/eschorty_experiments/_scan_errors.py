@@ -24,26 +24,18 @@ RIM_MM = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanErrors:
-    """Errors of the points of one scan.
-
-    Attributes
-    ----------
-    error_mm : ndarray of float64, shape (points,)
-        Measured minus true range at each point's own stage position and column; NaN where the
-        scene has no surface.
-    gross : ndarray of bool, shape (points,)
-        More than ``GROSS_PX`` rows off, or where the scene has no surface.
-    inside : ndarray of bool, shape (points,)
-        The surface continues for ``RIM_MM`` ahead and behind along the stage, so that the line's
-        thickness is on one surface.
-    completeness : float
-        Share of the truth's periods and columns that have a point.
-    """
+    """Errors of the points of one scan; arrays of shape (points,)."""
 
     error_mm: NDArray[np.float64]
+    """Measured minus true range at each point's own stage position and column; NaN where the scene
+    has no surface."""
     gross: NDArray[np.bool_]
+    """More than ``GROSS_PX`` rows off, or where the scene has no surface."""
     inside: NDArray[np.bool_]
+    """The surface continues for ``RIM_MM`` ahead and behind along the stage, so that the line's
+    thickness is on one surface."""
     completeness: float
+    """Share of the truth's periods and columns that have a point."""
 
     @property
     def median_mm(self) -> float:
@@ -93,19 +85,10 @@ def scan_errors(
 ) -> ScanErrors:
     """Compare every point with the scene at its time, and the recording's truth with the points.
 
-    Parameters
-    ----------
-    profiles : Profiles
-    recording : Recording
-        With its truth and its stage positions.
-    scene : KnownScene
-        The recorded scene.
-    every : int
-        Compare one of so many columns; the truth of all takes longer to compute than the scan.
-
-    Returns
-    -------
-    ScanErrors
+    - ``recording``: With its truth and its stage positions.
+    - ``scene``: The recorded scene.
+    - ``every``: Compare one of so many columns; the truth of all takes longer to compute than the
+      scan.
     """
     model = recording.calibration.model()
     profiles = profiles.select(profiles.column % every == 0)

@@ -36,10 +36,7 @@ _COLUMNS = {
 def markdown(table: str) -> str:
     """Return the Markdown table of the text of ``tradeoff-changes.csv``.
 
-    Raises
-    ------
-    ArgumentError
-        When a column is missing.
+    Raises ``ArgumentError`` without rows, or when a column is missing.
     """
     rows = list(csv.DictReader(io.StringIO(table)))
     if not rows or not {"setting", *_COLUMNS} <= set(rows[0]):
@@ -61,10 +58,7 @@ def markdown(table: str) -> str:
 def replaced(document: str, table: str) -> str:
     """Return ``document`` with ``table`` between the markers.
 
-    Raises
-    ------
-    ArgumentError
-        When it does not have each marker once, in order.
+    Raises ``ArgumentError`` when it does not have each marker once, in order.
     """
     before, begin, rest = document.partition(BEGIN)
     _, end, after = rest.partition(END)
