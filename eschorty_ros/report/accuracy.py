@@ -1,4 +1,8 @@
-"""Range errors of a cloud against a known scene, and its completeness."""
+"""Range errors of a cloud against a known scene, and its completeness.
+
+``points`` are POINT_DTYPE of shape (n,), metres in ``eschorty_base``; ``stage_direction`` is the
+stage's unit vector.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +37,7 @@ class KnownScene(Protocol):
 class Sweep:
     """A sweep of the stage at constant speed under a modulated laser, or several to and fro.
 
-    Raises
-    ------
-    ArgumentError
-        When speed or frequency is not positive.
+    Raises ``ArgumentError`` when speed or frequency is not positive.
     """
 
     start_mm: float
@@ -63,44 +64,31 @@ class Sweep:
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """A cloud against its scene.
-
-    Attributes
-    ----------
-    periods : int
-        Modulation periods entirely within the sweep.
-    points : int
-        All points of the cloud.
-    completeness : float
-        Share of the columns lit in the middle of those periods that have a point.
-    error_median_mm, error_p95_mm : float
-        Median and 95th percentile of the absolute range error.
-    bias_mm : float
-        Median of the signed range error (measured minus true).
-    within_1_sigma, within_2_sigma : float
-        Share of points whose error is within one and two of their own sigma.
-    off_target : int
-        Points where the scene has no surface; they enter no error statistic.
-    flagged : int
-        Points with a flag.
-    good_median_mm, good_p95_mm, good_within_1_sigma, good_within_2_sigma : float
-        The same statistics of the points without a flag.
-    """
+    """A cloud against its scene."""
 
     periods: int
+    """Modulation periods entirely within the sweep."""
     points: int
+    """All points of the cloud."""
     completeness: float
+    """Share of the columns lit in the middle of those periods that have a point."""
     error_median_mm: float
     error_p95_mm: float
+    """Median and 95th percentile of the absolute range error."""
     bias_mm: float
+    """Median of the signed range error (measured minus true)."""
     within_1_sigma: float
     within_2_sigma: float
+    """Share of points whose error is within one and two of their own sigma."""
     off_target: int
+    """Points where the scene has no surface; they enter no error statistic."""
     flagged: int
+    """Points with a flag."""
     good_median_mm: float
     good_p95_mm: float
     good_within_1_sigma: float
     good_within_2_sigma: float
+    """The same statistics of the points without a flag."""
 
 
 def stage_and_range_mm(
@@ -108,17 +96,8 @@ def stage_and_range_mm(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return stage position and range of every point, undoing ``P = (R, 0, Z) + s t_hat``.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-        Metres, in ``eschorty_base``.
-    stage_direction : tuple of float
-        Unit vector of the stage.
-
-    Raises
-    ------
-    ArgumentError
-        When the stage moves within the laser sheet, which leaves its position unknown.
+    Raises ``ArgumentError`` when the stage moves within the laser sheet, which leaves its position
+    unknown.
     """
     along_x, along_y, _ = stage_direction
     if abs(along_y) < 1e-6:
@@ -135,17 +114,9 @@ def true_range_mm(
     stage_mm: NDArray[np.float64],
     columns: NDArray[np.integer[Any]],
 ) -> NDArray[np.float64]:
-    """Return the range of the scene at one stage position and column per point.
+    """Return the range of the scene at one stage position and column per point, shape (n,).
 
-    Parameters
-    ----------
-    stage_mm : ndarray of float64, shape (n,)
-    columns : ndarray of integers, shape (n,)
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-        Millimetres; NaN where the sheet hits nothing.
+    In mm; NaN where the sheet hits nothing.
     """
     truth = np.full(len(stage_mm), np.nan)
     if truth.size == 0:
@@ -193,18 +164,8 @@ def complete_periods(
     The points determine the stage position of one period; the others follow one pitch apart, with
     or without points. Without any point the first period begins with the sweep.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    sweep : Sweep
-    stage_direction : tuple of float
-
-    Returns
-    -------
-    positions_mm : ndarray of float64
-        Stage position at the middle of the events of each period.
-    number : ndarray of int64, shape (n,)
-        Index of a point's period, -1 for none.
+    Returns the stage position (mm) at the middle of the events of each period, and the index of
+    each point's period, shape (n,), -1 for none.
     """
     pitch = sweep.pitch_mm
     low, high = sorted((sweep.start_mm, sweep.stop_mm))
@@ -232,15 +193,7 @@ def measure(
 ) -> Accuracy:
     """Compare a cloud with its scene.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    scene : KnownScene
-    model : RangeModel
-    sweep : Sweep
-    stage_direction : tuple of float
-    error_mm : ndarray of float64, shape (n,), optional
-        Result of `range_error_mm` when it is already known.
+    - ``error_mm``: Result of `range_error_mm` when it is already known, shape (n,).
     """
     if error_mm is None:
         error_mm = range_error_mm(points, scene, model, stage_direction)
@@ -273,19 +226,10 @@ def recorded_truth(
 ) -> NDArray[np.void]:
     """Return the scene's ranges at the periods of a recorded scan, by its stage's log.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-        The scan's cloud: it shows where the periods are.
-    scene : KnownScene
-    recording : Recording
-        Of the scan, as the nodes recorded it.
-    sweep : Sweep
+    Returns TRUTH_DTYPE, one row per whole period and column whose line is on the sensor.
 
-    Returns
-    -------
-    ndarray of TRUTH_DTYPE
-        One row per whole period and column whose line is on the sensor.
+    - ``points``: The scan's cloud: it shows where the periods are.
+    - ``recording``: Of the scan, as the nodes recorded it.
     """
     samples, calibration = recording.stage_samples, recording.calibration
     model, every = calibration.model(), np.arange(calibration.columns, dtype=np.int64)
@@ -316,18 +260,7 @@ def pass_index(
     sweep: Sweep,
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> NDArray[np.int64]:
-    """Return the number of each point's pass, from the stage's direction in each period.
-
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    sweep : Sweep
-    stage_direction : tuple of float
-
-    Returns
-    -------
-    ndarray of int64, shape (n,)
-    """
+    """Return the number of each point's pass, from the stage's direction in each period."""
     if sweep.passes == 1 or len(points) == 0:
         return np.zeros(len(points), dtype=np.int64)
     stage_mm, _ = stage_and_range_mm(points, stage_direction)
@@ -349,21 +282,11 @@ def pass_index(
 def measure_recorded(
     points: NDArray[np.void], profiles: Profiles, recording: Recording
 ) -> Accuracy | None:
-    """Compare a cloud with the truth of its recording.
+    """Compare a cloud with the truth of its recording; ``None`` without ``truth.csv``.
 
     Where several periods make a profile, profiles are counted in place of periods.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-    profiles : Profiles
-        The same points with their sensor times.
-    recording : Recording
-
-    Returns
-    -------
-    Accuracy or None
-        ``None`` without ``truth.csv``.
+    - ``profiles``: The same points with their sensor times.
     """
     truth = recording.truth
     if truth is None or len(truth) == 0:
