@@ -125,6 +125,9 @@ def fit(
 ) -> CalibrationFit:
     """Fit Eq. 2 by weighted least squares, and known sizes with it where k is free.
 
+    Ranges depend on k and k' only through their product, so freeing both needs sizes, spacings or a
+    prior on one.
+
     - ``targets``: A row weighs with ``sigma_row^2 + (K / (R + b)^2 sigma_range)^2``; the range
       error that row and width of one target share is accounted for.
     - ``design``: Nominal build: values of the parameters that stay fixed, centres of the priors,
@@ -139,11 +142,6 @@ def fit(
     Raises ``ArgumentError`` when a target is off the sensor or behind the focal line, or a name is
     unknown. Raises ``FitError`` when the targets do not determine the parameters; names the
     condition number.
-
-    Notes
-    -----
-    Ranges depend on k and k' only through their product, so freeing both needs sizes, spacings or
-    a prior on one.
 
     Examples
     --------

@@ -44,16 +44,13 @@ class FilterCounters:
 class ActivityFilter:
     """Streaming background-activity filter; the result does not depend on how events are split.
 
+    Times must not fall, from call to call either, as a decoder guarantees. Triggers pass unchanged.
+
     - ``width``, ``height``: Sensor size in pixels, 1 to 2048.
     - ``window_us``: Longest age of a supporting event, 1 to 1 000 000 us. The default spans a laser
       edge's burst; a longer one keeps hardly more of the line and more background.
 
     Raises ``ArgumentError`` when a value is outside its range.
-
-    Notes
-    -----
-    Times must not fall, from call to call either, as a decoder guarantees. Triggers pass
-    unchanged.
     """
 
     def __init__(self, width: int = 1280, height: int = 720, window_us: int = 500) -> None:

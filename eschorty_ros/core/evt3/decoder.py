@@ -41,21 +41,14 @@ class Decoder:
     >>> events.packed().tolist()
     [(100, 5, 42, 1)]
 
-    Parameters
-    ----------
-    width, height : int
-        Sensor size in pixels, 1 to 2048. Events outside are dropped and counted.
-
-    Raises
-    ------
-    ArgumentError
-        When a size is outside its range.
-
-    Notes
-    -----
     A TIME_HIGH that changed zeroes the low bits, a repeated one keeps them. A step back by more
     than half the range is a wrap; time never falls. A jump of more than 12 ms either way counts
     only when the next TIME_HIGH confirms it. Nothing is emitted before the first TIME_HIGH.
+
+    - ``width``, ``height``: Sensor size in pixels, 1 to 2048. Events outside are dropped and
+      counted.
+
+    Raises ``ArgumentError`` when a size is outside its range.
     """
 
     def __init__(self, width: int = 1280, height: int = 720) -> None:
@@ -130,15 +123,9 @@ class Decoder:
     def decode(self, data: Bytes) -> Events:
         """Return events and triggers of the next bytes of the stream.
 
-        Parameters
-        ----------
-        data : bytes-like
-            Any length, odd ones included; pieces around 128 KiB are fastest.
+        They are views of reused buffers, valid until the next call.
 
-        Returns
-        -------
-        Events
-            Views of reused buffers, valid until the next call.
+        - ``data``: Any length, odd ones included; pieces around 128 KiB are fastest.
         """
         return self.decode_words(self.words(data))
 

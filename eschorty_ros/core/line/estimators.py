@@ -54,10 +54,8 @@ def half_width_fixed(fwhm_px: float) -> int:
 def check_method(method: str, returns: str = "strongest") -> tuple[int, int]:
     """Return the codes of a method and of the returns it reports.
 
-    Raises
-    ------
-    ArgumentError
-        When there is no such method or choice of returns, or the method does not separate returns.
+    Raises ``ArgumentError`` when there is no such method or choice of returns, or the method does
+    not separate returns.
     """
     if not isinstance(method, str) or method not in CENTROIDS:
         raise ArgumentError(f"centroid is {method!r}; choose one of {', '.join(CENTROIDS)}")

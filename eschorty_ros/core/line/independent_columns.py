@@ -27,29 +27,19 @@ class Centroids:
     """One entry per column, shape (columns,); NaN (and 0 events) where there is no row.
 
     With ``returns="all"`` the arrays but ``ambiguous`` have shape (columns, 2), nearest first.
-
-    Attributes
-    ----------
-    row : float64
-        Row of the line, px.
-    sigma_row : float64
-        Its standard deviation, px.
-    width : float64
-        Sample standard deviation of the rows used, px.
-    events : int64
-        Events used.
-    ambiguous : bool
-        Two separate, equally dense groups of events with ``returns="strongest"``: no row.
-    edge : bool
-        The first or last row of the sensor cuts the line, which ``sigma_row`` allows for.
     """
 
     row: NDArray[np.float64]
     sigma_row: NDArray[np.float64]
+    """Row of the line and its standard deviation, px."""
     width: NDArray[np.float64]
+    """Sample standard deviation of the rows used, px."""
     events: NDArray[np.int64]
+    """Events used."""
     ambiguous: NDArray[np.bool_]
+    """Two separate, equally dense groups of events with ``returns="strongest"``: no row."""
     edge: NDArray[np.bool_]
+    """The first or last row of the sensor cuts the line, which ``sigma_row`` allows for."""
 
 
 def estimate(
@@ -66,40 +56,6 @@ def estimate(
 ) -> Centroids:
     """Return the row of the line in each column, independently of the others.
 
-    Parameters
-    ----------
-    rows : array of integer, shape (N,)
-        Rows of the events, 0 to ``height`` - 1, grouped by column in any order.
-    offsets : array of int64, shape (columns + 1,)
-        Column ``c`` has the events ``rows[offsets[c]:offsets[c + 1]]``.
-    method : {"mode_mean", "mean", "median"}
-        ``mode_mean`` averages the densest window (half width 1.3 x ``line_width_px``, at most 5
-        mean-shift steps) and ignores background elsewhere. ``mean`` and ``median`` use the full
-        column (``mean`` is the method of the paper).
-    returns : {"strongest", "first", "last", "all"}
-        Returns to report where a column has a second one: another window at least
-        2 x ``line_width_px`` away whose inner half has at least half as many events, and more than
-        background explains. ``first`` is the one at the least row, hence the nearest.
-    line_width_px : float
-        Full width of the line at half maximum, rows.
-    height : int
-        Rows of the sensor, at most 1023.
-    events_min : int
-        Columns with fewer events in the window give NaN.
-    sigma_factor, sigma_floor_px : float
-        Error model of ``sigma_row``, see `sigma`.
-
-    Returns
-    -------
-    Centroids
-
-    Raises
-    ------
-    ArgumentError
-        When rows, offsets or a parameter are not as described above.
-
-    Notes
-    -----
     Every method is exactly symmetric under mirroring and shifting of the rows and does not depend
     on their order. Of equally dense windows the one that ends with more events is used, then the
     narrower one; overlapping ones are merged; of two separate equal ones the strongest is NaN,
@@ -107,6 +63,24 @@ def estimate(
 
     Where the sensor's edge cuts the line ``sigma_row`` covers the bias of the part that is left. A
     stream corrects it, with the footprint of the line elsewhere.
+
+    - ``rows``: Rows of the events, integers of shape (N,), 0 to ``height`` - 1, grouped by column
+      in any order.
+    - ``offsets``: Integers of shape (columns + 1,); column ``c`` has the events
+      ``rows[offsets[c]:offsets[c + 1]]``.
+    - ``method``: ``mode_mean`` averages the densest window (half width 1.3 x ``line_width_px``, at
+      most 5 mean-shift steps) and ignores background elsewhere. ``mean`` and ``median`` use the
+      full column (``mean`` is the method of the paper).
+    - ``returns``: ``strongest``, ``first``, ``last`` or ``all``: the returns to report where a
+      column has a second one, another window at least 2 x ``line_width_px`` away whose inner half
+      has at least half as many events, and more than background explains. ``first`` is the one at
+      the least row, hence the nearest.
+    - ``line_width_px``: Full width of the line at half maximum, rows.
+    - ``height``: Rows of the sensor, at most 1023.
+    - ``events_min``: Columns with fewer events in the window give NaN.
+    - ``sigma_factor``, ``sigma_floor_px``: Error model of ``sigma_row``, see `sigma`.
+
+    Raises ``ArgumentError`` when an argument is not as described above.
 
     Examples
     --------

@@ -54,30 +54,20 @@ def relative_reflectance(
 ) -> tuple[Array, Array]:
     """Return the reflectance of each point relative to its profile's median or a white target.
 
-    Parameters
-    ----------
-    edge_us : ndarray of int64, shape (n,)
-        Points of one profile share a value and follow each other.
-    width_px : ndarray of float64, shape (n,)
-        Sample standard deviation of the rows used, px.
-    events : ndarray of uint32, shape (n,)
-        Events used.
-    footprint_sigma_px : float
-        Standard deviation of the laser line's intensity over the rows, px.
-    white_width_px : float
-        Median ``width_px`` of a white target's points; 0 for the profile's own median.
+    The second array is the standard deviation of one point, without that of the reference. Both
+    have shape (n,), NaN where the reflectance is more than a factor of 1000 off: the width is then
+    that of background.
 
-    Returns
-    -------
-    reflectance, sigma : ndarray of float64, shape (n,)
-        ``sigma`` is the standard deviation of one point, without that of the reference. NaN where
-        the reflectance is more than a factor of 1000 off: the width is then that of background.
+    - ``edge_us``: One entry per point, shape (n,), like ``width_px`` and ``events``. Points of one
+      profile share a value and follow each other.
+    - ``width_px``: Sample standard deviation of the rows used.
+    - ``events``: Events used.
+    - ``footprint_sigma_px``: Standard deviation of the laser line's intensity over the rows.
+    - ``white_width_px``: Median ``width_px`` of a white target's points; 0 for the profile's own
+      median.
 
-    Raises
-    ------
-    ArgumentError
-        When shapes differ, ``footprint_sigma_px`` is not within 0.1 to 1000 px or
-        ``white_width_px`` not within 0 to 1000 px.
+    Raises ``ArgumentError`` when shapes differ, ``footprint_sigma_px`` is not within 0.1 to 1000 px
+    or ``white_width_px`` not within 0 to 1000 px.
     """
     edge_us = integer_vector("edge_us", edge_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     width_px, counts = _checked(width_px, events)

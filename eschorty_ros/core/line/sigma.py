@@ -44,10 +44,7 @@ class ErrorModel(NamedTuple):
 def error_model(method: str, sigma_factor: float, sigma_floor_px: float) -> ErrorModel:
     """Return the error model of an estimator.
 
-    Raises
-    ------
-    ArgumentError
-        When a value is negative or not finite.
+    Raises ``ArgumentError`` when a value is negative or not finite.
     """
     return ErrorModel(
         factor=number("sigma_factor", sigma_factor, 0.0, _SIGMA_LIMIT),

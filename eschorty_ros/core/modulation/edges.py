@@ -54,28 +54,18 @@ class EdgeSchedule:
     Edge ``k`` after an anchor is at ``anchor + round(k / f)`` with the quotient exact (Python
     integers to jump, an integer remainder to step), so no error grows with time or index.
 
-    Parameters
-    ----------
-    modulation : Modulation
-    every : int
-        Return only each ``every``-th edge; 0 while that is not known, until ``anchor``.
-
-    Attributes
-    ----------
-    anchored : bool
-        True when the phase is fixed.
-    safe_us : int
-        Time before which events can be assigned to periods.
-    periods_jumped : int
-        Profiles without events that :meth:`jump` has skipped.
-
-    Notes
-    -----
     A rising trigger within a quarter of a period of the predicted edge replaces it and becomes the
     new anchor. Where a trigger is missing the prediction is used, but only after that quarter has
     passed. Triggers elsewhere are counted as spurious, unless three edges in a row went missing:
     then the next trigger sets a new phase. Events are never assigned to a period before its limits
     are certain, so the result does not depend on when data arrive.
+
+    - ``every``: Return only each ``every``-th edge; 0 while that is not known, until ``anchor``.
+
+    Public attributes:
+    - ``anchored``: True when the phase is fixed.
+    - ``safe_us``: Time before which events can be assigned to periods.
+    - ``periods_jumped``: Profiles without events that :meth:`jump` has skipped.
     """
 
     def __init__(self, modulation: Modulation, every: int = 1) -> None:

@@ -20,10 +20,8 @@ EventArrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 class HeldEvents:
     """A growing queue of events in time order.
 
-    Attributes
-    ----------
-    refused : int
-        Leading events in which no phase was found.
+    Public attributes:
+    - ``refused``: Leading events in which no phase was found.
     """
 
     def __init__(self) -> None:

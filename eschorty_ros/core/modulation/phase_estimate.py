@@ -20,27 +20,19 @@ _RAYLEIGH_MIN = 30.0
 
 @dataclass(frozen=True, slots=True)
 class PhaseEstimate:
-    """A rising edge found in a window of events.
-
-    Attributes
-    ----------
-    edge_us : int
-        Sensor time of a rising edge within the window's first period, from the earliest events
-        after it: late by the pixels' shortest latency. The first event's where none is ``found``.
-    strength : float
-        Vector strength of all events, 0 to 1 (ON events against the rising edge, OFF events
-        against the falling one).
-    rayleigh : float
-        Strength squared times the number of events; exponential with mean 1 for unmodulated
-        events.
-    found : bool
-        True when the window is modulated by the Rayleigh test.
-    """
+    """A rising edge found in a window of events."""
 
     edge_us: int
+    """Sensor time of a rising edge within the window's first period, from the earliest events after
+    it: late by the pixels' shortest latency. The first event's where none is ``found``."""
     strength: float
+    """Vector strength of all events, 0 to 1 (ON events against the rising edge, OFF events against
+    the falling one)."""
     rayleigh: float
+    """Strength squared times the number of events; exponential with mean 1 for unmodulated
+    events."""
     found: bool
+    """True when the window is modulated by the Rayleigh test."""
 
 
 def estimate_phase(
@@ -52,23 +44,11 @@ def estimate_phase(
     reduced by the duty cycle and both have one mean direction. The edge is where the burst begins:
     where the counts rise above the background.
 
-    Parameters
-    ----------
-    t_us : ndarray of int64, shape (n,)
-        In time order.
-    polarity : ndarray of uint8, shape (n,)
-        1 for ON.
-    modulation : Modulation
-        ``on_edge_us`` is not used.
+    - ``t_us``: Shape (n,), in time order.
+    - ``polarity``: Shape (n,), 1 for ON.
+    - ``modulation``: ``on_edge_us`` is not used.
 
-    Returns
-    -------
-    PhaseEstimate
-
-    Raises
-    ------
-    ArgumentError
-        When there are no events, or they are not in time order.
+    Raises ``ArgumentError`` when there are no events, or they are not in time order.
     """
     t_us = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     fall = np.flatnonzero(np.diff(t_us) < 0)

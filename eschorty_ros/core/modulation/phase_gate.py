@@ -25,45 +25,27 @@ TURN = 1 << 32
 
 
 class PhaseGate(NamedTuple):
-    """Parts of the period in which ON and OFF events are kept, 2**32 per turn, as uint32.
-
-    Attributes
-    ----------
-    step : int
-        Turns per microsecond; 0 is no gate.
-    on_begin, on_span, off_begin, off_span : int
-        Phase behind the rising edge at which events are kept from, and for how long.
-    keeps_late : int
-        1 where other events are kept apart, 0 where they are dropped.
-    """
+    """Parts of the period in which ON and OFF events are kept, 2**32 per turn, as uint32."""
 
     step: int = 0
+    """Turns per microsecond; 0 is no gate."""
     on_begin: int = 0
     on_span: int = TURN - 1
     off_begin: int = 0
     off_span: int = TURN - 1
+    """Phase behind the rising edge at which events are kept from, and for how long."""
     keeps_late: int = 0
+    """1 where other events are kept apart, 0 where they are dropped."""
 
 
 def phase_gate(modulation: Modulation, gate_us: int) -> PhaseGate:
-    """Return the gate behind the edges of ``modulation``.
+    """Return the gate behind the edges of ``modulation``; none where its windows cover the period.
 
-    Parameters
-    ----------
-    modulation : Modulation
-        A sine has no edges and is not gated.
-    gate_us : int
-        Time after each edge in which events are kept, 0 to 100 000 us; 0 is no gate.
+    A sine has no edges and is not gated.
 
-    Returns
-    -------
-    PhaseGate
-        No gate where the windows cover the period.
+    - ``gate_us``: Time after each edge in which events are kept, 0 to 100 000 us; 0 is no gate.
 
-    Raises
-    ------
-    ArgumentError
-        When ``gate_us`` is outside its range.
+    Raises ``ArgumentError`` when ``gate_us`` is outside its range.
     """
     integer("gate_us", gate_us, 0, GATE_MAX_US)
     period_us, length_us = modulation.period_us, LEAD_US + gate_us

@@ -40,21 +40,13 @@ class PhaseLock:
 
     Nothing is moved where ``on_edge_us`` is given or triggers come.
 
-    Parameters
-    ----------
-    modulation : Modulation
-    every : int
-        See ``EdgeSchedule``.
+    - ``every``: See ``EdgeSchedule``.
 
-    Attributes
-    ----------
-    schedule : EdgeSchedule
-    estimate : PhaseEstimate or None
-        The first one.
-    missing : bool
-        True when the stream ended without a phase; periods then count from the first event.
-    refused : int
-        Events dropped because they waited too long for a phase.
+    Public attributes:
+    - ``estimate``: The first estimate of the phase.
+    - ``missing``: True when the stream ended without a phase; periods then count from the first
+      event.
+    - ``refused``: Events dropped because they waited too long for a phase.
     """
 
     def __init__(self, modulation: Modulation, every: int = 1) -> None:
