@@ -37,39 +37,26 @@ _MOVING_SHARE = 0.8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """Points and profiles of a recording.
-
-    Attributes
-    ----------
-    points : ndarray of POINT_DTYPE
-        In ``eschorty_base``; ``t`` in seconds since the first event.
-    profiles : Profiles
-        The same points before placing, with their rows and times; none where the points are in a
-        file and the recording has no truth to compare them with.
-    counters : dict
-        The reconstructor's, and ``points_without_stage``.
-    profile_count, events : int
-    periods_per_profile : int
-    seconds : float
-        Wall time from the file to placed points and warnings.
-    warnings : tuple of str
-        One line each.
-    organized : ndarray of POINT_DTYPE, shape (profiles, columns), or None
-        ``points`` as a height map, with the setting ``organized``.
-    pass_lag : PassLag or None
-        What has been taken off times and places of the points, which passes forth and back show.
-    """
+    """Points and profiles of a recording."""
 
     points: NDArray[np.void]
+    """POINT_DTYPE, in ``eschorty_base``; ``t`` in seconds since the first event."""
     profiles: Profiles
+    """The same points before placing, with their rows and times; none where the points are in a
+    file and the recording has no truth to compare them with."""
     counters: dict[str, int]
+    """The reconstructor's, and ``points_without_stage``."""
     profile_count: int
     periods_per_profile: int
     events: int
     seconds: float
+    """Wall time from the file to placed points and warnings."""
     warnings: tuple[str, ...]
+    """One line each."""
     organized: NDArray[np.void] | None = None
+    """``points`` as a height map, shape (profiles, columns), with the setting ``organized``."""
     pass_lag: PassLag | None = None
+    """What has been taken off times and places of the points, which passes forth and back show."""
 
     @property
     def events_per_second(self) -> float:
@@ -86,28 +73,14 @@ def reconstruct_recording(
 ) -> Result:
     """Return the points of a recording, placed along the stage's travel.
 
-    Parameters
-    ----------
-    recording : Recording
-    settings : Settings, optional
-        Those of the recorded scan when left out; ``stage_speed_mm_s`` is taken from the stage's
-        samples instead.
-    progress : callable, optional
-        Called with bytes read so far and bytes in all.
-    jobs : int, optional
-        Threads; one per core at hand when left out. The points do not depend on it.
-    folder : Path, optional
-        Where the points are written while the recording is read; the result's are maps of files
-        there, and the memory does not grow with the recording. In memory when left out.
+    - ``settings``: Those of the recorded scan when left out; ``stage_speed_mm_s`` is taken from the
+      stage's samples instead.
+    - ``progress``: Called with bytes read so far and bytes in all.
+    - ``jobs``: Threads; one per core at hand when left out. The points do not depend on it.
+    - ``folder``: Where the points are written while the recording is read; the result's are maps of
+      files there, and the memory does not grow with the recording. In memory when left out.
 
-    Returns
-    -------
-    Result
-
-    Raises
-    ------
-    FormatError
-        When the event file is not EVT3.
+    Raises ``FormatError`` when the event file is not EVT3.
     """
     began = time.perf_counter()
     settings = settings or recorded_settings(recording)
@@ -261,10 +234,7 @@ def _joined(parts: list[Any]) -> Any:
 def recorded_settings(recording: Recording) -> Settings:
     """Return the settings of the recorded scan, the defaults where the recording has none.
 
-    Raises
-    ------
-    FormatError
-        When the recording's settings are not those of a reconstruction.
+    Raises ``FormatError`` when the recording's settings are not those of a reconstruction.
     """
     settings = Settings.from_file(recording.settings, recording.path / SETTINGS_FILE)
     return settings.allowed(recording.modulation)

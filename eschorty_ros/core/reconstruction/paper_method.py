@@ -75,27 +75,16 @@ def reconstruct(
 ) -> Profiles:
     """Return the column means of every modulation period.
 
-    Parameters
-    ----------
-    t_us : array_like of int64, shape (n,)
-        Times, never falling.
-    column, row : array_like of integer, shape (n,)
-        Inside the sensor of ``model``.
-    model : RangeModel
-    modulation : Modulation
-        ``on_edge_us`` gives the periods' phase; the first event's time when it is ``None``.
-    events_min : int
-        Columns with fewer events give no point.
+    ``sigma_row`` is the plain standard deviation of the column, as in the paper.
 
-    Returns
-    -------
-    Profiles
-        ``sigma_row`` is the plain standard deviation of the column, as in the paper.
+    - ``t_us``: int64 of shape (n,), never falling.
+    - ``column``, ``row``: Integers of shape (n,), inside the sensor of ``model``.
+    - ``modulation``: ``on_edge_us`` gives the periods' phase; the first event's time when it is
+      ``None``.
+    - ``events_min``: Columns with fewer events give no point.
 
-    Raises
-    ------
-    ArgumentError
-        When the three arrays differ in length, times fall or a pixel is off the sensor.
+    Raises ``ArgumentError`` when the three arrays differ in length, times fall or a pixel is off
+    the sensor.
     """
     t = integer_vector("t_us", t_us, np.int64, -TIME_LIMIT, TIME_LIMIT)
     x = integer_vector("column", column, np.int64, 0, model.columns - 1)

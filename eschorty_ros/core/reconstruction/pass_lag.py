@@ -65,19 +65,11 @@ def pass_lag(
 ) -> PassLag | None:
     """Return how late the points of passes in both directions are.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE, shape (n,)
-        Placed, in any order.
-    origin_us : int
-        Time of the track at which their ``t`` is 0.
-    track : StageTrack
-    stage_direction : array_like, shape (3,)
+    ``None`` where passes do not overlap on slopes, or the lag is not above its error.
 
-    Returns
-    -------
-    PassLag or None
-        ``None`` where passes do not overlap on slopes, or the lag is not above its error.
+    - ``points``: POINT_DTYPE, shape (n,): placed, in any order.
+    - ``origin_us``: Time of the track at which their ``t`` is 0.
+    - ``stage_direction``: Unit vector, shape (3,).
     """
     some = _speed_mm_us(points[:: 1 + len(points) // _POINTS_SEEN], origin_us, track)
     if np.unique(np.sign(some[_cruises(some)])).size < 2:

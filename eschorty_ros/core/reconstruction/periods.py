@@ -24,17 +24,8 @@ _AHEAD_US = 100_000
 class PeriodCutter:
     """Assigns events to the periods of one modulation; holds back those not certain yet.
 
-    Parameters
-    ----------
-    modulation : Modulation
-    every : int
-        Periods per profile; 0 chooses them from the first events.
-    assembler : ProfileAssembler or WindowAssembler
-        Takes the events and the periods' beginnings.
-
-    Attributes
-    ----------
-    lock : PhaseLock
+    - ``every``: Periods per profile; 0 chooses them from the first events.
+    - ``assembler``: Takes the events and the periods' beginnings.
     """
 
     def __init__(

@@ -101,15 +101,7 @@ class ProfileAssembler:
 
     All memory of the compiled pass is allocated here and reused from period to period.
 
-    Parameters
-    ----------
-    settings : Settings
-    model : RangeModel
-
-    Raises
-    ------
-    ArgumentError
-        When the sensor has more rows than the packed form of an event.
+    Raises ``ArgumentError`` when the sensor has more rows than the packed form of an event.
     """
 
     def __init__(self, settings: Settings, model: RangeModel) -> None:
@@ -203,12 +195,8 @@ class ProfileAssembler:
     def merge(self, held: Arrays, new: Arrays, edges: Edges) -> None:
         """Assign events to periods and close the periods whose end is reached.
 
-        Parameters
-        ----------
-        held, new : tuple of ndarray
-            Times in us, columns, rows and polarities in time order, first those of ``held``.
-        edges : Edges
-            No more events come before the last one.
+        Events are in time order, first those of ``held``. No more come before the last of
+        ``edges``.
         """
         parts = EventArrays(*held), EventArrays(*new)
         size = held[0].size + new[0].size
@@ -230,20 +218,10 @@ class ProfileAssembler:
     ) -> tuple[np.int64 | int, int]:
         """Decode words straight into the columns of the open period and of those that follow.
 
-        Parameters
-        ----------
-        words : ndarray of uint16
-        decoder : Decoder
-            Its state is advanced.
-        span : Span
-            The pass stops before the first event at its end or later, and before a trigger.
-        edges : Edges
-            Beginnings of periods before the span's end.
+        Returns the numbers of words read and of edges used. Advances the decoder's state.
 
-        Returns
-        -------
-        int, int
-            Words read and edges used.
+        - ``span``: The pass stops before the first event at its end or later, and before a trigger.
+        - ``edges``: Beginnings of periods before the span's end.
         """
         progress = _Progress(0, 0)
         rows_max = self._memory.output.row.size - self._memory.rows.row.size

@@ -54,14 +54,8 @@ class ProfileLength:
     give more when the laser is switched on. Blocks without light do not count. A block has
     `BLOCK_US`, but two periods at least; the first one ends with enough events after four.
 
-    Parameters
-    ----------
-    modulation : Modulation
-
-    Attributes
-    ----------
-    refused : int
-        Events dropped because they waited too long for light.
+    Public attributes:
+    - ``refused``: Events dropped because they waited too long for light.
     """
 
     def __init__(self, modulation: Modulation) -> None:

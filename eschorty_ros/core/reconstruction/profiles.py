@@ -33,44 +33,30 @@ _DTYPES = {
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LineRows:
-    """Rows of the line as arrays of equal length, ordered by period, column and return index.
-
-    Attributes
-    ----------
-    period : int64
-        Index of the modulation period the profile begins with.
-    edge_us : int64
-        Rising edge that begins it, sensor time.
-    t_us : int64
-        Time of the light on the surface, sensor time: the mean time of the events used, less the
-        delay of the stream's events behind the middle of the light (`delay`) where it is known.
-    column : uint16
-    row, sigma_row : float64
-        Row of the line and its standard deviation, px.
-    events : uint32
-        Events used.
-    width_px : float64
-        Sample standard deviation of the rows used; 0 for a single event.
-    return_index : uint8
-        Place among the rows of the same profile and column, nearest range first.
-    flags : uint16
-        Bits of ``FLAGS``: what makes a point worse than its neighbours; 0 for a good one.
-    reflectance, reflectance_sigma : float64, optional
-        Relative reflectance and its standard deviation; ``None`` where it is not estimated.
-    """
+    """Rows of the line as arrays of equal length, ordered by period, column and return index."""
 
     period: NDArray[np.int64]
+    """Index of the modulation period the profile begins with."""
     edge_us: NDArray[np.int64]
+    """Rising edge that begins it, sensor time."""
     t_us: NDArray[np.int64]
+    """Time of the light on the surface, sensor time: the mean time of the events used, less the
+    delay of the stream's events behind the middle of the light (`delay`) where it is known."""
     column: NDArray[np.uint16]
     row: NDArray[np.float64]
     sigma_row: NDArray[np.float64]
+    """Row of the line and its standard deviation, px."""
     events: NDArray[np.uint32]
+    """Events used."""
     width_px: NDArray[np.float64]
+    """Sample standard deviation of the rows used; 0 for a single event."""
     return_index: NDArray[np.uint8]
+    """Place among the rows of the same profile and column, nearest range first."""
     flags: NDArray[np.uint16]
+    """Bits of ``FLAGS``: what makes a point worse than its neighbours; 0 for a good one."""
     reflectance: NDArray[np.float64] | None = None
     reflectance_sigma: NDArray[np.float64] | None = None
+    """Relative reflectance and its standard deviation; ``None`` where it is not estimated."""
 
     def __len__(self) -> int:
         return len(self.column)
@@ -151,23 +137,13 @@ class Profiles(LineRows):
 def place_link(profiles: Profiles, model: RangeModel, origin_us: int = 0) -> NDArray[np.void]:
     """Return the points in the moving frame ``eschorty_link``: x = range, z along the line, y = 0.
 
-    Parameters
-    ----------
-    profiles : Profiles
-    model : RangeModel
-    origin_us : int
-        Sensor time that counts as ``t = 0``, subtracted before the conversion to float.
+    They have POINT_DTYPE, or REFLECTANCE_DTYPE where the profiles have a reflectance, and shape
+    (len(profiles),), in metres and seconds; ``sigma`` is the range's standard deviation.
 
-    Returns
-    -------
-    ndarray of POINT_DTYPE, shape (len(profiles),)
-        Metres and seconds; ``sigma`` is the range's standard deviation. REFLECTANCE_DTYPE where
-        the profiles have a reflectance.
+    - ``origin_us``: Sensor time that counts as ``t = 0``, subtracted before the conversion to
+      float.
 
-    Raises
-    ------
-    ArgumentError
-        When an array of the profiles has another dtype or length.
+    Raises ``ArgumentError`` when an array of the profiles has another dtype or length.
     """
     known = profiles.reflectance is not None
     origin_us = integer("origin_us", origin_us, -TIME_LIMIT, TIME_LIMIT)
@@ -263,16 +239,12 @@ def place(
 def add_stage(points: NDArray[np.void], position_mm: ArrayLike, stage_direction: ArrayLike) -> None:
     """Move ``points`` in place by ``s t_hat``: ``P = P_link + s t_hat``.
 
-    Parameters
-    ----------
-    points : ndarray of POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,)
-    position_mm : array_like of float64, shape (n,) or scalar
-    stage_direction : array_like of float64, shape (3,)
+    - ``points``: POINT_DTYPE or REFLECTANCE_DTYPE, shape (n,).
+    - ``position_mm``: Shape (n,), or a scalar for all points.
+    - ``stage_direction``: Unit vector, shape (3,).
 
-    Raises
-    ------
-    ArgumentError
-        When the positions do not match the points or the direction is not a unit vector.
+    Raises ``ArgumentError`` when the positions do not match the points or the direction is not a
+    unit vector.
     """
     _move(points, _positions("position_mm", position_mm, len(points)), _unit(stage_direction))
 
@@ -305,10 +277,7 @@ def _move(points, position_mm, direction):
 def stage_offset_m(position_mm: ArrayLike, stage_direction: ArrayLike) -> NDArray[np.float64]:
     """Return ``s t_hat`` in metres, x, y and z along the first axis.
 
-    Raises
-    ------
-    ArgumentError
-        When the direction is not a unit vector.
+    Raises ``ArgumentError`` when the direction is not a unit vector.
     """
     direction = _unit(stage_direction)
     return np.multiply.outer(direction, reals("position_mm", position_mm)) * 1e-3

@@ -56,18 +56,10 @@ def recording_warnings(
 ) -> list[str]:
     """Return one line for each contradiction and for the cause of a cloud with few points.
 
-    Parameters
-    ----------
-    recording : Recording
-    settings : Settings
-    counters : mapping of str to int
-        The reconstructor's, and ``points_without_stage``.
-    points : ndarray of POINT_DTYPE
-        The cloud.
-    span_us : tuple of int or None
-        Sensor times of the first and the last event, ``None`` without events.
-    shown_hz : float or None
-        See `shown_frequency_hz`.
+    - ``counters``: The reconstructor's, and ``points_without_stage``.
+    - ``points``: The cloud, of POINT_DTYPE.
+    - ``span_us``: Sensor times of the first and the last event, ``None`` without events.
+    - ``shown_hz``: See `shown_frequency_hz`.
     """
     found = recording.scan.faults if recording.scan is not None else []
     if span_us is None:

@@ -78,18 +78,11 @@ class _Points(NamedTuple):
 class StepCompensator:
     """Corrects a stream of profiles; holds back as many as a step takes to cross the beam.
 
-    Parameters
-    ----------
-    settings : Settings
-        ``stage_speed_mm_s`` gives the speed, and by its sign the direction of the surface, unless
-        the rows show another one.
-    model : RangeModel
-    modulation : Modulation
+    - ``settings``: ``stage_speed_mm_s`` gives the speed, and by its sign the direction of the
+      surface, unless the rows show another one.
 
-    Attributes
-    ----------
-    columns_compensated : int
-        Points whose row was corrected.
+    Public attributes:
+    - ``columns_compensated``: Points whose row was corrected.
     """
 
     def __init__(self, settings: Settings, model: RangeModel, modulation: Modulation) -> None:
@@ -119,10 +112,7 @@ class StepCompensator:
     def push(self, rows: LineRows) -> LineRows:
         """Return the corrected profiles whose neighbours are known by now.
 
-        Parameters
-        ----------
-        rows : LineRows
-            Complete profiles, in order.
+        - ``rows``: Complete profiles, in order.
         """
         starts = np.flatnonzero(np.diff(rows.period, prepend=-1 - rows.period[:1]))
         done = []

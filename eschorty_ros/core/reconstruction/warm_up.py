@@ -23,11 +23,7 @@ def warm_up(calibration: Calibration, settings: Settings | None = None) -> None:
     does this before it accepts data, which would pile up meanwhile; a command before it measures
     the time.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    settings : Settings, optional
-        Filter and estimator to compile.
+    - ``settings``: Filter and estimator to compile.
     """
     periods, columns, events = 4, 8, 6
     modulation = Modulation(1000.0, on_edge_us=0)

@@ -55,19 +55,11 @@ class WindowAssembler:
     with faults, and where the sensor's edge cuts the line, the window is assembled again, behind
     the one before it. So rows and counts are those of one assembler, in the same order.
 
-    Parameters
-    ----------
-    settings : Settings
-    model : RangeModel
-    jobs : int
-        Threads.
-    each : callable
-        Called with the rows of each window as soon as those before it are known.
-
-    Notes
-    -----
     Where nothing comes between rows and ranges the threads compute the ranges, too: rows are
     `Profiles`, and the counts have ``points_beyond_pole``.
+
+    - ``jobs``: Threads.
+    - ``each``: Called with the rows of each window as soon as those before it are known.
     """
 
     def __init__(
