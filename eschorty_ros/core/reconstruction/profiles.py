@@ -33,30 +33,20 @@ _DTYPES = {
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LineRows:
-    """Rows of the line as arrays of equal length, ordered by period, column and return index."""
+    """Rows of the line: `Profiles` without the ranges."""
 
     period: NDArray[np.int64]
-    """Index of the modulation period the profile begins with."""
     edge_us: NDArray[np.int64]
-    """Rising edge that begins it, sensor time."""
     t_us: NDArray[np.int64]
-    """Time of the light on the surface, sensor time: the mean time of the events used, less the
-    delay of the stream's events behind the middle of the light (`delay`) where it is known."""
     column: NDArray[np.uint16]
     row: NDArray[np.float64]
     sigma_row: NDArray[np.float64]
-    """Row of the line and its standard deviation, px."""
     events: NDArray[np.uint32]
-    """Events used."""
     width_px: NDArray[np.float64]
-    """Sample standard deviation of the rows used; 0 for a single event."""
     return_index: NDArray[np.uint8]
-    """Place among the rows of the same profile and column, nearest range first."""
     flags: NDArray[np.uint16]
-    """Bits of ``FLAGS``: what makes a point worse than its neighbours; 0 for a good one."""
     reflectance: NDArray[np.float64] | None = None
     reflectance_sigma: NDArray[np.float64] | None = None
-    """Relative reflectance and its standard deviation; ``None`` where it is not estimated."""
 
     def __len__(self) -> int:
         return len(self.column)
@@ -105,10 +95,31 @@ class LineRows:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Profiles(LineRows):
-    """Points of complete profiles: the line's rows and their ranges.
+    """Points of complete profiles as arrays of equal length, by period, column and return index.
 
     Attributes
     ----------
+    period : int64
+        Index of the modulation period the profile begins with.
+    edge_us : int64
+        Rising edge that begins it, sensor time.
+    t_us : int64
+        Time of the light on the surface, sensor time: the mean time of the events used, less the
+        delay of the stream's events behind the middle of the light where it is known.
+    column : uint16
+    row, sigma_row : float64
+        Row of the line and its standard deviation, px.
+    events : uint32
+        Events used.
+    width_px : float64
+        Sample standard deviation of the rows used; 0 for a single event.
+    return_index : uint8
+        Place among the points of the same profile and column, nearest range first.
+    flags : uint16
+        Bits that state what makes a point worse than its neighbours (1: on two surfaces, 2: cut by
+        the sensor's edge, 4: few events); 0 for a good one.
+    reflectance, reflectance_sigma : float64, optional
+        Relative reflectance and its standard deviation; ``None`` where it is not estimated.
     range_mm, sigma_mm : float64
         Range along the sheet (Eq. 2) and its standard deviation.
     """
