@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
+from eschorty_ros.core.optics import Calibration, load_calibration
 from eschorty_ros.core.reconstruction import (
     Profiles,
     Settings,
@@ -61,6 +62,9 @@ class Cloud:
 def reconstruct(
     recording: str | os.PathLike[str] | Recording,
     progress: Callable[[int, int], Any] | None = None,
+    *,
+    calibration: str | os.PathLike[str] | Calibration | None = None,
+    frequency_hz: float | None = None,
     **settings: Any,
 ) -> Cloud:
     """Return the cloud of a recording.
@@ -71,6 +75,10 @@ def reconstruct(
         A recording's folder.
     progress : callable, optional
         Called with bytes read so far and bytes in all.
+    calibration : name, path or Calibration, optional
+        Instead of the recording's.
+    frequency_hz : float, optional
+        Of the laser, instead of the recording's.
     **settings
         Fields of `Settings`, such as ``centroid="median"``; the others are those of the recorded
         scan, or the defaults.
@@ -84,11 +92,11 @@ def reconstruct(
     """
     unknown = sorted(settings.keys() - {field.name for field in fields(Settings)})
     if unknown:
-        raise ArgumentError(
-            f"there is no setting {unknown[0]!r}; `help(es.Settings)` lists them, and laser and "
-            "calibration are those of the recording's files"
-        )
+        raise ArgumentError(f"there is no setting {unknown[0]!r}; `help(es.Settings)` lists them")
     loaded = recording if isinstance(recording, Recording) else load_recording(recording)
+    if not (calibration is None or isinstance(calibration, Calibration)):
+        calibration = load_calibration(calibration)
+    loaded = loaded.corrected(calibration, frequency_hz)
     chosen = replace(recorded_settings(loaded), **settings)
     found = reconstruct_recording(loaded, chosen, progress)
     return Cloud(

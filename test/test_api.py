@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import eschorty_ros as es
@@ -20,3 +21,7 @@ def test_settings_are_checked_and_an_empty_cloud_is_not_saved(tmp_path):
         empty.save(tmp_path / "cloud.ply")
     assert (tmp_path / "cloud.ply").read_text() == "the last good one"
     assert "events_min" in empty.warnings[0]
+    other = es.reconstruct(tmp_path, calibration=replace(narrow, b_mm=narrow.b_mm + 5.0))
+    plain = es.reconstruct(tmp_path)
+    assert np.median(plain.points["x"] - other.points["x"]) == pytest.approx(5e-3, abs=1e-6)
+    assert "given as 71 Hz" in es.reconstruct(tmp_path, frequency_hz=71.0).warnings[0]

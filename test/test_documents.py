@@ -40,7 +40,7 @@ ELSEWHERE = (
 )  # fmt: skip
 # They change the computer or are other programs' own, so that no test runs them.
 NOT_RUN = {
-    "sudo", "export", "for", "do", "done", "colcon", "source", ".",
+    "sudo", "export", "for", "do", "done", "colcon", "source", ".", "python3",
     "EVENTS=qos_overrides./eschorty/camera/events",
 }  # fmt: skip
 SHORT = {"simulate": {"stop": 18.0}}

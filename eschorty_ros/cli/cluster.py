@@ -24,7 +24,7 @@ def on_cluster(
         from distributed import Client, as_completed
     except ImportError as error:
         raise EschortyError(
-            "--dask needs dask.distributed; install it by `pip install 'eschorty_ros[cluster]'`"
+            "--dask needs dask.distributed; install it by `pip install distributed`"
         ) from error
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)

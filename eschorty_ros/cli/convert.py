@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from eschorty_ros.cli.console import progress_bar
-from eschorty_ros.cli.options import BAG_OPTIONS, bag_options, refuse_given
+from eschorty_ros.cli.options import recorded_options, refuse_given
 
 STORAGES = ("mcap", "sqlite3")
 
@@ -23,7 +23,7 @@ STORAGES = ("mcap", "sqlite3")
     show_default=True,
     help="Storage of a bag that is written.",
 )
-@bag_options
+@recorded_options
 def command(
     source: Path,
     target: Path,
@@ -55,7 +55,7 @@ def command(
         recording_of(source, target, frequency, calibration, packet_period)
         click.echo(str(target))
         return
-    refuse_given(BAG_OPTIONS, "is for a bag; SOURCE is none")
+    refuse_given(("frequency", "calibration", "packet_period"), "is for a bag; SOURCE is none")
     recording = load_recording(source)
     with progress_bar("converting") as report:
         recording_to_bag(recording, target, storage, lambda share: report(share, ""))

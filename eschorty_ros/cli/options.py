@@ -73,20 +73,18 @@ def sweep_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-BAG_OPTIONS = ("frequency", "calibration", "packet_period")
-
-
-def bag_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that replace topics which a bag lacks to a command."""
+def recorded_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that replace what a recording or a bag has, or lacks, to a command."""
     for option in (
         click.option(
             "--calibration",
-            help="For a bag without reconstruction/calibration: a build's name or file.",
+            help=f"{', '.join(SHIPPED)}, or the path of a calibration.yaml.  "
+            "[default: the recorded one]",
         ),
         click.option(
             "--frequency",
             type=click.FloatRange(16, 20_000),
-            help="For a bag without laser/state: modulation frequency, Hz.",
+            help="Modulation frequency, Hz.  [default: the recorded one]",
         ),
         click.option(
             "--packet-period",

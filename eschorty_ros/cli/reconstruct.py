@@ -17,7 +17,7 @@ from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
-from eschorty_ros.cli.options import BAG_OPTIONS, bag_options, given, refuse_given
+from eschorty_ros.cli.options import given, recorded_options, refuse_given
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def setting_options() -> list[click.Parameter]:
     metavar="ADDRESS",
     help="Reconstruct on the cluster of this dask scheduler, one task a recording.",
 )
-@bag_options
+@recorded_options
 @json_option
 def command(
     recordings: tuple[Path, ...],
@@ -121,6 +121,7 @@ def command(
     Examples:
       eschorty reconstruct rec
       eschorty reconstruct rec --out rec.ply --centroid median
+      eschorty reconstruct rec --calibration built.yaml
       eschorty reconstruct rec --json --smoothing-half-width 0
       eschorty reconstruct bag.mcap --frequency 70 --calibration my.yaml
       eschorty reconstruct monday/* --dask tcp://host:8786
@@ -138,7 +139,7 @@ def command(
                 f"{recording} is a file; give a recording's folder or a bag; {RAW_ALONE}"
             )
         if not bag:
-            refuse_given(BAG_OPTIONS, f"is for a bag; {recording} is none")
+            refuse_given(["packet_period"], f"is for a bag; {recording} is none")
     targets = [out or _target(recording) for recording in recordings]
     if several and len(set(targets)) < len(targets):
         twice = next(target for target in targets if targets.count(target) > 1)
@@ -213,12 +214,15 @@ def reconstruct_to(
     With ``show`` the progress is printed.
     """
     from eschorty_ros.core.base.files import check_writable, temporary_folder
+    from eschorty_ros.core.optics import load_calibration
     from eschorty_ros.core.storage import load_recording
     from eschorty_ros.live.bag_files import is_bag
 
     check_writable(target)
     if not is_bag(recording):
-        return _reconstruct(load_recording(recording), target, jobs, given, show)
+        build = None if calibration is None else load_calibration(calibration)
+        loaded = load_recording(recording).corrected(build, frequency)
+        return _reconstruct(loaded, target, jobs, given, show)
     with temporary_folder() as made:
         folder = made / recording.stem
         recording_of(recording, folder, frequency, calibration, packet_period_ms, given)

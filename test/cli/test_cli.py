@@ -252,9 +252,20 @@ def test_reconstruct_offers_every_setting(recording, tmp_path):
     assert len(read_cloud(out)) > 0
     for bad in (("--centroid", "guess"), ("--events-min", 0), ("--out", tmp_path / "cloud.xyz")):
         assert run("reconstruct", recording, *bad).exit_code == 2, bad
-    for of_bags in (("--frequency", 70), ("--calibration", "config_3"), ("--packet-period", 4)):
-        refused = run("reconstruct", recording, *of_bags)
-        assert (refused.exit_code, f"{of_bags[0]} is for a bag" in refused.output) == (2, True)
+    refused = run("reconstruct", recording, "--packet-period", 4)
+    assert (refused.exit_code, "--packet-period is for a bag" in refused.output) == (2, True)
+
+
+def test_a_calibration_and_a_frequency_stand_in_for_the_recorded_ones(recording, tmp_path):
+    out = tmp_path / "cloud.ply"
+    good("reconstruct", recording, "--out", out)
+    recorded = read_cloud(out)
+    good("reconstruct", recording, "--out", out, "--calibration", "nominal")
+    other = read_cloud(out)
+    np.testing.assert_array_equal(recorded["t"], other["t"])
+    assert np.median(np.abs(recorded["x"] - other["x"])) > 1e-3
+    done = run("reconstruct", recording, "--out", out, "--frequency", 140)
+    assert "given as 140 Hz and the events show 70 Hz; correct it" in done.stderr
 
 
 def test_info_shows_the_content_of_a_recording_and_a_raw_file(recording):

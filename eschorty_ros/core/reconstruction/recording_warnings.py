@@ -71,8 +71,8 @@ def recording_warnings(
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE
         or_slow = f", or the pixels follow one period of {multiple:.0f}" if whole else ""
         found.append(
-            f"frequency_hz is {stated_hz:g} in laser.yaml and the events show {shown_hz:.4g} Hz; "
-            f"correct it{or_slow}"
+            f"the laser's frequency is given as {stated_hz:g} Hz and the events show "
+            f"{shown_hz:.4g} Hz; correct it{or_slow}"
         )
     without_stage = counters["points_without_stage"]
     if without_stage:

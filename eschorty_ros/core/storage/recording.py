@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from io import TextIOWrapper
 from pathlib import Path
@@ -133,6 +133,15 @@ class Recording:
     scan: ScanLog | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     marks: NDArray[np.void] = field(default_factory=lambda: np.empty(0, MARK_DTYPE))
+
+    def corrected(
+        self, calibration: Calibration | None = None, frequency_hz: float | None = None
+    ) -> Recording:
+        """Return the recording with another calibration or frequency of the laser, if given."""
+        modulation = self.modulation
+        if frequency_hz is not None:
+            modulation = replace(modulation, frequency_hz=frequency_hz)
+        return replace(self, calibration=calibration or self.calibration, modulation=modulation)
 
     @cached_property
     def truth(self) -> NDArray[np.void] | None:

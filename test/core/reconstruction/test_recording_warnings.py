@@ -54,7 +54,7 @@ def test_a_dark_recording_says_so(tmp_path):
     ("change", "settings", "words", "points"),
     [
         *(
-            (lambda r, hz=hz: at_hz(r, hz), {}, f"is {hz} in laser.yaml and the events show 70", 1)
+            (lambda r, hz=hz: at_hz(r, hz), {}, f"given as {hz} Hz and the events show 70", 1)
             for hz in (35, 71, 100, 140, 700)
         ),
         (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
