@@ -377,8 +377,15 @@ class Reconstructor:
             )
         per_column = counts["events_binned"] / max(counts["periods_closed"] * columns, 1)
         few = counts["columns_too_few_events"]
-        if few > 10 * counts["points"] and per_column < EVENTS_WANTED:
-            wanted = min(math.ceil(every * EVENTS_WANTED / max(per_column, 1e-3)), 1000)
+        if 2 * counts["events_outside_roi"] > counts["events"] and few >= 10 * points:
+            share = counts["events_outside_roi"] / counts["events"]
+            found.append(
+                f"{share:.0%} of the events are outside the limits of columns and ranges; widen "
+                "column_first, column_last, range_min or range_max"
+            )
+        elif few > 10 * points and per_column < EVENTS_WANTED:
+            most = periods_max(self.modulation)
+            wanted = min(math.ceil(every * EVENTS_WANTED / max(per_column, 1e-3)), most)
             found.append(
                 f"{few} columns have too few events for a point, {per_column:.2g} per column and "
                 f"profile on average; set periods_per_profile to about {wanted}"

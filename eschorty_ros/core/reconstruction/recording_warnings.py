@@ -120,7 +120,7 @@ def _few_points(
     modulated: bool,
 ) -> list[str]:
     """Return the largest loss where it left few points or none, ``dark`` where there is none."""
-    if 2 * counters["events_gated"] > counters["events"]:
+    if 2 * max(counters["events_gated"], counters["events_outside_roi"]) > counters["events"]:
         # The reconstructor has a line for it.
         return []
     lost = max(_LOSSES, key=lambda name: counters[name])

@@ -62,6 +62,8 @@ def test_a_dark_recording_says_so(tmp_path):
         (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
         (lambda r: r, {"events_min": 50}, "fewer events than events_min = 50; lower it", 1),
+        (lambda r: r, {"range_min": 3.0}, "of the events are outside the limits of columns and", 0),
+        (lambda r: r, {"column_first": 1500}, "100% of the events are outside the limits of", 0),
         (lambda r: r, {"phase_gate_us": 1}, "phase_gate_us removes 100% of the events; set", 0),
     ],
 )  # fmt: skip
