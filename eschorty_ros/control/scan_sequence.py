@@ -17,8 +17,8 @@ _COMPLETE = 0.98
 _FAILED_DRAIN_S = 5.0
 # Longest time for the end of a scan per second of its sweep, on a computer that falls behind.
 _DRAIN_PER_S = 200.0
-SPEED_MIN_MM_S = 1e-3
-"""Least speed of a scan or move: a slower one takes days."""
+SPEED_MIN_MM_S = 0.05
+"""Least speed of a scan or move: between two statuses a slower stage seems to rest."""
 PASSES_MAX = 255
 """Most passes of a scan, as the action's goal can state them."""
 

@@ -77,7 +77,7 @@ def test_a_scan_reaches_its_accuracy_and_ends_with_the_laser_off(tmp_path):
     ("option", "words"),
     [
         (("--stop", "500"), "stop is 500 mm; choose 0 to 220 mm, the stage's travel"),
-        (("--speed", "900"), "speed is 900 mm/s; choose 0.001 to 250 mm/s"),
+        (("--speed", "900"), "speed is 900 mm/s; choose 0.05 to 250 mm/s"),
     ],
 )
 def test_limits_are_checked_in_the_options_unit_before_anything_starts(tmp_path, option, words):

@@ -317,7 +317,9 @@ class _Move(_Leg):
         begin_s = self._not_before_s
         if self._timing is not None:
             begin_s = max(begin_s, self._timing.begin_s)
-            if (self._timing.end_s - begin_s) * 1e9 <= spread_ns:
+            # A slow carriage takes long for what a reading may deviate by.
+            slack_s = 2.0 * self._tolerance_mm / max(*self._speed, 1e-3)
+            if (self._timing.end_s - begin_s - slack_s) * 1e9 <= spread_ns:
                 return TIME_LIMIT
         return self.from_ns + round(begin_s * 1e9)
 

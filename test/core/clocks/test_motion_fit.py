@@ -63,6 +63,21 @@ def test_sweep_at_300_mm_s_within_20_um(rate_hz: float, request_ms: float) -> No
     assert max(errors) < 20.0
 
 
+@pytest.mark.parametrize("speed_mm_s", [0.05, 0.5, 5.0])
+def test_a_slow_move_is_known_as_it_goes(speed_mm_s: float) -> None:
+    """Readings of 1 um leave its start uncertain for long, but not its position."""
+    order = plan_move(ORDERED_NS, 10.0, 10.0 + 5.0 * speed_mm_s, speed_mm_s, 2000.0)
+    true = plan_move(ORDERED_NS + 1_500_000, 10.0, 10.0 + 5.0 * speed_mm_s, speed_mm_s, 2000.0)
+    fit, line = MotionFit(), Line(20.0, 3.0, seed=1)
+    line.read(fit, true, ORDERED_NS)
+    fit.expect_move(order)
+    for until_ns in range(ORDERED_NS + 500_000_000, true.end_ns, 100_000_000):
+        line.read(fit, true, until_ns)
+        assert fit.until_ns is not None
+        assert until_ns - fit.until_ns < 100_000_000
+    assert worst_um(fit, true) < 1.0
+
+
 def test_receipt_alone_within_the_lower_envelope() -> None:
     errors = [worst_um(*sweep(Line(50.0, 0.5, seed, asked=False))) for seed in range(12)]
     print(f"receipt only, 0.5 ms of jitter: {max(errors):.1f} um at most")
