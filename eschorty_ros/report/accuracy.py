@@ -318,7 +318,9 @@ def measure_recorded(
         lit = lit[phase::every]
         profile = np.rint((number - phase) / every).astype(np.int64)
         number = np.where(number >= 0, np.clip(profile, 0, len(lit) - 1), -1)
-    return _accuracy(points, error_mm, lit, number)
+    # Before the first period with a truth and after the last one nothing is known.
+    off_target = int(np.count_nonzero(np.isnan(error_mm) & (number >= 0)))
+    return replace(_accuracy(points, error_mm, lit, number), off_target=off_target)
 
 
 def _accuracy(

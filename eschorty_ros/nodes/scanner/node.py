@@ -17,6 +17,7 @@ from rclpy.node import Node
 from eschorty_ros.action import Scan
 from eschorty_ros.control.scan_sequence import (
     PASSES_MAX,
+    SPEED_MIN_MM_S,
     End,
     ScanFailure,
     ScanLimits,
@@ -36,20 +37,22 @@ from eschorty_ros.nodes.ros.parameters import Param, Parameters
 from eschorty_ros.nodes.ros.spin import ends, run, unless_shut_down
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 
+_SPEED_MIN = m_from_mm(SPEED_MIN_MM_S)
+
 TABLE = (
     Param("auto_scan", False, "do one scan as soon as the other nodes are ready"),
     Param("start", 0.01, "auto_scan: stage position where the sweep begins", "m", -1.0, 1.0),
     Param("stop", 0.06, "auto_scan: stage position where it ends", "m", -1.0, 1.0),
-    Param("speed", 0.05, "auto_scan: stage speed", "m/s", 1e-6, 1.0),
+    Param("speed", 0.05, "auto_scan: stage speed", "m/s", _SPEED_MIN, 1.0),
     Param("frequency", 0.0, "auto_scan: modulation frequency; 0 keeps the laser's", "Hz",
           0.0, FREQUENCY_MAX_HZ),
     Param("duty", 0.0, "auto_scan: duty; 0 keeps the laser's", "", 0.0, 0.999),
     Param("passes", 1, "auto_scan: sweeps forth and back", "", 1, PASSES_MAX),
     Param("travel_min", 0.0, "lower end of the stage's travel", "m", -1.0, 1.0),
     Param("travel_max", 0.22, "upper end of the stage's travel", "m", -1.0, 1.0),
-    Param("speed_max", 0.25, "fastest scan", "m/s", 1e-6, 1.0),
+    Param("speed_max", 0.25, "fastest scan", "m/s", _SPEED_MIN, 1.0),
     Param("acceleration", 2.0, "acceleration of the stage, for the run-up", "m/s^2", 1e-3, 100.0),
-    Param("approach_speed", 0.1, "speed towards the start", "m/s", 1e-6, 1.0),
+    Param("approach_speed", 0.1, "speed towards the start", "m/s", _SPEED_MIN, 1.0),
     # Without `eschorty compile` the nodes of a first run answer later still.
     Param("node_timeout", 60.0, "longest wait for the other nodes", "s", 0.1, 600.0),
     Param("service_timeout", 5.0, "longest wait for an answer", "s", 0.1, 60.0),
