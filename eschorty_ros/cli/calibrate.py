@@ -13,7 +13,7 @@ import click
 from eschorty_ros.cli.console import pairs, progress_bar, show, table
 from eschorty_ros.cli.files import OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
-from eschorty_ros.cli.options import refuse_given
+from eschorty_ros.cli.options import Number, refuse_given
 from eschorty_ros.core.base.errors import FitError
 from eschorty_ros.core.optics import SHIPPED
 
@@ -60,13 +60,13 @@ _OF_SOURCES = ("moving", "range_per_stage", "free", "prior", "robust", "row_sigm
 )
 @click.option(
     "--moving",
-    type=float,
+    type=Number(),
     metavar="MM",
     help="One target moved by the stage instead of posts: its range with the stage at 0.",
 )
 @click.option(
     "--range-per-stage",
-    type=click.FloatRange(-1, 1),
+    type=Number(-1, 1),
     default=1.0,
     show_default=True,
     help="With --moving: range gained per stage travel, negative towards the sensor.",
@@ -91,11 +91,11 @@ _OF_SOURCES = ("moving", "range_per_stage", "free", "prior", "robust", "row_sigm
     "[default: with joint, from 5 targets on]",
 )
 @click.option(
-    "--row-sigma", type=click.FloatRange(0, min_open=True), default=0.3, show_default=True,
+    "--row-sigma", type=Number(0, min_open=True), default=0.3, show_default=True,
     help="Error of a row, px, where targets.csv gives none.",
 )  # fmt: skip
 @click.option(
-    "--range-sigma", type=click.FloatRange(0), default=1.0, show_default=True,
+    "--range-sigma", type=Number(0), default=1.0, show_default=True,
     help="Error of a known range, mm, where the file gives none.",
 )  # fmt: skip
 @click.option(
@@ -302,9 +302,10 @@ def _finish(report: CalibrationReport, made_with: Mapping[str, str], out: Path) 
     from eschorty_ros.report.calibration_page import calibration_html
 
     page = calibration_html(report, made_with)
-    save_calibration(report.calibration, out)
+    # Last, so that an old one stays where the page has no room.
     with atomic_write(out.with_suffix(".html")) as stream:
         stream.write(page.encode())
+    save_calibration(report.calibration, out)
     _show(report)
     click.echo(str(out))
     click.echo(str(out.with_suffix(".html")))

@@ -9,6 +9,7 @@ import click
 
 from eschorty_ros.cli.console import decimals, show, table
 from eschorty_ros.cli.files import OUT_FILE
+from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,32 +22,36 @@ _LIGHT_S = 0.5 / 70.0
 
 
 @click.command("design")
-@click.option("--focal-mm", type=float, default=24.0, show_default=True, help="Focal length, mm.")
-@click.option("--f-number", type=float, default=2.0, show_default=True, help="Aperture.")
 @click.option(
-    "--theta-deg", type=float, default=85.87, show_default=True, help="Tilt of the laser sheet."
+    "--focal-mm", type=Number(), default=24.0, show_default=True, help="Focal length, mm."
 )
-@click.option("--theta-prime-deg", type=float, help="Tilt of the sensor; with --near-mm.")
+@click.option("--f-number", type=Number(), default=2.0, show_default=True, help="Aperture.")
 @click.option(
-    "--near-mm", type=float, default=810.45, show_default=True, help="Range at row 0, mm."
+    "--theta-deg", type=Number(), default=85.87, show_default=True, help="Tilt of the laser sheet."
+)
+@click.option("--theta-prime-deg", type=Number(), help="Tilt of the sensor; with --near-mm.")
+@click.option(
+    "--near-mm", type=Number(), default=810.45, show_default=True, help="Range at row 0, mm."
 )
 @click.option(
-    "--far-mm", type=float, help="Range at the last row, mm; finds the sensor tilt by itself."
+    "--far-mm", type=Number(), help="Range at the last row, mm; finds the sensor tilt by itself."
 )
-@click.option("--b-mm", type=float, default=0.0, show_default=True, help="Datum to focal line, mm.")
+@click.option(
+    "--b-mm", type=Number(), default=0.0, show_default=True, help="Datum to focal line, mm."
+)
 @click.option(
     "--ranges", type=click.IntRange(2, 100), default=8, show_default=True, help="Table rows."
 )
 @click.option(
-    "--pixel-um", type=float, default=4.86, show_default=True, help="Pixel pitch of the sensor."
+    "--pixel-um", type=Number(), default=4.86, show_default=True, help="Pixel pitch of the sensor."
 )
 @click.option("--columns", type=int, default=1280, show_default=True, help="Columns of the sensor.")
 @click.option("--rows", type=int, default=720, show_default=True, help="Rows of the sensor.")
 @click.option(
-    "--power-mw", type=float, help="Peak power of the line: adds photons and an estimated class."
+    "--power-mw", type=Number(), help="Peak power of the line: adds photons and an estimated class."
 )
 @click.option(
-    "--wavelength-nm", type=float, default=450.0, show_default=True, help="With --power-mw."
+    "--wavelength-nm", type=Number(), default=450.0, show_default=True, help="With --power-mw."
 )
 @click.option(
     "--out",

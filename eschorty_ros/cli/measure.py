@@ -11,6 +11,7 @@ import click
 
 from eschorty_ros.cli.console import show, table
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
+from eschorty_ros.cli.options import Number
 from eschorty_ros.surfaces.plane import COMMON_SHARE
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--common-mm",
-    type=click.FloatRange(0.0),
+    type=Number(0.0),
     help="Sigma of a range error that all points of one surface share.  [default: "
     f"{COMMON_SHARE:g} of the points' own sigma]",
 )

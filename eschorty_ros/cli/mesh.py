@@ -10,6 +10,7 @@ import click
 
 from eschorty_ros.cli.console import show, table
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
+from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
     from eschorty_ros.surfaces.mesh import Mesh
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 @click.argument("cloud", type=IN_FILE)
 @click.option(
     "--sigmas",
-    type=click.FloatRange(0.0, min_open=True),
+    type=Number(0.0, min_open=True),
     default=2.0,
     show_default=True,
     help="95 % of the points are within this multiple of their own sigma from the mesh.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -9,6 +10,26 @@ import click
 
 from eschorty_ros.core.optics import SHIPPED
 from eschorty_ros.simulation.pixels import PRESETS
+
+SWEEP_MAX_MM = 1000.0
+"""Longer than any stage that scans; a recording of it would fill a disk."""
+
+
+class Number(click.FloatRange):
+    """A finite number, within bounds if they are given."""
+
+    name = "number"
+
+    def _describe_range(self) -> str:
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number; refuse NaN and infinity."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not finite.", param, ctx)
+        return number
+
 
 _SWEEP = (
     click.option(
@@ -20,7 +41,7 @@ _SWEEP = (
     ),
     click.option(
         "--frequency",
-        type=click.FloatRange(16, 20_000),
+        type=Number(16, 20_000),
         default=70.0,
         show_default=True,
         help="Modulation frequency, Hz; one profile per period, or per several where one has too "
@@ -28,16 +49,16 @@ _SWEEP = (
     ),
     click.option(
         "--speed",
-        type=click.FloatRange(0, min_open=True),
+        type=Number(0, min_open=True),
         default=50.0,
         show_default=True,
         help="Stage speed, mm/s.",
     ),
     click.option(
-        "--start", type=float, default=10.0, show_default=True, help="Stage position, mm."
+        "--start", type=Number(), default=10.0, show_default=True, help="Stage position, mm."
     ),
     click.option(
-        "--stop", type=float, default=110.0, show_default=True, help="Stage position, mm."
+        "--stop", type=Number(), default=110.0, show_default=True, help="Stage position, mm."
     ),
     click.option(
         "--calibration",
@@ -83,12 +104,12 @@ def recorded_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--frequency",
-            type=click.FloatRange(16, 20_000),
+            type=Number(16, 20_000),
             help="Modulation frequency, Hz.  [default: the recorded one]",
         ),
         click.option(
             "--packet-period",
-            type=click.FloatRange(0, 100),
+            type=Number(0, 100),
             default=4.0,
             show_default=True,
             help="For a bag without camera/clock: time over which the camera collects events "
@@ -115,6 +136,9 @@ def check_sweep(start_mm: float, stop_mm: float) -> None:
     """Refuse a sweep without length as wrong usage."""
     if start_mm == stop_mm:
         raise click.UsageError(f"--start and --stop are both {start_mm:g} mm; give a distance")
+    for name, value_mm in (("start", start_mm), ("stop", stop_mm)):
+        if abs(value_mm) > SWEEP_MAX_MM:
+            raise click.UsageError(f"--{name} is {value_mm:g} mm; choose up to {SWEEP_MAX_MM:g} mm")
 
 
 def page_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from eschorty_ros.cli.cluster import on_cluster
-from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
+from eschorty_ros.cli.console import Report, accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
-from eschorty_ros.cli.options import given, recorded_options, refuse_given
+from eschorty_ros.cli.options import Number, given, recorded_options, refuse_given
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def setting_options() -> list[click.Parameter]:
             low, high = meta["range"]
             kind = click.IntRange(int(low), int(high))
         else:
-            kind = click.FloatRange(*meta["range"])
+            kind = Number(*meta["range"])
         unit = f" ({meta['unit']})" if meta["unit"] else ""
         options.append(
             click.Option(
@@ -225,8 +225,14 @@ def reconstruct_to(
         return _reconstruct(loaded, target, jobs, given, show)
     with temporary_folder() as made:
         folder = made / recording.stem
-        recording_of(recording, folder, frequency, calibration, packet_period_ms, given)
+        with _progress("reading the bag", show) as report:
+            report(0.0, "with compiling on the first run")
+            recording_of(recording, folder, frequency, calibration, packet_period_ms, given)
         return _reconstruct(load_recording(folder), target, jobs, given, show)
+
+
+def _progress(title: str, show: bool) -> AbstractContextManager[Report]:
+    return progress_bar(title) if show else nullcontext(lambda share, note: None)
 
 
 def _reconstruct(
@@ -243,8 +249,7 @@ def _reconstruct(
     from eschorty_ros.report.accuracy import measure_recorded
 
     chosen = replace(recorded_settings(loaded), **given)
-    shown = progress_bar("reconstructing") if show else nullcontext(lambda done, note: None)
-    with shown as report, folder_beside(target) as folder:
+    with _progress("reconstructing", show) as report, folder_beside(target) as folder:
         report(0.0, "compiling, first run only")
         warm_up(loaded.calibration, chosen)
         result = reconstruct_recording(

@@ -10,6 +10,7 @@ import click
 
 from eschorty_ros.cli.console import show, table
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE, json_option
+from eschorty_ros.cli.options import Number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,13 +26,13 @@ if TYPE_CHECKING:
     "starts",
     multiple=True,
     nargs=6,
-    type=float,
+    type=Number(),
     metavar="X Y Z RX RY RZ",
     help="First guess for the next cloud: shift in mm, rotation vector in degrees.  [default: 0]",
 )
 @click.option(
     "--reach-mm",
-    type=click.FloatRange(0.0, min_open=True),
+    type=Number(0.0, min_open=True),
     default=10.0,
     show_default=True,
     help="Farthest partner of a point in the first round; halved three times.",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +12,7 @@ import click
 from eschorty_ros.cli.console import accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.files import IN_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
-from eschorty_ros.cli.options import check_sweep, page_options, sweep_options
+from eschorty_ros.cli.options import check_sweep, page_options, refuse_given, sweep_options
 from eschorty_ros.core.base.errors import DeviceError, EschortyError
 
 if TYPE_CHECKING:
@@ -103,6 +105,10 @@ def command(
     from eschorty_ros.viewer.page import load_viser, open_when_served
 
     check_sweep(start, stop)
+    if hardware is not None:
+        refuse_given(("scene", "pixels", "effects", "seed"), "is for a simulated scene")
+    if not live:
+        refuse_given(("host", "port"), "belongs to --live")
     one_scan = nodes_module("one_process.scan", make="scan")
     _check(scene, calibration, effects)
     tables = None
@@ -130,16 +136,29 @@ def command(
         load_viser()
         open_when_served(host, port)
         click.echo(f"page at http://{host}:{port}", err=True)
-    out.mkdir(parents=True, exist_ok=True)
-    check_writable(out / "scan.pcd")
-    if record is not None:
-        make_recording_folder(record)
-    with ended_by_signals(), progress_bar("scanning") as feedback:
+    with _made(out, record), ended_by_signals(), progress_bar("scanning") as feedback:
+        out.mkdir(parents=True, exist_ok=True)
+        check_writable(out / "scan.pcd")
+        if record is not None:
+            make_recording_folder(record)
         result = one_scan.scan_once(job, feedback)
     finish(job, result, out)
     if live:
         # The browser comes back to the same address by itself.
         serve_cloud(result.points, host, port)
+
+
+@contextlib.contextmanager
+def _made(*folders: Path | None) -> Iterator[None]:
+    """Remove those of the folders that are new and empty where the block fails."""
+    new = [folder for folder in folders if folder is not None and not folder.exists()]
+    try:
+        yield
+    except BaseException:
+        for folder in new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def _check(scene: str, calibration: str, effects: str) -> None:
@@ -191,6 +210,11 @@ def finish(job: ScanJob, result: ScanResult, out: Path) -> None:
     if result.recording:
         try:
             recording = load_recording(result.recording)
+        except EschortyError as error:
+            raise DeviceError(
+                f"the recording is not complete: {result.message or error}"
+            ) from error
+        try:
             known = accuracy.recorded_truth(result.points, seen, recording, sweep)
             columns = (known[name] for name in ("t_us", "column", "range_mm"))
             write_truth_csv(Path(result.recording, TRUTH_FILE), *columns)

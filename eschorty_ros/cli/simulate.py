@@ -8,7 +8,7 @@ import click
 
 from eschorty_ros.cli.console import pairs, progress_bar
 from eschorty_ros.cli.instrument import ended_by_signals
-from eschorty_ros.cli.options import check_sweep, sweep_options
+from eschorty_ros.cli.options import Number, check_sweep, sweep_options
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import remove_abandoned
 
@@ -23,7 +23,7 @@ from eschorty_ros.core.base.files import remove_abandoned
 )
 @click.option(
     "--duty",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    type=Number(0, 1, min_open=True, max_open=True),
     default=0.5,
     show_default=True,
     help="Share of the period with the laser on.",

@@ -10,7 +10,7 @@ import click
 
 from eschorty_ros.cli.files import IN_FILE, OUT_FILE
 from eschorty_ros.cli.instrument import ended_by_signals, nodes_module
-from eschorty_ros.cli.options import page_options
+from eschorty_ros.cli.options import page_options, refuse_given
 from eschorty_ros.core.base.errors import DeviceError, FormatError, OtherFormatError
 
 if TYPE_CHECKING:
@@ -71,6 +71,8 @@ def command(
         raise click.UsageError(
             "give CLOUD, with --window or --browser, or --live, with --allow-scan, without it"
         )
+    if not (browser or live):
+        refuse_given(("host", "port"), "belongs to --browser or --live")
     if out is not None and (window or browser or live):
         raise click.UsageError("--out is the picture; --window, --browser and --live draw none")
     if cloud is None:

@@ -138,7 +138,6 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """
     target = Path(path)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(target) as stream:
             figure.savefig(stream, format=target.suffix[1:].lower(), dpi=DPI)
     except ArgumentError:

@@ -116,6 +116,11 @@ def test_help_imports_nothing_heavy():
         ("simulate", "--frequency", "fast", "--out", "x"),
         ("design", "--theta-prime-deg", "-7", "--far-mm", "2000"),
         ("view", __file__, "--browser", "--out", "x.png"),
+        ("view", __file__, "--port", "9000"),
+        ("scan", "--hardware", __file__, "--scene", "sphere"),
+        ("scan", "--port", "9000"),
+        ("simulate", "--stop", "nan", "--out", "x"),
+        ("simulate", "--stop", "100000", "--out", "x"),
         ("convert", __file__, "x", "--packet-period", "9"),
     ],
 )

@@ -166,3 +166,20 @@ def test_a_recording_without_room_for_its_truth_is_a_warning_below_the_scan(tmp_
     printed = capsys.readouterr()
     assert "complete, 100.0%" in printed.out
     assert printed.err.startswith("eschorty: warning: the recording has no truth: ")
+    # A disk was full during the sweep.
+    (rec / "stage.csv").write_text("")
+    full = "recording: no space left on device"
+    result = ScanResult(True, full, points, 1, 9, 0, 0, "complete", 1.0, str(rec))
+    with pytest.raises(DeviceError, match=f"the recording is not complete: {full}"):
+        finish(request, result, tmp_path)
+
+
+def test_a_scan_that_fails_leaves_no_empty_folders(tmp_path, monkeypatch):
+    def fail(*_arguments):
+        raise DeviceError("the camera is lost")
+
+    monkeypatch.setattr("eschorty_ros.nodes.one_process.scan.scan_once", fail)
+    options = ["scan", "--out", str(tmp_path / "scan"), "--record", str(tmp_path / "rec")]
+    done = CliRunner().invoke(main, options)
+    assert (done.exit_code, done.stderr.splitlines()[-1]) == (1, "eschorty: the camera is lost")
+    assert list(tmp_path.iterdir()) == []

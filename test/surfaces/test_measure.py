@@ -118,4 +118,4 @@ def test_the_command_prints_values_with_their_sigma(tmp_path):
     twice = [*arguments[:2], "--json", *["--region", "20:140,:"] * 2]
     done = CliRunner().invoke(main, twice)
     assert '"gap_mm": {"value": null' in done.stdout
-    assert CliRunner().invoke(main, [*arguments[:2], "--common-mm", "nan"]).exit_code == 1
+    assert CliRunner().invoke(main, [*arguments[:2], "--common-mm", "nan"]).exit_code == 2
