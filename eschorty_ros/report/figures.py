@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 POINTS_IN_2D = 200_000
 POINTS_IN_3D = 30_000
 TICKS_IN_3D = 5
+LABEL_PAD = 6.0
 SHORT_SIDE = 0.4
 LONG_MAP = 8.0
 SIGMAS_SHOWN = 5.0
@@ -284,7 +285,9 @@ def _view_3d(
         linewidths=0.0,
         depthshade=False,
     )
-    axes.set(xlabel="y, stage (mm)", ylabel="x, range (mm)", zlabel="z, line (mm)")
+    axes.set_xlabel("y, stage (mm)", labelpad=LABEL_PAD)
+    axes.set_ylabel("x, range (mm)", labelpad=LABEL_PAD)
+    axes.set_zlabel("z, line (mm)")
     axes.set_title(f"Point cloud ({shown.size:,} points shown)")
     _true_to_scale(axes, np.stack([cloud[name] for name in "yxz"]) * 1e3)
     # From the sensor's view with the line upright, y points to the left.
@@ -302,7 +305,7 @@ def _true_to_scale(axes: Any, xyz_mm: NDArray[np.floating[Any]]) -> None:
     middle = 0.5 * (low + high)
     low, high = middle - 0.5 * spans, middle + 0.5 * spans
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(spans, zoom=0.8)
+    axes.set_box_aspect(spans, zoom=0.85)
     for k, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
         count = max(round(TICKS_IN_3D * spans[k] / longest), 3)
         ticks = MaxNLocator(count).tick_values(low[k], high[k])
