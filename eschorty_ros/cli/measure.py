@@ -138,6 +138,13 @@ def _print(measured: Measured, title: str) -> None:
             _text(flat.value_mm), f"{flat.of_plane_mm:.2f}",
         )  # fmt: skip
     show(first)
+    bent = [str(n) for n, surface in enumerate(measured.surfaces, 1) if surface.flat.of_no_plane]
+    if bent:
+        click.echo(
+            f"eschorty: warning: no plane: {', '.join(bent)}, by flatness; slopes, distances and "
+            "angles are those of the plane that fits best; choose parts with --region",
+            err=True,
+        )
     if measured.pairs:
         second = table("", "to surface 1", "distance mm", "angle °", "flush mm", "gap mm")
         for number, pair in enumerate(measured.pairs, 2):

@@ -23,7 +23,6 @@ from eschorty_ros.surfaces.plane import (
     solve,
 )
 
-SURFACES_MAX = 8
 # Smaller pieces are no surfaces to measure: share of the points.
 _PIECE_MIN = 0.02
 _MEDIAN_HALF = 2
@@ -150,7 +149,7 @@ def _found(grid: CloudGrid) -> list[NDArray[np.bool_]]:
     # Wide rims close the leaks where noise joins the two sides of a step.
     number, _ = label(binary_erosion(whole, iterations=_RIM, border_value=1))
     sizes = np.bincount(number[known], minlength=2)[1:]
-    large = np.argsort(-sizes, kind="stable")[:SURFACES_MAX]
+    large = np.argsort(-sizes, kind="stable")
     masks = [number == at + 1 for at in large if sizes[at] >= _PIECE_MIN * known.sum()]
     if not masks:
         raise ArgumentError(

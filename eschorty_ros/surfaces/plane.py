@@ -23,6 +23,7 @@ COMMON_SHARE = 0.16
 MAD = 1.4826
 """Standard deviation of Gaussian errors over their median absolute deviation."""
 _CUT_SIGMA = 4.0
+_SURE_SIGMAS = 3.0
 _ITERATIONS = 20
 # Errors of columns closer than 17, which smoothing averages at most, and of lines closer than 4 are
 # alike; fewer than 4 strips show no scatter.
@@ -100,6 +101,11 @@ class Flatness(NamedTuple):
 
     value_mm: Value
     of_plane_mm: float
+
+    @property
+    def of_no_plane(self) -> bool:
+        """Return whether it is above that of a perfect plane by more than its error explains."""
+        return self.value_mm.value - self.of_plane_mm > _SURE_SIGMAS * self.value_mm.sigma
 
 
 def fit_plane(part: Part, common_mm: float = 0.0) -> Plane:

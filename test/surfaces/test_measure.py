@@ -110,10 +110,15 @@ def test_the_command_prints_values_with_their_sigma(tmp_path):
     assert done.exit_code == 0, done.output
     assert "flatness mm" in done.output
     assert "gap mm" in done.output
+    assert done.stderr == ""
     assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
     facts = json.loads(CliRunner().invoke(main, [*arguments[:2], "--json"]).stdout)
     distance = facts["pairs"][0]["distance_mm"]
     assert abs(abs(distance["value"]) - 10.0) < 4.0 * distance["sigma"] < 1.0
+    # Nor is a surface with a fold of 1 mm a plane.
+    write_cloud(tmp_path / "bent.ply", cloud(lambda y, z: 1300.0 + 0.1 * np.abs(y - y.mean())))
+    bent = CliRunner().invoke(main, ["measure", str(tmp_path / "bent.ply")])
+    assert "warning: no plane: 1, by flatness" in bent.stderr
     # The same columns twice overlap: there is no gap.
     twice = [*arguments[:2], "--json", *["--region", "20:140,:"] * 2]
     done = CliRunner().invoke(main, twice)
