@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.modulation.frequency_estimate import FrequencyEstimate
 from eschorty_ros.core.reconstruction.settings import Settings
@@ -15,6 +17,9 @@ _PIECE_BYTES = 1 << 23
 _CHUNK_BYTES = 1 << 19
 _CHUNK_EVENTS = 1 << 15
 _FEW = 10
+# Longest way of a stage in metres, and what the readings of one at rest differ by.
+_METRES_MAX = 0.3
+_REST_MM = 0.003
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
 _LOSSES = {
@@ -66,6 +71,11 @@ def recording_warnings(
         return [*found, f"no points: {without_modulation(0, 0.0)}"]
     stated_hz = recording.modulation.frequency_hz
     found += _geometry(recording)
+    way_mm = float(np.ptp(recording.stage_samples["position_mm"]))
+    if _REST_MM < way_mm <= _METRES_MAX:
+        found.append(
+            f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
+        )
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
         whole = multiple > 1.5 and abs(multiple - round(multiple)) < _WHOLE

@@ -61,7 +61,6 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
     tables["reconstruction"] |= {"calibration": job.calibration, "calibration_folder": job.folder}
     bench = bench_options("posts", job.as_built, 0, "paper")
     with composition(tables, (Calibrate, "calibrate"), bench) as running:
-        feedback(0.0, "starting")
         goal = Calibrate.Goal(
             targets=[target_message(target) for target in job.targets],
             method=job.method,
@@ -76,7 +75,7 @@ def calibrate_once(job: CalibrationJob, feedback: Feedback) -> CalibrationResult
                 state.waits_for or f"{state.phase} {state.matched} of {state.posts} posts known",
             )
 
-        ended = running.result(goal, on_feedback)
+        ended = running.result(goal, on_feedback, feedback)
     return CalibrationResult(
         message=str(ended.message),
         calibration=load_calibration(ended.file) if ended.success else None,

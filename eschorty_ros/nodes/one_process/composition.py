@@ -91,24 +91,32 @@ class Composition:
         self._spinning = spinning
         self._action = action
 
-    def wait_until_active(self) -> None:
+    def wait_until_active(self, feedback: Feedback) -> None:
         """Wait until every node is active and the action's server has been discovered.
 
-        Raises ``DeviceError`` when a node failed or takes far too long.
+        ``feedback`` is called with what is missing. Raises ``DeviceError`` when a node failed or
+        takes far too long.
         """
+
+        def active() -> bool:
+            feedback(0.0, "; ".join(self._waiting()) or "starting")
+            return self._active() and bool(self._action.server_is_ready())
+
         wait(
-            lambda: self._active() and self._action.server_is_ready(),
+            active,
             START_S,
             lambda: "; ".join(("the nodes are not active", *self._waiting())),
         )
 
-    def result(self, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
+    def result(self, goal: Any, on_feedback: Callable[[Any], None], starting: Feedback) -> Any:
         """Send a goal once all nodes are active; return its result. An interruption cancels it.
+
+        ``starting`` is called with what is missing until then.
 
         Raises ``DeviceError`` when a node fails, or the server refuses the goal or sends no
         feedback any more.
         """
-        self.wait_until_active()
+        self.wait_until_active(starting)
         newest_s = time.monotonic()
 
         def receive(message: Any) -> None:

@@ -116,10 +116,9 @@ def scan_once(job: ScanJob, feedback: Feedback) -> ScanResult:
         feedback(float(state.progress), state.waits_for or f"{state.phase} {state.points:,} points")
 
     with composition(tables, (Scan, "scan"), bench) as running:
-        feedback(0.0, "starting")
         clouds: list[PointCloud2] = []
         running.client.create_subscription(PointCloud2, "scan/points", clouds.append, qos.latched())
-        ended = running.result(goal, on_feedback)
+        ended = running.result(goal, on_feedback, feedback)
         if ended.points:
             wait(
                 lambda: clouds and len(points_from_message(clouds[-1])) == ended.points,

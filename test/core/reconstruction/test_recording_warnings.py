@@ -24,8 +24,9 @@ def at_hz(recording, frequency_hz):
     return replace(recording, modulation=replace(recording.modulation, frequency_hz=frequency_hz))
 
 
-def with_stage(recording, later_us, part=slice(None)):
+def with_stage(recording, later_us, part=slice(None), scale=1.0):
     samples = recording.stage_samples[part].copy()
+    samples["position_mm"] *= scale
     samples["t_us"] += later_us
     track = StageTrack()
     track.append(samples["t_us"], samples["position_mm"])
@@ -59,6 +60,7 @@ def test_a_dark_recording_says_so(tmp_path):
         ),
         (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
         (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
+        (lambda r: with_stage(r, 0, scale=1e-3), {}, "moves by 0.03 mm in stage.csv; where", 1),
         (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
         (lambda r: r, {"events_min": 50}, "fewer events than events_min = 50; lower it", 1),

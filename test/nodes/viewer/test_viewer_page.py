@@ -50,7 +50,7 @@ def test_a_scan_is_started_from_the_page_and_its_points_appear(page, tmp_path):
     tables["viewer"] = {"port": free_port(), "allow_scan": True}
     bench = bench_options("steps", "config_3", 1, "paper")
     with composition(tables, (Scan, "scan"), bench) as running:
-        running.wait_until_active()
+        running.wait_until_active(lambda share, note: None)
         viewer = next(node for node in running.nodes if node.get_name() == "viewer")
         page.goto(viewer.page.url)
         page.get_by_role("button", name="Start scan").wait_for(timeout=WAIT_MS)
