@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.storage import POINT_DTYPE, join_points
+from eschorty_ros.core.storage.recording import between
 from eschorty_ros.live.sensor_epoch import SensorTimes
-
-_HALF_NM = 0.5e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +84,10 @@ class ScanBuffer:
             )
         self.scan_id = scan_id
         self.points_outside = self.points_over_limit = 0
-        self._low_mm = min(start_mm, stop_mm) - _HALF_NM
-        self._high_mm = max(start_mm, stop_mm) + _HALF_NM
+        self._limits_mm = start_mm, stop_mm
         self._points_max = points_max
         self._parts: list[PlacedPoints] = []
         self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
 
     def add(self, placed: PlacedPoints) -> None:
         """Keep the points between the limits."""
@@ -106,7 +101,7 @@ class ScanBuffer:
             self._count += len(kept)
 
     def _inside(self, placed: PlacedPoints) -> PlacedPoints:
-        inside = (placed.stage_mm >= self._low_mm) & (placed.stage_mm <= self._high_mm)
+        inside = between(placed.stage_mm, *self._limits_mm)
         self.points_outside += int(np.count_nonzero(~inside))
         return placed if inside.all() else placed.select(inside)
 

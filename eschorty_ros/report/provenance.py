@@ -24,7 +24,7 @@ def provenance(effort: Effort) -> dict[str, str]:
     made |= {name: _version(name) for name in LIBRARIES}
     return made | {
         "System": f"{platform.system()} {platform.machine()}",
-        "CPU": f"{cpu_model()}, {_usable_cores()} usable",
+        "CPU": f"{cpu_model()}, {len(os.sched_getaffinity(0))} usable",
         "Seed": str(effort.seed),
         "Effort": "fast: a coarse run" if effort.fast else "full",
     }
@@ -41,12 +41,6 @@ def cpu_model() -> str:
         if key.strip() == "model name":
             return value.strip()
     return platform.processor() or "unknown"
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _version(name: str) -> str:

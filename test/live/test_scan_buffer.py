@@ -96,7 +96,7 @@ def test_points_over_the_limit_are_counted():
     buffer = ScanBuffer("a", 0.0, 1.0, points_max=3)
     for _ in range(2):
         buffer.add(placed([0.5, 0.5], [T0_NS, T0_NS], [1, 2]))
-    assert len(buffer) == 3
+    assert len(buffer.assemble().points) == 3
     assert buffer.points_over_limit == 1
 
 

@@ -339,10 +339,8 @@ CALLS: dict[str, Call] = {
     "storage.RawWriter": call(
         raw_writer,
         path=("events.raw", path()),
-        serial=("00000000", Kind([None, 3, "xyz", ""])),
         width=SIDE,
         height=SIDE,
-        sensor_name=("IMX636", Kind([None, 3, "two words", "", "ü"])),
     ),
     "storage.RawWriter.write": call(raw_write, data=(b"abc", stream())),
     "storage.write_cloud": call(

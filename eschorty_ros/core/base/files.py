@@ -9,6 +9,7 @@ import stat
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -127,6 +128,20 @@ def temporary_folder() -> Iterator[Path]:
     """Make a folder for short-lived files; one of a run that was killed is removed by the next."""
     with _partial(Path(tempfile.gettempdir()), f"eschorty_{os.getuid()}_", "") as folder:
         yield folder
+
+
+def append_whole(file: FileIO, data: bytes | memoryview) -> None:
+    """Append all of ``data`` to an unbuffered file, or raise ``OSError`` and append nothing."""
+    end, view = file.tell(), memoryview(data)
+    try:
+        while view:
+            view = view[file.write(view) :]
+    except OSError:
+        # The disk may be gone.
+        with suppress(OSError):
+            file.truncate(end)
+            file.seek(end)
+        raise
 
 
 def remove_abandoned(parent: Path, prefix: str = ".", suffix: str = _PARTIAL) -> None:

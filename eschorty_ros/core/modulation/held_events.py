@@ -13,7 +13,7 @@ _DTYPES = (np.int64, np.uint16, np.uint16, np.uint8)
 HELD_EVENTS_MAX = 1 << 22
 """Events that wait for a phase, or for the periods of a profile, at most."""
 
-EventArrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+Arrays = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Times in us (int64), columns (uint16), rows (uint16) and polarities (uint8)."""
 
 
@@ -21,25 +21,26 @@ class HeldEvents:
     """A growing queue of events in time order.
 
     Public attributes:
-    - ``refused``: Leading events in which no phase was found.
+    - ``searched``: Leading events in which no phase was found.
+    - ``refused``: Events dropped because they waited too long for a phase or for light.
     """
 
     def __init__(self) -> None:
         self._buffers = tuple(np.empty(_CAPACITY, dtype) for dtype in _DTYPES)
         self._first = 0
         self._end = 0
-        self.refused = 0
+        self.searched = self.refused = 0
 
     def __len__(self) -> int:
         return self._end - self._first
 
     @property
-    def arrays(self) -> EventArrays:
+    def arrays(self) -> Arrays:
         """The queued events: views valid until the next change."""
         t, x, y, p = (values[self._first : self._end] for values in self._buffers)
         return t, x, y, p
 
-    def append(self, events: EventArrays) -> None:
+    def append(self, events: Arrays) -> None:
         """Copy events to the end."""
         count = events[0].size
         if self._end + count > self._buffers[0].size:
@@ -51,9 +52,14 @@ class HeldEvents:
     def drop(self, count: int) -> None:
         """Remove the first ``count`` events."""
         self._first += count
-        self.refused = max(self.refused - count, 0)
+        self.searched = max(self.searched - count, 0)
         if self._first == self._end:
             self._first = self._end = 0
+
+    def refuse(self, count: int) -> None:
+        """Remove the first ``count`` events, which nothing can use."""
+        self.refused += count
+        self.drop(count)
 
     def _make_room(self, count: int) -> None:
         held = len(self)

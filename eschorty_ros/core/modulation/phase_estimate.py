@@ -15,6 +15,7 @@ from eschorty_ros.core.modulation.modulation import Modulation
 WINDOW_PERIODS = 4
 WINDOW_EVENTS = 2048
 _HISTOGRAM_BINS = 200
+# Strength squared times the events: exponential with mean 1 where they are not modulated.
 _RAYLEIGH_MIN = 30.0
 
 
@@ -28,9 +29,6 @@ class PhaseEstimate:
     strength: float
     """Vector strength of all events, 0 to 1 (ON events against the rising edge, OFF events against
     the falling one)."""
-    rayleigh: float
-    """Strength squared times the number of events; exponential with mean 1 for unmodulated
-    events."""
     found: bool
     """True when the window is modulated by the Rayleigh test."""
 
@@ -66,10 +64,9 @@ def estimate_phase(
     phase -= modulation.duty * (polarity == 0)
     phase -= np.floor(phase)
     strength = float(abs(np.exp(2j * np.pi * phase).mean()))
-    rayleigh = strength * strength * t_us.size
-    found = rayleigh > _RAYLEIGH_MIN
+    found = strength * strength * t_us.size > _RAYLEIGH_MIN
     begin = _burst_begin(phase) if found else 0.0
-    return PhaseEstimate(origin + round(begin * period_us), strength, rayleigh, found)
+    return PhaseEstimate(origin + round(begin * period_us), strength, found)
 
 
 def _burst_begin(phase: NDArray[np.float64]) -> float:

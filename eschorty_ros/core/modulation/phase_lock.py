@@ -43,17 +43,13 @@ class PhaseLock:
     - ``every``: See ``EdgeSchedule``.
 
     Public attributes:
-    - ``estimate``: The first estimate of the phase.
     - ``missing``: True when the stream ended without a phase; periods then count from the first
       event.
-    - ``refused``: Events dropped because they waited too long for a phase.
     """
 
     def __init__(self, modulation: Modulation, every: int = 1) -> None:
         self.schedule = EdgeSchedule(modulation, every)
-        self.estimate: PhaseEstimate | None = None
         self.missing = False
-        self.refused = 0
         self._modulation = modulation
         self._block = max(_BLOCK_PERIODS, round(BLOCK_US / modulation.period_us))
         self._block_end_us: int | None = None
@@ -87,7 +83,7 @@ class PhaseLock:
             return True
         while True:
             t, _, _, p = held.arrays
-            begin = held.refused
+            begin = held.searched
             window = estimation_window(t[begin:], now_us, self._modulation)
             trigger_us = self.schedule.first_trigger_us
             end_us = END_OF_STREAM_US if window is None else window.end_us
@@ -100,10 +96,9 @@ class PhaseLock:
             estimate = estimate_phase(t[begin:end], p[begin:end], self._modulation)
             if estimate.found:
                 return self._anchor(estimate, first_us)
-            held.refused = end
+            held.searched = end
             if end > HELD_EVENTS_MAX:
-                self.refused += end
-                held.drop(end)
+                held.refuse(end)
                 if len(held) == 0:
                     return False
                 first_us = int(held.arrays[0][0])
@@ -116,7 +111,6 @@ class PhaseLock:
         return last
 
     def _anchor(self, estimate: PhaseEstimate, first_us: int) -> bool:
-        self.estimate = estimate
         self.schedule.anchor(estimate.edge_us, first_us)
         self._block_end_us = self.schedule.middle_after(self._block)
         return True

@@ -26,7 +26,7 @@ from eschorty_ros.core.reconstruction.recording_warnings import (
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import POINT_DTYPE, REFLECTANCE_DTYPE, Recording, height_map
 from eschorty_ros.core.storage.raw_file import RawReader
-from eschorty_ros.core.storage.recording import SETTINGS_FILE, TRUTH_FILE
+from eschorty_ros.core.storage.recording import SETTINGS_FILE, TRUTH_FILE, between
 
 # Bytes of the file that are mapped at a time, in one thread and in several.
 _PASS_BYTES = 1 << 20
@@ -160,7 +160,7 @@ class _Cloud:
         known = np.isfinite(position)
         self.without_stage += int(known.size - known.sum())
         if recording.scan is not None:
-            known &= recording.scan.between(position)
+            known &= between(position, recording.scan.start_mm, recording.scan.stop_mm)
         if not known.all():
             profiles, position = profiles.select(known), position[known]
         if not len(profiles):

@@ -9,7 +9,7 @@ from eschorty_ros.core.evt3 import Decoder, Events
 from eschorty_ros.core.evt3.words import EXT_TRIGGER
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.modulation.edges import EDGES_MAX
-from eschorty_ros.core.modulation.held_events import EventArrays, HeldEvents
+from eschorty_ros.core.modulation.held_events import Arrays, HeldEvents
 from eschorty_ros.core.modulation.phase_lock import END_OF_STREAM_US, PhaseLock
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
 from eschorty_ros.core.reconstruction.profile_length import ProfileLength
@@ -45,7 +45,7 @@ class PeriodCutter:
         """Counts by name."""
         return {
             "events_held": len(self._held),
-            "events_outside_phase": self.lock.refused + self._length.refused,
+            "events_outside_phase": self._held.refused,
             "periods_empty": self.lock.schedule.periods_jumped,
             **self.lock.counters,
         }
@@ -132,7 +132,7 @@ class PeriodCutter:
         t, x, y, p = self._held.arrays
         self._assign((t[:0], x[:0], y[:0], p[:0]), watermark_us)
 
-    def _assign(self, new: EventArrays, watermark_us: int) -> None:
+    def _assign(self, new: Arrays, watermark_us: int) -> None:
         """Assign the events certain before the watermark, held ones first; hold back the rest."""
         held, lock = self._held, self.lock
         first = 0
@@ -159,6 +159,6 @@ class PeriodCutter:
         held.append((t[first:], x[first:], y[first:], p[first:]))
 
 
-def _part(events: EventArrays, begin: int, end: int) -> EventArrays:
+def _part(events: Arrays, begin: int, end: int) -> Arrays:
     t, x, y, p = events
     return t[begin:end], x[begin:end], y[begin:end], p[begin:end]

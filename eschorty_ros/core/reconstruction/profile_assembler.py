@@ -27,7 +27,7 @@ from eschorty_ros.core.line.estimators import CENTROIDS, FULL_COLUMN_METHODS
 from eschorty_ros.core.line.learned_gate import make_gate, same_gate
 from eschorty_ros.core.line.window import ROW_LAST
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.held_events import EventArrays as Arrays
+from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.modulation.phase_gate import _gate_part
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profile_rows import (

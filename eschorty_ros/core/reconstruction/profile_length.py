@@ -53,15 +53,11 @@ class ProfileLength:
     is not enough in the first block, with twice as many events, the next one counts, since pixels
     give more when the laser is switched on. Blocks without light do not count. A block has
     `BLOCK_US`, but two periods at least; the first one ends with enough events after four.
-
-    Public attributes:
-    - ``refused``: Events dropped because they waited too long for light.
     """
 
     def __init__(self, modulation: Modulation) -> None:
         self._modulation = modulation
         self._span_us = max(BLOCK_US, round(_BLOCK_PERIODS * modulation.period_us))
-        self.refused = 0
         self._seen = 0
         self._window: tuple[int, int] | None = None
 
@@ -86,8 +82,7 @@ class ProfileLength:
                 elif end > HELD_EVENTS_MAX:
                     if self._modulation.on_edge_us is not None:
                         return 1
-                    self.refused += end
-                    held.drop(end)
+                    held.refuse(end)
                     self._seen = 0
                     if len(held) == 0:
                         return 0

@@ -16,7 +16,6 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.evt3 import ActivityFilter, Decoder, Events, Triggers
 from eschorty_ros.core.line import relative_reflectance
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.phase_estimate import PhaseEstimate
 from eschorty_ros.core.optics import Calibration
 from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
@@ -396,11 +395,6 @@ class Reconstructor:
                 f"profile, {self.modulation.frequency_hz / every:.4g} profiles per second"
             )
         return found
-
-    @property
-    def phase(self) -> PhaseEstimate | None:
-        """The first estimate of the phase, ``None`` where it is known or not found yet."""
-        return self._periods.lock.estimate
 
     @property
     def counters(self) -> dict[str, int]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from eschorty_ros.core.evt3 import Decoder
 from eschorty_ros.core.evt3.cuts import Cut, next_cut
 from eschorty_ros.core.modulation import Modulation
-from eschorty_ros.core.modulation.held_events import EventArrays
+from eschorty_ros.core.modulation.held_events import Arrays
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction import profile_rows
 from eschorty_ros.core.reconstruction.profile_assembler import Edges, ProfileAssembler, Span
@@ -95,7 +95,7 @@ class WindowAssembler:
         counts.update(self._counts)
         return dict(counts)
 
-    def merge(self, held: EventArrays, new: EventArrays, edges: Edges) -> None:
+    def merge(self, held: Arrays, new: Arrays, edges: Edges) -> None:
         """Assign events to periods, in this thread; see `ProfileAssembler.merge`."""
         self._open.merge(held, new, edges)
 

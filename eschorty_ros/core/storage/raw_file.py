@@ -6,7 +6,6 @@ header stops at the first two bytes that are not ``% ``.
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import mmap
 import os
@@ -15,8 +14,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from eschorty_ros.core.base.arrays import byte_view, file_path, integer
-from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.base.files import open_regular_file
+from eschorty_ros.core.base.errors import FormatError
+from eschorty_ros.core.base.files import append_whole, open_regular_file
 from eschorty_ros.core.evt3 import words as w3
 
 CHUNK_BYTES = 128 * 1024
@@ -208,35 +207,25 @@ class RawWriter:
     """Writes an EVT3 RAW file with the header keys that older and newer readers need.
 
     - ``path``: The file to write; replaced when it exists.
-    - ``serial``: Serial number, 8 hexadecimal digits.
     - ``width``, ``height``: Sensor size in pixels.
-    - ``date``: Time of the recording; now (UTC) when left out.
 
-    Raises ``ArgumentError`` when a value is not allowed in a header. Raises ``FormatError`` when
+    Raises ``ArgumentError`` for a size that is none. Raises ``FormatError`` when
     the file cannot be written.
     """
 
     def __init__(
         self,
         path: str | Path,
-        serial: str = "00000000",
         width: int = 1280,
         height: int = 720,
-        sensor_name: str = "IMX636",
-        date: datetime.datetime | None = None,
     ) -> None:
-        if not (isinstance(serial, str) and re.fullmatch(r"[0-9a-fA-F]{8}", serial)):
-            raise ArgumentError(f"serial is {serial!r}; give 8 hexadecimal digits")
-        if not (isinstance(sensor_name, str) and re.fullmatch(r"[!-~]+", sensor_name)):
-            raise ArgumentError(f"sensor_name is {sensor_name!r}; give one ASCII word")
         for name, size in (("width", width), ("height", height)):
             integer(name, size, 1, _SIZE_MAX)
         self.path = file_path("path", path)
         self.bytes_written = 0
-        recorded = date or datetime.datetime.now(datetime.UTC)
         header = {
             "camera_integrator_name": "Prophesee",
-            "date": recorded.strftime("%Y-%m-%d %H:%M:%S"),
+            "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M:%S"),
             "evt": "3.0",
             "format": f"EVT3;height={height};width={width}",
             "generation": "4.2",
@@ -245,14 +234,14 @@ class RawWriter:
             "plugin_integrator_name": "Prophesee",
             "plugin_name": "hal_plugin_prophesee",
             "sensor_generation": "4.2",
-            "sensor_name": sensor_name,
-            "serial_number": serial.lower(),
+            "sensor_name": "IMX636",
+            "serial_number": "00000000",
             "system_ID": "49",
         }
         lines = "".join(f"% {key} {value}\n" for key, value in header.items()) + "% end\n"
         try:
             self._file = self.path.open("wb", buffering=0)
-            self._append(memoryview(lines.encode("ascii")))
+            append_whole(self._file, lines.encode("ascii"))
         except OSError as error:
             raise FormatError(f"{self.path}: {error.strerror or error}; choose another") from error
 
@@ -264,22 +253,10 @@ class RawWriter:
         """
         view = byte_view("data", data)
         try:
-            self._append(view)
+            append_whole(self._file, view)
         except OSError as error:
             raise FormatError(f"{self.path}: {error.strerror or error}; free some space") from error
         self.bytes_written += len(view)
-
-    def _append(self, view: memoryview) -> None:
-        end = self._file.tell()
-        try:
-            while view:
-                view = view[self._file.write(view) :]
-        except OSError:
-            # The disk may be gone.
-            with contextlib.suppress(OSError):
-                self._file.truncate(end)
-                self._file.seek(end)
-            raise
 
     def close(self) -> None:
         """Finish the file; idempotent. Raises ``FormatError`` when it cannot be written."""

@@ -61,6 +61,12 @@ class _LaserFile(Schema):
     on_edge_us: Annotated[int, Within(-(2**63), 2**63 - 1)] | None = None
 
 
+def between(stage_mm: NDArray[np.float64], start_mm: float, stop_mm: float) -> NDArray[np.bool_]:
+    """Return a mask of the stage positions between start and stop, both included."""
+    low_mm, high_mm = sorted((start_mm, stop_mm))
+    return (stage_mm >= low_mm - _HALF_NM_MM) & (stage_mm <= high_mm + _HALF_NM_MM)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ScanLog(Schema):
     """The scan that a recording is of, and what the recording lacks.
@@ -79,11 +85,6 @@ class ScanLog(Schema):
     packets_lost: Annotated[int, Within(0)] = 0
     packets_left_out: Annotated[int, Within(0)] = 0
     reason: str | None = None
-
-    def between(self, stage_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return a mask of the stage positions between start and stop, both included."""
-        low_mm, high_mm = sorted((self.start_mm, self.stop_mm))
-        return (stage_mm >= low_mm - _HALF_NM_MM) & (stage_mm <= high_mm + _HALF_NM_MM)
 
     @property
     def faults(self) -> list[str]:

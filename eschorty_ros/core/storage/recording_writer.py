@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.arrays import file_path
 from eschorty_ros.core.base.errors import ArgumentError, FormatError
-from eschorty_ros.core.base.files import atomic_write
+from eschorty_ros.core.base.files import append_whole, atomic_write
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration, save_calibration
 from eschorty_ros.core.storage.cloud import Points, write_cloud
@@ -142,15 +142,9 @@ class _Table:
         self._write(csv_lines(rows))
 
     def _write(self, text: bytes) -> None:
-        end = self._file.tell()
         try:
-            if self._file.write(text) != len(text):
-                raise OSError("no space left on device")
+            append_whole(self._file, text)
         except OSError as error:
-            # The disk may be gone.
-            with contextlib.suppress(OSError):
-                self._file.truncate(end)
-                self._file.seek(end)
             raise FormatError(f"{self._path}: {error.strerror or error}; free some space") from None
 
     def __enter__(self) -> _Table:

@@ -313,7 +313,7 @@ def test_jittered_and_missing_triggers_lose_no_event():
 def test_phase_is_estimated_and_nothing_is_lost():
     found, reconstructor = reconstruct(encoded(lines(periods=8, edge_us=9000)), Modulation(70.0))
     assert not reconstructor.phase_missing
-    error = (reconstructor.phase.edge_us - 9000 + 7143) % (1e6 / 70) - 7143
+    error = (found.edge_us[0] - 9000 + 7143) % (1e6 / 70) - 7143
     assert abs(error) < 700
     assert reconstructor.counters["events_outside_phase"] == 0
     assert len(found) > 0.98 * 8 * 1280
