@@ -250,12 +250,33 @@ class SweepProgress:
         self._way_mm = request.passes * (self._ends_mm[1] - self._ends_mm[0])
         self._gone_mm = 0.0
         self._last_mm: float | None = None
+        self._totals: tuple[float, int, int] | None = None
+        self._points = self._profiles = 0.0
+
+    def counts(self, position_mm: float, points: int, profiles: int) -> tuple[int, int]:
+        """Return the points and profiles between start and stop so far.
+
+        ``points`` and ``profiles`` are the reconstruction's totals when its newest point is of a
+        stage position; a reconstruction that starts again counts on.
+        """
+        before = self._totals
+        if not math.isnan(position_mm):
+            self._totals = position_mm, points, profiles
+        if before is not None and self._totals is not None and self._totals[0] != before[0]:
+            inside_mm = abs(self._limited(position_mm) - self._limited(before[0]))
+            share = inside_mm / abs(position_mm - before[0])
+            self._points += max(points - before[1], 0) * share
+            self._profiles += max(profiles - before[2], 0) * share
+        return round(self._points), round(self._profiles)
+
+    def _limited(self, position_mm: float) -> float:
+        return min(max(position_mm, self._ends_mm[0]), self._ends_mm[1])
 
     def share(self, phase: str, position_mm: float) -> float:
         """Return the share, 0 to 1, when the newest point is of a stage position in ``phase``."""
         if phase not in ("sweeping", "finishing") or math.isnan(position_mm):
             return 0.0
-        position_mm = min(max(position_mm, self._ends_mm[0]), self._ends_mm[1])
+        position_mm = self._limited(position_mm)
         if self._last_mm is not None:
             self._gone_mm += abs(position_mm - self._last_mm)
         self._last_mm = position_mm

@@ -50,6 +50,22 @@ def test_passes_go_forth_and_back_under_one_light():
     assert progress.share("finishing", 40.0) == 1.0
 
 
+def test_points_of_the_way_to_the_start_and_beyond_the_stop_are_not_counted():
+    progress = SweepProgress(REQUEST)
+    totals = [
+        (math.nan, 0),
+        (18.0, 500),
+        (19.0, 1500),
+        (21.0, 3500),
+        (40.0, 22_500),
+        (42.0, 24_500),
+    ]
+    counts = [progress.counts(at_mm, points, points // 100) for at_mm, points in totals]
+    assert counts == [(0, 0), (0, 0), (0, 0), (1000, 10), (20_000, 200), (20_000, 200)]
+    # Another reconstruction.
+    assert progress.counts(30.0, 10, 0) == (20_000, 200)
+
+
 @pytest.mark.parametrize("step", [("check_nodes", 1), ("configure_laser", 1), ("move", 1),
                                   ("begin_scan", 1), ("laser_on", 1), ("move", 2)])  # fmt: skip
 @pytest.mark.parametrize("error", [ScanFailure("stage: stuck"), ScanCanceled()])

@@ -196,27 +196,25 @@ class ScannerNode(Node):
     def _feedback(self, goal: Any, request: ScanRequest) -> Callable[[str], None]:
         sent_s = -math.inf
         sent_phase = ""
-        points_before = profiles_before = 0
         progress = SweepProgress(request)
 
         def send(phase: str) -> None:
-            nonlocal sent_s, sent_phase, points_before, profiles_before
+            nonlocal sent_s, sent_phase
             now_s = time.monotonic()
             if phase == sent_phase and now_s - sent_s < _FEEDBACK_S:
                 return
             sent_s, sent_phase = now_s, phase
             monitor = self._client.monitor
-            share = progress.share(phase, monitor.reconstructed_mm())
+            reconstructed_mm = monitor.reconstructed_mm()
+            share = progress.share(phase, reconstructed_mm)
             feedback = Scan.Feedback(phase=phase, progress=share)
             feedback.position = m_from_mm(monitor.position_mm)
             feedback.waits_for = self._client.waits_for
             state = self._client.monitor.reconstruction
-            if state is not None and phase in ("preparing", "to_start"):
-                # Of the reconstruction that is there now: another one counts from 0.
-                points_before, profiles_before = state.points, state.profiles
             if state is not None:
-                feedback.points = max(state.points - points_before, 0)
-                feedback.profiles = max(state.profiles - profiles_before, 0)
+                feedback.points, feedback.profiles = progress.counts(
+                    reconstructed_mm, state.points, state.profiles
+                )
                 feedback.events_per_second = state.events_per_second
             with unless_shut_down(self):
                 goal.publish_feedback(feedback)
