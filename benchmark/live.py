@@ -179,8 +179,8 @@ def measured(arguments: argparse.Namespace) -> tuple[float, ...]:
     from ros_process import Observer
     from sensor_msgs.msg import PointCloud2
 
+    from eschorty_ros.live.device_messages import ns_from_stamp
     from eschorty_ros.nodes.ros import qos
-    from eschorty_ros.nodes.ros.conversions import ns_from_stamp
 
     frequency_hz, packet_ms, rate = (
         arguments.frequency[0],
