@@ -1,11 +1,14 @@
 """What the package promises to other ROS 2 software and to those who install it."""
 
+import ast
+import importlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -97,6 +100,19 @@ def test_imports_without_ros(module: str) -> None:
         "assert 'open3d' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=ROOT)
+
+
+def test_scripts_import_names_that_exist() -> None:
+    """Benchmarks and the pages' scripts run by hand."""
+    missing = []
+    for script in (*ROOT.glob("benchmark/*.py"), *ROOT.glob("docs/*.py")):
+        for node in ast.walk(ast.parse(script.read_text())):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("eschorty_"):
+                module = importlib.import_module(str(node.module))
+                for name in (alias.name for alias in node.names):
+                    if not hasattr(module, name) and not find_spec(f"{node.module}.{name}"):
+                        missing.append(f"{script.name}: {node.module}.{name}")
+    assert missing == []
 
 
 def test_the_public_names_are_there_and_come_on_first_use() -> None:
