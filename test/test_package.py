@@ -110,7 +110,9 @@ def test_scripts_import_names_that_exist() -> None:
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("eschorty_"):
                 module = importlib.import_module(str(node.module))
                 for name in (alias.name for alias in node.names):
-                    if not hasattr(module, name) and not find_spec(f"{node.module}.{name}"):
+                    package = hasattr(module, "__path__")
+                    known = package and find_spec(f"{node.module}.{name}") is not None
+                    if not known and not hasattr(module, name):
                         missing.append(f"{script.name}: {node.module}.{name}")
     assert missing == []
 
