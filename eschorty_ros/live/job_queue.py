@@ -49,12 +49,17 @@ class JobQueue:
     def run(self, job: Job, timeout_s: float, running: Callable[[], bool]) -> tuple[bool, str]:
         """Queue a small job and wait for its end, at most while ``running()``.
 
-        Returns whether it succeeded, and the reason of a failure.
+        Returns whether it succeeded, and the reason of a failure. A job that has not begun within
+        ``timeout_s`` never does; one of 0 is not waited for.
         """
         answered = threading.Event()
         refusal: list[str] = []
+        # Taken once: by the worker that begins the job, or by the caller who gives up.
+        turn = threading.Lock()
 
         def guarded() -> None:
+            if not turn.acquire(blocking=False):
+                return
             try:
                 job()
             except EschortyError as error:
@@ -67,11 +72,13 @@ class JobQueue:
 
         if not self.post(guarded):
             return False, "the reconstruction has too much to do; send less"
+        if timeout_s == 0.0:
+            return True, ""
         end_s = time.monotonic() + timeout_s
         while not answered.wait(min(_POLL_S, timeout_s)):
             if not running():
                 return False, "the node was shut down"
-            if time.monotonic() > end_s:
+            if time.monotonic() > end_s and turn.acquire(blocking=False):
                 return False, f"the reconstruction did not answer within {timeout_s:g} s"
         return not refusal, "".join(refusal)
 

@@ -239,7 +239,9 @@ def recorded_truth(
     for number, (_, positions, _) in enumerate(passes):
         for position in positions:
             below = at_mm < position
-            crossed = np.flatnonzero(below[1:] != below[:-1])[number : number + 1]
+            # Those of the sweep are the last: the stage may cross it on the way to the start.
+            crossed = np.flatnonzero(below[1:] != below[:-1])[-sweep.passes :]
+            crossed = crossed[number : number + 1]
             if not crossed.size:
                 continue
             ends = slice(crossed[0], crossed[0] + 2)

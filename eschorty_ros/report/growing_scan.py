@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.core.base.files import atomic_write
 from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.report.figures import central, grid_of, image_of
@@ -40,7 +41,8 @@ def write_growing_scan(points: NDArray[np.void], path: str | os.PathLike[str]) -
     - ``points``: POINT_DTYPE, shape (n,).
     - ``path``: Ends in ``.gif``.
 
-    Raises ``ArgumentError`` when the cloud is empty, or the path cannot be written.
+    Raises ``ArgumentError`` when the cloud has less than two profiles or columns, or the path
+    cannot be written.
     """
     from PIL import Image
 
@@ -73,6 +75,8 @@ def _surface(points: NDArray[np.void]) -> _Surface:
     near = (high - range_mm) / (high - low)
     shown = (near >= 0.0) & (near <= 1.0)
     images = [image_of(grid, points, values) for values in xyz.T]
+    if min(images[0].shape) < 2:
+        raise ArgumentError("a growing scan needs two profiles and two columns or more; give them")
     light = _light(np.stack(images))[grid.profile, points["column"]]
     colour = colormaps["viridis"](0.15 + 0.85 * near)[:, :3] * light[:, None]
     xyz -= 0.5 * (xyz[shown].min(axis=0) + xyz[shown].max(axis=0))

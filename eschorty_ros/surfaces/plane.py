@@ -18,6 +18,7 @@ from eschorty_ros.core.base.errors import ArgumentError
 from eschorty_ros.surfaces.grid import CloudGrid
 
 POINTS_MIN = 30
+_EXTENT_MIN_MM = 0.01
 COMMON_SHARE = 0.16
 """Mean error of simulated planes that face the sensor, as a share of the points' own sigma."""
 MAD = 1.4826
@@ -181,6 +182,12 @@ def check_part(part: Part) -> None:
         raise ArgumentError(
             f"a surface has {len(part.line):,} points in {lines} periods and {columns} columns; "
             f"choose a region with {POINTS_MIN} points or more in 3 of each"
+        )
+    extent_mm = np.ptp(part.xyz[:, 1:], axis=0)
+    if extent_mm.min() < _EXTENT_MIN_MM:
+        raise ArgumentError(
+            f"a surface extends {extent_mm[0]:.3g} mm along y and {extent_mm[1]:.3g} mm along z; "
+            "a plane needs an extent in both: give a sweep"
         )
 
 

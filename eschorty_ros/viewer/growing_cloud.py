@@ -37,6 +37,7 @@ class GrowingCloud:
         self._limit = integer("limit", limit, 2, 100_000_000)
         self._lock = threading.Lock()
         self._kept = np.empty((limit, 3 + len(COLOURS)), np.float32)
+        self.changes = 0
         self.clear()
 
     def clear(self) -> None:
@@ -45,7 +46,7 @@ class GrowingCloud:
             self._count = self._received = 0
             self._stride = 1
             self._pass, self._way = 1, 0.0
-            self.changes = 0
+            self.changes += 1
 
     def add(self, points: NDArray[np.void]) -> None:
         """Add points in m with ``x y z sigma``, and ``t column reflectance`` where known."""

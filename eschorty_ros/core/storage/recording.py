@@ -80,6 +80,7 @@ class ScanLog(Schema):
     scan_id: str
     start_mm: float
     stop_mm: float
+    passes: Annotated[int, Within(1)] = 1
     stage_gap_s: Annotated[float, Within(0.0, 1e9)] = 0.0
     state: Literal["recording", "ended"] = "recording"
     packets_lost: Annotated[int, Within(0)] = 0

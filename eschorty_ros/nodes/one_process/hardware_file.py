@@ -15,7 +15,7 @@ from eschorty_ros.nodes.camera import node as camera
 from eschorty_ros.nodes.laser import node as laser
 from eschorty_ros.nodes.reconstruction import parameters as reconstruction_parameters
 from eschorty_ros.nodes.replay import node as replay
-from eschorty_ros.nodes.ros import lifecycle
+from eschorty_ros.nodes.ros import drivers, lifecycle
 from eschorty_ros.nodes.ros.drivers import REAL
 from eschorty_ros.nodes.ros.parameters import check_name, from_settings, of_ros
 from eschorty_ros.nodes.scanner import node as scanner
@@ -67,7 +67,8 @@ def read_parameters(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
             raise FormatError(
                 f"{where}: {full_name} is {short(table)}; write parameters under {_KEY} in it"
             )
-        params = {param.name: param for param in (*TABLES[name], lifecycle.AUTO_START)}
+        started = [lifecycle.AUTO_START] if name in drivers.REAL else []
+        params = {param.name: param for param in (*TABLES[name], *started)}
         for parameter, value in values.items():
             if not of_ros(parameter):
                 with _in_file(document.at((full_name, _KEY, parameter))):

@@ -84,6 +84,7 @@ class ReconstructionNode(Node):
         finally:
             slow.cancel()
         self._override = modulation_override(self.parameters)
+        self._record_named = ""
         self._pipeline = Pipeline(
             self.calibration,
             self.parameters.settings(Settings),
@@ -259,16 +260,21 @@ class ReconstructionNode(Node):
     def _publish_scan(self, scan: AssembledScan, now_ns: int) -> None:
         self._outputs.scan(scan, now_ns, self.parameters["organized"] == "on")
 
-    def _recorder(self, scan_id: str, start_mm: float, stop_mm: float) -> ScanRecorder | None:
+    def _recorder(
+        self, scan_id: str, start_mm: float, stop_mm: float, passes: int
+    ) -> ScanRecorder | None:
         """Return a recorder of a scan, ``None`` unless the parameter ``record`` is set."""
         values = self.parameters
         if not values["record"]:
             return None
-        folder = Path(values["record"]).expanduser() / (values["record_name"] or scan_id)
+        named, self._record_named = self._record_named, values["record_name"]
+        name = scan_id if named == self._record_named else self._record_named
+        folder = Path(values["record"]).expanduser() / (name or scan_id)
         log = ScanLog(
             scan_id=scan_id,
             start_mm=start_mm,
             stop_mm=stop_mm,
+            passes=passes,
             stage_gap_s=float(values["stage_gap"]),
         )
         settings = dataclasses.asdict(values.settings(Settings))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,7 @@ from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.border import UINT32_MAX, check_text, saturated
 from eschorty_ros.nodes.ros.conversions import mm_from_m
 from eschorty_ros.nodes.ros.peers import OnePublisher, publishers_fault
+from eschorty_ros.nodes.ros.repeated_call import RESEND_S
 from eschorty_ros.nodes.ros.steady_timer import steady_timer
 from eschorty_ros.srv import BeginScan, EndScan
 
@@ -67,7 +69,7 @@ class ScanServices:
         running: Callable[[], bool],
         stage_timeout_s: float,
         publish: Callable[[AssembledScan, int], None],
-        recorder: Callable[[str, float, float], ScanRecorder | None],
+        recorder: Callable[[str, float, float, int], ScanRecorder | None],
         short: CallbackGroup,
     ) -> None:
         self._node, self._pipeline, self._topics = node, pipeline, topics
@@ -78,6 +80,7 @@ class ScanServices:
         self._recorder: ScanRecorder | None = None
         self._ended: Callable[[ScanReport], None] | None = None
         self._ended_s = 0.0
+        self._refused = "", "", -math.inf
         group = MutuallyExclusiveCallbackGroup()
         for kind, name, callback in (
             (BeginScan, "reconstruction/begin_scan", self._on_begin),
@@ -105,6 +108,17 @@ class ScanServices:
             ended(report)
 
     def _on_begin(self, request: Any, response: Any) -> Any:
+        # A request that is repeated while the first one is refused must not begin the scan.
+        scan_id, reason, at_s = self._refused
+        if request.scan_id == scan_id and time.monotonic() - at_s < RESEND_S:
+            response.success, response.message = False, reason
+            return response
+        response = self._begin(request, response)
+        if not response.success:
+            self._refused = request.scan_id, response.message, time.monotonic()
+        return response
+
+    def _begin(self, request: Any, response: Any) -> Any:
         # A publisher may discover this node's subscriptions before they discover the publisher.
         # After the answer every message sent must arrive.
         fault = self._fault()
@@ -121,7 +135,7 @@ class ScanServices:
         repeated = self._pipeline.scan_id == request.scan_id
         recorder = self._recorder
         if not repeated:
-            recorder = self._make_recorder(request.scan_id, *limits_mm)
+            recorder = self._make_recorder(request.scan_id, *limits_mm, passes)
         if recorder is not None and (fault := recorder.made(_RECORD_S)):
             response.success, response.message = False, fault
             return response

@@ -6,7 +6,8 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from eschorty_ros.core.clocks import NS_PER_US
 from eschorty_ros.core.storage import Recording, load_recording
 from eschorty_ros.core.storage.raw_file import RawReader
 from eschorty_ros.live.device_messages import ns_from_stamp
-from eschorty_ros.live.recorded_packets import timed_packets
+from eschorty_ros.live.recorded_packets import TimedPacket, timed_packets
 from eschorty_ros.msg import LaserState, ReconstructionState
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.conversions import m_from_mm, stamp_from_ns
@@ -117,20 +118,31 @@ class ReplayNode(Node):
     def _play(self) -> None:
         self._await_reconstruction()
         name = f"replay-{Path(self.parameters['recording']).resolve().name}"
-        position_mm = self._recording.stage_samples["position_mm"]
-        self._zero_ns = int(self.get_clock().now().nanoseconds)
-        self._publish_clock_and_laser()
+        scan, position_mm = self._recording.scan, self._recording.stage_samples["position_mm"]
+        start_mm, stop_mm = float(position_mm.min()), float(position_mm.max())
+        if scan is not None:
+            start_mm, stop_mm = scan.start_mm, scan.stop_mm
+        marks = self._recording.marks
+        packets = timed_packets(self._reader, marks)
+        first = next(packets, None)
+        begin_us = int(self._recording.stage_samples["t_us"][0])
+        if first is not None:
+            begin_us = min(begin_us, first.from_us)
+        self._zero_ns = int(self.get_clock().now().nanoseconds) - begin_us * NS_PER_US
+        self._publish_clock()
+        self._publish_laser(begin_us, on=not marks["laser_on"].any())
         self._call(
             self._begin,
             BeginScan.Request(
                 scan_id=name,
-                start=m_from_mm(float(position_mm.min())),
-                stop=m_from_mm(float(position_mm.max())),
+                start=m_from_mm(start_mm),
+                stop=m_from_mm(stop_mm),
+                passes=1 if scan is None else scan.passes,
             ),
             again=True,
         )
-        lost_before = self._lost
-        last_us = self._publish_stream()
+        lost_before = self._lost - int(marks["packets_lost"].sum())
+        last_us = 0 if first is None else self._publish_stream(chain([first], packets))
         self._publish_rows(np.iinfo(np.int64).max)
         self._await_processed(last_us)
         for warning in self._reader.warnings:
@@ -162,38 +174,46 @@ class ReplayNode(Node):
                     f"{end.node_name} subscribes to camera/events best effort and may lose packets"
                 )
 
-    def _publish_clock_and_laser(self) -> None:
+    def _publish_clock(self) -> None:
         reference = TimeReference(source="recording")
         reference.header.stamp = stamp_from_ns(self._zero_ns)
         self._clock_reference.publish(reference)
-        modulation = self._recording.modulation
+
+    def _publish_laser(self, t_us: int, on: bool) -> None:
+        modulation, output = self._recording.modulation, LaserState.OUTPUT_OFF
+        stamp = stamp_from_ns(self._ns(t_us))
+        if on:
+            output = LaserState.OUTPUT_ON
         state = LaserState(
-            requested=LaserState.OUTPUT_ON,
-            output=LaserState.OUTPUT_ON,
+            requested=output,
+            output=output,
             waveform=modulation.waveform,
             frequency=modulation.frequency_hz,
             duty=modulation.duty,
-            output_since=stamp_from_ns(self._zero_ns),
+            output_since=stamp,
             reason="replay of a recording",
         )
-        state.header.stamp = stamp_from_ns(self._zero_ns)
+        state.header.stamp = stamp
         if modulation.on_edge_us is not None:
             state.phase_epoch = stamp_from_ns(self._ns(modulation.on_edge_us))
         self._laser.publish(state)
 
-    def _publish_stream(self) -> int:
+    def _publish_stream(self, packets: Iterable[TimedPacket]) -> int:
         """Publish all packets and the stage rows up to each; return the last sensor time (us)."""
         rate = self.parameters["rate"]
         rows_us = self._recording.stage_samples["t_us"]
         pending: list[int] = []
         began_s = time.monotonic()
         first_us: int | None = None
-        until_us = 0
-        for seq, packet in enumerate(timed_packets(self._reader)):
+        until_us = seq = 0
+        for packet in packets:
             first_us = packet.from_us if first_us is None else first_us
             until_us = packet.until_us
             self._pace(began_s, (until_us - first_us) * 1e-6, rate)
             self._publish_rows(until_us)
+            if packet.laser_on:
+                self._publish_laser(packet.from_us, on=True)
+            seq += packet.packets_lost
             message = EventPacket(
                 height=self._reader.header.height,
                 width=self._reader.header.width,
@@ -204,6 +224,7 @@ class ReplayNode(Node):
             message.header.stamp = stamp_from_ns(self._ns(packet.from_us))
             message.header.frame_id = OPTICAL
             self._events.publish(message)
+            seq += 1
             pending.append(until_us)
             ahead = pending[-_PACKETS_AHEAD] if len(pending) >= _PACKETS_AHEAD else None
             row = self._next_row - _ROWS_AHEAD

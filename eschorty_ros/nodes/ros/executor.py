@@ -329,6 +329,8 @@ class Spinning:
                 return
             try:
                 self.executor.spin_until_future_complete(self._turn, _TURN_S)
+            except ExternalShutdownException:
+                return
             except Exception as error:
                 # Such as a message that cannot be read.
                 text = f"{error!r}"[:_LINE_MAX]

@@ -6,7 +6,7 @@ import math
 import time
 from typing import Any
 
-_RESEND_S = 2.0
+RESEND_S = 2.0
 
 
 class RepeatedCall:
@@ -23,7 +23,7 @@ class RepeatedCall:
 
     def done(self) -> bool:
         """Send the request if it is due; return whether an answer has come."""
-        due = self._again and time.monotonic() - self._sent_s > _RESEND_S
+        due = self._again and time.monotonic() - self._sent_s > RESEND_S
         if due or not self._futures:
             self._sent_s = time.monotonic()
             self._futures.append(self._client.call_async(self._request))

@@ -120,6 +120,7 @@ class ScannerNode(Node):
             callback_group=group,
         )
         diagnostics.Diagnostics(self, self._report, group)
+        self._own_goal = b""
         if self.parameters["auto_scan"]:
             self._self_client = ActionClient(self, Scan, "scan", callback_group=group)
             self._auto_timer = steady_timer(self, 0.1, self._auto_scan, group)
@@ -179,12 +180,16 @@ class ScannerNode(Node):
     def _canceled(self, goal: Any) -> bool:
         """Return whether the goal is canceled; ``ScanFailure`` when no client is left."""
         now_s = time.monotonic()
-        if now_s - self._client_seen_s > _CLIENT_TIMEOUT_S:
-            raise ScanFailure("scanner: no client of the scan is left; the scan ends")
+        # Counted first: nothing is, while a scan begins or this process stalls.
         if now_s - self._clients_counted_s > _COUNT_CLIENTS_S:
             self._clients_counted_s = now_s
-            if self.count_clients(f"{self.resolve_service_name('scan')}/_action/get_result"):
+            own = bytes(goal.goal_id.uuid) == self._own_goal
+            clients = self.count_clients(f"{self.resolve_service_name('scan')}/_action/get_result")
+            # The node's own client asks for no other goal.
+            if clients > (bool(self._own_goal) and not own):
                 self._client_seen_s = now_s
+        if now_s - self._client_seen_s > _CLIENT_TIMEOUT_S:
+            raise ScanFailure("scanner: no client of the scan is left; the scan ends")
         return bool(goal.is_cancel_requested)
 
     def _refuse(self, goal: Any, reason: str) -> Any:
@@ -258,7 +263,10 @@ class ScannerNode(Node):
         self._auto_timer.cancel()
         names = ("start", "stop", "speed", "frequency", "duty", "passes")
         values = {name: self.parameters[name] for name in names}
-        self._self_client.send_goal_async(Scan.Goal(**values))
+        self._self_client.send_goal_async(Scan.Goal(**values)).add_done_callback(self._on_own_goal)
+
+    def _on_own_goal(self, answered: Any) -> None:
+        self._own_goal = bytes(answered.result().goal_id.uuid)
 
     def _wait_for(self, missing: str) -> None:
         waiting = f"waiting: {missing}; the scan begins when it is there"

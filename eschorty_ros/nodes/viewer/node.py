@@ -63,6 +63,7 @@ class ViewerNode(Node):
         self._interlock_open = True
         self._scan_id = ""
         self._handle: Any = None
+        self._cancel_wanted = False
         self._scanner_s = float("-inf")
         self._record_before: str | None = None
         self._frame: Any = None
@@ -88,11 +89,19 @@ class ViewerNode(Node):
 
     def safe_state(self) -> None:
         """Cancel a scan of the page; the scanner switches the laser off also without it."""
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            with unless_shut_down(self):
-                handle.cancel_goal_async()
+        self._cancel_wanted = True
+        with unless_shut_down(self):
+            self._release()
         self.page.stop()
+
+    def _release(self) -> None:
+        """Cancel the page's scan, if there is one, and restore what it has set."""
+        handle, self._handle = self._handle, None
+        before, self._record_before = self._record_before, None
+        if handle is not None:
+            handle.cancel_goal_async()
+        if before is not None:
+            self._set_record(before)
 
     def _on_points(self, message: PointCloud2) -> None:
         self._cloud.add(_points(message))
@@ -143,7 +152,10 @@ class ViewerNode(Node):
             except ArgumentError as error:
                 self._status.message = f"not started: {error}"
         self._check_scanner()
-        if self._handle is not None and (cancel or self._control.abandoned(self.page.pages)):
+        if cancel and not self._control.under_way:
+            self._status.message = "no scan of this page is under way"
+        self._cancel_wanted |= cancel or self._control.abandoned(self.page.pages)
+        if self._handle is not None and self._cancel_wanted:
             self._handle.cancel_goal_async()
         if time.monotonic() - self._laser_s >= _LASER_SILENT_S:
             self._status.laser, self._status.reason = "no report", ""
@@ -155,6 +167,9 @@ class ViewerNode(Node):
         """Give up a scan whose scanner is gone; another one may have come in its place."""
         silent_s = time.monotonic() - self._scanner_s
         if self._control.under_way and silent_s > _SCANNER_SILENT_S:
+            # One that has only stalled goes on with its goal.
+            if self._handle is not None:
+                self._handle.cancel_goal_async()
             self._end("the scanner does not answer; start another scan when it is there again")
 
     def _end(self, message: str) -> None:
@@ -162,12 +177,11 @@ class ViewerNode(Node):
         self._handle = None
         self._control.ended()
         self._status.phase, self._status.message = "", message
-        if self._record_before is not None:
-            self._set_record(self._record_before)
-            self._record_before = None
+        self._release()
 
     def _begin(self, values: ScanValues) -> None:
         self._status.message, self._scanner_s = "", time.monotonic()
+        self._cancel_wanted = False
         goal = Scan.Goal(
             start=m_from_mm(values.start_mm),
             stop=m_from_mm(values.stop_mm),
@@ -181,6 +195,8 @@ class ViewerNode(Node):
             return
 
         def on_value(future: Any) -> None:
+            if not self._control.under_way:
+                return
             self._record_before = future.result().values[0].string_value
             self._set_record(values.record).add_done_callback(on_set)
 
@@ -203,6 +219,9 @@ class ViewerNode(Node):
     def _send(self, goal: Any) -> None:
         if not self._control.under_way:
             return
+        if self._cancel_wanted:
+            self._end("canceled before it began")
+            return
         self._scan.send_goal_async(goal, feedback_callback=self._on_feedback).add_done_callback(
             self._on_answer
         )
@@ -216,6 +235,8 @@ class ViewerNode(Node):
             self._end("not started: the scanner refused the goal")
             return
         self._handle = handle
+        if self._cancel_wanted:
+            handle.cancel_goal_async()
         handle.get_result_async().add_done_callback(lambda ended: self._on_result(handle, ended))
 
     def _on_feedback(self, message: Any) -> None:
