@@ -261,3 +261,12 @@ def test_the_truth_of_a_recorded_scan_is_the_scene_at_its_periods(tmp_path, back
     stage_mm = recording.stage.position_mm(times)
     expected = scene.range_mm(stage_mm, np.arange(1280), MODEL)
     np.testing.assert_allclose(truth["range_mm"], expected[np.isfinite(expected)], atol=0.01)
+    # A stage that has crossed the sweep before, on its way to the start.
+    samples = recording.stage_samples
+    way = np.linspace(*(ends if back else ends[::-1]), 50)
+    approach = np.zeros(50, samples.dtype)
+    approach["t_us"], approach["position_mm"] = np.arange(50) * 1000, way[::-1] if back else way
+    samples = samples.copy()
+    approach["t_us"] += samples["t_us"][0] - 50_000
+    later = replace(recording, stage_samples=np.concatenate([approach, samples]))
+    np.testing.assert_array_equal(accuracy.recorded_truth(points, scene, later, sweep), truth)

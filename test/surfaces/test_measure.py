@@ -103,6 +103,21 @@ def test_a_cloud_without_surfaces_and_bad_regions_have_one_line():
         measure(points)
 
 
+def test_a_cloud_of_a_stage_at_rest_has_one_line(tmp_path):
+    points = cloud(lambda y, z: 1300.0 + 0.0 * z)
+    points["y"] = 0.01
+    write_cloud(tmp_path / "rest.ply", points)
+    write_cloud(tmp_path / "one.ply", points[points["t"] == points["t"][0]])
+    for name, command in (
+        ("rest", ["measure"]),
+        ("one", ["view", "--out", str(tmp_path / "one.gif")]),
+    ):
+        done = CliRunner().invoke(main, [*command, str(tmp_path / f"{name}.ply")])
+        assert done.exit_code == 1, done.output
+        assert done.stderr.startswith("eschorty: ")
+        assert done.stderr.count("\n") == 1
+
+
 def test_the_command_prints_values_with_their_sigma(tmp_path):
     write_cloud(tmp_path / "c.ply", cloud(lambda y, z: np.where(z < 0, 1300.0, 1310.0)))
     arguments = ["measure", str(tmp_path / "c.ply"), "--out", str(tmp_path / "c.png")]

@@ -163,10 +163,10 @@ def replay(given: Mapping[str, str]) -> Description:
         },
         "replay": _typed(given, "replay", ("recording", "rate")),
     }
+    values = _with_file(nodes, given)
     with _naming("recording"):
         # The settings of the recorded scan, unless the file has others.
-        nodes["reconstruction"] |= load_recording(given["recording"]).settings
-    _with_file(nodes, given)
+        nodes["reconstruction"] |= load_recording(values["replay"]["recording"]).settings
     return _described(given, nodes, None)
 
 

@@ -141,7 +141,7 @@ class ReplayNode(Node):
             ),
             again=True,
         )
-        lost_before = self._lost - int(marks["packets_lost"].sum())
+        lost_before = self._lost + int(marks["packets_lost"].sum())
         last_us = 0 if first is None else self._publish_stream(chain([first], packets))
         self._publish_rows(np.iinfo(np.int64).max)
         self._await_processed(last_us)

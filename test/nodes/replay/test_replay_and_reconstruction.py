@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import recorded_scan
 from diagnostic_msgs.msg import DiagnosticArray
 from eschorty_ros.msg import ReconstructionState
 from eschorty_ros.srv import BeginScan, EndScan
@@ -14,7 +15,9 @@ from waiting import DEADLINE_S, wait_until
 
 from eschorty_ros.core.optics import load_calibration
 from eschorty_ros.core.reconstruction import reconstruct_recording
+from eschorty_ros.core.storage import load_recording
 from eschorty_ros.live.device_messages import ns_from_stamp
+from eschorty_ros.nodes.one_process import launch_arguments
 from eschorty_ros.nodes.ros import qos
 from eschorty_ros.nodes.ros.cloud_messages import points_from_message
 from eschorty_ros.nodes.ros.domain import free_domain
@@ -175,6 +178,34 @@ def test_a_second_replay_as_fast_as_possible_gives_the_same_points(live):
     clouds = live.growing["scan/points"]
     wait_until(lambda: len(clouds) > 1, "the second scan")
     assert_same_points(clouds[-1], live.expected)
+
+
+def test_a_recorded_scan_is_replayed_as_it_was(tmp_path):
+    """With its settings, limits, losses, and the laser's start in the middle."""
+    source = recorded_scan.source(tmp_path / "source")
+    scan = recorded_scan.LiveScan(source, tmp_path / "rec", lost=(40, 41, 46))
+    scan.run()
+    scan.recorder.wait(DEADLINE_S)
+    recording = load_recording(tmp_path / "rec")
+    expected = reconstruct_recording(recording).points
+    parameters = launch_arguments.replay(
+        {item.name: item.default for item in launch_arguments.REPLAY}
+        | {"recording": str(recording.path)}
+    ).nodes["reconstruction"]
+    # On a command line `off` would be a truth value.
+    parameters = {name: value for name, value in parameters.items() if value != "off"}
+    domain = free_domain()
+    with (
+        NodeProcess(NODES.format("reconstruction"), parameters, domain=domain),
+        Observer(domain) as observer,
+    ):
+        clouds = observer.collect(PointCloud2, "scan/points", qos.latched())
+        replay(recording, 0.0, domain)
+        wait_until(lambda: clouds, "scan/points")
+        points = points_from_message(clouds[-1])
+    assert len(points) == len(expected) > 500
+    for name in ("x", "y", "z", "sigma", "column"):
+        np.testing.assert_array_equal(points[name], expected[name], err_msg=name)
 
 
 def test_a_missing_recording_is_one_line(tmp_path):

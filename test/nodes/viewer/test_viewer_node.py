@@ -132,9 +132,22 @@ def test_a_scan_of_the_page_has_all_its_values_and_outlives_no_scanner(world):
         with viewer.page._lock:
             viewer.page._cancel = True
         wait(says(viewer, "complete, 7 points"))
+        # Before the scanner has accepted it.
+        first.release.clear()
+        begun = len(first.goals)
+        ask(viewer, VALUES._replace(record="/data"))
+        with viewer.page._lock:
+            viewer.page._cancel = True
+        wait(lambda: not viewer._control.under_way and viewer.page._start is None)
+        assert len(first.goals) == begun
+        wait(says(viewer, "canceled before it began"))
+        wait(lambda: first.get_parameter("record").value == "/before")
+        with viewer.page._lock:
+            viewer.page._cancel = True
+        wait(says(viewer, "no scan of this page is under way"))
         first.silent = True
         ask(viewer)
-        wait(lambda: len(first.goals) == 3)
+        wait(lambda: len(first.goals) == begun + 1)
         wait(says(viewer, "the scanner does not answer"))
         first.release.set()
         time.sleep(0.5)
