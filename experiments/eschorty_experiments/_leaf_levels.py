@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.optics import RangeModel
-from eschorty_ros.core.reconstruction import Result
+from eschorty_ros.core.reconstruction import Result, Settings
 from eschorty_ros.report.accuracy import stage_and_range_mm
 from eschorty_ros.report.figures import grid_of, image_of, new_figure
 from eschorty_ros.simulation.scenes import LEVELS, SEPARATION_MM, Leaves
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 EDGE_MM = 3.0
 """Half of the footprint along the stage: nearer to a leaf's rim the line is on two leaves."""
 
-EDGE_COLUMNS = 3
-"""The default smoothing reaches two columns."""
+EDGE_COLUMNS = Settings().smoothing_half_width + 1
+"""One more than the default smoothing reaches."""
 
 VEINLESS_MM = 0.05
 

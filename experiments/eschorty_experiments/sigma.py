@@ -287,10 +287,6 @@ _REMARKS = (
     "many of them. The tables give their share and their coverage, and that of all points.",
     "On a single scene the share differs: much of the error repeats from period to period, so a "
     "flat target shows the error of a few rows only.",
-    "At 5 kHz and 20 kHz sigma is too small, at 5 kHz by a factor of two to three: the automatic "
-    "number of periods per profile leaves 5 to 7 events per point, whose scatter exceeds the "
-    "expected one so far that smoothing averages nothing. With `periods_per_profile 4` at 5 kHz 68 "
-    "% of the points of the plane are within one sigma, and the error is a seventh.",
     "mean uses every event of a column and is shown with a phase gate of 1 ms. Without it most of "
     "its error is due to one to three background events per column, which sigma covers: the share "
     "within two sigma is then above 98 %.",

@@ -167,3 +167,6 @@ def test_flag_is_for_cut_lines_only(method):
     found = estimate(rows, [0, 60, 120, 180, 180], method)
     assert found.edge.tolist() == [False, True, True, False]
     assert found.sigma_row[1] > 3.0 * found.sigma_row[0]
+    # Of a line beyond the edge one row is left.
+    last = estimate(np.full(50, 719), [0, 50], method)
+    assert last.edge.all()

@@ -207,8 +207,9 @@ def _own_variances(variance, row, events, line_variance, estimator, sigma2):
 def _cut_lines(variance, row, line_variance, sensor_rows, truncated, common2):
     """Mark lines that the sensor's edge cuts; their shared variance covers the bias."""
     for c in range(np.uintp(row.size)):
-        # Background widens a column without moving the line to the edge.
-        line = min(variance[c], _BACKGROUND_FREE * line_variance)
+        # Background widens a column without moving the line to the edge. Of a line beyond the edge
+        # one row may be left.
+        line = max(min(variance[c], _BACKGROUND_FREE * line_variance), 1.0 / 12.0)
         common2[c] = (
             line if min(row[c], sensor_rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
         )

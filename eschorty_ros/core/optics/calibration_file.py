@@ -22,7 +22,6 @@ from eschorty_ros.core.optics.range_model import (
     COLUMNS,
     PIXEL_UM,
     POLE_MARGIN_PX,
-    PRINCIPAL_COLUMN,
     ROWS,
     RangeModel,
     object_scale_mm,
@@ -80,7 +79,7 @@ class Calibration(Schema):
     columns: Pixels = COLUMNS
     rows: Pixels = ROWS
     roi_px: tuple[int, int, int, int] | None = None
-    principal_column: float = PRINCIPAL_COLUMN
+    principal_column: float | None = None
     stage_direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
     id: str | None = None
     date: str | None = None
@@ -147,6 +146,12 @@ class Calibration(Schema):
             return self.k_mm
         return object_scale_mm(self.focal_length_mm, self.theta_deg)
 
+    @property
+    def optical_column(self) -> float:
+        """Column of the optical axis: as given, or the sensor's middle."""
+        given = self.principal_column
+        return (self.columns - 1) / 2 if given is None else given
+
     def model(self) -> RangeModel:
         """Return the range equation of this calibration."""
         return RangeModel(
@@ -157,7 +162,7 @@ class Calibration(Schema):
             pixel_um=self.pixel_um,
             columns=self.columns,
             rows=self.rows,
-            principal_column=self.principal_column,
+            principal_column=self.optical_column,
             theta_deg=self.theta_deg,
             b_prime_1_px=self.b_prime_1_px,
             b_prime_2_px=self.b_prime_2_px,
