@@ -50,7 +50,7 @@ def _search(column, half, estimator):
         line += found.other.sums.events
     others = column.events - line
     if events < estimator.events_min or not _exceeds_background(
-        line, others, half, estimator.sensor_rows
+        line, others, half, estimator.rows_taken
     ):
         return Returns(TOO_FEW, False, found.window, found.other)
     return found
@@ -92,7 +92,7 @@ def _all_returns(column, half, estimator, found):
         return found
     if found.status == AMBIGUOUS:
         return Returns(FOUND, True, found.window, found.other)
-    return _second_return(column, half, estimator.sensor_rows, estimator.events_min, found.window)
+    return _second_return(column, half, estimator.rows_taken, estimator.events_min, found.window)
 
 
 @kernel(_nrt=False)

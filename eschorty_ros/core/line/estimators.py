@@ -33,7 +33,8 @@ class Estimator(NamedTuple):
 
     ``half_max`` is the half width of a window for the widest line, fixed point, and
     ``line_variance`` the variance of its rows. With ``seeded`` the search begins at the column's
-    last row, or at its neighbour's.
+    last row, or at its neighbour's. Columns take events of ``rows_taken`` rows, fewer than the
+    ``sensor_rows`` in a region of interest.
     """
 
     method: int
@@ -41,6 +42,7 @@ class Estimator(NamedTuple):
     seeded: bool
     events_min: int
     sensor_rows: int
+    rows_taken: int
     half_max: int
     line_variance: float
     error_model: ErrorModel

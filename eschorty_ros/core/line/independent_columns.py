@@ -106,6 +106,7 @@ def estimate(
         seeded=False,
         events_min=events_min,
         sensor_rows=height,
+        rows_taken=height,
         half_max=half_width_fixed(line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * float(line_width_px) ** 2,
         error_model=error_model(method, sigma_factor, sigma_floor_px),

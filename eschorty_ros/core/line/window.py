@@ -313,15 +313,15 @@ def _densest_window(column, half):
 
 
 @kernel
-def _exceeds_background(events, others, half, sensor_rows):
+def _exceeds_background(events, others, half, rows_taken):
     """Return true when a window has more ``events`` than background of the others' density.
 
     The background is uniform; the excess has to exceed 4 standard deviations.
     """
     width = (2 * half) / FRACTION + 1.0
-    if width >= sensor_rows:
+    if width >= rows_taken:
         return True
-    expected = others * width / (sensor_rows - width)
+    expected = others * width / (rows_taken - width)
     excess = events - expected
     return excess > 0.0 and excess * excess > 16.0 * expected
 
@@ -333,7 +333,7 @@ def _chernoff_exponent(events, expected):
 
 
 @kernel
-def _is_significant(events, others, half, sensor_rows):
+def _is_significant(events, others, half, rows_taken):
     """Return true when background has ``events`` in any window of a column with low probability.
 
     The probability is Chernoff's bound on the Poisson tail, times the number of windows that the
@@ -341,8 +341,8 @@ def _is_significant(events, others, half, sensor_rows):
     one more, in case there are none.
     """
     width = (2 * half) / FRACTION + 1.0
-    expected = (others + 1.0) * width / max(sensor_rows - 2.0 * width, width)
-    choices = max(2.0 * sensor_rows / width, 1.0)
+    expected = (others + 1.0) * width / max(rows_taken - 2.0 * width, width)
+    choices = max(2.0 * rows_taken / width, 1.0)
     return _chernoff_exponent(events, expected) > np.log(_FALSE_SECOND * choices)
 
 
@@ -353,7 +353,7 @@ def _box_events(column, centre, half):
 
 
 @kernel(_nrt=False)
-def _second_return(column, half, sensor_rows, events_min, a):
+def _second_return(column, half, rows_taken, events_min, a):
     """Search for the return of another surface than that of window ``a``.
 
     It is 2 full widths at half maximum away or more, the box around it has at least half as many
@@ -382,4 +382,4 @@ def _second_return(column, half, sensor_rows, events_min, a):
     if a.sums.events < events_min or b.sums.events < events_min:
         return alone
     others = column.events - a.sums.events - b.sums.events
-    return Returns(FOUND, _is_significant(b.sums.events, others, half, sensor_rows), a, b)
+    return Returns(FOUND, _is_significant(b.sums.events, others, half, rows_taken), a, b)

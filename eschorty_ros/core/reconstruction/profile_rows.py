@@ -66,7 +66,7 @@ from eschorty_ros.core.line.unusual import (
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
-from eschorty_ros.core.reconstruction.region import region
+from eschorty_ros.core.reconstruction.region import region, rows_taken
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.storage import FEW_EVENTS, MIXED, SENSOR_EDGE
 
@@ -129,6 +129,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         seeded=True,
         events_min=settings.events_min,
         sensor_rows=model.rows,
+        rows_taken=rows_taken(settings, model),
         half_max=half_width_fixed(settings.line_width_px),
         line_variance=VARIANCE_PER_WIDTH2 * settings.line_width_px**2,
         error_model=error_model(

@@ -26,6 +26,13 @@ def region(columns: Columns, settings: Settings, model: RangeModel) -> Columns:
     )
 
 
+def rows_taken(settings: Settings, model: RangeModel) -> int:
+    """Return how many rows a column of the region has, their median."""
+    lit, first, last = _limits(settings, model)
+    rows = np.floor(last) - np.ceil(first) + 1.0
+    return round(float(np.median(rows[lit]))) if lit.any() else model.rows
+
+
 def region_window(settings: Settings, model: RangeModel) -> tuple[int, int, int, int]:
     """Return the least window of the sensor that holds the region that ``settings`` give.
 

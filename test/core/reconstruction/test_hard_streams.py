@@ -218,6 +218,12 @@ def test_what_does_not_follow_the_laser_gives_no_points(case):
     assert reconstructor.counters["columns_unmodulated"] > 1000
 
 
+def test_background_within_a_region_gives_no_points_either():
+    camera = Camera(periods=140)
+    found, _ = points(camera, camera.scattered(5e6), range_min=1.25, range_max=1.4)
+    assert len(found) <= 100, f"seed {camera.seed}"
+
+
 def test_what_gives_off_events_alone_is_no_line_of_a_profile_of_several_periods():
     camera = Camera(frequency_hz=300.0, periods=210)
     t, x, y, p = camera.moving_object(3e6)
