@@ -92,12 +92,13 @@ class Rows(NamedTuple):
 class PeriodSums(NamedTuple):
     """Pooled sum of squares of the rows used with its degrees of freedom, and counts of columns.
 
-    ``events`` are those of the columns with a row, used or not.
+    ``events`` are those of the columns with a row, used or not; there are so many ``lines``.
     """
 
     squares: float
     freedom: np.int64
     events: np.int64
+    lines: np.int64
     too_few_events: np.int64
     ambiguous: np.int64
     two_returns: np.int64
@@ -252,11 +253,11 @@ def _rows_of_windows(out, line_variance, estimator, refined):
 
 @kernel(_nrt=False)
 def _pooled(out, estimator):
-    """Return the pooled squares of the rows used, their degrees of freedom and the events.
+    """Return the pooled squares of the rows used, their degrees of freedom, events and columns.
 
     Lines that are cut, and full columns with background, do not have the width of a line.
     """
-    squares, freedom, events = 0.0, np.int64(0), np.int64(0)
+    squares, freedom, events, lines = 0.0, np.int64(0), np.int64(0), np.int64(0)
     most = _BACKGROUND_FREE * estimator.line_variance
     windowed = _is_windowed(estimator.method)
     for k in range(out.row.shape[0]):
@@ -267,7 +268,8 @@ def _pooled(out, estimator):
                 squares += out.variance[k, c] * used
                 freedom += used
                 events += out.windows.column_events[k, c] if k == 0 else 0
-    return squares, freedom, events
+                lines += k == 0
+    return squares, freedom, events, lines
 
 
 @kernel(_nrt=False)
@@ -342,7 +344,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             window, other = other, window
     footprint.state.near_edge = near_edge
     _rows_of_windows(out, line_variance, estimator, refined)
-    squares, freedom, events = _pooled(out, estimator)
+    squares, freedom, events, lines = _pooled(out, estimator)
     return PeriodSums(
-        squares, freedom, events, few, ambiguous, two, unmodulated, events_unmodulated
+        squares, freedom, events, lines, few, ambiguous, two, unmodulated, events_unmodulated
     )

@@ -83,6 +83,8 @@ _OUTPUT_PROFILES = 64
 _WIDTH_MIN_DOF = 64
 # Times the limit that a line may be wide.
 _WIDER = 4
+# Evenly filled windows measure 1.77 times their width, those of a line once; between the two.
+_FILLED = 1.33
 
 
 class _Output(NamedTuple):
@@ -201,12 +203,15 @@ def _begin_window(memory, state):
 def _adapted_half(half, sums, half_max):
     """Return the half width for the next period: 1.3 x the width of this one's rows, averaged.
 
-    It exceeds the limit where most events of the columns are in the windows, hence the line's.
+    It exceeds the limit where most events of the columns are in the windows, hence the line's, or
+    where these are filled evenly, hence too narrow, in most columns: background has few rows.
     """
     if sums.freedom < _WIDTH_MIN_DOF:
         return half
     measured = HALF_PER_SIGMA * np.sqrt(sums.squares / sums.freedom)
-    limit = half_max * (_WIDER if 3 * sums.freedom > 2 * sums.events else 1)
+    filled = measured > _FILLED * half and sums.lines > sums.too_few_events + sums.unmodulated
+    wider = 3 * sums.freedom > 2 * sums.events or filled
+    limit = half_max * (_WIDER if wider else 1)
     return np.int64(min(max(np.rint(0.5 * (half + measured)), HALF_MIN), limit))
 
 

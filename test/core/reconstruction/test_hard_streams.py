@@ -279,6 +279,17 @@ def test_a_line_wider_than_the_limit_is_followed_with_a_warning():
     assert "wider than line_width_px = 20" in warning
 
 
+@pytest.mark.parametrize("line_width_px", [3.0, 5.0, 8.0])
+def test_a_limit_far_below_the_line_is_exceeded_with_a_warning(line_width_px):
+    camera = Camera(periods=24, half_width_px=10.0)
+    lines = camera.line(wavy), camera.scattered(1e6)
+    found, reconstructor = points(camera, *lines, line_width_px=line_width_px)
+    error = error_px(found)[found.period >= 10]
+    assert np.median(np.abs(error)) < 0.1, f"seed {camera.seed}"
+    assert abs(error.mean()) < 0.05
+    assert any("wider than line_width_px" in line for line in reconstructor.warnings)
+
+
 def _kept(camera: Camera, share: float) -> Events:
     t, x, y, p = camera.line(wavy)
     kept = camera.rng.random(t.size) < share
