@@ -120,7 +120,7 @@ def recorded_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def given(names: Iterable[str]) -> list[str]:
+def stated(names: Iterable[str]) -> list[str]:
     """Return those options of the command that runs that stand on the command line."""
     source = click.get_current_context().get_parameter_source
     return [name for name in names if source(name) is not click.core.ParameterSource.DEFAULT]
@@ -128,7 +128,7 @@ def given(names: Iterable[str]) -> list[str]:
 
 def refuse_given(names: Iterable[str], reason: str) -> None:
     """Refuse options that stand on the command line without effect as wrong usage."""
-    if without_effect := given(names):
+    if without_effect := stated(names):
         raise click.UsageError(f"--{without_effect[0].replace('_', '-')} {reason}")
 
 

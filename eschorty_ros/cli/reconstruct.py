@@ -17,7 +17,7 @@ from eschorty_ros.cli.console import Report, accuracy_rows, pairs, progress_bar
 from eschorty_ros.cli.convert import recording_of
 from eschorty_ros.cli.files import OUT_FILE, json_option
 from eschorty_ros.cli.instrument import ended_by_signals
-from eschorty_ros.cli.options import Number, given, recorded_options, refuse_given
+from eschorty_ros.cli.options import Number, recorded_options, refuse_given, stated
 from eschorty_ros.core.base.errors import EschortyError
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def command(
     task = partial(
         reconstruct_to,
         jobs=jobs,
-        given={name: settings[name] for name in given(settings)},
+        given={name: settings[name] for name in stated(settings)},
         frequency=frequency,
         calibration=calibration,
         packet_period_ms=packet_period,
@@ -225,8 +225,7 @@ def reconstruct_to(
         return _reconstruct(loaded, target, jobs, given, show)
     with temporary_folder() as made:
         folder = made / recording.stem
-        with _progress("reading the bag", show) as report:
-            report(0.0, "with compiling on the first run")
+        with _progress("reading the bag", show):
             recording_of(recording, folder, frequency, calibration, packet_period_ms, given)
         return _reconstruct(load_recording(folder), target, jobs, given, show)
 

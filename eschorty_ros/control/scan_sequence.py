@@ -260,9 +260,11 @@ class SweepProgress:
         stage position; a reconstruction that starts again counts on.
         """
         before = self._totals
-        if not math.isnan(position_mm):
+        if math.isnan(position_mm):
+            before = None
+        else:
             self._totals = position_mm, points, profiles
-        if before is not None and self._totals is not None and self._totals[0] != before[0]:
+        if before is not None and position_mm != before[0]:
             inside_mm = abs(self._limited(position_mm) - self._limited(before[0]))
             share = inside_mm / abs(position_mm - before[0])
             self._points += max(points - before[1], 0) * share

@@ -146,14 +146,9 @@ class Calibration(Schema):
             return self.k_mm
         return object_scale_mm(self.focal_length_mm, self.theta_deg)
 
-    @property
-    def optical_column(self) -> float:
-        """Column of the optical axis: as given, or the sensor's middle."""
-        given = self.principal_column
-        return (self.columns - 1) / 2 if given is None else given
-
     def model(self) -> RangeModel:
         """Return the range equation of this calibration."""
+        middle = (self.columns - 1) / 2
         return RangeModel(
             k_mm=self.object_scale_mm,
             k_prime_px=self.k_prime_px,
@@ -162,7 +157,7 @@ class Calibration(Schema):
             pixel_um=self.pixel_um,
             columns=self.columns,
             rows=self.rows,
-            principal_column=self.optical_column,
+            principal_column=middle if self.principal_column is None else self.principal_column,
             theta_deg=self.theta_deg,
             b_prime_1_px=self.b_prime_1_px,
             b_prime_2_px=self.b_prime_2_px,

@@ -63,6 +63,7 @@ from eschorty_ros.core.line.unusual import (
     empty_usual_widths,
     empty_widths,
 )
+from eschorty_ros.core.line.window import FRACTION
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import RangeModel
 from eschorty_ros.core.reconstruction.profiles import LineRows
@@ -83,8 +84,8 @@ _OUTPUT_PROFILES = 64
 _WIDTH_MIN_DOF = 64
 # Times the limit that a line may be wide.
 _WIDER = 4
-# Evenly filled windows measure 1.77 times their width, those of a line once; between the two.
-_FILLED = 1.33
+# Evenly filled windows measure 1.77 times their width, those of a line once: in the middle.
+_FILLED = np.sqrt(HALF_PER_SIGMA / FRACTION / np.sqrt(3.0))
 
 
 class _Output(NamedTuple):

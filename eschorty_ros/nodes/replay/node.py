@@ -180,10 +180,8 @@ class ReplayNode(Node):
         self._clock_reference.publish(reference)
 
     def _publish_laser(self, t_us: int, on: bool) -> None:
-        modulation, output = self._recording.modulation, LaserState.OUTPUT_OFF
-        stamp = stamp_from_ns(self._ns(t_us))
-        if on:
-            output = LaserState.OUTPUT_ON
+        modulation, stamp = self._recording.modulation, stamp_from_ns(self._ns(t_us))
+        output = LaserState.OUTPUT_ON if on else LaserState.OUTPUT_OFF
         state = LaserState(
             requested=output,
             output=output,

@@ -168,8 +168,7 @@ class ViewerNode(Node):
         silent_s = time.monotonic() - self._scanner_s
         if self._control.under_way and silent_s > _SCANNER_SILENT_S:
             # One that has only stalled goes on with its goal.
-            if self._handle is not None:
-                self._handle.cancel_goal_async()
+            self._release()
             self._end("the scanner does not answer; start another scan when it is there again")
 
     def _end(self, message: str) -> None:

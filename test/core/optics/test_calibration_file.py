@@ -48,7 +48,7 @@ def test_shipped_builds_carry_the_printed_numbers(build):
     c = load_calibration(build)
     assert (c.theta_prime_deg, c.k_prime_px, c.b_prime_px) == PRINTED[build]
     assert (c.name, c.focal_length_mm, c.f_number, c.theta_deg) == (build, 24.0, 2.0, 85.87)
-    assert (c.pixel_um, c.columns, c.rows, c.optical_column) == (4.86, 1280, 720, 639.5)
+    assert (c.pixel_um, c.columns, c.rows, c.principal_column) == (4.86, 1280, 720, 639.5)
     assert replace(c, principal_column=None, columns=640).model().principal_column == 319.5
     assert (c.b_mm, c.k_mm, c.stage_direction) == (0.0, None, (0.0, 1.0, 0.0))
     assert c.object_scale_mm == pytest.approx(24.0624852154, abs=1e-10)
