@@ -25,9 +25,10 @@ def kernel(*arguments: Any, **options: Any) -> Any:
     ``@kernel`` compiles at the first call, ``@kernel(signature, ...)`` at import and for these
     signatures only. Keyword options are those of ``numba.njit``.
 
-    ``_nrt=False`` is for inner kernels that neither make nor return arrays. They count no
-    references to the arrays they use: each count is atomic and costs as much as a column's sums.
-    What they call inherits it, but for kernels with ``_nrt=True``.
+    ``_nrt=False`` is for inner kernels that make no arrays. They count no references to the arrays
+    they use: each count is atomic and costs as much as a column's sums. What they call inherits it,
+    but for kernels with ``_nrt=True``. A kernel that counts must return no arrays to one that does
+    not, which would never release them, or the reverse.
 
     ``forceinline=True`` is for kernels that run for every column: a call copies every field of its
     arguments and results.

@@ -185,7 +185,7 @@ def _without(column, first, last):
     return _column(column.packed, column.start, n, column.lit_us)
 
 
-@kernel(_nrt=True)
+@kernel(_nrt=False)
 def _without_hot_pixels(column, first, last, blink, counts):
     """Remove from a column the pixels of rows first..last that fire without the laser.
 
@@ -194,8 +194,11 @@ def _without_hot_pixels(column, first, last, blink, counts):
     """
     for i in range(column.start, column.start + column.events):
         counts[column.packed[i] & ROW_MASK] += 1
-    near = counts[first : last + 1]
-    hot = max(2.0 * near.sum() / max(np.count_nonzero(near), 1), _HOT_EVENTS_MIN)
+    events, pixels = np.int64(0), 0
+    for row in range(first, last + 1):
+        events += counts[row]
+        pixels += counts[row] > 0
+    hot = max(2.0 * events / max(pixels, 1), _HOT_EVENTS_MIN)
     left = column
     for row in range(first, last + 1):
         if counts[row] >= hot and not _laser_test(left, row, row, blink).follows:

@@ -108,7 +108,7 @@ def _pad(packed, end):
         packed[np.uintp(end) + i] = PAD
 
 
-@kernel
+@kernel(inline="always")
 def _column(packed, start, events, lit_us):
     """Return a column, which has been padded."""
     return Column(packed, start, events, (events + BLOCK - 1) // BLOCK, lit_us)

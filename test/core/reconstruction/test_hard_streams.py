@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from independent_pixels import FIRST_EDGE_US, Camera, Events, stream, wavy
+from numba.core.runtime import _nrt_python as nrt
+from numba.core.runtime import rtsys
 from reconstructing import CALIBRATION, reconstruct
 
 from eschorty_ros.core.evt3 import Decoder
@@ -449,3 +451,24 @@ def test_a_learned_footprint_reduces_the_error_where_half_of_the_events_are_lost
     error = np.abs(error_px(learned))
     assert np.quantile(error, 0.6827) < 0.75 * np.quantile(np.abs(error_px(plain)), 0.6827)
     assert 0.63 < np.mean(error < learned.sigma_row) < 0.9, f"seed {camera.seed}"
+
+
+def test_a_push_leaves_no_memory_behind():
+    # Columns of background are tested, and pixels that fire all the time removed from them.
+    camera = Camera(periods=40)
+    data = stream(camera.line(wavy), camera.scattered(5e6), camera.hot_pixels(300, 20_000.0))
+    modulation = Modulation(camera.frequency_hz, camera.duty, on_edge_us=FIRST_EDGE_US)
+    reconstructor = Reconstructor(CALIBRATION, modulation, Settings())
+    size = len(data) // 20
+    nrt.memsys_enable_stats()
+    try:
+        held = []
+        for begin in range(0, 20 * size, size):
+            reconstructor.push(data[begin : begin + size])
+            statistics = rtsys.get_allocation_stats()
+            held.append(statistics.mi_alloc - statistics.mi_free)
+    finally:
+        nrt.memsys_disable_stats()
+    assert reconstructor.counters["columns_unmodulated"] > 0, f"seed {camera.seed}"
+    # What is held from one push to the next is held from the first ones on.
+    assert held[-1] == held[5], f"seed {camera.seed}"
