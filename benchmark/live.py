@@ -111,6 +111,9 @@ def publish(arguments: argparse.Namespace) -> None:
         loops, index = divmod(number, len(packets))
         t_us = number * packet_us
         due_s = begun_s + (t_us + packet_us) * 1e-6 / arguments.rate[0]
+        packet = EventPacket(height=720, width=COLUMNS, seq=number, encoding="evt3")
+        packet.events = array("B", later(packets[index], loops))
+        packet.header.stamp = stamp_from_ns(begun_ns + (t_us + packet_us) * 1000)
         time.sleep(max(due_s - time.monotonic(), 0.0))
         while odom_us <= t_us + packet_us:
             message = Odometry()
@@ -118,9 +121,6 @@ def publish(arguments: argparse.Namespace) -> None:
             message.pose.pose.position.y = odom_us * 1e-9
             odom.publish(message)
             odom_us += ODOM_US
-        packet = EventPacket(height=720, width=COLUMNS, seq=number, encoding="evt3")
-        packet.events = array("B", later(packets[index], loops))
-        packet.header.stamp = stamp_from_ns(begun_ns + (t_us + packet_us) * 1000)
         events.publish(packet)
     print(total, begun_ns, time.process_time() - cpu_s, flush=True)
     time.sleep(DRAIN_S)

@@ -223,7 +223,8 @@ class Pipeline:
             )
         if self.capture is not None:
             raise ArgumentError("a calibration is running; wait for its end or cancel it")
-        self._buffer = ScanBuffer(scan_id, start_mm, stop_mm)
+        # What still waits for a stage position is of before the scan.
+        self._buffer = ScanBuffer(scan_id, start_mm, stop_mm, self.stream.processed_until_ns)
         self._coverage = SweepCoverage(start_mm, stop_mm, passes)
         self._recorder = recorder
         if recorder is not None and self.placer.track.last_us is not None:

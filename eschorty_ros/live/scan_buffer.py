@@ -64,17 +64,23 @@ class ScanBuffer:
     Points whose position is not final are all kept until the end.
 
     - ``start_mm``, ``stop_mm``: Limits of the stage position, both included, in either order.
+    - ``since_ns``: Points of periods that begin before this ROS time are left out.
     - ``points_max``: Points above this number are left out.
 
     Public attributes:
     - ``points_outside``, ``points_over_limit``: Points left out because they are not between the
-      limits, or were too many.
+      limits or of before, or were too many.
 
     Raises ``ArgumentError`` when a limit is not finite or the identifier is empty.
     """
 
     def __init__(
-        self, scan_id: str, start_mm: float, stop_mm: float, points_max: int = 40_000_000
+        self,
+        scan_id: str,
+        start_mm: float,
+        stop_mm: float,
+        since_ns: int | None = None,
+        points_max: int = 40_000_000,
     ) -> None:
         if not scan_id:
             raise ArgumentError("scan_id is empty; give the scan a name")
@@ -85,12 +91,17 @@ class ScanBuffer:
         self.scan_id = scan_id
         self.points_outside = self.points_over_limit = 0
         self._limits_mm = start_mm, stop_mm
+        self._since_ns = -(1 << 62) if since_ns is None else since_ns
         self._points_max = points_max
         self._parts: list[PlacedPoints] = []
         self._count = 0
 
     def add(self, placed: PlacedPoints) -> None:
         """Keep the points between the limits."""
+        begun = placed.edge_ns >= self._since_ns
+        if not begun.all():
+            self.points_outside += int(np.count_nonzero(~begun))
+            placed = placed.select(begun)
         kept = placed if placed.sensor is not None else self._inside(placed)
         room = self._points_max - self._count
         if len(kept) > room:

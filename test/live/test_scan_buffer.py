@@ -92,6 +92,13 @@ def test_a_scan_without_points_has_the_reason(points, events, without, outside, 
     assert bool(report.message) == bool(begins)
 
 
+def test_points_of_before_the_scan_are_left_out_and_counted():
+    buffer = ScanBuffer("a", 0.0, 1.0, since_ns=T0_NS)
+    buffer.add(placed([0.5, 0.5, 0.5], [T0_NS - 1, T0_NS, T0_NS + 1], [1, 2, 3]))
+    assert len(buffer.assemble().points) == 2
+    assert buffer.points_outside == 1
+
+
 def test_points_over_the_limit_are_counted():
     buffer = ScanBuffer("a", 0.0, 1.0, points_max=3)
     for _ in range(2):

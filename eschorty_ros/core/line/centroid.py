@@ -122,6 +122,18 @@ def empty_rows(returns: int, columns: int) -> Rows:
     return Rows(windows, row, sigma2, common2, variance, events, mean_dt_us, *flags)
 
 
+@kernel(_nrt=False, forceinline=True)
+def _cut_bias2(row, variance, line_variance, sensor_rows):
+    """Return the squared bias of a row if half of its line is on the sensor, and whether less is.
+
+    Then the centre is beyond the sensor, and the bias that of a line of ``line_variance``.
+    """
+    from_edge = min(row, sensor_rows - 1.0 - row) + 0.5
+    # Rows lit evenly from the edge on are 1.7 deviations from it; half of them vary by a fourth.
+    less = from_edge * from_edge < 4.0 * variance < line_variance
+    return _HALF_BIAS2 * (line_variance if less else variance), less
+
+
 @kernel
 def _learns(footprint):
     """Return true when the line's footprint is learned from the profile."""
@@ -151,14 +163,16 @@ def _refine(column, at, window, line_variance, estimator, footprint, row_counts,
     if trying and near and not cut and at[0] == 0:
         footprint.trial[c] = best - row
     if learned >= 0.0 and (cut or (near and takes)):
-        windows.row[at] = min(max(best, -0.5), sensor_rows - 0.5)
+        reported = min(max(best, -0.5), sensor_rows - 0.5)
+        windows.row[at] = reported
         windows.sigma2[at] = learned
         bias = 0.0
-        if footprint.state.cut_computations > 0:
-            # No whole line has been seen. The part that is left is off by so much, less what the
-            # footprint of cut lines explains.
-            bias = max(np.sqrt(_HALF_BIAS2 * variance) - abs(best - row), 0.0)
-        windows.common2[at] = bias * bias
+        bias2, less = _cut_bias2(row, variance, line_variance, sensor_rows)
+        if less or footprint.state.cut_computations > 0:
+            # The footprint has no whole line, or no rows beyond the sensor. The part that is left
+            # is off by so much, less what the footprint explains.
+            bias = max(np.sqrt(bias2) - abs(reported - row), 0.0)
+        windows.common2[at] = bias * bias + (best - reported) ** 2
 
 
 @kernel(_nrt=False, forceinline=True)
@@ -211,12 +225,12 @@ def _cut_lines(variance, row, line_variance, sensor_rows, truncated, common2):
         # Background widens a column without moving the line to the edge. Of a line beyond the edge
         # one row may be left.
         line = max(min(variance[c], _BACKGROUND_FREE * line_variance), 1.0 / 12.0)
+        bias2, _ = _cut_bias2(row[c], line, line_variance, sensor_rows)
         common2[c] = (
-            line if min(row[c], sensor_rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
+            bias2 if min(row[c], sensor_rows - 1.0 - row[c]) < _HALF_SPAN * np.sqrt(line) else 0.0
         )
     for c in range(np.uintp(row.size)):
         truncated[c] = common2[c] > 0.0
-        common2[c] *= _HALF_BIAS2
 
 
 @kernel(_nrt=False)

@@ -18,6 +18,7 @@ from eschorty_ros.core.reconstruction import (
     Settings,
     reconstruct_recording,
 )
+from eschorty_ros.core.storage import SENSOR_EDGE
 from eschorty_ros.report.accuracy import true_range_mm
 from eschorty_ros.simulation.pixels import preset
 from eschorty_ros.simulation.scenes import Plane, named
@@ -472,3 +473,21 @@ def test_a_push_leaves_no_memory_behind():
     assert reconstructor.counters["columns_unmodulated"] > 0, f"seed {camera.seed}"
     # What is held from one push to the next is held from the first ones on.
     assert held[-1] == held[5], f"seed {camera.seed}"
+
+
+@pytest.mark.parametrize("lit_columns", [160, 1280], ids=["beside whole lines", "everywhere"])
+@pytest.mark.parametrize("beyond_px", [2.0, 5.0])
+def test_sigma_of_a_line_whose_centre_is_beyond_the_sensor_covers_its_error(lit_columns, beyond_px):
+    camera = Camera(periods=24)
+
+    def row(k, column):
+        cut = column % (2 * lit_columns) < lit_columns
+        return np.where(cut, -beyond_px, 350.0) + 0.05 * k + 0.002 * (column % lit_columns)
+
+    found, _ = points(camera, camera.line(row))
+    truth = row(found.period, found.column.astype(float))
+    cut = found.select((found.period >= 8) & (truth < 100.0))
+    off = np.abs(cut.row - row(cut.period, cut.column.astype(float)))
+    assert len(cut) > 5000, f"seed {camera.seed}"
+    assert np.all(cut.flags & SENSOR_EDGE), f"seed {camera.seed}"
+    assert np.mean(off < 3.0 * cut.sigma_row) > 0.7, f"seed {camera.seed}"
