@@ -45,10 +45,11 @@ LOOP_US = 2 * 125 * 4096
 NEAR = {70.0: 70.3125}
 ODOM_US = 10_000
 DRAIN_S, SETTLED_S, MINUTE_S = 10.0, 1.0, 60.0
+MINUTE = "1 min"
 COLUMNS_SHOWN = {
     "Hz": "7.1f", "ms": "6.3f", "x real": "6.1f", "sent": "8.0f", "lost": "6.0f", "Mev/s": "7.1f",
     "per CPU s": "9.1f", "offline": "8.1f", "cores": "6.2f", "publisher": "9.2f", "MB": "6.0f",
-    "1 min": "6.0f", "MB end": "6.0f", "first ms": "8.1f", "median ms": "9.1f", "p99 ms": "7.1f",
+    MINUTE: "6.0f", "MB end": "6.0f", "first ms": "8.1f", "median ms": "9.1f", "p99 ms": "7.1f",
 }  # fmt: skip
 NODE = "eschorty_ros.nodes.reconstruction.node"
 
@@ -259,14 +260,15 @@ def main() -> None:
     reliability = "reliable" if arguments.reliable else "best effort"
     print(f"{cpu_name()}; Python {platform.python_version()}; numpy {np.__version__}; "
           f"rclpy {version('rclpy')}; packets {reliability}")  # fmt: skip
-    print(*(f"{name:>{int(form.split('.')[0])}}" for name, form in COLUMNS_SHOWN.items()))
+    shown = {name: form for name, form in COLUMNS_SHOWN.items() if arguments.soak or name != MINUTE}
+    print(*(f"{name:>{int(form.split('.')[0])}}" for name, form in shown.items()))
     for frequency_hz in arguments.frequency:
         for packet_ms in arguments.packet_ms:
             for rate in arguments.rate:
                 one = argparse.Namespace(**vars(arguments))
                 one.frequency, one.packet_ms, one.rate = [frequency_hz], [packet_ms], [rate]
-                cells = zip(measured(one), COLUMNS_SHOWN.values(), strict=True)
-                print(*(format(value, form) for value, form in cells), flush=True)
+                values = dict(zip(COLUMNS_SHOWN, measured(one), strict=True))
+                print(*(format(values[name], form) for name, form in shown.items()), flush=True)
 
 
 if __name__ == "__main__":

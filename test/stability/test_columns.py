@@ -148,13 +148,17 @@ def test_line_cut_in_half_is_off_by_the_truncated_normal(edge, sigma_px, measure
     rng = np.random.default_rng(SEED)
     away = np.abs(rng.normal(0.0, sigma_px, (200, 400)))
     rows = np.abs(edge - np.clip(np.floor(away), 0, 719).astype(np.int64))
-    found = estimate(rows.ravel(), np.arange(201) * 400, "mean")
+    width_px = 2.355 * sigma_px
+    found = estimate(rows.ravel(), np.arange(201) * 400, "mean", line_width_px=width_px)
     bias = np.abs(found.row.mean() - edge)
     expected = np.sqrt(2.0 / np.pi) * sigma_px - 0.5
     measured("bias against 0.8 sigma, px", abs(bias - expected), 0.02 * sigma_px)
     assert found.edge.all()
     assert (np.abs(found.row - edge) < 3.0 * found.sigma_row).all()
     assert (np.abs(found.row - edge) > 0.5 * found.sigma_row).all()
+    # It may be less than half of a wider line.
+    wider = estimate(rows.ravel(), np.arange(201) * 400, "mean", line_width_px=2.0 * width_px)
+    assert (wider.sigma_row > 1.5 * found.sigma_row).all()
 
 
 @every_method

@@ -21,6 +21,7 @@ from eschorty_ros.core.reconstruction.periods import PASS_WORDS, PeriodCutter
 from eschorty_ros.core.reconstruction.profile_assembler import ProfileAssembler
 from eschorty_ros.core.reconstruction.profile_length import EVENTS_WANTED, periods_max
 from eschorty_ros.core.reconstruction.profiles import LineRows, Profiles
+from eschorty_ros.core.reconstruction.readout_window import window_model, window_words
 from eschorty_ros.core.reconstruction.region import within_ranges
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
@@ -93,7 +94,9 @@ class Reconstructor:
         jobs: int = 1,
     ) -> None:
         self.settings = settings = settings or Settings()
-        self.model = model = calibration.model()
+        self.model = calibration.model()
+        self._first_row, self._window_model = window_model(calibration)
+        model = self._window_model
         self.first_t_us: int | None = None
         self.newest_t_us: int | None = None
         self._decoder = Decoder(model.columns, model.rows)
@@ -145,6 +148,8 @@ class Reconstructor:
         for profiles in before:
             each(profiles)
         words, begin = self._decoder.words(byte_view("data", data)), 0
+        if self._first_row:
+            words = window_words(words, self._first_row)
         while begin < words.size:
             size = _PIECE_WORDS
             if self._filter is None:
@@ -243,7 +248,7 @@ class Reconstructor:
             return rows
         if self._compensator is None:
             settings = replace(settings, periods_per_profile=every)
-            self._compensator = StepCompensator(settings, self.model, self.modulation)
+            self._compensator = StepCompensator(settings, self._window_model, self.modulation)
         rows = self._compensator.push(rows)
         return LineRows.concatenate([rows, self._compensator.flush()]) if last else rows
 
@@ -252,8 +257,10 @@ class Reconstructor:
         if isinstance(rows, Profiles):
             profiles = rows
         else:
-            profiles = Profiles.from_rows(rows, self.model)
+            profiles = Profiles.from_rows(rows, self._window_model)
             self._counts["points_beyond_pole"] += len(rows) - len(profiles)
+        if self._first_row:
+            profiles = replace(profiles, row=profiles.row + self._first_row)
         within = within_ranges(profiles.range_mm, self.settings)
         if not within.all():
             self._counts["points_outside_roi"] += len(profiles) - int(within.sum())
