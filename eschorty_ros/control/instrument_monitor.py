@@ -55,13 +55,13 @@ class InstrumentMonitor:
     - ``camera_present``: Returns whether a node publishes events.
 
     Public attributes:
-    - ``samples``: ROS time (ns) and stage position (mm) since ``restart_samples``.
+    - ``samples``: ROS time (ns) and stage position (mm) since ``restart_samples``; none before.
     """
 
     def __init__(self, camera_present: Callable[[], bool]) -> None:
         self._camera_present = camera_present
         self.samples: deque[tuple[int, float]] = deque(maxlen=_SAMPLES_MAX)
-        self._samples_from_ns = 0
+        self._samples_from_ns = math.inf
         self.laser: LaserReport | None = None
         self.reconstruction: ReconstructionStatus | None = None
         self.position_mm = float("nan")
@@ -105,8 +105,8 @@ class InstrumentMonitor:
         if t_ns >= self._samples_from_ns:
             self.samples.append((t_ns, position_mm))
 
-    def restart_samples(self, from_ns: int) -> None:
-        """Keep the stage's samples from this ROS time on."""
+    def restart_samples(self, from_ns: float) -> None:
+        """Keep the stage's samples from this ROS time on; ``inf`` keeps none."""
         self._samples_from_ns = from_ns
         self.samples.clear()
 

@@ -66,6 +66,9 @@ def test_a_drain_ends_although_there_is_progress():
 
 def test_the_progress_is_where_the_stage_was_at_the_newest_event():
     subject = monitor()
+    # Between two scans, however long, none are kept.
+    subject.update_stage(20, 6.0, 10.0, 0.0)
+    assert not subject.samples
     subject.restart_samples(100)
     # Of the approach, which ended elsewhere, and late.
     subject.update_stage(50, 7.0, 10.0, 0.0)

@@ -247,6 +247,7 @@ class ScannerNode(Node):
             recording=summary.recording,
         )
         samples = list(self._client.monitor.samples)
+        self._client.monitor.restart_samples(math.inf)
         if samples:
             start_ns = crossing_ns(samples, request.start_mm)
             stop_ns = crossing_ns(samples[::-1], request.last_mm)
