@@ -20,6 +20,8 @@ _FEW = 10
 # Longest way of a stage in metres, and what the readings of one at rest differ by.
 _METRES_MAX = 0.3
 _REST_MM = 0.003
+# Part of the stage's way that may be after the last event: camera and stage do not end at once.
+_LEFT_SHARE = 0.02
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
 _LOSSES = {
@@ -71,10 +73,18 @@ def recording_warnings(
         return [*found, f"no points: {without_modulation(0, 0.0)}"]
     stated_hz = recording.modulation.frequency_hz
     found += _geometry(recording)
-    way_mm = float(np.ptp(recording.stage_samples["position_mm"]))
+    samples = recording.stage_samples
+    way_mm = float(np.ptp(samples["position_mm"]))
     if _REST_MM < way_mm <= _METRES_MAX:
         found.append(
             f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
+        )
+    after = samples["position_mm"][np.searchsorted(samples["t_us"], span_us[1]) :]
+    if after.size and np.ptp(after) > max(_LEFT_SHARE * way_mm, _REST_MM):
+        found.append(
+            f"the events end at {span_us[1] * 1e-6:.3f} s, and the stage moves {np.ptp(after):.3g} "
+            f"mm after that; where these were scanned, too, {recording.events_path.name} is cut: "
+            "copy it again"
         )
     if shown_hz is not None and shown_hz != stated_hz:
         multiple = stated_hz / shown_hz
@@ -86,7 +96,7 @@ def recording_warnings(
         )
     without_stage = counters["points_without_stage"]
     if without_stage:
-        first_us, last_us = recording.stage_samples["t_us"][[0, -1]]
+        first_us, last_us = samples["t_us"][[0, -1]]
         found.append(
             f"stage.csv covers {first_us * 1e-6:.3f} to {last_us * 1e-6:.3f} s of "
             f"{span_us[0] * 1e-6:.3f} to {span_us[1] * 1e-6:.3f} s: {without_stage:,} of "

@@ -33,6 +33,13 @@ def with_stage(recording, later_us, part=slice(None), scale=1.0):
     return replace(recording, stage=track, stage_samples=samples)
 
 
+def with_half_of_the_events(recording):
+    data = recording.events_path.read_bytes()
+    cut = recording.path.parent / "cut.raw"
+    cut.write_bytes(data[: len(data) // 4 * 2])
+    return replace(recording, events_path=cut)
+
+
 @pytest.mark.parametrize("scene", ["plane", "posts"])
 def test_a_good_recording_has_no_warning(recording, tmp_path, scene):
     if scene == "posts":
@@ -60,6 +67,7 @@ def test_a_dark_recording_says_so(tmp_path):
         ),
         (lambda r: with_stage(r, 100_000_000), {}, "covers 100.000 to 100.840 s of 0.000 to", 0),
         (lambda r: with_stage(r, 0, slice(10, 41)), {}, "covers 0.100 to 0.400 s of 0.000 to", 1),
+        (lambda r: with_half_of_the_events(r), {}, "mm after that; where these were scanned", 1),
         (lambda r: with_stage(r, 0, scale=1e-3), {}, "moves by 0.03 mm in stage.csv; where", 1),
         (lambda r: replace(r, calibration=replace(NARROW, rows=480)), {}, "of 96 x 480; give", 1),
         (lambda r: r, {"events_min": 1000}, "0 points: ", 0),
