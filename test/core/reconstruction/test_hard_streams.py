@@ -454,12 +454,17 @@ def test_a_learned_footprint_reduces_the_error_where_half_of_the_events_are_lost
     assert 0.63 < np.mean(error < learned.sigma_row) < 0.9, f"seed {camera.seed}"
 
 
-def test_a_push_leaves_no_memory_behind():
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"returns": "all"}, {"noise_filter": "activity"}, {"phase_gate_us": -1}],
+    ids=str,
+)
+def test_a_push_leaves_no_memory_behind(settings):
     # Columns of background are tested, and pixels that fire all the time removed from them.
     camera = Camera(periods=40)
     data = stream(camera.line(wavy), camera.scattered(5e6), camera.hot_pixels(300, 20_000.0))
     modulation = Modulation(camera.frequency_hz, camera.duty, on_edge_us=FIRST_EDGE_US)
-    reconstructor = Reconstructor(CALIBRATION, modulation, Settings())
+    reconstructor = Reconstructor(CALIBRATION, modulation, Settings(**settings))
     size = len(data) // 20
     nrt.memsys_enable_stats()
     try:
