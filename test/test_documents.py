@@ -247,3 +247,11 @@ def test_the_architecture_names_files_and_functions_that_exist():
                     assert re.search(rf"\b{part}\b", sources), f"{name} is not in {files}"
     for folder in re.findall(r"^\| `(\w+)/`", page, re.MULTILINE):
         assert (ROOT / "eschorty_ros" / folder).is_dir()
+
+
+def test_the_readme_has_the_speeds_that_the_benchmark_wrote():
+    page = (ROOT / "docs" / "performance.md").read_text()
+    row = r"^\| \d+ Hz \| [\d.]+ M \| [\d.]+ \| \d+ \| (\d+) \| [\d.]+ \| [\d.]+ \| (\d+) \|$"
+    speeds, ratios = zip(*re.findall(row, page, re.MULTILINE), strict=True)
+    (slow, fast), (low, high) = sorted(map(int, speeds)), sorted(map(int, ratios))
+    assert f"{slow} to {fast} million events a second, {low} to {high} times" in README.read_text()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -56,7 +55,6 @@ class PacedWaiting:
         self._canceled, self._feedback = canceled, feedback
         self._watching = self._shielded = False
         self._phase = "preparing"
-        self.monitor.restart_samples(math.inf)
 
     def end(self) -> None:
         """Make every wait fail from now on."""

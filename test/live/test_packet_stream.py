@@ -20,6 +20,7 @@ from eschorty_ros.live.packet_times import (
     first_time_high_us,
     first_time_us,
 )
+from eschorty_ros.live.pipeline import Pipeline
 
 ZERO_NS = 1_700_000_000_123_456_789
 EDGE_US = 1000
@@ -450,3 +451,27 @@ def test_a_packet_whose_time_runs_on_is_refused():
         with pytest.raises(FormatError, match="spans"):
             check_span(data)
     check_span(line())
+
+
+def test_profiles_that_wait_for_the_stage_as_a_scan_begins_are_not_of_it():
+    data = line()
+    pipeline = Pipeline(CALIBRATION, Settings(periods_per_profile=1), 1.0, 0.0, 6.0)
+    pipeline.stream.announce_zero(ZERO_NS)
+    pipeline.stream.set_laser(MODULATION, ZERO_NS + EDGE_US * 1000)
+    parts = packets(data, size=len(data) // 16 * 2)
+    for packet in parts[:4]:
+        pipeline.add_packet(packet, 0.0)
+    pipeline.process(0.0)
+    waiting = pipeline.placer.waiting
+    assert waiting > 0
+    pipeline.begin_scan("s", 0.0, 1.0)
+    for packet in parts[4:]:
+        pipeline.add_packet(packet, 0.0)
+    pipeline.process(0.0)
+    for at_ns in (ZERO_NS, ZERO_NS + 1_000_000_000):
+        pipeline.add_stage(at_ns, 0.5)
+    pipeline.close_period("s", 0.0)
+    pipeline.place(0.0)
+    report = pipeline.end_scan()
+    assert report.points_outside >= waiting
+    assert 0 < len(report.scan.points) == len(plain(data)) - report.points_outside

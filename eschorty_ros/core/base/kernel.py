@@ -27,8 +27,8 @@ def kernel(*arguments: Any, **options: Any) -> Any:
 
     ``_nrt=False`` is for inner kernels that make no arrays. They count no references to the arrays
     they use: each count is atomic and costs as much as a column's sums. What they call inherits it,
-    but for kernels with ``_nrt=True``. A kernel that counts must return no arrays to one that does
-    not, which would never release them, or the reverse.
+    but for kernels with ``_nrt=True``. A kernel that counts returns no arrays to one that does not,
+    which would never release them.
 
     ``forceinline=True`` is for kernels that run for every column: a call copies every field of its
     arguments and results.

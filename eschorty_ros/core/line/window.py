@@ -108,6 +108,7 @@ def _pad(packed, end):
         packed[np.uintp(end) + i] = PAD
 
 
+# In line, as kernels that count references to arrays call it, and others that do not.
 @kernel(inline="always")
 def _column(packed, start, events, lit_us):
     """Return a column, which has been padded."""

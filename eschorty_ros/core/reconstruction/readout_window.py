@@ -21,10 +21,7 @@ def window_model(calibration: Calibration) -> tuple[int, RangeModel]:
 
 
 def window_words(words: NDArray[np.uint16], first: int) -> NDArray[np.uint16]:
-    """Return the EVT3 ``words`` with rows counted from ``first``; earlier rows are the last ones.
-
-    Those are beyond any sensor.
-    """
+    """Return the EVT3 ``words`` with rows from ``first``; earlier ones are past the window."""
     mask = np.uint16(ADDRESSES - 1)
     row = (words & ~mask) | ((words & mask) - np.uint16(first) & mask)
     moved = np.where(words >> 12 == ADDR_Y, row, words)

@@ -95,8 +95,8 @@ class Reconstructor:
     ) -> None:
         self.settings = settings = settings or Settings()
         self.model = calibration.model()
-        self._first_row, self._window_model = window_model(calibration)
-        model = self._window_model
+        self._first_row, model = window_model(calibration)
+        self._window_model = model
         self.first_t_us: int | None = None
         self.newest_t_us: int | None = None
         self._decoder = Decoder(model.columns, model.rows)

@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from independent_pixels import FIRST_EDGE_US, Camera, Events, stream
-from reconstructing import CALIBRATION
+from reconstructing import CALIBRATION, reconstruct
 
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.optics import Calibration
-from eschorty_ros.core.reconstruction import Profiles, Reconstructor, Settings
+from eschorty_ros.core.reconstruction import Profiles
 from eschorty_ros.core.storage import SENSOR_EDGE
 
 FIRST, ROWS = 301, 120
@@ -16,8 +17,7 @@ FIRST, ROWS = 301, 120
 
 def reconstructed(camera: Camera, events: Events, calibration: Calibration) -> Profiles:
     modulation = Modulation(camera.frequency_hz, camera.duty, on_edge_us=FIRST_EDGE_US)
-    reconstructor = Reconstructor(calibration, modulation, Settings())
-    return Profiles.concatenate([reconstructor.push(stream(events)), reconstructor.flush()])
+    return reconstruct(stream(events), modulation, calibration=calibration)[0]
 
 
 def read_out(events: Events) -> Events:
@@ -38,19 +38,20 @@ def test_lines_inside_the_window_are_where_they_are_without_it():
     np.testing.assert_allclose(window.sigma_mm, whole.sigma_mm, rtol=1e-6)
 
 
-def test_a_line_that_the_windows_first_row_cuts_is_marked_and_in_its_place():
+@pytest.mark.parametrize("at_row", [FIRST + 1.5, FIRST + ROWS - 2.5], ids=["first", "last"])
+def test_a_line_that_the_windows_first_or_last_row_cuts_is_marked_and_in_its_place(at_row):
     camera = Camera(periods=24)
 
     def row(k, c):
         cut = (np.asarray(c) // 160) % 2 == 0
-        return np.where(cut, FIRST + 1.5, FIRST + 60.0) + 0.03 * k
+        return np.where(cut, at_row, FIRST + 60.0) + 0.03 * np.sign(FIRST + 60.0 - at_row) * k
 
     events = read_out(camera.line(row))
     off = {}
     for build in (CALIBRATION, WINDOW):
         found = reconstructed(camera, events, build)
         truth = row(found.period, found.column)
-        cut = (found.period >= 8) & (truth < FIRST + 30)
+        cut = (found.period >= 8) & (np.abs(truth - at_row) < 30)
         off[build.roi_px] = np.median(np.abs(found.row - truth)[cut])
         marked = np.mean((found.flags & SENSOR_EDGE > 0)[cut])
         assert marked == (build is WINDOW), f"seed {camera.seed}"
