@@ -66,14 +66,16 @@ class LineHistory(NamedTuple):
 
     The first and the last block are outside the sensor. The line moves by ``step_px`` from profile
     to profile, a mean over recent ones. A line that moves is off by the standard deviation
-    ``common_px`` and by what the rows of its ``polarities`` show, at most: the variance ``moved2``;
-    ``passing2`` is that of an edge that it passes.
+    ``common_px`` and by what the rows of its ``polarities`` show, at most. With what its bursts
+    show, ``shift_px``, that is the variance ``moved2``; ``passing2`` is that of an edge that it
+    passes.
     """
 
     now: BlockSums
     recent: BlockMeans
     polarities: PolarityMeans
     step_px: NDArray[np.float64]
+    shift_px: NDArray[np.float64]
     moved2: NDArray[np.float64]
     passing2: NDArray[np.float64]
     common_px: float
@@ -88,8 +90,10 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     blocks = -(-columns // BLOCK_COLUMNS) + 2
     now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
     polarities = PolarityMeans(*np.zeros((2, blocks)))
-    step_px, moved2, passing2 = np.zeros((3, blocks))
-    return LineHistory(now, recent, polarities, step_px, moved2, passing2, common_px, windowed)
+    step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
+    return LineHistory(
+        now, recent, polarities, step_px, shift_px, moved2, passing2, common_px, windowed
+    )
 
 
 @kernel(_nrt=False)
@@ -162,7 +166,8 @@ def _compare_with_recent(history, known, usual, width_variance):
             apart = abs(polarities.row[near].sum()) / max(compared, 1)
             apart = min(apart, history.step_px[block])
             off2 = history.common_px**2 + apart * apart
-            history.moved2[block] = min(max(moved2, 0.0), off2)
+            shift_px = history.shift_px[block]
+            history.moved2[block] = min(max(moved2, 0.0), off2) + shift_px * shift_px
         history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
         recent.width[block] += weight * (width - recent.width[block])

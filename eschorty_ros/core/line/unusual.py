@@ -116,14 +116,15 @@ def _restart_widths(widths, known):
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
+    history.shift_px[:] = 0.0
     _update(widths, widths.smoothed.shape[1])
 
 
 @kernel(_nrt=False)
-def _is_usual(widths, width, reach):
+def _is_usual(below, width, reach):
     place = _width_bin(width)
     low, high = max(place - reach, 0), min(place + reach + 1, _BINS)
-    return widths.below[high] - widths.below[low] >= _USUAL_SHARE * widths.below[_BINS]
+    return below[high] - below[low] >= _USUAL_SHARE * below[_BINS]
 
 
 @kernel
@@ -255,7 +256,7 @@ def _mark_unusual(rows, smoothing, lit_share):
                 averaged = smoothing.used[k, c]
                 share = WIDTH_COLUMNS / min(averaged, WIDTH_COLUMNS)
                 reach = np.int64(max(np.rint(sigma * np.sqrt(share) * _PER_ROW), 1.0))
-            if known and not _is_usual(widths, width, reach):
+            if known and not _is_usual(widths.below, width, reach):
                 steady = not displacement * displacement > _STEADY**2 * own2
                 weight = _MIXED_WEIGHT if steady else _MOVING_WEIGHT
                 unusual2 = _unusual_variance(width, usual)

@@ -56,6 +56,7 @@ _COUNTERS = (
     "columns_two_returns",
     "columns_unmodulated",
     "events_unmodulated",
+    "points_burst_shift",
 )
 # ``part_us`` is where the part of the gate begins, ``status`` one of the three below, ``half`` the
 # half width of a window for the open period in fixed point, ``rows`` the number of rows in the

@@ -9,6 +9,13 @@ from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
 from eschorty_ros.core.line.blinking import Blink
+from eschorty_ros.core.line.burst_shift import (
+    Bursts,
+    _compare_bursts,
+    _forget_bursts,
+    _points_shifted,
+    empty_bursts,
+)
 from eschorty_ros.core.line.centroid import (
     Rows,
     _estimate_columns,
@@ -110,6 +117,7 @@ class Memory(NamedTuple):
     estimator: Estimator
     gate: LearnedGate
     blink: Blink
+    bursts: Bursts
     footprint: Footprint
     known: Footprint
     known_widths: UsualWidths
@@ -149,6 +157,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
         columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
         estimator=estimator,
         blink=Blink(),
+        bursts=empty_bursts(model.columns),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
         known_widths=empty_usual_widths(),
@@ -192,6 +201,7 @@ def _begin_window(memory, state):
     memory.columns.seeds[:] = -1
     memory.columns.rivals[:] = -1
     _forget_scatter(memory.scatter)
+    _forget_bursts(memory.bursts)
     memory.smoothing.errors[:] = 0.0
     memory.delay.time_us = memory.delay.points = 0
     _forget_gate(memory.gate)
@@ -288,8 +298,14 @@ def _close(memory, state, counters):
     _scale_smoothed(rows, scatter, smoothing)
     history = smoothing.widths.history
     _compare_polarities(columns, half, state.profiles % BLOCK_COLUMNS, history)
+    if history.windowed:
+        _compare_bursts(
+            columns, half, state.profiles, blink, history.step_px, rows.common2[0], memory.bursts,
+            history.shift_px,
+        )  # fmt: skip
     state.profiles += 1
     _mark_unusual(rows, smoothing, memory.light.lit_share)
+    counters.points_burst_shift += _points_shifted(history.shift_px, history.now.points)
     enough = state.points >= _KNOWN_PROFILES * max(state.points_most, 1)
     always = estimator.method == _LEARNED
     if _choose(footprint, rows.row[0], history, late and enough, always):
@@ -303,7 +319,8 @@ def _close(memory, state, counters):
     if state.known_half == 0:
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
-            smoothing.widths.usual.number[:] = 0.0
+            smoothing.widths.usual.number[:], history.shift_px[:] = 0.0, 0.0
+            _forget_bursts(memory.bursts)
         if enough and footprint.state.choice != UNDECIDED:
             state.known_half = state.half
             _keep_widths(smoothing.widths, memory.known_widths)

@@ -34,6 +34,11 @@ _BLOCK_WORDS = 1 << 13
 _STAGE_EDGES_MAX = 1024
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
+_BURST_SHIFT_SHARE = 0.1
+_FEWER_EVENTS = (
+    "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
+    "bias_diff_off)"
+)
 
 
 class Reconstructor:
@@ -371,9 +376,14 @@ class Reconstructor:
         if counts["sensor_drop_words"]:
             found.append(
                 f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
-                "events, which moves rows where one side of the line is lost; limit the camera's "
-                "region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
-                "bias_diff_off)"
+                f"events, which moves rows where one side of the line is lost; {_FEWER_EVENTS}"
+            )
+        share = counts["points_burst_shift"] / max(points, 1)
+        if share > _BURST_SHIFT_SHARE:
+            found.append(
+                f"early and late events of a burst have different rows in {share:.0%} of the "
+                "points: the readout loses one side of the line, or the line is lopsided; sigma "
+                f"has the difference; {_FEWER_EVENTS}"
             )
         if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
             found.append(

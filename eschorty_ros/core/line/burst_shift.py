@@ -1,0 +1,174 @@
+"""How far the rows of early events of a burst are from those of the later ones.
+
+All events of a line that is at rest and symmetric have the same mean row. Where a readout takes
+fewer events than the pixels give, and loses them in the order of the rows, those at the height of
+the burst have lost one side of the line, and the later ones have not. What the bursts of both
+polarities show is an uncertainty of the row; one of them alone differs where pixels answer the two
+edges of the laser differently.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
+from eschorty_ros.core.line.window import (
+    BLOCK,
+    FRACTION,
+    PAD,
+    POLARITY,
+    ROW_MASK,
+    TIME_SHIFT,
+)
+
+# Share of the sums that the next profile keeps.
+_KEPT = 1.0 - 1.0 / 16.0
+# The number of events is above this bit, the sum of their rows below it.
+_ONE_BITS = np.uint32(20)
+_ONE = np.uint32(1 << 20)
+# Length of a burst, of 2**32 per turn: what a moving line reaches or leaves later is none of it.
+_BURST = 1 << 30
+# Where late events begin, at first, and the share of its value by which an event moves that.
+_LATE = 1 << 26
+_STEP = 1.0 / 128.0
+# Difference of both parts over the standard deviation by which whole pixels move the mean row.
+_EXPLAINED = 12.0
+# Profiles without which a shift is chance. From then on one of as many is compared.
+_PROFILES_MIN = 4
+# Standard deviations of a sum over blocks that chance may have; each column is in three of them.
+_BY_CHANCE = 2.0 * np.sqrt(3.0)
+# Least mean product of the shifts of both polarities, px squared: 0.0 to 0.2 where nothing is lost.
+_PRODUCT_MIN = 0.5
+
+
+class Bursts(NamedTuple):
+    """Sums over recent profiles by block of columns, polarity and part of the burst.
+
+    Early events, part 0, are before the phase ``late``, of 2**32 per turn: three of four. The first
+    and the last block are outside the sensor.
+    """
+
+    events: NDArray[np.float64]
+    rows_px: NDArray[np.float64]
+    late: NDArray[np.float64]
+
+
+def empty_bursts(columns: int) -> Bursts:
+    """Return no bursts."""
+    blocks = -(-columns // BLOCK_COLUMNS) + 2
+    events, rows_px = np.zeros((2, blocks, 2, 2))
+    return Bursts(events, rows_px, np.full((blocks, 2), float(_LATE)))
+
+
+@kernel
+def _forget_bursts(bursts):
+    bursts.events[:], bursts.rows_px[:] = 0.0, 0.0
+    bursts.late[:] = _LATE
+
+
+@kernel(_nrt=False)
+def _add_sums(bursts, block, polarity, early, late, origin_px):
+    """Add numbers of events, and sums of their rows beside the origin, of both parts."""
+    more_late = 0.0
+    for part, both in ((0, early), (1, late)):
+        n = np.int64(both >> _ONE_BITS)
+        bursts.events[block, polarity, part] += n
+        bursts.rows_px[block, polarity, part] += (
+            np.int64(both & (_ONE - np.uint32(1))) + n * origin_px
+        )
+        more_late += 3.0 * n if part else -n
+    bursts.late[block, polarity] *= 1.0 + _STEP * more_late
+
+
+@kernel(_nrt=False)
+def _add_column(packed, start, seed, half, blink, block, bursts):
+    """Add the events of a column within ``half`` of its ``seed`` that are in a burst."""
+    first = (seed - half + FRACTION - 1) // FRACTION
+    base, span = np.uint32(first), np.uint32((seed + half) // FRACTION - first)
+    late_on, late_off = np.uint32(bursts.late[block, 1]), np.uint32(bursts.late[block, 0])
+    none = np.uint32(0)
+    begin = np.uintp(start)
+    while packed[begin] != PAD:
+        # A block's number of events and the sum of their rows share a register.
+        on_early, on_late, off_early, off_late = none, none, none, none
+        for i in range(begin, begin + np.uintp(BLOCK)):
+            v = packed[i]
+            d = np.uint32((v & ROW_MASK) - base)
+            on = (v & POLARITY) > 0
+            turn = np.uint32((v >> TIME_SHIFT) * blink.step)
+            phase = np.uint32(turn - (none if on else blink.duty))
+            late = phase >= (late_on if on else late_off)
+            value = np.uint32(_ONE + d) if (d <= span) & (phase < _BURST) else none
+            on_early = np.uint32(on_early + (value if on & (not late) else none))
+            on_late = np.uint32(on_late + (value if on & late else none))
+            off_early = np.uint32(off_early + (value if (not on) & (not late) else none))
+            off_late = np.uint32(off_late + (value if (not on) & late else none))
+        _add_sums(bursts, block, 1, on_early, on_late, first - seed / FRACTION)
+        _add_sums(bursts, block, 0, off_early, off_late, first - seed / FRACTION)
+        begin += np.uintp(BLOCK)
+
+
+@kernel(inline="always")
+def _near(sums, block, polarity, part):
+    b = np.uintp(block)
+    return sums[b - 1, polarity, part] + sums[b, polarity, part] + sums[b + 1, polarity, part]
+
+
+@kernel(_nrt=False)
+def _difference(bursts, block, polarity, explained_px):
+    """Return how far early and late rows near a block differ beyond what is explained, px."""
+    early = _near(bursts.events, block, polarity, 0)
+    late = _near(bursts.events, block, polarity, 1)
+    if min(early, late) < 1.0:
+        return 0.0
+    early_px = _near(bursts.rows_px, block, polarity, 0) / early
+    difference = early_px - _near(bursts.rows_px, block, polarity, 1) / late
+    return np.sign(difference) * max(abs(difference) - explained_px, 0.0)
+
+
+@kernel(_nrt=False)
+def _points_shifted(shift_px, points):
+    """Return how many of the ``points``, by block, have a shift."""
+    shifted = 0.0
+    for block in range(points.size):
+        if shift_px[block] > 0.0:
+            shifted += points[block]
+    return np.int64(shifted)
+
+
+@kernel(_nrt=False)
+def _compare_bursts(columns, half, profiles, blink, steps_px, common2, bursts, shift_px):
+    """Add one column of each block, and set the shifts of the bursts after so many ``profiles``.
+
+    Lines move by ``steps_px`` from profile to profile, by block; ``common2`` are the variances that
+    the rows of neighbours share, px squared, by column.
+    """
+    if blink.step == 0 or (profiles > _PROFILES_MIN and profiles % _PROFILES_MIN > 0):
+        return
+    place = (profiles + profiles // _PROFILES_MIN) % BLOCK_COLUMNS
+    blocks, products, squares = 0, 0.0, 0.0
+    for block in range(1, shift_px.size - 1):
+        for polarity in range(2):
+            for part in range(2):
+                bursts.events[block, polarity, part] *= _KEPT
+                bursts.rows_px[block, polarity, part] *= _KEPT
+        c = np.uintp((block - 1) * BLOCK_COLUMNS + place)
+        shift_px[block] = 0.0
+        if c >= columns.seeds.size or columns.seeds[c] < 0 or np.isnan(common2[c]):
+            continue
+        start, seed = columns.starts[c], columns.seeds[c]
+        _add_column(columns.packed, start, seed, half, blink, block, bursts)
+        explained_px = steps_px[block] + _EXPLAINED * np.sqrt(common2[c])
+        on = _difference(bursts, block, 1, explained_px)
+        off = _difference(bursts, block, 0, explained_px)
+        shift_px[block] = min(abs(on), abs(off)) if on * off > 0.0 else 0.0
+        products += on * off
+        squares += (on * off) ** 2
+        blocks += 1
+    chance = _BY_CHANCE * np.sqrt(squares)
+    if profiles < _PROFILES_MIN or products < max(_PRODUCT_MIN * blocks, chance):
+        shift_px[:] = 0.0
