@@ -3,7 +3,9 @@
 ON events follow a rising edge of the laser and OFF events a falling one. With the phase of OFF
 events turned back by the duty cycle, a line's events have one direction on the circle of phases,
 and those of background, of hot pixels and of things that move have none. Their vector strength R,
-the length of the mean unit vector, separates the two without knowing the phase itself.
+the length of the mean unit vector, separates the two without knowing the phase itself. A lamp and
+an edge that passes may have bursts as short within one period. Their phases differ from the one
+that the lines of a stream have in common, which its first profiles show.
 """
 
 from __future__ import annotations
@@ -11,11 +13,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
 from eschorty_ros.core.line.window import (
     BLOCK,
     CHUNK,
+    FRACTION,
+    PAD,
     POLARITY,
     ROW_BITS,
     ROW_MASK,
@@ -43,18 +49,25 @@ _BURSTS_MIN = 12.0
 _HOT_EVENTS_MIN = 6
 # Lengths of the integer unit vectors, and of their sums per event.
 _UNIT = 4096.0
+# Lines that show their common phase, and the least vector strength of their phases.
+_LINES_MIN = 256.0
+_COMMON_MIN = 0.5
+# Cosine of an eighth of a turn, by which a line's phase may differ from the common one.
+_ALIKE = np.sqrt(0.5)
 
 
 class Blink(NamedTuple):
     """Turns per microsecond and the turn from rising to falling edge, both of 2**32 per turn.
 
     A ``step`` of 0 is no test. ``lit_us`` is the time from rising to falling edge, 0 where a
-    profile has more periods than one.
+    profile has more periods than one. ``lines`` has the sums of the unit vectors of the stream's
+    lines, x and y, and their number.
     """
 
     step: np.uint32 = np.uint32(0)
     duty: np.uint32 = np.uint32(0)
     lit_us: np.uint32 = np.uint32(0)
+    lines: NDArray[np.float64] = np.zeros(3)
 
 
 class Vector(NamedTuple):
@@ -81,6 +94,7 @@ def blink(modulation: Modulation, every: int) -> Blink:
         np.uint32(round(turn / modulation.period_us)),
         np.uint32(round(turn * modulation.duty)),
         np.uint32(round(modulation.duty * modulation.period_us) if every == 1 else 0),
+        np.zeros(3),
     )
 
 
@@ -137,6 +151,45 @@ def _is_in_phase(sums, blink):
 
 
 @kernel(_nrt=False)
+def _is_alike(vector, blink):
+    """Return true when a phase is near that which the stream's lines have in common, if any."""
+    x, y, lines = blink.lines[0], blink.lines[1], blink.lines[2]
+    common = np.sqrt(x * x + y * y)
+    if lines < _LINES_MIN or common < _COMMON_MIN * lines:
+        return True
+    length = np.sqrt(float(vector.x * vector.x + vector.y * vector.y))
+    return vector.x * x + vector.y * y > _ALIKE * common * length
+
+
+@kernel(_nrt=False)
+def _is_of_the_stream(column, window, blink):
+    """Return true when a window's events are in phase, with the laser and with other lines."""
+    if not _is_in_phase(window.sums, blink):
+        return False
+    return _is_alike(_vector(column, window.first, window.last, blink), blink)
+
+
+@kernel(_nrt=False)
+def _add_lines(columns, half, place, blink):
+    """Add the lines of a profile, one of each block of columns, to those of the stream."""
+    for c in range(np.uintp(place), np.uintp(columns.seeds.size), np.uintp(BLOCK_COLUMNS)):
+        seed = columns.seeds[c]
+        if blink.step == 0 or seed < 0:
+            continue
+        start, events = columns.starts[c], np.int64(0)
+        while columns.packed[np.uintp(start + events)] != PAD:
+            events += 1
+        column = _column(columns.packed, start, events, blink.lit_us)
+        first = max((seed - half) // FRACTION, 0)
+        vector = _vector(column, first, (seed + half) // FRACTION, blink)
+        length = np.sqrt(float(vector.x * vector.x + vector.y * vector.y))
+        if length > 0.0:
+            blink.lines[0] += vector.x / length
+            blink.lines[1] += vector.y / length
+            blink.lines[2] += 1.0
+
+
+@kernel(_nrt=False)
 def _laser_test(column, first, last, blink):
     """Test whether the events of rows first..last follow the laser."""
     vector = _vector(column, first, last, blink)
@@ -145,8 +198,9 @@ def _laser_test(column, first, last, blink):
     square = length2 / (n * n * _UNIT * _UNIT)
     rayleigh = n * square
     if square > _STRENGTH_MIN**2:
+        alike = _is_alike(vector, blink)
         follows = rayleigh > min(_RAYLEIGH_MIN, _SQUARE_ENOUGH * n)
-        return _LaserTest(follows, rayleigh > _RAYLEIGH_SURE)
+        return _LaserTest(alike & follows, alike & (rayleigh > _RAYLEIGH_SURE))
     # A line that moves while it is lit has events all the time, and a burst at both edges. What
     # passes within a part of the period has one at most.
     bursts = _has_bursts(column, first, last, blink)

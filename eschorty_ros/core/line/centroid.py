@@ -311,7 +311,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
         out.ambiguous[c] = False
         if n < estimator.events_min:
             few += n > 0
-            columns.rivals[c] = -1
+            columns.rivals[c], columns.events[c] = -1, 0
             continue
         column = _column(packed, columns.starts[c], n, blink.lit_us)
         known = columns.seeds[c] >= 0
@@ -324,6 +324,7 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             if _is_clear(window, column, estimator, blink):
                 columns.rivals[c] = -1
                 columns.seeds[c] = neighbour = window.centre
+                columns.events[c] = window.sums.events
                 _put((0, c), window, n, False, out)
                 if not plain:
                     _refine(
@@ -340,10 +341,12 @@ def _estimate_columns(columns, half, estimator, blink, footprint, out, row_count
             out.ambiguous[c] = found.status == AMBIGUOUS
             ambiguous += found.status == AMBIGUOUS
             few += found.status == TOO_FEW
+            columns.events[c] = 0
             if not known:
                 columns.seeds[c] = -1
             continue
         columns.seeds[c] = neighbour = found.window.centre
+        columns.events[c] = found.window.sums.events
         two += found.second
         window, other = _reported(estimator.returns, found)
         left = _column(packed, columns.starts[c], searched.events, blink.lit_us)

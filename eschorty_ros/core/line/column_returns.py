@@ -7,7 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.blinking import _is_in_phase, _laser_test, _without, _without_hot_pixels
+from eschorty_ros.core.line.blinking import (
+    _is_in_phase,
+    _is_of_the_stream,
+    _laser_test,
+    _without,
+    _without_hot_pixels,
+)
 from eschorty_ros.core.line.estimators import _LAST, _STRONGEST, _is_windowed
 from eschorty_ros.core.line.window import (
     AMBIGUOUS,
@@ -26,6 +32,8 @@ _WINDOWS_MAX = 4
 # Weight of each of two neighbours' evidence; 2 x 0.45 < 1, so that it sums to at most 10 times a
 # column's own.
 _VOTE = 0.45
+# Share of its events that a line keeps where nothing hides it.
+_UNCHANGED = 0.85
 
 
 class _ColumnReturns(NamedTuple):
@@ -179,6 +187,24 @@ def _is_clear(window, column, estimator, blink):
 
 
 @kernel(_nrt=False)
+def _goes_on(window, found, columns, c, half, estimator):
+    """Return true when a column's line is where it was, as strong, and another one is new there.
+
+    A lamp or an edge that passes can have a burst in phase with the laser, but not in two profiles
+    at the same rows. What is new and stays is a rival in the next profile.
+    """
+    new, old, rival = found.window, window.sums.events, columns.rivals[c]
+    return (
+        found.status == FOUND
+        and estimator.returns == _STRONGEST
+        and old >= max(_UNCHANGED * columns.events[c], float(estimator.events_min))
+        and columns.events[c] > 0
+        and abs(new.centre - window.centre) > half
+        and (rival < 0 or abs(new.centre - rival) > half)
+    )
+
+
+@kernel(_nrt=False)
 def _column_returns(column, c, half, columns, estimator, blink, window, row_counts):
     """Search a column for its returns; ``window`` is that around its last row, if it has one."""
     testing = _is_windowed(estimator.method) and blink.step > 0
@@ -186,7 +212,15 @@ def _column_returns(column, c, half, columns, estimator, blink, window, row_coun
     found = Returns(FOUND, False, window, window)
     if window.sums.events < estimator.events_min or 2 * window.sums.events <= column.events:
         found = _search(column, half, estimator)
-    in_phase = found.status == FOUND and _is_in_phase(found.window.sums, blink)
+        goes_on = testing and _goes_on(window, found, columns, c, half, estimator)
+        if goes_on and _laser_test(column, window.first, window.last, blink).sure:
+            new = found.window
+            columns.rivals[c], columns.evidence[c] = new.centre, 0.0
+            if not _laser_test(column, new.first, new.last, blink).follows:
+                columns.rivals[c] = -1
+                column = _without(column, new.first, new.last)
+            return _ColumnReturns(Returns(FOUND, False, window, window), column.events, False)
+    in_phase = found.status == FOUND and _is_of_the_stream(column, found.window, blink)
     if testing and found.status != TOO_FEW and not in_phase:
         found, column, uncertain = _modulated(column, found, half, estimator, blink, row_counts)
         if found.status == UNMODULATED:

@@ -24,7 +24,8 @@ class Columns(NamedTuple):
     The ``counts[c, 1]`` late ones of a `PhaseGate` that keeps them follow where the ``room`` for
     the others ends, with its padding. It grows up to ``limit``. ``seeds`` are the rows of the lines
     in the last period, fixed point; -1 for none. ``rivals`` are those of second lines that are
-    nearly as strong, and ``evidence`` the events by which the first ones have been stronger. In a
+    nearly as strong, and ``evidence`` the events by which the first ones have been stronger. Those
+    have had ``events``; 0 for none. In a
     region of interest column ``c`` takes ``row_first[c]`` and the ``row_span[c]`` rows behind it;
     without one both are empty. ``refused`` counts the events that `_bin` did not append, by reason.
     """
@@ -35,6 +36,7 @@ class Columns(NamedTuple):
     seeds: NDArray[np.int64]
     rivals: NDArray[np.int64]
     evidence: NDArray[np.float64]
+    events: NDArray[np.int64]
     room: int
     limit: int
     row_first: NDArray[np.uint32]
@@ -85,6 +87,7 @@ def empty_columns(columns: int, limit: int, room: int = _ROOM) -> Columns:
         seeds=np.full(columns, -1, np.int64),
         rivals=np.full(columns, -1, np.int64),
         evidence=np.zeros(columns),
+        events=np.zeros(columns, np.int64),
         room=room,
         limit=limit,
         row_first=_ALL_ROWS,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel, record
-from eschorty_ros.core.line.blinking import Blink
+from eschorty_ros.core.line.blinking import Blink, _add_lines
 from eschorty_ros.core.line.burst_shift import (
     Bursts,
     _compare_bursts,
@@ -199,7 +199,7 @@ def _begin_window(memory, state):
     state.window = state.profiles = 0
     state.half = state.known_half if state.known_half > 0 else memory.estimator.half_max
     memory.columns.seeds[:] = -1
-    memory.columns.rivals[:] = -1
+    memory.columns.rivals[:], memory.columns.events[:] = -1, 0
     _forget_scatter(memory.scatter)
     _forget_bursts(memory.bursts)
     memory.smoothing.errors[:] = 0.0
@@ -317,6 +317,7 @@ def _close(memory, state, counters):
             footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.sensor_rows
         )
     if state.known_half == 0:
+        _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
             smoothing.widths.usual.number[:], history.shift_px[:] = 0.0, 0.0
