@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eschorty_ros.core.reconstruction.clock_turns import in_turn
 from eschorty_ros.core.reconstruction.pass_lag import PassLag, pass_lag, take_off_lag
 from eschorty_ros.core.reconstruction.profiles import Profiles, place
 from eschorty_ros.core.reconstruction.reconstructor import Reconstructor
@@ -84,6 +85,7 @@ def reconstruct_recording(
     """
     began = time.perf_counter()
     settings = settings or recorded_settings(recording)
+    recording, turned = in_turn(recording)
     settings = replace(settings, stage_speed_mm_s=stage_speed_mm_s(recording))
     jobs = len(os.sched_getaffinity(0)) if jobs is None else jobs
     reconstructor = Reconstructor(recording.calibration, recording.modulation, settings, jobs)
@@ -115,6 +117,7 @@ def reconstruct_recording(
     shown_hz = shown_frequency_hz(recording) if shown is None else shown.result()
     warnings = (
         *map(str, reader.warnings),
+        *turned,
         *reconstructor.warnings,
         *recording_warnings(recording, used, counters, points, span_us, shown_hz),
     )

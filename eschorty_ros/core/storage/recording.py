@@ -145,6 +145,15 @@ class Recording:
             modulation = replace(modulation, frequency_hz=frequency_hz)
         return replace(self, calibration=calibration or self.calibration, modulation=modulation)
 
+    def earlier(self, by_us: int) -> Recording:
+        """Return the recording with earlier times of the stage and of the laser's edge."""
+        samples, modulation = self.stage_samples.copy(), self.modulation
+        samples["t_us"] -= by_us
+        if modulation.on_edge_us is not None:
+            modulation = replace(modulation, on_edge_us=modulation.on_edge_us - by_us)
+        track = _track(samples, self.scan)
+        return replace(self, stage=track, stage_samples=samples, modulation=modulation)
+
     @cached_property
     def truth(self) -> NDArray[np.void] | None:
         """True ranges, TRUTH_DTYPE, read on first use; ``None`` when there are none.
@@ -172,12 +181,10 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
     samples = read_stage_csv(folder / STAGE_FILE)
     scan = read_scan_yaml(folder / SCAN_FILE) if (folder / SCAN_FILE).exists() else None
     settings, marks = folder / SETTINGS_FILE, folder / MARKS_FILE
-    track = StageTrack(round(scan.stage_gap_s * 1e6) or None if scan is not None else None)
-    track.append(samples["t_us"], samples["position_mm"])
     return Recording(
         path=folder,
         events_path=folder / EVENTS_FILE,
-        stage=track,
+        stage=_track(samples, scan),
         stage_samples=samples,
         modulation=read_laser_yaml(folder / LASER_FILE),
         calibration=load_calibration(folder / CALIBRATION_FILE),
@@ -185,6 +192,12 @@ def load_recording(path: str | os.PathLike[str]) -> Recording:
         settings=read_settings_yaml(settings) if settings.exists() else {},
         marks=read_marks_csv(marks) if marks.exists() else np.empty(0, MARK_DTYPE),
     )
+
+
+def _track(samples: NDArray[np.void], scan: ScanLog | None) -> StageTrack:
+    track = StageTrack(round(scan.stage_gap_s * 1e6) or None if scan is not None else None)
+    track.append(samples["t_us"], samples["position_mm"])
+    return track
 
 
 def read_scan_yaml(path: str | os.PathLike[str]) -> ScanLog:

@@ -58,6 +58,17 @@ def test_a_dark_recording_says_so(tmp_path):
     assert "events follow the laser's modulation at 70 Hz" in found.warnings[-1]
 
 
+def test_stage_positions_of_a_later_turn_of_the_cameras_clock_are_those_of_the_events(recording):
+    later_us, edge_us = 3 << 24, recording.modulation.on_edge_us
+    later = with_stage(recording, later_us)
+    modulation = replace(recording.modulation, on_edge_us=edge_us + later_us)
+    found = reconstruct_recording(replace(later, modulation=modulation))
+    as_recorded = reconstruct_recording(recording)
+    assert found.points.tobytes() == as_recorded.points.tobytes()
+    (warning,) = found.warnings
+    assert "3 x 16.777216 s" in warning
+
+
 @pytest.mark.parametrize(
     ("change", "settings", "words", "points"),
     [

@@ -1,0 +1,53 @@
+"""Whole turns of the camera's clock between the events of a recording and its stage positions.
+
+EVT3 carries 24 bits of a microsecond clock, so that a stream which begins later than 16.8 s after
+the camera has been started begins in an unknown turn. It is decoded as if that were the first one.
+"""
+
+from __future__ import annotations
+
+from eschorty_ros.core.evt3 import Decoder, time_span_us
+from eschorty_ros.core.storage import Recording
+from eschorty_ros.core.storage.raw_file import RawReader
+
+_TURN_US = 1 << 24
+_CHUNK_BYTES = 1 << 19
+_MAPPED_BYTES = 1 << 27
+# Share of the shorter one of events and positions that both have to cover.
+_COVERED = 0.9
+
+
+def in_turn(recording: Recording) -> tuple[Recording, list[str]]:
+    """Return the recording with its times in the turn of its events, and a line where they change.
+
+    They change where all of the stage's positions are after the events, and most are at their times
+    when whole turns are taken off.
+    """
+    first_us, last_us = recording.stage.first_us, recording.stage.last_us
+    if first_us is None or last_us is None or first_us < _TURN_US // 2:
+        return recording, []
+    begin_us = _begin_us(recording)
+    reader = RawReader(recording.events_path)
+    span_us = sum(map(time_span_us, reader.mapped(_MAPPED_BYTES)))
+    turns = round((first_us - begin_us) / _TURN_US)
+    off_us = turns * _TURN_US
+    both_us = min(begin_us + span_us, last_us - off_us) - max(begin_us, first_us - off_us)
+    covered = both_us > _COVERED * min(span_us, last_us - first_us)
+    if turns < 1 or first_us <= begin_us + span_us or not covered:
+        return recording, []
+    line = (
+        f"the events begin {turns} x 16.777216 s, turns of the camera's 24-bit clock, before "
+        "stage.csv; they are taken off the times of stage.csv and laser.yaml"
+    )
+    return recording.earlier(off_us), [line]
+
+
+def _begin_us(recording: Recording) -> int:
+    """Return the time of the first event, 0 without any."""
+    reader = RawReader(recording.events_path)
+    decoder = Decoder(reader.header.width, reader.header.height)
+    for chunk in reader.chunks(_CHUNK_BYTES):
+        events = decoder.decode(chunk)
+        if len(events):
+            return int(events.t[0])
+    return 0
