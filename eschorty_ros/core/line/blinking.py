@@ -5,7 +5,7 @@ events turned back by the duty cycle, a line's events have one direction on the 
 and those of background, of hot pixels and of things that move have none. Their vector strength R,
 the length of the mean unit vector, separates the two without knowing the phase itself. A lamp and
 an edge that passes may have bursts as short within one period. Their phases differ from the one
-that the lines of a stream have in common, which its first profiles show.
+that the lines of a stream have in common.
 """
 
 from __future__ import annotations
@@ -49,25 +49,27 @@ _BURSTS_MIN = 12.0
 _HOT_EVENTS_MIN = 6
 # Lengths of the integer unit vectors, and of their sums per event.
 _UNIT = 4096.0
-# Lines that show their common phase, and the least vector strength of their phases.
-_LINES_MIN = 256.0
-_COMMON_MIN = 0.5
-# Cosine of an eighth of a turn, by which a line's phase may differ from the common one.
-_ALIKE = np.sqrt(0.5)
+# Share of the lines of a stream that the next profile keeps, and the least number of them.
+_KEPT = 0.75
+_LINES_MIN = 64.0
+# Cosines of the eighth of a turn by which a line's phase may differ from the common one, and of the
+# 32nd within which half of the lines are: phases that vary with the row or drift have none.
+_ALIKE = np.cos(np.pi / 4.0)
+_NEAR = np.cos(np.pi / 16.0)
 
 
 class Blink(NamedTuple):
     """Turns per microsecond and the turn from rising to falling edge, both of 2**32 per turn.
 
     A ``step`` of 0 is no test. ``lit_us`` is the time from rising to falling edge, 0 where a
-    profile has more periods than one. ``lines`` has the sums of the unit vectors of the stream's
-    lines, x and y, and their number.
+    profile has more periods than one. ``lines`` has the sums of the unit vectors of recent lines,
+    x and y, and the numbers of those that had lines before them and of those near these.
     """
 
     step: np.uint32 = np.uint32(0)
     duty: np.uint32 = np.uint32(0)
     lit_us: np.uint32 = np.uint32(0)
-    lines: NDArray[np.float64] = np.zeros(3)
+    lines: NDArray[np.float64] = np.zeros(4)
 
 
 class Vector(NamedTuple):
@@ -94,7 +96,7 @@ def blink(modulation: Modulation, every: int) -> Blink:
         np.uint32(round(turn / modulation.period_us)),
         np.uint32(round(turn * modulation.duty)),
         np.uint32(round(modulation.duty * modulation.period_us) if every == 1 else 0),
-        np.zeros(3),
+        np.zeros(4),
     )
 
 
@@ -151,14 +153,18 @@ def _is_in_phase(sums, blink):
 
 
 @kernel(_nrt=False)
+def _cosine(vector, blink):
+    """Return the cosine between a phase and that of recent lines; 0 if there are none."""
+    x, y = blink.lines[0], blink.lines[1]
+    lengths2 = (x * x + y * y) * float(vector.x * vector.x + vector.y * vector.y)
+    return (vector.x * x + vector.y * y) / np.sqrt(lengths2) if lengths2 > 0.0 else 0.0
+
+
+@kernel(_nrt=False)
 def _is_alike(vector, blink):
     """Return true when a phase is near that which the stream's lines have in common, if any."""
-    x, y, lines = blink.lines[0], blink.lines[1], blink.lines[2]
-    common = np.sqrt(x * x + y * y)
-    if lines < _LINES_MIN or common < _COMMON_MIN * lines:
-        return True
-    length = np.sqrt(float(vector.x * vector.x + vector.y * vector.y))
-    return vector.x * x + vector.y * y > _ALIKE * common * length
+    number, near = blink.lines[2], blink.lines[3]
+    return number < _LINES_MIN or 2.0 * near < number or _cosine(vector, blink) > _ALIKE
 
 
 @kernel(_nrt=False)
@@ -172,6 +178,7 @@ def _is_of_the_stream(column, window, blink):
 @kernel(_nrt=False)
 def _add_lines(columns, half, place, blink):
     """Add the lines of a profile, one of each block of columns, to those of the stream."""
+    x, y, number, near = 0.0, 0.0, 0.0, 0.0
     for c in range(np.uintp(place), np.uintp(columns.seeds.size), np.uintp(BLOCK_COLUMNS)):
         seed = columns.seeds[c]
         if blink.step == 0 or seed < 0:
@@ -184,9 +191,14 @@ def _add_lines(columns, half, place, blink):
         vector = _vector(column, first, (seed + half) // FRACTION, blink)
         length = np.sqrt(float(vector.x * vector.x + vector.y * vector.y))
         if length > 0.0:
-            blink.lines[0] += vector.x / length
-            blink.lines[1] += vector.y / length
-            blink.lines[2] += 1.0
+            x += vector.x / length
+            y += vector.y / length
+            number += blink.lines[0] != 0.0
+            near += _cosine(vector, blink) > _NEAR
+    blink.lines[0] = _KEPT * blink.lines[0] + x
+    blink.lines[1] = _KEPT * blink.lines[1] + y
+    blink.lines[2] = _KEPT * blink.lines[2] + number
+    blink.lines[3] = _KEPT * blink.lines[3] + near
 
 
 @kernel(_nrt=False)

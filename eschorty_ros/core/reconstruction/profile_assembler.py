@@ -151,7 +151,7 @@ class ProfileAssembler:
         memory = before._memory
         self._memory = self._memory._replace(
             gate=same_gate(memory.gate),
-            blink=memory.blink,
+            blink=memory.blink._replace(lines=self._memory.blink.lines),
             light=memory.light,
             scatter=self._memory.scatter._replace(laser_edges=memory.scatter.laser_edges),
             known=memory.known,

@@ -156,7 +156,7 @@ def allocate(settings: Settings, model: RangeModel) -> Memory:
     return Memory(
         columns=region(empty_columns(model.columns, settings.column_limit), settings, model),
         estimator=estimator,
-        blink=Blink(),
+        blink=Blink(lines=np.zeros(4)),
         bursts=empty_bursts(model.columns),
         footprint=make_footprint(estimator.half_max, model.columns),
         known=make_footprint(estimator.half_max, model.columns),
@@ -202,6 +202,7 @@ def _begin_window(memory, state):
     memory.columns.rivals[:], memory.columns.events[:] = -1, 0
     _forget_scatter(memory.scatter)
     _forget_bursts(memory.bursts)
+    memory.blink.lines[:] = 0.0
     memory.smoothing.errors[:] = 0.0
     memory.delay.time_us = memory.delay.points = 0
     _forget_gate(memory.gate)
@@ -297,6 +298,7 @@ def _close(memory, state, counters):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     history = smoothing.widths.history
+    _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)
     _compare_polarities(columns, half, state.profiles % BLOCK_COLUMNS, history)
     if history.windowed:
         _compare_bursts(
@@ -317,7 +319,6 @@ def _close(memory, state, counters):
             footprint, rows.row[0], smoothing.row[0], uncertain, truncated, estimator.sensor_rows
         )
     if state.known_half == 0:
-        _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)
         if half >= estimator.half_max and state.half > half:
             # Its window cuts a line that is wider than expected.
             smoothing.widths.usual.number[:], history.shift_px[:] = 0.0, 0.0
