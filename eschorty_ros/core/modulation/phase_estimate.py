@@ -15,6 +15,8 @@ from eschorty_ros.core.modulation.modulation import Modulation
 WINDOW_PERIODS = 4
 WINDOW_EVENTS = 2048
 _HISTOGRAM_BINS = 200
+# Bins of a burst may be empty where the readout takes one row after the other.
+_GAP_BINS = 3
 # Strength squared times the events: exponential with mean 1 where they are not modulated.
 _RAYLEIGH_MIN = 30.0
 
@@ -79,9 +81,11 @@ def _burst_begin(phase: NDArray[np.float64]) -> float:
     level = background + 0.05 * (float(counts[peak]) - background)
     begin = peak
     for back in range(1, _HISTOGRAM_BINS // 2):
-        if counts[(peak - back) % _HISTOGRAM_BINS] <= level:
+        before = (peak - back - np.arange(_GAP_BINS)) % _HISTOGRAM_BINS
+        if counts[before].mean() <= level:
             break
-        begin = peak - back
+        if counts[before[0]] > level:
+            begin = peak - back
     return (begin % _HISTOGRAM_BINS) / _HISTOGRAM_BINS
 
 

@@ -110,6 +110,17 @@ def test_noise_has_no_phase():
         assert not estimate_phase(t, rng.integers(0, 2, 3000), Modulation(70.0)).found
 
 
+@pytest.mark.parametrize("row_us", [1, 2, 3])
+def test_a_burst_that_is_read_out_row_by_row_begins_with_its_first_row(row_us):
+    """At 5 kHz a row takes a good part of a bin of the estimate: bins between rows are empty."""
+    t = 1000 + 200 * np.arange(30)[:, None] + np.arange(0, 60, row_us)
+    t, p = np.repeat(np.concatenate([t, t + 100]).ravel(), 16), np.repeat([1, 0], t.size * 16)
+    order = np.argsort(t, kind="stable")
+    found = estimate_phase(t[order], p[order].astype(np.uint8), Modulation(5000.0))
+    assert found.found
+    assert abs((found.edge_us - 1000 + 100) % 200 - 100) <= 2
+
+
 def test_window_does_not_depend_on_when_it_is_asked_for():
     rng = np.random.default_rng(SEED)
     t = np.sort(rng.integers(0, 10_000_000, 20_000))
