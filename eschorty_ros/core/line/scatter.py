@@ -197,9 +197,12 @@ def _scale(rows, scatter, smoothing):
         locking2 = _pixel_locking_variance(sums, block, levels) if measured else 0.0
         ratio = ratio if measured else 1.0
         factor = min(ratio, scatter.factor_max) if measured else 1.0
+        # Independent events scatter more than those of pixels, and bound what is not measured.
+        independent = 0.0 if measured or scatter.factor_max == 0.0 else 1.0
         for k in range(returns):
             for c in range(np.uintp(begin), np.uintp(end)):
                 sigma2, cut = rows.sigma2[k, c], rows.truncated[k, c]
+                sigma2 += independent * rows.variance[k, c] / max(rows.events[k, c], 1)
                 scattered = _DEVIATIONS_MAX * np.sqrt(2.0 * ratio * sigma2)
                 gate_px = max(smoothing.gate_px, scattered)
                 smoothing.gates_px[k, c] = smoothing.gate_px if cut else gate_px

@@ -14,7 +14,8 @@ The other part is what neighbouring columns share (`line_history`).
 
 The floor and b are fitted to the simulated scenes of the report's sigma experiment, at 70, 300 and
 1000 Hz. In a stream the own part of windowed estimators is scaled by the scatter of near columns
-(`scatter`), so that the floor matters only where few differences near a column are known.
+(`scatter`), so that the floor matters only where few differences near a column are known; there the
+variance of independent events is added.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,8 +16,10 @@ from eschorty_ros.core.modulation.modulation import Modulation
 WINDOW_PERIODS = 4
 WINDOW_EVENTS = 2048
 _HISTOGRAM_BINS = 200
-# Bins of a burst may be empty where the readout takes one row after the other.
-_GAP_BINS = 3
+# A readout that takes one row after the other may leave so long without an event in a burst, and
+# so many bins are taken as such at most: noise fills some.
+_ROW_US = 3.0
+_GAP_BINS_MAX = 3
 # Strength squared times the events: exponential with mean 1 where they are not modulated.
 _RAYLEIGH_MIN = 30.0
 
@@ -67,12 +70,16 @@ def estimate_phase(
     phase -= np.floor(phase)
     strength = float(abs(np.exp(2j * np.pi * phase).mean()))
     found = strength * strength * t_us.size > _RAYLEIGH_MIN
-    begin = _burst_begin(phase) if found else 0.0
+    gap_bins = min(math.ceil(_ROW_US * _HISTOGRAM_BINS / period_us), _GAP_BINS_MAX)
+    begin = _burst_begin(phase, gap_bins) if found else 0.0
     return PhaseEstimate(origin + round(begin * period_us), strength, found)
 
 
-def _burst_begin(phase: NDArray[np.float64]) -> float:
-    """Return the phase, 0 to 1, at which the largest burst rises above the background."""
+def _burst_begin(phase: NDArray[np.float64], gap_bins: int) -> float:
+    """Return the phase, 0 to 1, at which the largest burst rises above the background.
+
+    It may be as low for less than ``gap_bins``.
+    """
     bins = np.minimum((phase * _HISTOGRAM_BINS).astype(np.int64), _HISTOGRAM_BINS - 1)
     counts = np.bincount(bins, minlength=_HISTOGRAM_BINS).astype(np.float64)
     smooth = counts + np.roll(counts, 1) + np.roll(counts, -1)
@@ -81,7 +88,7 @@ def _burst_begin(phase: NDArray[np.float64]) -> float:
     level = background + 0.05 * (float(counts[peak]) - background)
     begin = peak
     for back in range(1, _HISTOGRAM_BINS // 2):
-        before = (peak - back - np.arange(_GAP_BINS)) % _HISTOGRAM_BINS
+        before = (peak - back - np.arange(gap_bins)) % _HISTOGRAM_BINS
         if counts[before].mean() <= level:
             break
         if counts[before[0]] > level:

@@ -378,6 +378,18 @@ def test_a_readout_that_reports_lost_events_has_a_warning():
     assert len(warning) < 300
 
 
+@pytest.mark.parametrize("strip", [6, 10])
+def test_sigma_of_narrow_strips_covers_their_error(strip):
+    """They have no columns far enough apart to compare; seven of ten events are lost."""
+    camera = Camera(periods=20)
+    line = camera.line(lambda k, c: np.where(c % 60 < strip, wavy(k, c), np.nan))
+    kept = np.random.default_rng(3).random(line[0].size) < 0.3
+    found, _ = points(camera, tuple(values[kept] for values in line))
+    within = [np.mean(np.abs(error_px(found)) < k * found.sigma_row) for k in (1.0, 2.0)]
+    assert within[0] > 0.6, f"seeds {camera.seed} and 3"
+    assert within[1] > 0.9
+
+
 @pytest.mark.parametrize("lamp_hz", [100.0, 120.0])
 def test_a_lamp_beside_the_line_is_not_taken_for_it(lamp_hz):
     """It flickers at twice the mains frequency, and has more events than the line."""
