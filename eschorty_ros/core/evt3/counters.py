@@ -56,6 +56,21 @@ class Counters:
     """1 while half a word waits for its second byte."""
 
     @property
+    def broken_words(self) -> int:
+        """All words that break the grammar or the order of TIME_HIGH."""
+        return (
+            self.x_without_y
+            + self.vectors_without_base
+            + self.vectors_past_width
+            + self.y_past_height
+            + self.broken_triples
+            + self.broken_continuations
+            + self.unknown_words
+            + self.time_high_back
+            + self.time_high_dropped
+        )
+
+    @property
     def sensor_drop_words(self) -> int:
         """All words by which the sensor reported a saturated readout."""
         return (

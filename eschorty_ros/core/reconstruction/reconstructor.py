@@ -35,6 +35,8 @@ _STAGE_EDGES_MAX = 1024
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
 _BURST_SHIFT_SHARE = 0.1
+# Words that a stream which begins anywhere, or goes on after a gap, may break.
+_BROKEN_PER_GAP = 10
 _FEWER_EVENTS = (
     "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
     "bias_diff_off)"
@@ -373,6 +375,14 @@ class Reconstructor:
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
                 "check frequency and laser, or choose a lower frequency where pixels are too slow"
             )
+        jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
+        if jumps > 0:
+            found.append(f"the camera's time jumps forward {jumps} times: events are missing there")
+        if counts["broken_words"] > _BROKEN_PER_GAP * (1 + counts["decoder_gaps"]):
+            found.append(
+                f"{counts['broken_words']} words of the events are not as EVT3 has them: bytes are "
+                "lost or changed; copy the file again, or check the camera's cable"
+            )
         if counts["sensor_drop_words"]:
             found.append(
                 f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
@@ -425,8 +435,8 @@ class Reconstructor:
         ``events_unmodulated`` (some of those binned) and ``columns_unmodulated`` do not follow the
         laser.
         ``points_flagged`` are some of ``points``, or with ``keep`` good left out.
-        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words`` and
-        ``decoder_*`` come from the decoder.
+        ``periods_closed`` had events, ``periods_empty`` none. ``sensor_drop_words``,
+        ``broken_words`` and ``decoder_*`` come from the decoder.
         """
         counts = Counter(self._counts)
         counts.update(self._periods.counters)
@@ -439,5 +449,6 @@ class Reconstructor:
         )
         decoder = self._decoder.counters
         counts["sensor_drop_words"] = decoder.sensor_drop_words
+        counts["broken_words"] = decoder.broken_words
         counts.update({f"decoder_{k}": int(v) for k, v in asdict(decoder).items()})
         return dict(counts)

@@ -20,8 +20,10 @@ _FEW = 10
 # Longest way of a stage in metres, and what the readings of one at rest differ by.
 _METRES_MAX = 0.3
 _REST_MM = 0.003
-# Part of the stage's way that may be after the last event: camera and stage do not end at once.
+# Part of the stage's way and time that may be after the last event: camera and stage do not end at
+# once.
 _LEFT_SHARE = 0.02
+_LEFT_US = 100_000
 # Difference of a multiple of the frequency from a whole one.
 _WHOLE = 0.01
 _LOSSES = {
@@ -79,7 +81,7 @@ def recording_warnings(
         found.append(
             f"the stage moves by {way_mm:.3g} mm in stage.csv; where these are metres, write mm"
         )
-    after = samples["position_mm"][np.searchsorted(samples["t_us"], span_us[1]) :]
+    after = samples["position_mm"][np.searchsorted(samples["t_us"], span_us[1] + _LEFT_US) :]
     if after.size and np.ptp(after) > max(_LEFT_SHARE * way_mm, _REST_MM):
         found.append(
             f"the events end at {span_us[1] * 1e-6:.3f} s, and the stage moves {np.ptp(after):.3g} "

@@ -428,6 +428,30 @@ def test_a_readout_that_loses_one_side_of_the_line_has_a_warning_and_a_larger_si
     assert len(warning) < 300
 
 
+def _without_a_part(words):
+    return np.delete(words, np.arange(words.size // 4, words.size // 2))
+
+
+def _with_other_words(words):
+    words = words.copy()
+    words[:: words.size // 50] = 0xD000
+    return words
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_without_a_part, "time jumps forward 1 times: events are missing there"),
+        (_with_other_words, "words of the events are not as EVT3 has them"),
+    ],
+)
+def test_a_stream_that_is_not_complete_has_a_warning(change, reason):
+    camera = Camera(periods=12)
+    words = change(np.frombuffer(stream(camera.line(wavy)), "<u2"))
+    _, reconstructor = reconstruct(words.tobytes(), Modulation(70.0, on_edge_us=FIRST_EDGE_US))
+    assert sum(reason in warning for warning in reconstructor.warnings) == 1
+
+
 def test_a_recording_of_two_periods_has_two_profiles():
     """Periods in the dark behind them do not count when their length is chosen."""
     camera, dark = Camera(periods=2), Camera(periods=12)
