@@ -375,6 +375,12 @@ class Reconstructor:
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
                 "check frequency and laser, or choose a lower frequency where pixels are too slow"
             )
+        used, bridged = counts["triggers_used"], counts["edges_bridged"]
+        if bridged > used > 0:
+            found.append(
+                f"the trigger input has an edge in {used} of {used + bridged} periods, which begin "
+                "profiles; where these edges are not the laser's, disconnect it"
+            )
         jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
         if jumps > 0:
             found.append(f"the camera's time jumps forward {jumps} times: events are missing there")

@@ -308,6 +308,14 @@ def test_jittered_and_missing_triggers_lose_no_event():
     per_period = [int(np.sum(found.events[found.edge_us == e])) for e in kept]
     expected = [len(part[0]) for part in parts]
     np.testing.assert_allclose(per_period, expected, rtol=0.02)
+    assert not reconstructor.warnings
+
+
+def test_a_few_edges_on_the_trigger_input_have_a_warning():
+    rng = np.random.default_rng(SEED)
+    data = encoded(line_events(rng, flat, periods=20), np.array([81_000, 202_000, 267_000]))
+    _, reconstructor = reconstruct(data, Modulation(70.0))
+    assert any("input has an edge in 3 of" in warning for warning in reconstructor.warnings)
 
 
 def test_phase_is_estimated_and_nothing_is_lost():
