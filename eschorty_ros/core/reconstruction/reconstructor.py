@@ -35,6 +35,7 @@ _STAGE_EDGES_MAX = 1024
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
 _BURST_SHIFT_SHARE = 0.1
+_RATE_CONTROL_SHARE = 0.01
 # Words that a stream which begins anywhere, or goes on after a gap, may break.
 _BROKEN_PER_GAP = 10
 _FEWER_EVENTS = (
@@ -393,6 +394,12 @@ class Reconstructor:
             found.append(
                 f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
                 f"events, which moves rows where one side of the line is lost; {_FEWER_EVENTS}"
+            )
+        before = counts["decoder_erc_events_in"]
+        share = 1.0 - counts["decoder_erc_events_out"] / max(before, 1)
+        if before and share > _RATE_CONTROL_SHARE:
+            found.append(
+                f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
             )
         share = counts["points_burst_shift"] / max(points, 1)
         if share > _BURST_SHIFT_SHARE:

@@ -10,7 +10,7 @@ from numba.core.runtime import _nrt_python as nrt
 from numba.core.runtime import rtsys
 from reconstructing import CALIBRATION, reconstruct
 
-from eschorty_ros.core.evt3 import Decoder
+from eschorty_ros.core.evt3 import Decoder, Encoder
 from eschorty_ros.core.modulation import Modulation
 from eschorty_ros.core.reconstruction import (
     Profiles,
@@ -426,6 +426,16 @@ def test_a_readout_that_loses_one_side_of_the_line_has_a_warning_and_a_larger_si
     (warning,) = reconstructor.warnings
     assert "the readout loses one side of the line" in warning
     assert len(warning) < 300
+
+
+def test_a_rate_control_that_drops_events_has_a_warning():
+    camera = Camera(periods=4)
+    data = stream(camera.line(wavy))
+    encoder = Encoder()
+    reports = encoder.encode([], [], [], [], rate_counts=[[1000, 5000, 4000], [2000, 5000, 5000]])
+    modulation = Modulation(70.0, on_edge_us=FIRST_EDGE_US)
+    _, reconstructor = reconstruct(reports + data, modulation)
+    assert any("rate control drops 10% of the events" in line for line in reconstructor.warnings)
 
 
 def _without_a_part(words):
