@@ -6,6 +6,9 @@ its centre and OFF events behind it. Where both are as far, the line is in the m
 rows. The mean of all events is nearer to the kind with more of them, and its distance from the
 middle is its uncertainty, up to the way of the line from profile to profile.
 
+Rows that jump forth and back, all columns alike, have successive differences of opposite sign.
+Minus their mean product is the variance of the jumps; a way has none.
+
 A line that gets narrower for a few profiles passes an edge, and is off by half of the rows that are
 missing at most. Means over blocks show changes that are too small to be seen in a column.
 """
@@ -18,11 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.window import FRACTION_BITS, PAD, POLARITY, ROW_MASK
 
 # Standard deviation that the rows of a moving line share, px: 0.035 to 0.067 on simulated pixels.
 SIGMA_COMMON_PX = 0.04
+# Larger differences from profile to profile are those of another surface.
+_JITTER_MAX_PX = 1.0
 # Profiles whose mean a profile is compared with.
 _PROFILES = 16.0
 # Of a line that moves by more from profile to profile the lag, which learned rows reduce, is more
@@ -44,11 +49,18 @@ class BlockSums(NamedTuple):
 
 
 class BlockMeans(NamedTuple):
-    """Mean row and width of recent profiles by block, and the number of these profiles."""
+    """Mean row and width of recent profiles by block, and the number of these profiles.
+
+    The ``last`` row is that of the last profile, ``difference`` that from the one before it, and
+    ``jitter2`` the mean of minus the products of successive differences.
+    """
 
     row: NDArray[np.float64]
     width: NDArray[np.float64]
     profiles: NDArray[np.float64]
+    last: NDArray[np.float64]
+    difference: NDArray[np.float64]
+    jitter2: NDArray[np.float64]
 
 
 class PolarityMeans(NamedTuple):
@@ -88,7 +100,7 @@ def empty_history(columns: int, common_px: float, windowed: bool) -> LineHistory
     That of full columns, not ``windowed``, is not followed: their widths are those of background.
     """
     blocks = -(-columns // BLOCK_COLUMNS) + 2
-    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((3, blocks)))
+    now, recent = BlockSums(*np.zeros((4, blocks))), BlockMeans(*np.zeros((6, blocks)))
     polarities = PolarityMeans(*np.zeros((2, blocks)))
     step_px, shift_px, moved2, passing2 = np.zeros((4, blocks))
     return LineHistory(
@@ -141,15 +153,15 @@ def _compare_with_recent(history, known, usual, width_variance):
     """
     now, recent, polarities = history.now, history.recent, history.polarities
     for block in range(1, now.points.size - 1):
-        near = slice(block - 1, block + 2)
-        points, profiles = now.points[near].sum(), recent.profiles[block]
+        points, profiles = _near_sum(now.points, block), recent.profiles[block]
         history.moved2[block], history.passing2[block] = history.common_px**2, 0.0
         history.step_px[block] = 0.0
         if points == 0.0 or not history.windowed:
             continue
-        row, width = now.row[near].sum() / points, now.width[near].sum() / points
+        row, width = _near_sum(now.row, block) / points, _near_sum(now.width, block) / points
         moved = row - recent.row[block]
-        moved2 = moved * moved - now.sigma2[near].sum() / (points * points)
+        own2 = _near_sum(now.sigma2, block) / (points * points)
+        moved2 = moved * moved - own2
         narrower = min(recent.width[block], usual) - width
         wider = width - max(recent.width[block], usual)
         shift = max(PER_NARROWER * narrower, _PER_WIDER * wider, 0.0) if known else 0.0
@@ -163,11 +175,17 @@ def _compare_with_recent(history, known, usual, width_variance):
             compared = 0
             for other in range(block - 1, block + 2):
                 compared += polarities.columns[other] > 0.0
-            apart = abs(polarities.row[near].sum()) / max(compared, 1)
+            apart = abs(_near_sum(polarities.row, block)) / max(compared, 1)
             apart = min(apart, history.step_px[block])
             off2 = history.common_px**2 + apart * apart
             shift_px = history.shift_px[block]
             history.moved2[block] = min(max(moved2, 0.0), off2) + shift_px * shift_px
+            difference, before = row - recent.last[block], recent.difference[block]
+            if max(abs(difference), abs(before)) < _JITTER_MAX_PX and profiles > 2.0:
+                recent.jitter2[block] -= weight * (difference * before + recent.jitter2[block])
+            recent.difference[block] = difference
+            history.moved2[block] += max(recent.jitter2[block] - own2, 0.0)
+        recent.last[block] = row
         history.passing2[block] = max(passing2, 0.0)
         recent.row[block] += weight * (row - recent.row[block])
         recent.width[block] += weight * (width - recent.width[block])

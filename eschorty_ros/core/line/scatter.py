@@ -79,6 +79,13 @@ def empty_scatter(columns: int, factor_max: float) -> Scatter:
     return Scatter(Differences(*own), Differences(*smoothed), factor_max, np.ones(columns))
 
 
+@kernel(inline="always")
+def _near_sum(sums, block):
+    """Return the sum over a block and its two neighbours."""
+    b = np.uintp(block)
+    return sums[b - np.uintp(1)] + sums[b] + sums[b + np.uintp(1)]
+
+
 @kernel
 def _forget_scatter(scatter):
     """Forget all differences."""
@@ -140,10 +147,9 @@ def _median_difference(row):
 @kernel(_nrt=False)
 def _ratio(sums, block, factor_max):
     """Return the ratio of the squares near a block to those expected; -1 where it is not known."""
-    near = slice(block - 1, block + 2)
-    if factor_max == 0.0 or sums.number[near].sum() < _DIFFERENCES_MIN:
+    if factor_max == 0.0 or _near_sum(sums.number, block) < _DIFFERENCES_MIN:
         return -1.0
-    ratio = sums.squares[near].sum() / sums.expected[near].sum()
+    ratio = _near_sum(sums.squares, block) / _near_sum(sums.expected, block)
     return min(max(ratio, 1.0 / FACTOR_MAX), FACTOR_MAX)
 
 
@@ -172,11 +178,10 @@ def _pixel_locking_variance(sums, block, levels):
     variances for each. These follow from the mean size of differences: rows that leap to the next
     pixel are no scatter. Scatter dithers the first harmonic of an end's error.
     """
-    near = slice(block - 1, block + 2)
-    number = sums.number[near].sum()
-    size = sums.sizes[near].sum() / number
+    number = _near_sum(sums.number, block)
+    size = _near_sum(sums.sizes, block) / number
     end2 = 2.0 * levels * _SQUARE_PER_SIZE2 * size * size / 6.0
-    middle2 = max(_WHOLE - 0.25 * sums.lengths2[near].sum() / number, 0.0)
+    middle2 = max(_WHOLE - 0.25 * _near_sum(sums.lengths2, block) / number, 0.0)
     return middle2 / levels * np.exp(-((2.0 * np.pi) ** 2) * end2)
 
 

@@ -114,6 +114,7 @@ def _restart_widths(widths, known):
     usual.number[:], usual.median.difference = known.number, known.median.difference
     widths.last[:], widths.last_row[:] = np.nan, np.nan
     recent.row[:], recent.width[:], recent.profiles[:] = 0.0, 0.0, 0.0
+    recent.jitter2[:] = 0.0
     polarities.row[:], polarities.columns[:], history.step_px[:] = 0.0, 0.0, 0.0
     widths.below[:] = 0.0
     history.shift_px[:] = 0.0
