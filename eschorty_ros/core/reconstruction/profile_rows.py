@@ -298,6 +298,9 @@ def _close(memory, state, counters):
     counters.columns_smoothed += _smooth(rows, smoothing)
     _scale_smoothed(rows, scatter, smoothing)
     history = smoothing.widths.history
+    if sums.unmodulated > sums.lines:
+        # The laser or the period's edge has begun anew.
+        blink.lines[:] = 0.0
     _add_lines(columns, half, state.profiles % BLOCK_COLUMNS, blink)
     _compare_polarities(columns, half, state.profiles % BLOCK_COLUMNS, history)
     if history.windowed:
