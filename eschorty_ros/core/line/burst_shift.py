@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eschorty_ros.core.base.kernel import kernel
-from eschorty_ros.core.line.scatter import BLOCK_COLUMNS
+from eschorty_ros.core.line.scatter import BLOCK_COLUMNS, _near_sum
 from eschorty_ros.core.line.window import (
+    _ONE,
+    _ONE_BITS,
     BLOCK,
     FRACTION,
     PAD,
@@ -27,9 +29,6 @@ from eschorty_ros.core.line.window import (
 
 # Share of the sums that the next profile keeps.
 _KEPT = 1.0 - 1.0 / 16.0
-# The number of events is above this bit, the sum of their rows below it.
-_ONE_BITS = np.uint32(20)
-_ONE = np.uint32(1 << 20)
 # Length of a burst, of 2**32 per turn: what a moving line reaches or leaves later is none of it.
 _BURST = 1 << 30
 # Where late events begin, at first, and the share of its value by which an event moves that.
@@ -112,21 +111,15 @@ def _add_column(packed, start, seed, half, blink, block, bursts):
         begin += np.uintp(BLOCK)
 
 
-@kernel(inline="always")
-def _near(sums, block, polarity, part):
-    b = np.uintp(block)
-    return sums[b - 1, polarity, part] + sums[b, polarity, part] + sums[b + 1, polarity, part]
-
-
 @kernel(_nrt=False)
 def _difference(bursts, block, polarity, explained_px):
     """Return how far early and late rows near a block differ beyond what is explained, px."""
-    early = _near(bursts.events, block, polarity, 0)
-    late = _near(bursts.events, block, polarity, 1)
+    early = _near_sum(bursts.events[:, polarity, 0], block)
+    late = _near_sum(bursts.events[:, polarity, 1], block)
     if min(early, late) < 1.0:
         return 0.0
-    early_px = _near(bursts.rows_px, block, polarity, 0) / early
-    difference = early_px - _near(bursts.rows_px, block, polarity, 1) / late
+    early_px = _near_sum(bursts.rows_px[:, polarity, 0], block) / early
+    difference = early_px - _near_sum(bursts.rows_px[:, polarity, 1], block) / late
     return np.sign(difference) * max(abs(difference) - explained_px, 0.0)
 
 

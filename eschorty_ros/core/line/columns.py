@@ -24,7 +24,7 @@ class Columns(NamedTuple):
     The ``counts[c, 1]`` late ones of a `PhaseGate` that keeps them follow where the ``room`` for
     the others ends, with its padding. It grows up to ``limit``. ``seeds`` are the rows of the lines
     in the last period, fixed point; -1 for none. ``rivals`` are those of second lines that are
-    nearly as strong, and ``evidence`` the events by which the first ones have been stronger. Those
+    nearly as strong, and ``evidence`` the events by which the first ones have been stronger, which
     have had ``events``; 0 for none. In a
     region of interest column ``c`` takes ``row_first[c]`` and the ``row_span[c]`` rows behind it;
     without one both are empty. ``refused`` counts the events that `_bin` did not append, by reason.

@@ -25,6 +25,7 @@ from eschorty_ros.core.reconstruction.readout_window import window_model, window
 from eschorty_ros.core.reconstruction.region import within_ranges
 from eschorty_ros.core.reconstruction.settings import Settings
 from eschorty_ros.core.reconstruction.step_compensation import StepCompensator
+from eschorty_ros.core.reconstruction.stream_faults import stream_faults
 from eschorty_ros.core.reconstruction.windows import JOBS_MAX, WindowAssembler
 
 _PIECE_WORDS = 1 << 16
@@ -34,14 +35,6 @@ _BLOCK_WORDS = 1 << 13
 _STAGE_EDGES_MAX = 1024
 # A larger share of unmodulated columns is a wrong frequency or slow pixels, not things that move.
 _UNMODULATED_SHARE = 0.1
-_BURST_SHIFT_SHARE = 0.1
-_RATE_CONTROL_SHARE = 0.01
-# Words that a stream which begins anywhere, or goes on after a gap, may break.
-_BROKEN_PER_GAP = 10
-_FEWER_EVENTS = (
-    "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
-    "bias_diff_off)"
-)
 
 
 class Reconstructor:
@@ -349,7 +342,7 @@ class Reconstructor:
 
     @property
     def warnings(self) -> list[str]:
-        """One line for each reason why most of the events gave no points so far."""
+        """One line for each fault of the stream, and for each reason of points that miss."""
         counts = self.counters
         found: list[str] = []
         every, columns = self.periods_per_profile, self.model.columns
@@ -376,38 +369,7 @@ class Reconstructor:
                 f"follow the laser at {self.modulation.frequency_hz:g} Hz and gave no points; "
                 "check frequency and laser, or choose a lower frequency where pixels are too slow"
             )
-        used, bridged = counts["triggers_used"], counts["edges_bridged"]
-        if bridged > used > 0:
-            found.append(
-                f"the trigger input has an edge in {used} of {used + bridged} periods, which begin "
-                "profiles; where these edges are not the laser's, disconnect it"
-            )
-        jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
-        if jumps > 0:
-            found.append(f"the camera's time jumps forward {jumps} times: events are missing there")
-        if counts["broken_words"] > _BROKEN_PER_GAP * (1 + counts["decoder_gaps"]):
-            found.append(
-                f"{counts['broken_words']} words of the events are not as EVT3 has them: bytes are "
-                "lost or changed; copy the file again, or check the camera's cable"
-            )
-        if counts["sensor_drop_words"]:
-            found.append(
-                f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
-                f"events, which moves rows where one side of the line is lost; {_FEWER_EVENTS}"
-            )
-        before = counts["decoder_erc_events_in"]
-        share = 1.0 - counts["decoder_erc_events_out"] / max(before, 1)
-        if before and share > _RATE_CONTROL_SHARE:
-            found.append(
-                f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
-            )
-        share = counts["points_burst_shift"] / max(points, 1)
-        if share > _BURST_SHIFT_SHARE:
-            found.append(
-                f"early and late events of a burst have different rows in {share:.0%} of the "
-                "points: the readout loses one side of the line, or the line is lopsided; sigma "
-                f"has the difference; {_FEWER_EVENTS}"
-            )
+        found += stream_faults(counts)
         if 2 * counts["profiles_too_wide"] > counts["periods_closed"]:
             found.append(
                 f"the line is wider than line_width_px = {self.settings.line_width_px:g} in "

@@ -1,0 +1,52 @@
+"""What is wrong with a stream of events, as the counts of its decoder and its profiles show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+_BURST_SHIFT_SHARE = 0.1
+_RATE_CONTROL_SHARE = 0.01
+# Words that a stream which begins anywhere, or goes on after a gap, may break.
+_BROKEN_PER_GAP = 10
+_FEWER_EVENTS = (
+    "limit the camera's region of interest (roi), or raise its contrast thresholds (bias_diff_on, "
+    "bias_diff_off)"
+)
+
+
+def stream_faults(counts: Mapping[str, int]) -> list[str]:
+    """Return one line for each fault; ``counts`` are the counters of a `Reconstructor`."""
+    found: list[str] = []
+    used, bridged = counts["triggers_used"], counts["edges_bridged"]
+    if bridged > used > 0:
+        found.append(
+            f"the trigger input has an edge in {used} of {used + bridged} periods, which begin "
+            "profiles; where these edges are not the laser's, disconnect it"
+        )
+    jumps = counts["decoder_time_high_jumps"] - counts["decoder_gaps"]
+    if jumps > 0:
+        found.append(f"the camera's time jumps forward {jumps} times: events are missing there")
+    if counts["broken_words"] > _BROKEN_PER_GAP * (1 + counts["decoder_gaps"]):
+        found.append(
+            f"{counts['broken_words']} words of the events are not as EVT3 has them: bytes are "
+            "lost or changed; copy the file again, or check the camera's cable"
+        )
+    if counts["sensor_drop_words"]:
+        found.append(
+            f"the sensor reports {counts['sensor_drop_words']} times that its readout lost "
+            f"events, which moves rows where one side of the line is lost; {_FEWER_EVENTS}"
+        )
+    before = counts["decoder_erc_events_in"]
+    share = 1.0 - counts["decoder_erc_events_out"] / max(before, 1)
+    if before and share > _RATE_CONTROL_SHARE:
+        found.append(
+            f"the camera's event-rate control drops {share:.0%} of the events; {_FEWER_EVENTS}"
+        )
+    share = counts["points_burst_shift"] / max(counts["points"], 1)
+    if share > _BURST_SHIFT_SHARE:
+        found.append(
+            f"early and late events of a burst have different rows in {share:.0%} of the "
+            "points: the readout loses one side of the line, or the line is lopsided; sigma "
+            f"has the difference; {_FEWER_EVENTS}"
+        )
+    return found
